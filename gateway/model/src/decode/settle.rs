@@ -71,9 +71,10 @@ impl<T> Settler<T> {
                 entry.state = State::Settled(decoded);
             }
         }
-        let state = match decoded {
-            Decoded::Segment { id } => State::Waits(bus, id),
-            decoded => State::Settled(decoded),
+        let state = if let Decoded::Segment { id } = decoded {
+            State::Waits(bus, id)
+        } else {
+            State::Settled(decoded)
         };
         self.now = at;
         self.is_at_end = false;

@@ -40,6 +40,7 @@ impl Encode for Record<'_> {
 /// Returns the time of a frame on its bus according to its header, in ns since 1970. For a frame that was latched
 /// before the recording, this is earlier than the time of the record.
 ///
+/// # Errors
 /// Returns [`CdrError`] if the bytes are not a message of this type.
 pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
     Ok(CdrReader::new(message)?.get::<Header<'_>>()?.nanos)

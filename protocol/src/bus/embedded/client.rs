@@ -30,11 +30,11 @@ impl Carrier for Embedded {
     fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError> {
         let failed = |errno: Errno| BusError::open_error(name, "connect to", errno);
         let gone = |errno| match errno {
-            Errno::PIPE | Errno::CONNRESET => match closed_error(name, options.directory.as_deref()) {
-                // A busy client's hello comes after the server has turned it away.
-                BusError::HungUp(name) => BusError::NoRoom(name),
-                error => error,
-            },
+            // A busy client's hello comes after the server has turned the client away.
+            Errno::PIPE | Errno::CONNRESET if is_served(name, options.directory.as_deref()) => {
+                BusError::NoRoom(name.to_owned())
+            }
+            Errno::PIPE | Errno::CONNRESET => BusError::Closed(name.to_owned()),
             errno => failed(errno),
         };
         let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: ANSWER_TIMEOUT };
@@ -97,8 +97,16 @@ impl Carrier for Embedded {
 /// Returns the error for a lost connection: [`BusError::Closed`] if the server has ended, [`BusError::HungUp`] if it
 /// still serves other clients.
 pub(in crate::bus) fn closed_error(name: &str, directory: Option<&Path>) -> BusError {
-    let is_served = connect(name, directory).is_ok_and(|socket| is_kept(&socket));
-    if is_served { BusError::HungUp(name.to_owned()) } else { BusError::Closed(name.to_owned()) }
+    if is_served(name, directory) {
+        BusError::HungUp(name.to_owned())
+    } else {
+        BusError::Closed(name.to_owned())
+    }
+}
+
+/// Returns true if a server accepts clients of a bus. A client that it turns away for want of room counts as accepted.
+fn is_served(name: &str, directory: Option<&Path>) -> bool {
+    connect(name, directory).is_ok_and(|socket| is_kept(&socket))
 }
 
 /// Returns true if a server keeps a new connection open. A server that is ending resets new connections.
