@@ -12,10 +12,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
+use protocol::bus::{Bus, BusKind, BusOptions, Inbox, KindChoice};
 use protocol::can::Frame;
 use rustix::process::{Pid, Signal, kill_process};
-use vcan_setup::embedded::Served;
+use vcan_setup::embedded::ServerThread;
 
 type Outcome<T> = Result<T, Box<dyn Error>>;
 
@@ -88,15 +88,15 @@ fn main() -> Outcome<()> {
     Ok(())
 }
 
-fn serve(folder: &Path) -> Outcome<Served> {
+fn serve(folder: &Path) -> Outcome<ServerThread> {
     std::fs::create_dir_all(folder)?;
     std::fs::set_permissions(folder, std::os::unix::fs::PermissionsExt::from_mode(0o700))?;
-    Ok(Served::start_in(folder, BUS)?)
+    Ok(ServerThread::start_in(folder, BUS)?)
 }
 
 fn open(folder: &Path) -> Outcome<Bus> {
-    let options = Options { directory: Some(folder.to_owned()), ..Options::default() };
-    Ok(Bus::open(BUS, Choice::Only(BusKind::Embedded), &options)?)
+    let options = BusOptions { directory: Some(folder.to_owned()), ..BusOptions::default() };
+    Ok(Bus::open(BUS, KindChoice::Only(BusKind::Embedded), &options)?)
 }
 
 /// The links of both hosts, which are stopped on drop.

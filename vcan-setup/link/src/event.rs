@@ -4,7 +4,7 @@ use std::fmt;
 
 /// An event of a link.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub(crate) enum Event {
+pub(crate) enum LinkEvent {
     /// Another host has linked the bus.
     Joined(String),
     /// A host has left or can no longer be reached; its name is given.
@@ -30,7 +30,7 @@ pub(crate) enum Event {
     },
 }
 
-impl fmt::Display for Event {
+impl fmt::Display for LinkEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Joined(host) => write!(f, "host '{host}' has joined"),

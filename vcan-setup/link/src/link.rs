@@ -8,15 +8,15 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::bus::{Bus, BusError, BusKind, Inbox, Options};
+use protocol::bus::{Bus, BusError, BusKind, BusOptions, Inbox};
 use protocol::id::CellId;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use rustix::io::Errno;
-use vcan_setup::hosts::incoming::{Heard, Incoming, SOURCES};
+use vcan_setup::hosts::incoming::{Incoming, MAX_SOURCES, SourceAccount};
 use vcan_setup::hosts::message::Stamped;
-use vcan_setup::hosts::outgoing::{Outgoing, Sent};
-use vcan_setup::hosts::report::{Host, Report, listen};
-use vcan_setup::hosts::returned::Returned;
+use vcan_setup::hosts::outgoing::{BusAccount, Outgoing};
+use vcan_setup::hosts::report::{HostReport, LinkReport, listen};
+use vcan_setup::hosts::returned::CircleDetector;
 use zenoh::bytes::ZBytes;
 use zenoh::key_expr::KeyExpr;
 use zenoh::pubsub::Publisher;
@@ -24,29 +24,29 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::{Locality, Sample, SampleKind};
 use zenoh::{Session, Wait};
 
-use crate::event::Event;
+use crate::event::LinkEvent;
 use crate::log;
-use crate::session::{FRAMES, HEARD, LinkError, Settings, config, host_of, key, life};
+use crate::session::{FRAMES, HEARD, LinkError, LinkSettings, config, host_of, key, life};
 use crate::watchers::Watchers;
 
 /// The requested receive buffer of the bus socket, in bytes.
 const RECEIVE_BUFFER: usize = 8 << 20;
 /// The interval between two attempts to send to a bus whose queue is full.
-const RETRY: Duration = Duration::from_millis(1);
+const SEND_RETRY_INTERVAL: Duration = Duration::from_millis(1);
 /// The interval between two attempts to open an unavailable bus.
-const AGAIN: Duration = Duration::from_millis(100);
+const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
 /// The minimum interval between two messages about losses on standard error.
-const SAY: Duration = Duration::from_secs(1);
+const LOSS_REPORT_INTERVAL: Duration = Duration::from_secs(1);
 /// The interval between two reports to other hosts and to programs on this machine.
-const TELL: Duration = Duration::from_millis(200);
+const REPORT_INTERVAL: Duration = Duration::from_millis(200);
 /// The maximum number of batches read from the bus before the link sends and handles events again.
-const TURNS: usize = 4;
+const MAX_BATCHES: usize = 4;
 
 /// The state that the link's thread shares with the threads of Zenoh.
 struct Shared {
     incoming: Mutex<Incoming>,
     /// By host: the counts that this host has published of the frames received from here.
-    ours: Mutex<BTreeMap<String, Heard>>,
+    ours: Mutex<BTreeMap<String, SourceAccount>>,
     wake: OwnedFd,
 }
 
@@ -55,7 +55,7 @@ impl Shared {
         self.incoming.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn ours(&self) -> MutexGuard<'_, BTreeMap<String, Heard>> {
+    fn ours(&self) -> MutexGuard<'_, BTreeMap<String, SourceAccount>> {
         self.ours.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -66,20 +66,20 @@ impl Shared {
 }
 
 /// A link between a local bus and the buses of the same name on other hosts.
-pub(crate) struct Link {
-    settings: Settings,
+pub(crate) struct HostLink {
+    settings: LinkSettings,
     kind: BusKind,
     session: Session,
     publisher: Publisher<'static>,
     /// The publisher of the counts of frames received from the other hosts.
     accounts: Publisher<'static>,
     shared: Arc<Shared>,
-    events: Receiver<Event>,
+    events: Receiver<LinkEvent>,
     /// Subscriptions and liveliness tokens. Dropping them ends them.
     declared: Vec<Box<dyn Send>>,
     bus: Option<Bus>,
     outgoing: Outgoing,
-    returned: Returned,
+    returned: CircleDetector,
     began: Instant,
     missed_before: u64,
     there: BTreeSet<String>,
@@ -88,19 +88,19 @@ pub(crate) struct Link {
     tell_at: Instant,
 }
 
-impl fmt::Debug for Link {
+impl fmt::Debug for HostLink {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Link").field("settings", &self.settings).finish_non_exhaustive()
+        f.debug_struct("HostLink").field("settings", &self.settings).finish_non_exhaustive()
     }
 }
 
-impl Link {
+impl HostLink {
     /// Opens the bus and a Zenoh session. The other hosts need not be reachable yet.
     ///
     /// # Errors
     /// Returns [`LinkError`] if the bus cannot be opened, if the configuration is wrong, or if another process links
     /// the bus.
-    pub(crate) fn open(settings: Settings) -> Result<Self, LinkError> {
+    pub(crate) fn open(settings: LinkSettings) -> Result<Self, LinkError> {
         let own = key(FRAMES, &settings.bus, &settings.host)?;
         let config = config(&settings)?;
         let kind = settings.choice.resolve(&settings.bus);
@@ -141,7 +141,7 @@ impl Link {
             declared: Vec::new(),
             bus: Some(bus),
             outgoing: Outgoing::new(life()),
-            returned: Returned::default(),
+            returned: CircleDetector::default(),
             began: Instant::now(),
             missed_before: 0,
             there: BTreeSet::new(),
@@ -154,18 +154,19 @@ impl Link {
 
     /// Subscribes to what the other hosts publish: their frames, their counts of this host's frames, and their
     /// presence.
-    fn declare(&mut self, tell: &Sender<Event>) -> Result<(), LinkError> {
-        let Settings { bus, host, .. } = self.settings.clone();
+    fn declare(&mut self, tell: &Sender<LinkEvent>) -> Result<(), LinkError> {
+        let LinkSettings { bus, host, .. } = self.settings.clone();
         let shared = Arc::clone(&self.shared);
         self.subscribe(FRAMES, tell.clone(), move |from, bytes| {
-            shared.incoming().take(from, bytes).map_err(|error| error.to_string())
+            shared.incoming().receive(from, bytes).map_err(|error| error.to_string())
         })?;
         let (shared, this) = (Arc::clone(&self.shared), host.clone());
         self.subscribe(HEARD, tell.clone(), move |from, bytes| {
-            let heard: BTreeMap<String, Heard> = serde_json::from_slice(bytes)
+            let heard: BTreeMap<String, SourceAccount> = serde_json::from_slice(bytes)
                 .map_err(|error| format!("an invalid account of received frames: {error}"))?;
             let mut ours = shared.ours();
-            if let Some(heard) = heard.get(&this).filter(|_| ours.len() < SOURCES || ours.contains_key(from))
+            if let Some(heard) =
+                heard.get(&this).filter(|_| ours.len() < MAX_SOURCES || ours.contains_key(from))
             {
                 ours.insert(from.to_owned(), *heard);
             }
@@ -176,7 +177,7 @@ impl Link {
             let from = host_of(sample.key_expr().as_str()).to_owned();
             if from != this {
                 let is_there = sample.kind() == SampleKind::Put;
-                let _ = tell.send(if is_there { Event::Joined(from) } else { Event::Gone(from) });
+                let _ = tell.send(if is_there { LinkEvent::Joined(from) } else { LinkEvent::Gone(from) });
                 shared.wake();
             }
         };
@@ -192,10 +193,10 @@ impl Link {
     fn subscribe(
         &mut self,
         what: &str,
-        tell: Sender<Event>,
+        tell: Sender<LinkEvent>,
         take: impl Fn(&str, &[u8]) -> Result<(), String> + Send + Sync + 'static,
     ) -> Result<(), LinkError> {
-        let Settings { bus, host, .. } = self.settings.clone();
+        let LinkSettings { bus, host, .. } = self.settings.clone();
         let shared = Arc::clone(&self.shared);
         let taken = move |sample: Sample| {
             let from = host_of(sample.key_expr().as_str());
@@ -203,7 +204,7 @@ impl Link {
                 return;
             }
             if let Err(why) = take(from, &sample.payload().to_bytes()) {
-                let _ = tell.send(Event::Garbage(from.to_owned(), why));
+                let _ = tell.send(LinkEvent::Garbage(from.to_owned(), why));
             }
             shared.wake();
         };
@@ -224,7 +225,11 @@ impl Link {
     ///
     /// # Errors
     /// Returns [`LinkError::Wait`] if the system cannot wait.
-    pub(crate) fn run(mut self, stop: impl AsFd, mut report: impl FnMut(Event)) -> Result<Report, LinkError> {
+    pub(crate) fn run(
+        mut self,
+        stop: impl AsFd,
+        mut report: impl FnMut(LinkEvent),
+    ) -> Result<LinkReport, LinkError> {
         let (mut inbox, mut bytes) = (Inbox::new(), Vec::new());
         let (mut said, mut say_at, mut open_at) = ((0, 0), Instant::now(), Instant::now());
         let mut warned = BTreeSet::new();
@@ -233,10 +238,10 @@ impl Link {
                 break;
             }
             if self.bus.is_none() && open_at <= Instant::now() {
-                open_at = Instant::now() + AGAIN;
+                open_at = Instant::now() + REOPEN_INTERVAL;
                 self.bus = open(&self.settings).ok();
                 if self.bus.is_some() {
-                    report(Event::BusBack);
+                    report(LinkEvent::BusBack);
                 }
             }
             let lost = self.read(&mut inbox).and_then(|()| self.write());
@@ -244,30 +249,30 @@ impl Link {
                 self.bus = None;
                 self.missed_before += u64::from(inbox.dropped());
                 inbox = Inbox::new();
-                report(Event::BusAway(error.to_string()));
+                report(LinkEvent::BusAway(error.to_string()));
             }
             self.publish(&mut bytes);
             self.note_events(&mut report);
             if self.returned.count() > 0 && warned.insert(None) {
-                report(Event::Circle);
+                report(LinkEvent::Circle);
             }
             let shared: Vec<_> = self.shared.incoming().shared().map(str::to_owned).collect();
             for host in shared {
                 if warned.insert(Some(host.clone())) {
-                    report(Event::SameName(host));
+                    report(LinkEvent::SameName(host));
                 }
             }
             let losses = self.losses();
             if losses != said && say_at <= Instant::now() {
-                report(Event::Lost {
+                report(LinkEvent::Lost {
                     from_here: losses.0 - said.0,
                     from_others: losses.1.saturating_sub(said.1),
                 });
-                (said, say_at) = (losses, Instant::now() + SAY);
+                (said, say_at) = (losses, Instant::now() + LOSS_REPORT_INTERVAL);
             }
             self.watchers.accept();
             if self.tell_at <= Instant::now() {
-                self.tell();
+                self.send_reports();
             }
         }
         let report = self.report();
@@ -277,13 +282,13 @@ impl Link {
     }
 
     /// Updates which hosts are present, and reports the events that have occurred.
-    fn note_events(&mut self, report: &mut impl FnMut(Event)) {
+    fn note_events(&mut self, report: &mut impl FnMut(LinkEvent)) {
         for event in self.events.try_iter() {
-            if let Event::Joined(host) = &event
-                && self.there.len() < SOURCES
+            if let LinkEvent::Joined(host) = &event
+                && self.there.len() < MAX_SOURCES
             {
                 self.there.insert(host.clone());
-            } else if let Event::Gone(host) = &event {
+            } else if let LinkEvent::Gone(host) = &event {
                 self.there.remove(host);
             }
             // The report to programs on this machine is due at once, because a host has come or gone.
@@ -293,8 +298,8 @@ impl Link {
     }
 
     /// Publishes the counts of the other hosts' frames, and sends the report to the programs on this machine.
-    fn tell(&mut self) {
-        self.tell_at = Instant::now() + TELL;
+    fn send_reports(&mut self) {
+        self.tell_at = Instant::now() + REPORT_INTERVAL;
         let report = self.report();
         let heard: BTreeMap<_, _> = report.hosts.iter().map(|(host, it)| (host, it.heard)).collect();
         if let Ok(bytes) = serde_json::to_vec(&heard)
@@ -303,21 +308,21 @@ impl Link {
             // The counts are published five times a second, so a lost message does no harm.
             let _ = self.accounts.put(bytes).wait();
         }
-        self.watchers.tell(&report);
+        self.watchers.send(&report);
     }
 
     /// Reads frames from the bus and queues them for the other hosts.
     fn read(&mut self, inbox: &mut Inbox) -> Result<(), BusError> {
         let Some(bus) = &self.bus else { return Ok(()) };
         let now = nanos(self.began.elapsed());
-        for _ in 0..TURNS {
+        for _ in 0..MAX_BATCHES {
             let count = bus.receive(inbox)?;
             for received in inbox.frames() {
                 if self.returned.is_returned(now, &received.frame) {
                     continue;
                 }
                 let at_nanos = if received.at_nanos == 0 { wall() } else { received.at_nanos };
-                self.outgoing.take(Stamped { at_nanos, frame: received.frame });
+                self.outgoing.push(Stamped { at_nanos, frame: received.frame });
             }
             self.outgoing.miss(self.missed_before + u64::from(inbox.dropped()));
             if count == 0 {
@@ -383,14 +388,14 @@ impl Link {
         let is_full = !self.shared.incoming().waiting().is_empty();
         let until_told = self.tell_at.saturating_duration_since(Instant::now());
         let timeout = match &self.bus {
-            None => AGAIN.min(until_told),
-            Some(_) if is_full => RETRY.min(until_told),
+            None => REOPEN_INTERVAL.min(until_told),
+            Some(_) if is_full => SEND_RETRY_INTERVAL.min(until_told),
             Some(_) => until_told,
         };
         match poll(&mut polled, Timespec::try_from(timeout).ok().as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
             // The kernel lacks memory for a moment. All sources are then treated as ready.
-            Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(RETRY),
+            Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(SEND_RETRY_INTERVAL),
             Err(errno) => return Err(errno.into()),
         }
         let came = |at: usize| polled.get(at).is_some_and(|polled| !polled.revents().is_empty());
@@ -403,20 +408,20 @@ impl Link {
 
     /// Returns the number of lost frames from the local bus, and of those from other hosts.
     fn losses(&self) -> (u64, u64) {
-        let Sent { dropped, missed, .. } = self.outgoing.account();
+        let BusAccount { dropped, missed, .. } = self.outgoing.account();
         let incoming = self.shared.incoming();
         let of_others = incoming.accounts().map(|(_, heard, _)| heard.missing()).fold(0, u64::saturating_add);
         (dropped + missed, of_others)
     }
 
-    fn report(&self) -> Report {
+    fn report(&self) -> LinkReport {
         let incoming = self.shared.incoming();
         let ours = self.shared.ours();
-        let mut hosts: BTreeMap<String, Host> = incoming
+        let mut hosts: BTreeMap<String, HostReport> = incoming
             .accounts()
             .map(|(host, heard, nodes)| {
                 let nodes = nodes.iter().map(CellId::get).collect();
-                (host.to_owned(), Host { heard, nodes, ..Host::default() })
+                (host.to_owned(), HostReport { heard, nodes, ..HostReport::default() })
             })
             .collect();
         for (host, heard) in ours.iter() {
@@ -425,7 +430,7 @@ impl Link {
         for host in &self.there {
             hosts.entry(host.clone()).or_default().is_there = true;
         }
-        Report {
+        LinkReport {
             host: self.settings.host.clone(),
             sent: self.outgoing.account(),
             hosts,
@@ -435,12 +440,12 @@ impl Link {
     }
 }
 
-fn open(settings: &Settings) -> Result<Bus, BusError> {
-    let options = Options {
+fn open(settings: &LinkSettings) -> Result<Bus, BusError> {
+    let options = BusOptions {
         receive_buffer: RECEIVE_BUFFER,
         send_timeout: Duration::ZERO,
         directory: settings.directory.clone(),
-        ..Options::default()
+        ..BusOptions::default()
     };
     Bus::open(&settings.bus, settings.choice, &options)
 }

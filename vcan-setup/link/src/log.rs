@@ -12,7 +12,7 @@ use tracing::span::{Attributes, Id, Record};
 use tracing::subscriber::Interest;
 use tracing::{Event as Entry, Level, Metadata, Subscriber};
 
-use crate::event::Event;
+use crate::event::LinkEvent;
 use crate::session::plain;
 
 /// The log target under which Zenoh reports failed connections. Their level is debug, because Zenoh tries again.
@@ -21,18 +21,18 @@ const FAILED: &str = "Unable to connect to configured peer ";
 /// The beginnings of warnings about intended behaviour: gossip is disabled, and a host may be the first one.
 const EXPECTED: [&str; 2] = ["Gossip is disabled", "Scouting delay elapsed"];
 /// The time during which the same text is reported only once.
-const ONCE: Duration = Duration::from_secs(60);
+const REPEAT_INTERVAL: Duration = Duration::from_secs(60);
 /// The maximum number of texts that are compared with new ones.
 const TEXTS: usize = 64;
 
 /// A `tracing` subscriber that forwards log entries as events.
 struct Log {
-    tell: Mutex<Sender<Event>>,
+    tell: Mutex<Sender<LinkEvent>>,
     said: Mutex<BTreeMap<String, Instant>>,
 }
 
 /// Forwards Zenoh's warnings, errors and failed connections to `tell`. Only the first call in a process has an effect.
-pub(crate) fn listen(tell: Sender<Event>) {
+pub(crate) fn listen(tell: Sender<LinkEvent>) {
     let log = Log { tell: Mutex::new(tell), said: Mutex::default() };
     // If the process already has a subscriber, that one gets the entries.
     let _ = tracing::subscriber::set_global_default(log);
@@ -51,7 +51,7 @@ impl Visit for Text {
 
 /// Returns the text to report for a log entry. Returns `None` for expected warnings, and for debug entries about
 /// anything but failures.
-fn said(is_warning: bool, text: &str) -> Option<String> {
+fn event_text(is_warning: bool, text: &str) -> Option<String> {
     if let Some(failed) = text.strip_prefix(FAILED) {
         let failed = failed.split(". Retry in").next().unwrap_or(failed);
         let (endpoint, why) = failed.split_once("! ").unwrap_or((failed, ""));
@@ -65,7 +65,7 @@ fn said(is_warning: bool, text: &str) -> Option<String> {
 impl Log {
     fn is_new(&self, text: &str) -> bool {
         let (now, mut said) = (Instant::now(), self.said.lock().unwrap_or_else(PoisonError::into_inner));
-        said.retain(|_, at| now.duration_since(*at) < ONCE);
+        said.retain(|_, at| now.duration_since(*at) < REPEAT_INTERVAL);
         said.len() < TEXTS && said.insert(text.to_owned(), now).is_none()
     }
 }
@@ -88,10 +88,11 @@ impl Subscriber for Log {
     fn event(&self, entry: &Entry<'_>) {
         let mut text = Text::default();
         entry.record(&mut text);
-        let text = said(*entry.metadata().level() <= Level::WARN, &text.0).filter(|text| self.is_new(text));
+        let text =
+            event_text(*entry.metadata().level() <= Level::WARN, &text.0).filter(|text| self.is_new(text));
         if let Some(text) = text {
             let tell = self.tell.lock().unwrap_or_else(PoisonError::into_inner);
-            let _ = tell.send(Event::Transport(text));
+            let _ = tell.send(LinkEvent::Transport(text));
         }
     }
 
@@ -117,13 +118,13 @@ mod tests {
         let failed = "Unable to connect to configured peer tcp/10.0.0.1:7447! Can not create a new TCP link bound to \
                       tcp/10.0.0.1:7447: [[Connection refused (os error 111)]] at /x/unicast.rs:9.. Retry in 100ms.";
         assert_eq!(
-            said(false, failed).unwrap(),
+            event_text(false, failed).unwrap(),
             "cannot connect to tcp/10.0.0.1:7447, and tries again: Can not create a new TCP link bound to tcp/10.0.0.1:7447: \
              [[Connection refused (os error 111)]]"
         );
-        assert_eq!(said(false, "Try to connect: tcp/10.0.0.1:7447"), None);
-        assert_eq!(said(true, "Scouting delay elapsed before start conditions are met."), None);
+        assert_eq!(event_text(false, "Try to connect: tcp/10.0.0.1:7447"), None);
+        assert_eq!(event_text(true, "Scouting delay elapsed before start conditions are met."), None);
         let refused = "received fatal alert: UnknownCA. Hint: increase the system open file limit.";
-        assert_eq!(said(true, refused).unwrap(), "received fatal alert: UnknownCA");
+        assert_eq!(event_text(true, refused).unwrap(), "received fatal alert: UnknownCA");
     }
 }

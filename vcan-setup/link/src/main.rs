@@ -11,14 +11,14 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use clap::error::ErrorKind;
-use protocol::usage::{Failure, end, one_line, print};
+use protocol::usage::{Failure, exit_code, one_line_error, print_text};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::hosts::options::LinkOptions;
 use vcan_setup::hosts::program;
-use vcan_setup::hosts::report::{Host, Report};
+use vcan_setup::hosts::report::{HostReport, LinkReport};
 
-use link::Link;
-use session::Settings;
+use link::HostLink;
+use session::LinkSettings;
 
 #[derive(Debug, Parser)]
 #[command(name = "vcan-link", bin_name = "vcan-setup link", version)]
@@ -33,9 +33,9 @@ fn main() -> ExitCode {
         // The user requested help or the version; clap prints them.
         Err(queried) if !queried.use_stderr() => queried.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
+        Err(wrong) => Err(Failure::usage(one_line_error(&wrong.render().to_string()))),
     });
-    end("vcan-setup", done)
+    exit_code("vcan-setup", done)
 }
 
 fn run(options: LinkOptions) -> Result<(), Failure> {
@@ -46,7 +46,7 @@ fn run(options: LinkOptions) -> Result<(), Failure> {
     }
     let machine = || rustix::system::uname().nodename().to_string_lossy().into_owned();
     let host = options.host.unwrap_or_else(machine);
-    let settings = Settings {
+    let settings = LinkSettings {
         bus: options.bus.clone(),
         choice: options.bus_kind,
         directory: None,
@@ -55,30 +55,31 @@ fn run(options: LinkOptions) -> Result<(), Failure> {
         connect: options.connect,
         listen: options.listen,
     };
-    let link = Link::open(settings)
+    let link = HostLink::open(settings)
         .map_err(|error| if error.is_usage() { Failure::usage(error) } else { Failure::run(error) })?;
     let ready = format!("{} ({}) is linked as '{host}'", options.bus, link.kind());
     if options.json {
-        say(&ready)
+        print_to_stderr(&ready)
     } else {
-        print(&format!("{ready}\n"))?
+        print_text(&format!("{ready}\n"))?
     }
-    let report =
-        link.run(stopped, |event| say(&format!("{}: {event}", options.bus))).map_err(Failure::run)?;
-    print(&if options.json { json(&report)? } else { text(&report) })
+    let report = link
+        .run(stopped, |event| print_to_stderr(&format!("{}: {event}", options.bus)))
+        .map_err(Failure::run)?;
+    print_text(&if options.json { json(&report)? } else { text(&report) })
 }
 
-fn json(report: &Report) -> Result<String, Failure> {
+fn json(report: &LinkReport) -> Result<String, Failure> {
     serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run)
 }
 
-fn text(report: &Report) -> String {
-    let Report { sent, hosts, returned, .. } = report;
+fn text(report: &LinkReport) -> String {
+    let LinkReport { sent, hosts, returned, .. } = report;
     let mut text = format!(
         "from here: {} frames taken, {} sent in {} messages, {} dropped, {} missed\n",
         sent.taken, sent.sent, sent.messages, sent.dropped, sent.missed
     );
-    for (host, Host { heard, .. }) in hosts {
+    for (host, HostReport { heard, .. }) in hosts {
         text += &format!(
             "from '{host}': {} frames taken, {} sent to the bus; lost {} on the way, {} there, {} here; {} from before\n",
             heard.taken,
@@ -101,6 +102,6 @@ fn no_signals(error: std::io::Error) -> Failure {
     Failure::run(format!("cannot catch signals: {error}"))
 }
 
-fn say(text: &str) {
-    protocol::usage::say(&format!("vcan-setup: {text}"));
+fn print_to_stderr(text: &str) {
+    protocol::usage::eprint_line(&format!("vcan-setup: {text}"));
 }

@@ -4,7 +4,7 @@ use std::fmt;
 use std::io;
 use std::path::PathBuf;
 
-use protocol::bus::{BusError, Choice};
+use protocol::bus::{BusError, KindChoice};
 use serde_json::Value;
 use thiserror::Error;
 use zenoh::Config;
@@ -19,11 +19,11 @@ pub(crate) const HEARD: &str = "heard";
 
 /// The settings of a link.
 #[derive(Clone, Debug)]
-pub(crate) struct Settings {
+pub(crate) struct LinkSettings {
     /// The name of the bus, which is the same on all hosts.
     pub(crate) bus: String,
     /// The kind of the local bus.
-    pub(crate) choice: Choice,
+    pub(crate) choice: KindChoice,
     /// The directory of embedded buses; `None` for the default one.
     pub(crate) directory: Option<PathBuf>,
     /// The name under which the other hosts know this host.
@@ -74,7 +74,7 @@ pub(crate) enum LinkError {
     Wait(#[source] io::Error),
 }
 
-impl Settings {
+impl LinkSettings {
     /// Converts an error of Zenoh, and adds the name of the configuration file if there is one.
     pub(crate) fn blame(&self, error: &str) -> LinkError {
         let of = self.config.as_ref().map_or_else(String::new, |path| format!("{}: ", path.display()));
@@ -114,7 +114,7 @@ pub(crate) fn plain(error: &str) -> String {
 ///
 /// Returns [`LinkError`] if the file cannot be read, if an endpoint has an unsupported form or lacks TLS beside others
 /// with TLS, or if no endpoint is given.
-pub(crate) fn config(settings: &Settings) -> Result<Config, LinkError> {
+pub(crate) fn config(settings: &LinkSettings) -> Result<Config, LinkError> {
     let mut config = match &settings.config {
         Some(path) => Config::from_file(path).map_err(|error| settings.blame(&error.to_string()))?,
         None => Config::default(),
@@ -161,7 +161,7 @@ struct Endpoints {
 }
 
 impl Endpoints {
-    fn new(settings: &Settings, config: &Config, mode: &str) -> Result<Self, LinkError> {
+    fn new(settings: &LinkSettings, config: &Config, mode: &str) -> Result<Self, LinkError> {
         let file = settings.config.as_ref().map_or_else(String::new, |path| path.display().to_string());
         let choose = |option: &str, given: &[String], key: &str| {
             let (source, endpoints) = if given.is_empty() {
@@ -268,9 +268,9 @@ mod tests {
         let path = folder.path().join("link.json5");
         fs::write(&path, text).unwrap();
         let owned = |texts: &[&str]| texts.iter().map(|&text| text.to_owned()).collect();
-        config(&Settings {
+        config(&LinkSettings {
             bus: "vcan0".to_owned(),
-            choice: Choice::Auto,
+            choice: KindChoice::Auto,
             directory: None,
             host: "here".to_owned(),
             config: (!text.is_empty()).then_some(path),

@@ -4,7 +4,7 @@ use std::io::{ErrorKind, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::{UnixListener, UnixStream};
 
-use vcan_setup::hosts::report::Report;
+use vcan_setup::hosts::report::LinkReport;
 
 /// The maximum number of connected programs; further ones are disconnected.
 const WATCHERS: usize = 64;
@@ -52,7 +52,7 @@ impl Watchers {
 
     /// Sends a report to all programs if it has changed. A program that does not read in time is disconnected, because
     /// an incomplete line would be worse for it.
-    pub(crate) fn tell(&mut self, report: &Report) {
+    pub(crate) fn send(&mut self, report: &LinkReport) {
         let Ok(mut line) = serde_json::to_vec(report) else { return };
         line.push(b'\n');
         if line != self.line {
@@ -67,7 +67,7 @@ mod tests {
     use std::path::Path;
 
     use protocol::bus::BusKind;
-    use vcan_setup::hosts::report::{Reports, listen};
+    use vcan_setup::hosts::report::{ReportReader, listen};
 
     use super::*;
 
@@ -76,15 +76,15 @@ mod tests {
         let bus = format!("w{}", std::process::id());
         let place = (BusKind::Embedded, Some(Path::new("/watchers")));
         let mut watchers = Watchers::new(listen(&bus, place.0, place.1).unwrap());
-        let report = |returned| Report { host: "x".repeat(100), returned, ..Report::default() };
-        watchers.tell(&report(1));
-        let mut reads = Reports::connect(&bus, place.0, place.1).unwrap();
-        let _sleeps = Reports::connect(&bus, place.0, place.1).unwrap();
+        let report = |returned| LinkReport { host: "x".repeat(100), returned, ..LinkReport::default() };
+        watchers.send(&report(1));
+        let mut reads = ReportReader::connect(&bus, place.0, place.1).unwrap();
+        let _sleeps = ReportReader::connect(&bus, place.0, place.1).unwrap();
         watchers.accept();
-        watchers.tell(&report(1));
+        watchers.send(&report(1));
         assert_eq!(reads.take().unwrap(), [report(1)], "once");
         for returned in 2..100_000 {
-            watchers.tell(&report(returned));
+            watchers.send(&report(returned));
             assert_eq!(reads.take().unwrap(), [report(returned)]);
             if watchers.streams.len() == 1 {
                 return;

@@ -34,15 +34,15 @@ pub trait Board {
         let _ = (node, factory);
     }
 
-    /// Sleeps until the time `due` or until a frame arrives, but at most [`LONGEST_SLEEP`]. May return early.
+    /// Sleeps until the time `due` or until a frame arrives, but at most [`MAX_SLEEP`]. May return early.
     fn sleep_until(&mut self, due: Micros);
 
     /// Stops forever, until another program is loaded into the microcontroller.
-    fn rest(&mut self) -> ! {
+    fn idle(&mut self) -> ! {
         loop {
             self.feed();
             let now = self.now();
-            self.sleep_until(now + Span(LONGEST_SLEEP));
+            self.sleep_until(now + Span(MAX_SLEEP));
         }
     }
 
@@ -55,13 +55,13 @@ pub trait Board {
     /// Reads the flash image of this cell from a copy outside the microcontroller, which takes precedence over flash.
     /// Returns the number of bytes written to `into`; `None` without such a copy. Only an emulator has a copy, because
     /// the emulated flash does not persist.
-    fn kept_elsewhere(&mut self, into: &mut [u8]) -> Option<usize> {
+    fn load_external(&mut self, into: &mut [u8]) -> Option<usize> {
         let _ = into;
         None
     }
 
     /// Writes an image, which flash already holds, to the copy outside the microcontroller. Returns true on success.
-    fn keep_elsewhere(&mut self, image: &[u8]) -> bool {
+    fn store_external(&mut self, image: &[u8]) -> bool {
         let _ = image;
         true
     }
@@ -69,7 +69,7 @@ pub trait Board {
 
 /// Maximum duration of a sleep in µs. It is short enough to feed the watchdog in time, and to detect every wrap of the
 /// clock's counter.
-pub const LONGEST_SLEEP: u64 = 500_000;
+pub const MAX_SLEEP: u64 = 500_000;
 
 /// A clock that does not wrap, from a 32-bit counter with 1 MHz.
 #[derive(Debug, Default)]
@@ -91,14 +91,14 @@ impl Clock {
 
     /// Returns the time at which the counter had this value. It must be less than 71 minutes before `now`.
     #[must_use]
-    pub fn before(now: Micros, counter: u32) -> Micros {
-        Micros(now.0 - u64::from(low(now).wrapping_sub(counter)))
+    pub fn time_of(now: Micros, counter: u32) -> Micros {
+        Micros(now.0 - u64::from(counter_value(now).wrapping_sub(counter)))
     }
 }
 
 /// Returns the counter value at a time: the lower 32 bits.
 #[must_use]
-pub const fn low(at: Micros) -> u32 {
+pub const fn counter_value(at: Micros) -> u32 {
     let [a, b, c, d, ..] = at.0.to_le_bytes();
     u32::from_le_bytes([a, b, c, d])
 }
@@ -113,7 +113,7 @@ mod tests {
         let times = [5, u32::MAX, 3, 4, u32::MAX - 1, 0].map(|counter| clock.at(counter).0);
         let wrap = 1 << 32;
         assert_eq!(times, [5, wrap - 1, wrap + 3, wrap + 4, 2 * wrap - 2, 2 * wrap]);
-        assert_eq!(Clock::before(Micros(wrap + 3), u32::MAX), Micros(wrap - 1));
-        assert_eq!(Clock::before(Micros(wrap + 3), 3), Micros(wrap + 3));
+        assert_eq!(Clock::time_of(Micros(wrap + 3), u32::MAX), Micros(wrap - 1));
+        assert_eq!(Clock::time_of(Micros(wrap + 3), 3), Micros(wrap + 3));
     }
 }

@@ -9,9 +9,9 @@ mod start {
     use core::panic::PanicInfo;
 
     use cell::board::Board as _;
-    use cell::boards::Chosen;
+    use cell::boards::SelectedBoard;
     use cell::place;
-    use cell::run::{Beginning, Cell};
+    use cell::run::{Cell, InitialState};
     use cell_node::node::Node;
     use cortex_m::peripheral::SCB;
     use cortex_m_rt::{ExceptionFrame, entry, exception};
@@ -21,17 +21,20 @@ mod start {
     fn main() -> ! {
         // The node is in a static instead of on the stack; `entry` makes the only reference to it.
         static mut NODE: MaybeUninit<Node> = MaybeUninit::uninit();
-        let mut board = Chosen::take();
+        let mut board = SelectedBoard::start();
         // Without a factory record the cell has no identity and must not send; it waits to be loaded again.
-        let Some((factory, node)) = begin(&mut board, NODE) else { board.rest() };
+        let Some((factory, node)) = begin(&mut board, NODE) else { board.idle() };
         match Cell::start(board, factory, node).run() {}
     }
 
     /// Returns the factory record, and the node before its flash contents are restored.
     // Not inlined, so that the contents of flash are off the stack when the cell runs.
     #[inline(never)]
-    fn begin<'a>(board: &mut Chosen, place: &'a mut MaybeUninit<Node>) -> Option<(Factory, &'a mut Node)> {
-        let beginning = Beginning::read(board)?;
+    fn begin<'a>(
+        board: &mut SelectedBoard,
+        place: &'a mut MaybeUninit<Node>,
+    ) -> Option<(Factory, &'a mut Node)> {
+        let beginning = InitialState::read(board)?;
         let now = board.now();
         let node = place::build(place, &beginning, now);
         beginning.restore(node);

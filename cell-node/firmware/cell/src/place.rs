@@ -9,16 +9,16 @@ use core::mem::MaybeUninit;
 use cell_node::node::Node;
 use protocol::time::Micros;
 
-use crate::run::Beginning;
+use crate::run::InitialState;
 
 /// Creates a node. The calling convention of C makes the caller pass the address at which it is built.
 #[expect(improper_ctypes_definitions, reason = "both sides are Rust, of one program")]
-extern "C" fn built(beginning: &Beginning, now: &Micros) -> Node {
+extern "C" fn built(beginning: &InitialState, now: &Micros) -> Node {
     beginning.node(*now)
 }
 
 /// Builds the node in the memory `place`, and returns a reference to it.
-pub fn build<'a>(place: &'a mut MaybeUninit<Node>, beginning: &Beginning, now: Micros) -> &'a mut Node {
+pub fn build<'a>(place: &'a mut MaybeUninit<Node>, beginning: &InitialState, now: Micros) -> &'a mut Node {
     const { assert!(size_of::<Node>() > 4) };
     // SAFETY: by the procedure call standard of 32-bit Arm (AAPCS32, 6.4 and 6.5), a function that returns a
     // struct of more than 4 bytes writes it to the address in r0, and takes its arguments in r1 and r2. The

@@ -3,17 +3,17 @@
 
 use core::convert::Infallible;
 
-use cell_node::flash::{self, Flash as Held, Kept};
+use cell_node::flash::{self, FlashContent, FlashState};
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use protocol::can::{Format, Frame};
 use protocol::factory::Factory;
 use protocol::id::CellId;
-use protocol::time::{Micros, Span};
 use protocol::port::LinkId;
+use protocol::time::{Micros, Span};
 
-use crate::board::{Board, LONGEST_SLEEP};
-use crate::store::{self, Found};
+use crate::board::{Board, MAX_SLEEP};
+use crate::store::{self, StoredImage};
 
 /// A cell that runs on a board.
 #[derive(Debug)]
@@ -25,13 +25,13 @@ pub struct Cell<'a, B> {
 
 /// The initial state of a cell: the factory record and the contents of flash.
 #[derive(Debug)]
-pub struct Beginning {
+pub struct InitialState {
     factory: Factory,
     identity: Identity,
-    held: Held,
+    held: FlashState,
 }
 
-impl Beginning {
+impl InitialState {
     /// Reads the factory record and flash of a board. Returns `None` for a blank factory record, without which a cell
     /// must not send.
     // Not inlined, so that its buffers are off the stack when the cell runs.
@@ -81,49 +81,49 @@ impl<'a, B: Board> Cell<'a, B> {
     /// Runs the loop forever.
     pub fn run(&mut self) -> Infallible {
         loop {
-            self.turn();
+            self.run_once();
         }
     }
 
     /// Runs one iteration of the loop: handles received frames and due timers, then sleeps. A cell that lost its node
     /// id to another cell receives but does not send.
-    pub fn turn(&mut self) {
+    pub fn run_once(&mut self) {
         self.board.feed();
         while let Some((frame, at)) = self.board.receive() {
-            if self.node.taken().is_some() {
+            if self.node.other_owner().is_some() {
                 continue;
             }
             let now = self.board.now();
-            self.take(now, now.since(at), &frame);
-            self.collect();
+            self.deliver(now, now.elapsed_since(at), &frame);
+            self.flush();
         }
         let now = self.board.now();
-        let longest = now + Span(LONGEST_SLEEP);
-        if self.node.taken().is_some() {
+        let longest = now + Span(MAX_SLEEP);
+        if self.node.other_owner().is_some() {
             return self.board.sleep_until(longest);
         }
         if self.node.poll_timeout() <= now {
             self.node.handle_timeout(now);
-            self.collect();
+            self.flush();
             return;
         }
         self.board.sleep_until(self.node.poll_timeout().min(longest));
     }
 
     /// Passes a frame to the node. A frame of a simulated wire goes to the port at the end of that wire.
-    fn take(&mut self, now: Micros, age: Span, frame: &Frame) {
+    fn deliver(&mut self, now: Micros, age: Span, frame: &Frame) {
         let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
             return self.node.handle_frame(now, age, frame);
         };
         let ours = Some(link_id.reversed());
         let port = self.factory.link_ids.iter().position(|link_id| *link_id == ours);
-        if let (Some(port), Some(message)) = (port, link_id.read(frame)) {
+        if let (Some(port), Some(message)) = (port, link_id.decode_frame(frame)) {
             self.node.handle_port(now, age, port, message);
         }
     }
 
     /// Writes the node's pending parameters to flash and reports the result to the node.
-    fn keep(&mut self) {
+    fn store_pending(&mut self) {
         if let Some(written) = self.write() {
             self.node.handle_stored(written);
         }
@@ -148,25 +148,25 @@ impl<'a, B: Board> Cell<'a, B> {
             return None;
         }
         let written = store::write(self.board.flash(), &image).is_ok();
-        Some(written && self.board.keep_elsewhere(&image))
+        Some(written && self.board.store_external(&image))
     }
 
     /// Writes the node's pending parameters to flash and sends its pending packets.
-    fn collect(&mut self) {
-        if self.node.taken().is_some() {
+    fn flush(&mut self) {
+        if self.node.other_owner().is_some() {
             return;
         }
-        self.keep();
+        self.store_pending();
         while let Some((port, message)) = self.node.poll_port_transmit() {
             if let Some(link_id) = self.factory.link_ids.get(port).copied().flatten() {
-                self.board.send(&link_id.frame(message));
+                self.board.send(&link_id.encode_frame(message));
             }
         }
         let format: Format = self.factory.format;
         while let Some(packet) = self.node.poll_transmit() {
             packet.frames(format).for_each(|frame| self.board.send(&frame));
         }
-        if self.node.poll_hears() {
+        if self.node.poll_received_ids() {
             self.board.filter(self.node, &self.factory);
         }
     }
@@ -176,11 +176,11 @@ impl<'a, B: Board> Cell<'a, B> {
 #[inline(never)]
 fn restore<B: Board>(board: &mut B) {
     let mut theirs = [0; flash::MAX_BYTES];
-    let Some(theirs) = board.kept_elsewhere(&mut theirs).and_then(|count| theirs.get(..count)) else {
+    let Some(theirs) = board.load_external(&mut theirs).and_then(|count| theirs.get(..count)) else {
         return;
     };
     let mut ours = [0; flash::MAX_BYTES];
-    let same = matches!(store::read(board.flash(), &mut ours), Found::Image(count) if ours.get(..count) == Some(theirs));
+    let same = matches!(store::read(board.flash(), &mut ours), StoredImage::Image(count) if ours.get(..count) == Some(theirs));
     if !same {
         // A failed write is noticed when the image is read.
         let _ = store::write(board.flash(), theirs);
@@ -189,15 +189,17 @@ fn restore<B: Board>(board: &mut B) {
 
 /// Reads from flash the node id that the network assigned, if any, and the parameters.
 #[inline(never)]
-fn read<B: Board>(board: &mut B, identity: Identity) -> (Option<CellId>, Held) {
+fn read<B: Board>(board: &mut B, identity: Identity) -> (Option<CellId>, FlashState) {
     let mut image = [0; flash::MAX_BYTES];
     let image = match store::read(board.flash(), &mut image) {
-        Found::Nothing => return (None, Held::Empty),
-        Found::Damaged => return (None, Held::Damaged),
-        Found::Image(count) => image.get(..count).unwrap_or_default(),
+        StoredImage::Nothing => return (None, FlashState::Empty),
+        StoredImage::Damaged => return (None, FlashState::Damaged),
+        StoredImage::Image(count) => image.get(..count).unwrap_or_default(),
     };
     match flash::decode(identity, image) {
-        Ok(Kept { number, parameters }) => (number, parameters.map_or(Held::Empty, Held::Sound)),
-        Err(_) => (None, Held::Damaged),
+        Ok(FlashContent { number, parameters }) => {
+            (number, parameters.map_or(FlashState::Empty, FlashState::Valid))
+        }
+        Err(_) => (None, FlashState::Damaged),
     }
 }

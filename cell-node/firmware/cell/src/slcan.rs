@@ -5,22 +5,22 @@ use core::fmt::Debug;
 
 use heapless::Deque;
 use protocol::can::Frame;
-use protocol::slcan::{self, Decoder, Line};
+use protocol::slcan::{self, Decoder, SlcanLine};
 
 /// Size of the receive buffer in bytes. It holds at least five FD frames of joints, or 40 ms at 115 200 baud.
-const BYTES: usize = 512;
+const BUFFER_BYTES: usize = 512;
 /// Maximum number of complete lines in the receive buffer.
-const LINES: usize = 32;
+const MAX_LINES: usize = 32;
 
 /// The receive buffer of the serial line. An interrupt handler writes to it and the main loop reads from it.
 #[derive(Debug)]
-pub struct Waiting {
-    bytes: Deque<u8, BYTES>,
+pub struct ReceiveBuffer {
+    bytes: Deque<u8, BUFFER_BYTES>,
     /// Counter value at the arrival of the end of each line, in µs.
-    ends: Deque<u32, LINES>,
+    ends: Deque<u32, MAX_LINES>,
 }
 
-impl Waiting {
+impl ReceiveBuffer {
     /// Creates an empty buffer.
     #[must_use]
     pub const fn new() -> Self {
@@ -46,7 +46,7 @@ impl Waiting {
     }
 
     /// Removes and decodes the next complete line. Returns it with the time of arrival of its end.
-    pub fn take(&mut self, decoder: &mut Decoder) -> Option<(Line, u32)> {
+    pub fn next_line(&mut self, decoder: &mut Decoder) -> Option<(SlcanLine, u32)> {
         let at = self.ends.pop_front()?;
         loop {
             let byte = self.bytes.pop_front()?;
@@ -58,7 +58,7 @@ impl Waiting {
     }
 }
 
-impl Default for Waiting {
+impl Default for ReceiveBuffer {
     fn default() -> Self {
         Self::new()
     }
@@ -84,7 +84,7 @@ mod tests {
     #[test]
     fn lines_come_out_with_their_times_and_not_before_their_ends() {
         let frames = [1, 2, 3].map(|id| Frame::fd(id, 0, &[7; 24]).unwrap());
-        let (mut waiting, mut decoder) = (Waiting::new(), Decoder::new());
+        let (mut waiting, mut decoder) = (ReceiveBuffer::new(), Decoder::new());
         let mut at = 0;
         for frame in &frames {
             for byte in text(frame) {
@@ -95,28 +95,28 @@ mod tests {
         let line = u32::try_from(text(&frames[0]).len()).unwrap();
         waiting.push(b't', at);
         for (number, frame) in (1..).zip(&frames) {
-            assert_eq!(waiting.take(&mut decoder), Some((Line::Frame(*frame), number * line * 10)));
+            assert_eq!(waiting.next_line(&mut decoder), Some((SlcanLine::Frame(*frame), number * line * 10)));
         }
-        assert_eq!(waiting.take(&mut decoder), None);
+        assert_eq!(waiting.next_line(&mut decoder), None);
     }
 
     #[test]
     fn what_does_not_fit_is_no_frame_and_what_comes_later_is() {
         let frame = Frame::fd(1, 0, &[7; 64]).unwrap();
-        let (mut waiting, mut decoder) = (Waiting::new(), Decoder::new());
+        let (mut waiting, mut decoder) = (ReceiveBuffer::new(), Decoder::new());
         for byte in text(&frame).repeat(9) {
             waiting.push(byte, 0);
         }
         let mut whole = 0;
-        while let Some((line, _)) = waiting.take(&mut decoder) {
-            whole += usize::from(line == Line::Frame(frame));
+        while let Some((line, _)) = waiting.next_line(&mut decoder) {
+            whole += usize::from(line == SlcanLine::Frame(frame));
         }
-        assert_eq!(whole, BYTES / text(&frame).len());
+        assert_eq!(whole, BUFFER_BYTES / text(&frame).len());
         for byte in [&[slcan::CR], &text(&frame)[..]].concat() {
             waiting.push(byte, 0);
         }
         let lines: Vec<_> =
-            core::iter::from_fn(|| waiting.take(&mut decoder)).map(|(line, _)| line).collect();
-        assert_eq!(lines.last(), Some(&Line::Frame(frame)));
+            core::iter::from_fn(|| waiting.next_line(&mut decoder)).map(|(line, _)| line).collect();
+        assert_eq!(lines.last(), Some(&SlcanLine::Frame(frame)));
     }
 }

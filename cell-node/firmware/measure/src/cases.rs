@@ -24,7 +24,7 @@ pub(crate) struct Case {
 include!(concat!(env!("OUT_DIR"), "/cases.rs"));
 
 /// A chain without rows.
-static NOTHING: Chain = Chain { name: "", rows: &[] };
+static EMPTY: Chain = Chain { name: "", rows: &[] };
 
 impl Chain {
     /// Returns the number of joints of the chain.
@@ -35,7 +35,7 @@ impl Chain {
 
 impl Case {
     pub(crate) fn chain(&self) -> &'static Chain {
-        CHAINS.get(usize::from(self.chain)).unwrap_or(&NOTHING)
+        CHAINS.get(usize::from(self.chain)).unwrap_or(&EMPTY)
     }
 
     /// Returns true if the instructions of this case are counted: those on the UR5 and on the long chains.

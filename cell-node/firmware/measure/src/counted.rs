@@ -1,7 +1,7 @@
 //! The functions whose instructions are counted. Each has an exported name, by which the emulator finds it.
 
 use cell_node::contact::{Force, Torque, TorqueRounding};
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::kernel::oracle::Projection;
 use cell_node::kernel::{Kernel, Wrench};
@@ -9,7 +9,7 @@ use cell_node::node::Node;
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{From, Joints, Message, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Joints, Message, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::time::{Micros, Span};
@@ -61,7 +61,7 @@ pub(crate) fn node() -> Node {
 /// Sets the cell's parameters.
 #[inline(never)]
 pub(crate) fn configure(node: &mut Node, parameters: &Parameters) {
-    node.restore(&Flash::Sound(*parameters));
+    node.restore(&FlashState::Valid(*parameters));
 }
 
 /// Runs a cell until it owns its node id, and applies a force of 3 N. Returns the frame with the joints for it to
@@ -75,20 +75,20 @@ pub(crate) fn pressed(node: &mut Node, joints: Joints) -> Option<Frame> {
     }
     let skin = SkinSensors { contact: [Q5_10::from_bits(1_024); 3], ..SkinSensors::default() };
     let to = Address::Cell(node.identity().cell?);
-    let press = Message::Stimulus { to, from: From::Next, page: SensorPage::Skin(skin) };
+    let press = Message::Stimulus { to, from: AppliesFrom::Next, page: SensorPage::Skin(skin) };
     let frame = |message: &Message| message.encode().frames(Format::Fd).next();
     node.handle_frame(now, Span(0), &frame(&press)?);
     frame(&Message::Joints { epoch: Epoch(1), joints })
 }
 
 /// The time at which joints are answered: after the address claim and before the next heartbeat.
-const AT: Micros = Micros(600_000);
+const ANSWER_TIME: Micros = Micros(600_000);
 
 /// Passes a joints frame to the node, and writes the frame of the node's reply to `answer`.
 #[inline(never)]
 #[unsafe(export_name = "measure_reply")]
 pub(crate) extern "C" fn reply(node: &mut Node, joints: &Frame, answer: &mut Frame) {
-    node.handle_frame(AT, Span(100), joints);
+    node.handle_frame(ANSWER_TIME, Span(100), joints);
     while let Some(packet) = node.poll_transmit() {
         for frame in packet.frames(Format::Fd) {
             *answer = frame;

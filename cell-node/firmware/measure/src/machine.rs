@@ -71,7 +71,7 @@ mod emulated {
     const PAINT: u32 = 0xCCCC_CCCC;
 
     /// Number of bytes below the stack pointer that are not painted: more than the registers that a function saves.
-    const OWN: usize = 64;
+    const UNPAINTED: usize = 64;
 
     unsafe extern "C" {
         static mut _stack_end: u32;
@@ -114,7 +114,7 @@ mod emulated {
     #[inline(never)]
     fn paint() {
         let mut place = &raw mut _stack_end;
-        let top = stack_pointer() - OWN;
+        let top = stack_pointer() - UNPAINTED;
         while place.addr() < top {
             // SAFETY: memory from the stack's end to below this frame, which is unused: there are no
             // interrupts, and this function calls no other.

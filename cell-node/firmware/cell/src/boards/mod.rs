@@ -6,9 +6,9 @@ mod microbit;
 mod stm32g4;
 
 #[cfg(feature = "microbit")]
-pub use microbit::Chosen;
+pub use microbit::SelectedBoard;
 #[cfg(feature = "stm32g4")]
-pub use stm32g4::Chosen;
+pub use stm32g4::SelectedBoard;
 
 use core::ptr::read_volatile;
 

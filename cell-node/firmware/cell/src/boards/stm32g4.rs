@@ -14,8 +14,8 @@ use protocol::factory::Factory;
 use protocol::time::{Micros, Span};
 
 use super::{factory, store};
-use crate::board::{Board, Clock, low};
-use crate::store::{Flash, NotWritten, Page, UNIT};
+use crate::board::{Board, Clock, counter_value};
+use crate::store::{Flash, Page, WRITE_SIZE, WriteError};
 
 mod can1;
 
@@ -56,7 +56,7 @@ const BUSY: u32 = 1 << 16;
 const ERRORS: u32 = 0xC3FA;
 
 /// Minimum time in µs from now to a timer compare. A nearer one may already have passed when it is set.
-const NEAR: u64 = 10;
+const MIN_LEAD: u64 = 10;
 
 fn read(address: usize) -> u32 {
     // SAFETY: the address of a register of this microcontroller, or of a word of its message RAM.
@@ -78,15 +78,15 @@ fn wait(address: usize, bits: u32, value: u32) {
 
 /// The STM32G431, the board that this build is for.
 #[derive(Debug)]
-pub struct Chosen {
+pub struct SelectedBoard {
     clock: Clock,
     flash: Pages,
 }
 
-impl Chosen {
+impl SelectedBoard {
     /// Initialises the board. Must be called only once.
     #[must_use]
-    pub fn take() -> Self {
+    pub fn start() -> Self {
         cortex_m::interrupt::disable();
         // The 24 MHz crystal / 6 * 80 / 4 = 80 MHz, for which flash needs two wait states.
         change(RCC_CR, 0, 1 << 16);
@@ -119,7 +119,7 @@ impl Chosen {
     }
 }
 
-impl Board for Chosen {
+impl Board for SelectedBoard {
     type Flash = Pages;
 
     fn factory(&mut self) -> Option<Factory> {
@@ -156,16 +156,16 @@ impl Board for Chosen {
     fn filter(&mut self, node: &Node, factory: &Factory) {
         let wires =
             factory.link_ids.into_iter().flatten().map(|link_id| link_id.reversed().raw_id() & !EXTENDED);
-        can1::filter(node.hears().map(|id| id.to_bits().into()), wires);
+        can1::filter(node.received_ids().map(|id| id.to_bits().into()), wires);
     }
 
     fn sleep_until(&mut self, due: Micros) {
-        write(TIM2_CCR1, low(due));
+        write(TIM2_CCR1, counter_value(due));
         write(TIM2_SR, 0);
         write(NVIC_ICPR, FDCAN1_IT0 | TIM2_IRQ);
         // `is_empty` sees frames from before this; later ones end `wfi`.
         can1::acknowledge();
-        if due.since(self.now()).0 > NEAR && can1::is_empty() {
+        if due.elapsed_since(self.now()).0 > MIN_LEAD && can1::is_empty() {
             wfi();
         }
     }
@@ -194,7 +194,7 @@ impl Pages {
     /// Runs a flash operation and waits until it is done. The processor stalls during the operation, because the
     /// program is in the same flash bank: 82 µs for 8 bytes, 22 ms for a page. The FIFO of the CAN controller buffers
     /// three frames in that time.
-    fn controlled(bits: u32, work: impl FnOnce()) -> Result<(), NotWritten> {
+    fn run_operation(bits: u32, work: impl FnOnce()) -> Result<(), WriteError> {
         wait(FLASH_SR, BUSY, 0);
         write(FLASH_SR, ERRORS);
         write(FLASH_KEYR, 0x4567_0123);
@@ -204,29 +204,29 @@ impl Pages {
         wait(FLASH_SR, BUSY, 0);
         let errors = read(FLASH_SR) & ERRORS;
         write(FLASH_CR, 1 << 31); // locked
-        if errors == 0 { Ok(()) } else { Err(NotWritten) }
+        if errors == 0 { Ok(()) } else { Err(WriteError) }
     }
 }
 
 impl Flash for Pages {
-    fn unit(&self, page: Page, at: usize) -> [u8; UNIT] {
+    fn unit(&self, page: Page, at: usize) -> [u8; WRITE_SIZE] {
         let address = Self::address(page, at);
         let ([a, b, c, d], [e, f, g, h]) =
             (read(address).to_le_bytes(), read(address + size_of::<u32>()).to_le_bytes());
         [a, b, c, d, e, f, g, h]
     }
 
-    fn erase(&mut self, page: Page) -> Result<(), NotWritten> {
-        let number = u32::try_from((Self::address(page, 0) - FLASH_BASE) / PAGE).map_err(|_| NotWritten)?;
+    fn erase(&mut self, page: Page) -> Result<(), WriteError> {
+        let number = u32::try_from((Self::address(page, 0) - FLASH_BASE) / PAGE).map_err(|_| WriteError)?;
         let bits = 1 << 1 | number << 3; // PER, PNB
-        Self::controlled(bits, || write(FLASH_CR, bits | 1 << 16))
+        Self::run_operation(bits, || write(FLASH_CR, bits | 1 << 16))
     }
 
-    fn program(&mut self, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten> {
+    fn program(&mut self, page: Page, at: usize, unit: [u8; WRITE_SIZE]) -> Result<(), WriteError> {
         let address = Self::address(page, at);
         let [a, b, c, d, e, f, g, h] = unit;
         // Writing both words of a unit in sequence programs it with its check bits.
-        Self::controlled(1, || {
+        Self::run_operation(1, || {
             write(address, u32::from_le_bytes([a, b, c, d]));
             write(address + size_of::<u32>(), u32::from_le_bytes([e, f, g, h]));
         })

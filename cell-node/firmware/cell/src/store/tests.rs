@@ -13,34 +13,34 @@ impl Simulated {
         Self { pages: [[0xFF; PAGE]; 2], left: usize::MAX }
     }
 
-    fn use_power(&mut self) -> Result<(), NotWritten> {
-        self.left = self.left.checked_sub(1).ok_or(NotWritten)?;
+    fn use_power(&mut self) -> Result<(), WriteError> {
+        self.left = self.left.checked_sub(1).ok_or(WriteError)?;
         Ok(())
     }
 
-    fn held(&self) -> Result<Vec<u8>, Found> {
+    fn held(&self) -> Result<Vec<u8>, StoredImage> {
         let mut image = [0; MAX_IMAGE];
         match read(self, &mut image) {
-            Found::Image(len) => Ok(image[..len].to_vec()),
+            StoredImage::Image(len) => Ok(image[..len].to_vec()),
             other => Err(other),
         }
     }
 }
 
 impl Flash for Simulated {
-    fn unit(&self, page: Page, at: usize) -> [u8; UNIT] {
-        self.pages[page as usize][at..at + UNIT].try_into().unwrap()
+    fn unit(&self, page: Page, at: usize) -> [u8; WRITE_SIZE] {
+        self.pages[page as usize][at..at + WRITE_SIZE].try_into().unwrap()
     }
 
-    fn erase(&mut self, page: Page) -> Result<(), NotWritten> {
+    fn erase(&mut self, page: Page) -> Result<(), WriteError> {
         self.use_power()?;
         self.pages[page as usize] = [0xFF; PAGE];
         Ok(())
     }
 
-    fn program(&mut self, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten> {
+    fn program(&mut self, page: Page, at: usize, unit: [u8; WRITE_SIZE]) -> Result<(), WriteError> {
         self.use_power()?;
-        let bytes = &mut self.pages[page as usize][at..at + UNIT];
+        let bytes = &mut self.pages[page as usize][at..at + WRITE_SIZE];
         assert_eq!(bytes, ERASED, "each unit is written once");
         bytes.copy_from_slice(&unit);
         Ok(())
@@ -54,12 +54,12 @@ fn image(of: u8, len: usize) -> Vec<u8> {
 #[test]
 fn the_newest_image_is_read_and_its_length_is_kept() {
     let mut flash = Simulated::new();
-    assert_eq!(flash.held(), Err(Found::Nothing));
+    assert_eq!(flash.held(), Err(StoredImage::Nothing));
     for (of, len) in [(1, 133), (2, 0), (3, 7), (4, 8), (5, MAX_IMAGE), (6, 145)] {
         write(&mut flash, &image(of, len)).unwrap();
         assert_eq!(flash.held(), Ok(image(of, len)));
     }
-    assert_eq!(write(&mut flash, &[0; MAX_IMAGE + 1]), Err(NotWritten));
+    assert_eq!(write(&mut flash, &[0; MAX_IMAGE + 1]), Err(WriteError));
     assert_eq!(flash.held(), Ok(image(6, 145)), "the old one still counts");
 }
 
@@ -105,7 +105,7 @@ fn damage_is_noticed_and_gone_after_the_next_image() {
     for (page, at) in [(0, 4), (0, 8 + 136), (1, 5), (1, 8 + 136 + 3)] {
         let mut flash = Simulated { pages: sound.pages, left: usize::MAX };
         flash.pages[page][at] = 0x55;
-        assert_eq!(flash.held(), Err(Found::Damaged), "byte {at} of page {page}");
+        assert_eq!(flash.held(), Err(StoredImage::Damaged), "byte {at} of page {page}");
         write(&mut flash, &image(3, 133)).unwrap();
         assert_eq!(flash.held(), Ok(image(3, 133)));
     }

@@ -7,7 +7,7 @@ use cortex_m_semihosting::syscall;
 /// Size of the path buffer in bytes, including the suffix.
 const MAX_PATH: usize = 256;
 /// Suffix of the file to which a new image is written.
-const PART: &[u8] = b".part";
+const PART_SUFFIX: &[u8] = b".part";
 /// Modes of OPEN: `rb` and `wb`.
 const READ: usize = 1;
 const WRITE: usize = 5;
@@ -22,19 +22,19 @@ struct Path {
 
 impl Path {
     /// Returns the path on the command line; `None` if the emulator was started without one.
-    fn given() -> Option<Self> {
+    fn from_command_line() -> Option<Self> {
         let mut bytes = [0; MAX_PATH];
         // SAFETY: the buffer is on this stack frame, and its size is passed.
-        let answer = unsafe { syscall!(GET_CMDLINE, bytes.as_mut_ptr(), MAX_PATH - PART.len() - 1) };
+        let answer = unsafe { syscall!(GET_CMDLINE, bytes.as_mut_ptr(), MAX_PATH - PART_SUFFIX.len() - 1) };
         let len = bytes.iter().position(|byte| *byte == 0)?;
         (answer == 0 && len > 0).then_some(Self { bytes, len })
     }
 
     /// Returns the path of the file to which a new image is written.
-    fn part(&self) -> Self {
+    fn part_path(&self) -> Self {
         let mut bytes = self.bytes;
-        bytes.iter_mut().skip(self.len).zip(PART).for_each(|(byte, part)| *byte = *part);
-        Self { bytes, len: self.len + PART.len() }
+        bytes.iter_mut().skip(self.len).zip(PART_SUFFIX).for_each(|(byte, part)| *byte = *part);
+        Self { bytes, len: self.len + PART_SUFFIX.len() }
     }
 
     fn open(&self, mode: usize) -> Option<File> {
@@ -57,7 +57,7 @@ impl Drop for File {
 /// Reads the file into `into`, as far as there is room. Returns the number of bytes read; `None` if there is no file.
 #[inline(never)]
 pub(super) fn load(into: &mut [u8]) -> Option<usize> {
-    let file = Path::given()?.open(READ)?;
+    let file = Path::from_command_line()?.open(READ)?;
     // SAFETY: the buffer and its size are passed.
     let left = unsafe { syscall!(READ, file.0, into.as_mut_ptr(), into.len()) };
     into.len().checked_sub(left)
@@ -67,8 +67,8 @@ pub(super) fn load(into: &mut [u8]) -> Option<usize> {
 // Not inlined, to keep the paths off the caller's stack.
 #[inline(never)]
 pub(super) fn store(image: &[u8]) -> bool {
-    let Some(path) = Path::given() else { return false };
-    let part = path.part();
+    let Some(path) = Path::from_command_line() else { return false };
+    let part = path.part_path();
     let Some(file) = part.open(WRITE) else { return false };
     // SAFETY: the buffer and its size are passed.
     let left = unsafe { syscall!(WRITE, file.0, image.as_ptr(), image.len()) };

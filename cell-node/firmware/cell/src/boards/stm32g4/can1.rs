@@ -32,7 +32,7 @@ const TO_SEND: usize = RAM + 0x278;
 /// Size in bytes of an element of the message RAM: two words and the data.
 const ELEMENT: usize = 72;
 /// Number of standard filters, and of extended ones.
-const STANDARD: usize = 28;
+const STANDARD_FILTERS: usize = 28;
 const EXTENDED: usize = 8;
 
 /// Bits of the register `CCCR`.
@@ -71,7 +71,7 @@ pub(super) fn open(format: Format) {
 pub(super) fn filter(standard: impl Iterator<Item = u32>, extended: impl Iterator<Item = u32>) {
     // A dual filter with two equal identifiers, to FIFO 0.
     let mut standard = standard.map(|id| 1 << 30 | 1 << 27 | id << 16 | id);
-    for index in 0..STANDARD {
+    for index in 0..STANDARD_FILTERS {
         write(RAM + 4 * index, standard.next().unwrap_or(0));
     }
     let mut extended = extended.map(|id| [1 << 29 | id, 1 << 30 | id]);
