@@ -107,6 +107,11 @@ impl Running {
         self.err.text.lock().unwrap().clone()
     }
 
+    /// Returns true if the program has not ended.
+    pub fn is_running(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_none()
+    }
+
     /// Waits until the process has ended, and returns its result.
     pub fn end(self) -> Ended {
         self.end_after(Duration::ZERO)
