@@ -410,7 +410,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
             "cell,force_n,q\n1,1,0 0.5\nvcan5:1,1,0 0.5\n",
             "skinbus: rows.csv, row 2: cell vcan5:1: the skin's buses are vcan0",
         ),
-        ("cell,force_n,q\n1,1,0\n", "skinbus: rows.csv, row 1: cell 1: 1 position: one is needed"),
+        ("cell,force_n,q\n1,1,0\n", "skinbus: rows.csv, row 1: cell 1: 1 position given: one is needed"),
         (
             "cell,force_n,q\n1,x,0 0.5\n",
             "skinbus: rows.csv: line 2: force_n = \"x\": a finite number is needed",
