@@ -207,9 +207,9 @@ mod tests {
             ),
             ("profile = [[-1.0, 3.0]]", "4:13: touch[0].profile[0][0] = -1: must be 0 to 3.2e7 s after"),
             ("profile = [[nan, 3.0]]", "4:13: touch[0].profile[0][0] = NaN: must be 0 to 3.2e7 s"),
-            ("profile = [[1.0, 96.0]]", "4:18: touch[0].profile[0][1] = 96: 0 to 95.997 N are possible"),
-            ("profile = [[1.0, -0.5]]", "4:18: touch[0].profile[0][1] = -0.5: 0 to 95.997 N are possible"),
-            ("profile = [[1.0, nan]]", "4:18: touch[0].profile[0][1] = NaN: 0 to 95.997 N are possible"),
+            ("profile = [[1.0, 96.0]]", "4:18: touch[0].profile[0][1] = 96: must be 0 to 95.997 N"),
+            ("profile = [[1.0, -0.5]]", "4:18: touch[0].profile[0][1] = -0.5: must be 0 to 95.997 N"),
+            ("profile = [[1.0, nan]]", "4:18: touch[0].profile[0][1] = NaN: must be 0 to 95.997 N"),
             (
                 "profile = [[1.0, 3.0, 2.0]]",
                 "4:12: touch[0].profile[0]: a point is two numbers, [t_s, force_n], not 3",
