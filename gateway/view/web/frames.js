@@ -63,7 +63,7 @@ function rowOf(frame, key, ask) {
   if (!frame.is_torque) return row;
   const button = element("button", "Why");
   button.type = "button";
-  button.setAttribute("aria-label", `Explain the torque at ${frame.at_s.toFixed(4)} s`);
+  button.setAttribute("aria-label", `Why the torque at ${frame.at_s.toFixed(4)} s is so`);
   button.onclick = () => {
     asked = sought = frame.number;
     hold(true);
@@ -86,7 +86,7 @@ function table(head, rows) {
 }
 
 function explain(why) {
-  const parts = [element("h3", `Explanation, epoch ${why.epoch}`)], cell = why.cell, force = cell?.force;
+  const parts = [element("h3", `Why, epoch ${why.epoch}`)], cell = why.cell, force = cell?.force;
   if (force) {
     parts.push(element("p", `Contact ${force.contact_n.map((v) => v.toFixed(4)).join(" + ")} = ${force.touch_n.toFixed(4)} N`),
       element("p", `Force ${force.alpha_c} × ${force.touch_n.toFixed(4)} N + ${force.alpha_p_n} N × ${force.proximity.toFixed(4)} = ${force.fused_n.toFixed(4)} N; in steps of 2⁻¹⁶ N: ${force.force_steps}`));
