@@ -28,28 +28,22 @@ enum ChainLength {
     FromJoints(Option<Length>),
 }
 
-/// A frame of a bus with its reassembled and decoded content.
+/// A frame of a bus, with the packet that it is or completes.
 #[derive(Clone, Copy, Debug)]
 pub struct Received<'f> {
     /// The frame.
     pub frame: &'f Frame,
-    /// Content of the frame.
-    pub content: Content,
-    /// Number of segments with the same identifier that were pending before this frame.
-    pub waited: usize,
-    /// Number of segments with the same identifier that are pending after this frame.
-    pub waiting: usize,
+    /// The packet, with its message unless this version cannot decode it.
+    pub packet: Result<(Packet, Result<Message, MessageError>), NoPacket>,
+    /// Pending segments with the identifier of the frame.
+    pub pending: Pending,
 }
 
-/// The content of a frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Content {
+/// The reason why a frame neither is nor completes a packet.
+#[derive(Clone, Copy, Debug)]
+pub enum NoPacket {
     /// A remote or error frame, or a 29-bit identifier: not a packet of this protocol.
     NotData,
-    /// The frame is or completes a packet that decodes to a message.
-    Message(Id, Packet, Message),
-    /// The frame is or completes a packet that this version cannot decode.
-    Meaningless(Id, Packet, MessageError),
     /// A segment of a packet in classic frames; the packet needs more segments.
     Segment(Id),
     /// A segment that does not continue the pending ones, or that arrived after their timeout: the pending packet is
@@ -59,11 +53,45 @@ pub enum Content {
     Damaged(Id, PacketError),
 }
 
+/// Number of pending segments of an identifier.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Pending {
+    /// Segments that were pending before a frame.
+    pub before: usize,
+    /// Segments that are pending after it.
+    pub after: usize,
+}
+
 impl Received<'_> {
     /// Returns the message that the frame is or completes.
     #[must_use]
     pub const fn message(&self) -> Option<&Message> {
-        if let Content::Message(_, _, message) = &self.content { Some(message) } else { None }
+        if let Ok((_, Ok(message))) = &self.packet { Some(message) } else { None }
+    }
+}
+
+/// A value for each identifier of 11 bits, allocated on first use: a bus uses few of them.
+#[derive(Clone, Debug)]
+pub(crate) struct ByIdentifier<T>(pub(crate) Vec<Option<Box<T>>>);
+
+impl<T> Default for ByIdentifier<T> {
+    fn default() -> Self {
+        Self(Vec::new())
+    }
+}
+
+impl<T: Clone + Default> ByIdentifier<T> {
+    /// Returns the value of an identifier, by default a new one.
+    pub(crate) fn entry(&mut self, id: Id) -> &mut T {
+        if self.0.is_empty() {
+            self.0.resize(IDENTIFIER_COUNT, None);
+        }
+        self.0.get_mut(usize::from(id.to_bits())).expect("an identifier has 11 bits").get_or_insert_default()
+    }
+
+    /// Returns the value of an identifier that was used.
+    pub(crate) fn get_mut(&mut self, id: Id) -> Option<&mut T> {
+        self.0.get_mut(usize::from(id.to_bits()))?.as_deref_mut()
     }
 }
 
@@ -73,8 +101,7 @@ pub struct PacketReader {
     /// Format of all frames; with `None`, the format of each frame is used.
     format: Option<Format>,
     length: ChainLength,
-    /// Reassembly state of each identifier.
-    segments: Vec<Option<Box<Reassembler>>>,
+    segments: ByIdentifier<Reassembler>,
 }
 
 impl Default for PacketReader {
@@ -86,8 +113,8 @@ impl Default for PacketReader {
 impl PacketReader {
     /// Creates a reader for a bus with an unknown chain; with `None`, the format of each frame is used.
     #[must_use]
-    pub const fn new(format: Option<Format>) -> Self {
-        Self { format, length: ChainLength::FromJoints(None), segments: Vec::new() }
+    pub fn new(format: Option<Format>) -> Self {
+        Self { format, length: ChainLength::FromJoints(None), segments: ByIdentifier::default() }
     }
 
     /// Creates a reader for a bus of a skin: packets have the format of the bus, and torques, joints and sums have the
@@ -97,31 +124,50 @@ impl PacketReader {
         Self {
             format: Some(skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format)),
             length: ChainLength::Described(skin.packet_length(bus)),
-            segments: Vec::new(),
+            segments: ByIdentifier::default(),
         }
     }
 
     /// Reads the next frame, which arrived `at`. Never panics.
     pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> Received<'f> {
-        let Ok(id) = data_id(frame) else {
-            return Received { frame, content: Content::NotData, waited: 0, waiting: 0 };
-        };
+        let (packet, pending) = self.packet(at, frame);
+        let packet = packet.map(|packet| (packet, self.decode(&packet)));
+        Received { frame, packet, pending }
+    }
+
+    /// Does the first half of [`read`](Self::read): returns the packet that the frame is or completes, for
+    /// [`decode`](Self::decode).
+    // Inlined, as `reassemble`: the receiver of a bus calls them for every frame, and copies each packet once less.
+    #[inline(always)]
+    pub(crate) fn packet(&mut self, at: Micros, frame: &Frame) -> (Result<Packet, NoPacket>, Pending) {
+        let Ok(id) = data_id(frame) else { return (Err(NoPacket::NotData), Pending::default()) };
         let packet = match self.format.unwrap_or_else(|| frame.format()) {
-            Format::Fd => Packet::from_fd(frame),
+            Format::Fd => Packet::from_fd(frame).and_then(|packet| self.of_described_length(packet)),
             Format::Classic if frame.format() == Format::Fd => {
                 Err(PacketError::Length { expected: 8, got: frame.data().len() })
             }
-            Format::Classic => return self.read_segment(at, id, frame),
+            Format::Classic => return self.reassemble(at, id, frame),
         };
-        let packet = packet.and_then(|packet| self.of_described_length(id, packet));
-        Received { frame, content: self.content(id, packet), waited: 0, waiting: 0 }
+        (packet.map_err(|error| NoPacket::Damaged(id, error)), Pending::default())
+    }
+
+    /// Does the second half of [`read`](Self::read): decodes a packet.
+    #[inline]
+    pub(crate) fn decode(&mut self, packet: &Packet) -> Result<Message, MessageError> {
+        let message = Message::decode(packet);
+        if let (Ok(Message::Joints { joints, .. }), ChainLength::FromJoints(length)) =
+            (&message, &mut self.length)
+        {
+            *length = Some(Length::for_joints(joints.in_use.into()));
+        }
+        message
     }
 
     /// Checks that the length of a packet fits the described chain.
-    fn of_described_length(&self, id: Id, packet: Packet) -> Result<Packet, PacketError> {
+    fn of_described_length(&self, packet: Packet) -> Result<Packet, PacketError> {
         match self.length {
             ChainLength::Described(length)
-                if packet.words.length() != length && Lengths::for_id(id) == Lengths::ALL =>
+                if packet.words.length() != length && Lengths::for_id(packet.id) == Lengths::ALL =>
             {
                 Err(PacketError::Length { expected: length.bytes(), got: packet.words.length().bytes() })
             }
@@ -129,53 +175,30 @@ impl PacketReader {
         }
     }
 
-    fn read_segment<'f>(&mut self, at: Micros, id: Id, frame: &'f Frame) -> Received<'f> {
+    #[inline(always)]
+    fn reassemble(&mut self, at: Micros, id: Id, frame: &Frame) -> (Result<Packet, NoPacket>, Pending) {
         let lengths = match self.length {
             ChainLength::Described(length) => Lengths::only(length),
             // Joints packets contain their own length.
             ChainLength::FromJoints(_) if id == Id::command(Command::Joints) => Lengths::ALL,
             ChainLength::FromJoints(length) => Lengths::for_chain(length),
         };
-        if self.segments.is_empty() {
-            self.segments.resize(IDENTIFIER_COUNT, None);
-        }
-        let segments = self.segments.get_mut(usize::from(id.to_bits())).expect("an identifier has 11 bits");
-        let segment = segments.get_or_insert_default();
-        let waited = segment.waiting();
-        let reassembly = segment.push(at, id, lengths, frame.data());
-        let waiting = segment.waiting();
-        let content = match reassembly {
-            Ok(Reassembly::Waiting) => Content::Segment(id),
-            Ok(Reassembly::Incomplete) => Content::AfterLost(id),
-            Ok(Reassembly::Complete(packet)) => self.content(id, Ok(packet)),
-            Ok(Reassembly::Ambiguous) => self.content(id, Err(PacketError::Ambiguous)),
-            Err(error) => self.content(id, Err(error)),
+        let segments = self.segments.entry(id);
+        let before = segments.waiting();
+        let packet = match segments.push(at, id, lengths, frame.data()) {
+            Ok(Reassembly::Complete(packet)) => Ok(packet),
+            Ok(Reassembly::Waiting) => Err(NoPacket::Segment(id)),
+            Ok(Reassembly::Incomplete) => Err(NoPacket::AfterLost(id)),
+            Ok(Reassembly::Ambiguous) => Err(NoPacket::Damaged(id, PacketError::Ambiguous)),
+            Err(error) => Err(NoPacket::Damaged(id, error)),
         };
-        Received { frame, content, waited, waiting }
-    }
-
-    fn content(&mut self, id: Id, packet: Result<Packet, PacketError>) -> Content {
-        let packet = match packet {
-            Ok(packet) => packet,
-            Err(error) => return Content::Damaged(id, error),
-        };
-        match Message::decode(&packet) {
-            Ok(message) => {
-                if let (Message::Joints { joints, .. }, ChainLength::FromJoints(length)) =
-                    (&message, &mut self.length)
-                {
-                    *length = Some(Length::for_joints(joints.in_use.into()));
-                }
-                Content::Message(id, packet, message)
-            }
-            Err(error) => Content::Meaningless(id, packet, error),
-        }
+        (packet, Pending { before, after: segments.waiting() })
     }
 
     /// Drops the pending segments with this identifier.
     pub fn drop_segments(&mut self, id: Id) {
-        if let Some(segments) = self.segments.get_mut(usize::from(id.to_bits())) {
-            *segments = None;
+        if let Some(segments) = self.segments.get_mut(id) {
+            *segments = Reassembler::NONE;
         }
     }
 }

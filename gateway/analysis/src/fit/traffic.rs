@@ -11,7 +11,7 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 use model::decode::wired;
-use model::packets::{Content, PacketReader};
+use model::packets::{NoPacket, PacketReader};
 
 /// The kinds of frames that only a bench sends, and a real robot does not.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -123,23 +123,23 @@ impl Traffic {
     /// Classifies the next frame. On a bus of another protocol no frame counts as the bench's. Never panics.
     pub fn sort(&mut self, nanos: u64, frame: &Frame) -> ClassifiedFrame {
         let received = self.packets.read(Micros(nanos / 1_000), frame);
-        let (id, packet) = match received.content {
-            Content::NotData => {
+        let packet = match received.packet {
+            Ok((packet, _)) => packet,
+            Err(NoPacket::NotData) => {
                 let bench = wired(frame).map(|_| BenchFrame::Wire);
                 return ClassifiedFrame { bench, ..ClassifiedFrame::OTHER };
             }
-            Content::Segment(_) => return ClassifiedFrame::OTHER,
-            Content::AfterLost(_) | Content::Damaged(..) => {
+            Err(NoPacket::Segment(_)) => return ClassifiedFrame::OTHER,
+            Err(NoPacket::AfterLost(_) | NoPacket::Damaged(..)) => {
                 self.others += 1;
                 return ClassifiedFrame::OTHER;
             }
-            Content::Message(id, packet, _) | Content::Meaningless(id, packet, _) => (id, packet),
         };
         let is_classic = frame.format() == Format::Classic;
         self.ours += if is_classic { packet.words.length().segments() as u64 } else { 1 };
         match received.message() {
             Some(message) if self.is_ours() => {
-                ClassifiedFrame { ends_pair: is_classic, from: id.sender(), ..self.message(message) }
+                ClassifiedFrame { ends_pair: is_classic, from: packet.id.sender(), ..self.message(message) }
             }
             _ => ClassifiedFrame::OTHER,
         }

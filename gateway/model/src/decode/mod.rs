@@ -32,12 +32,10 @@ use protocol::time::Micros;
 use std::collections::VecDeque;
 use thiserror::Error;
 
-use crate::packets::{Content, PacketReader, Received};
+use crate::packets::{ByIdentifier, NoPacket, PacketReader, Received};
 
 /// Maximum number of buses whose state is kept. Beyond it, the state of the oldest bus is dropped.
 pub const MAX_BUSES: usize = 64;
-/// The number of identifiers of 11 bits.
-const IDENTIFIER_COUNT: usize = 0x800;
 
 /// A frame by its meaning: foreign, damaged, a segment, or a decoded message.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -198,8 +196,7 @@ struct BusDecoder {
 /// Classifies the frames of one bus that a [`PacketReader`] has read.
 #[derive(Clone, Debug, Default)]
 struct Classifier {
-    /// State by identifier, allocated on first use: a capture may name any number of buses, each with few identifiers.
-    ids: Vec<Option<Box<Slot>>>,
+    ids: ByIdentifier<Slot>,
 }
 
 /// The state of one identifier of a bus.
@@ -239,46 +236,39 @@ type Classified = (Decoded, Vec<(u64, Decoded)>);
 impl Classifier {
     /// Classifies the frame with this number.
     fn take(&mut self, number: u64, received: &Received<'_>) -> Classified {
-        match received.content {
-            Content::NotData => (not_data(received.frame), Vec::new()),
-            Content::Message(id, packet, message) => (Decoded::Message(message), self.packet(id, &packet)),
-            Content::Meaningless(id, packet, error) => {
-                (Decoded::Meaningless { packet, error }, self.packet(id, &packet))
+        let id = match received.packet {
+            Ok((packet, message)) => {
+                let settled = self.packet(&packet);
+                return match message {
+                    Ok(message) => (Decoded::Message(message), settled),
+                    Err(error) => (Decoded::Meaningless { packet, error }, settled),
+                };
             }
-            Content::Segment(id) | Content::AfterLost(id) => {
-                let (slot, mut settled) = (self.slot(id), Vec::new());
-                slot.waiting.push_back(number);
-                slot.drop_beyond(received.waiting, id, &mut settled);
-                (Decoded::Segment { id }, settled)
-            }
-            Content::Damaged(id, fault) => {
-                let (slot, mut settled) = (self.slot(id), Vec::new());
+            Err(NoPacket::NotData) => return (not_data(received.frame), Vec::new()),
+            Err(NoPacket::Segment(id) | NoPacket::AfterLost(id)) => id,
+            Err(NoPacket::Damaged(id, fault)) => {
+                let (slot, mut settled) = (self.ids.entry(id), Vec::new());
                 if fault == PacketError::Ambiguous {
                     slot.drop_beyond(0, id, &mut settled);
                 }
-                (slot.refuse(id, fault), settled)
+                return (slot.refuse(id, fault), settled);
             }
-        }
+        };
+        let (slot, mut settled) = (self.ids.entry(id), Vec::new());
+        slot.waiting.push_back(number);
+        slot.drop_beyond(received.pending.after, id, &mut settled);
+        (Decoded::Segment { id }, settled)
     }
 
     /// Counts a packet, and settles its pending segments. Returns the numbers and classes of the frames that are
     /// settled.
-    fn packet(&mut self, id: Id, packet: &Packet) -> Vec<(u64, Decoded)> {
-        let (slot, mut settled) = (self.slot(id), Vec::new());
+    fn packet(&mut self, packet: &Packet) -> Vec<(u64, Decoded)> {
+        let id = packet.id;
+        let (slot, mut settled) = (self.ids.entry(id), Vec::new());
         slot.drop_beyond(packet.words.length().segments() - 1, id, &mut settled);
         settled.extend(slot.waiting.drain(..).map(|number| (number, Decoded::Segment { id })));
         slot.traffic.packet();
         settled
-    }
-
-    fn slot(&mut self, id: Id) -> &mut Slot {
-        if self.ids.is_empty() {
-            self.ids.resize(IDENTIFIER_COUNT, None);
-        }
-        self.ids
-            .get_mut(usize::from(id.to_bits()))
-            .expect("an identifier has 11 bits")
-            .get_or_insert_default()
     }
 }
 
@@ -307,7 +297,7 @@ impl Decoder {
     /// Returns the class of a segment whose packet will not be completed.
     fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
         let found = self.buses.iter_mut().find(|it| it.number == bus).and_then(|bus| {
-            let slot = bus.classifier.ids.get_mut(usize::from(id.to_bits()))?.as_mut()?;
+            let slot = bus.classifier.ids.get_mut(id)?;
             (slot.waiting.front() == Some(&number)).then_some((slot, &mut bus.packets))
         });
         let Some((slot, packets)) = found else {

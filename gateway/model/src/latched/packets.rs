@@ -21,7 +21,7 @@ use protocol::packet::{self, Epoch, PacketError, Reassembler};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
-use crate::packets::{Content, PacketReader};
+use crate::packets::{ByIdentifier, NoPacket, PacketReader};
 use crate::tracker::{AddressClaim, Contact, HeartbeatKind, PerCell};
 
 /// A frame that was received from the bus.
@@ -87,7 +87,7 @@ pub struct LatchedPackets {
     halt: SharedPacket,
     packets: PacketReader,
     /// Segments of incomplete packets, by identifier.
-    waiting: BTreeMap<u16, Vec<ReceivedFrame>>,
+    waiting: ByIdentifier<Vec<ReceivedFrame>>,
     /// Identifiers of the gateway's packets with pending segments, each with the time of its newest segment in ns since
     /// 1970.
     open: BTreeMap<u16, u64>,
@@ -101,7 +101,7 @@ impl Default for LatchedPackets {
             joints: None,
             halt: None,
             packets: PacketReader::new(None),
-            waiting: BTreeMap::new(),
+            waiting: ByIdentifier::default(),
             open: BTreeMap::new(),
         }
     }
@@ -209,30 +209,37 @@ impl LatchedPackets {
             Kind::Sensors | Kind::Configured => {}
             Kind::Sum | Kind::Torque => return,
         }
-        let received = self.packets.read(Micros(seen.at_nanos / 1_000), &seen.frame);
-        let packet = match received.content {
-            Content::Message(_, packet, _) | Content::Meaningless(_, packet, _) => packet,
-            Content::Segment(_) | Content::AfterLost(_) | Content::Damaged(_, PacketError::Ambiguous) => {
-                let waiting = self.waiting.entry(id.to_bits()).or_default();
+        let (packet, pending) = self.packets.packet(Micros(seen.at_nanos / 1_000), &seen.frame);
+        let packet = match packet {
+            Ok(packet) => packet,
+            Err(
+                NoPacket::Segment(_) | NoPacket::AfterLost(_) | NoPacket::Damaged(_, PacketError::Ambiguous),
+            ) => {
+                let waiting = self.waiting.entry(id);
                 waiting.push(seen);
-                waiting.drain(..waiting.len().saturating_sub(received.waiting));
+                waiting.drain(..waiting.len().saturating_sub(pending.after));
                 if !id.kind.is_from_cells() {
                     self.open.insert(id.to_bits(), seen.at_nanos);
                 }
                 return;
             }
-            Content::NotData | Content::Damaged(..) => return,
+            Err(NoPacket::NotData | NoPacket::Damaged(..)) => return,
         };
-        let mut frames = Vec::new();
-        if seen.frame.format() == Format::Classic {
+        // Exactly as much memory as the packet needs: many packets are kept.
+        let frames = if seen.frame.format() == Format::Fd {
+            vec![seen]
+        } else {
             self.open.remove(&id.to_bits());
-            frames = self.waiting.remove(&id.to_bits()).unwrap_or_default();
-            frames.drain(..(frames.len() + 1).saturating_sub(packet.words.length().segments()));
-        }
-        frames.push(seen);
-        let Some(message) = received.message() else { return };
+            let waiting = self.waiting.entry(id);
+            waiting.push(seen);
+            let first = waiting.len().saturating_sub(packet.words.length().segments());
+            let frames = waiting.drain(first..).collect();
+            waiting.clear();
+            frames
+        };
+        let Ok(message) = self.packets.decode(&packet) else { return };
         self.places += 1;
-        self.apply_message(message, &Arc::new(PlacedPacket { place: self.places, frames }));
+        self.apply_message(&message, &Arc::new(PlacedPacket { place: self.places, frames }));
     }
 
     /// Returns true if segments of a gateway packet are pending. A new part of the recording must not begin between

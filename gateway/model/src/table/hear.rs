@@ -1,6 +1,7 @@
-//! Applies received messages to the table of a bus.
+//! Receives frames, and applies their messages to the table of a bus.
 
-use protocol::id::{Id, Node};
+use protocol::can::Frame;
+use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{AppliesFrom, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::Parameter;
@@ -11,12 +12,97 @@ use super::held::Change;
 use super::replies::ReplyExpectation;
 use super::root_totals::{RootTotals, Sum, SumUse};
 use super::{Event, Notice, Positions, Table};
+use crate::packets::{NoPacket, Pending, Received};
 use crate::tracker::{HeartbeatKind, Update};
 
 /// Parameters whose write changes at once how a cell answers.
 const SWITCHED: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
 impl Table {
+    /// Reassembles and decodes a frame of this bus, for [`receive`](Self::receive) and other consumers.
+    pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> Received<'f> {
+        self.packets.read(at, frame)
+    }
+
+    /// Handles a frame that was on the bus at `at`; `own` is true if this gateway sent it. For a broadcast of this
+    /// gateway, `positions` returns the positions in rad or m from which its words were rounded, if they are known.
+    pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut Positions<'_>) {
+        let (packet, pending) = self.packets.packet(at, frame);
+        match packet {
+            Ok(packet) => {
+                let message = self.packets.decode(&packet);
+                self.receive_packet(at, own, packet.id, message.as_ref().ok(), positions);
+            }
+            Err(no_packet) => self.refuse(own, frame, no_packet, pending),
+        }
+    }
+
+    /// Does [`handle_frame`](Self::handle_frame) for a frame that has been [`read`](Self::read).
+    pub fn receive(&mut self, at: Micros, own: bool, received: &Received<'_>, positions: &mut Positions<'_>) {
+        match &received.packet {
+            Ok((packet, message)) => {
+                self.receive_packet(at, own, packet.id, message.as_ref().ok(), positions);
+            }
+            Err(no_packet) => self.refuse(own, received.frame, *no_packet, received.pending),
+        }
+    }
+
+    #[inline(always)]
+    fn receive_packet(
+        &mut self,
+        at: Micros,
+        own: bool,
+        id: Id,
+        message: Option<&Message>,
+        positions: &mut Positions<'_>,
+    ) {
+        self.counters.frame(id.kind, own);
+        match message {
+            Some(message) if own => self.receive_own(at, message, positions),
+            Some(message) => self.receive_foreign(at, id, message),
+            None => self.reject(id, own, Event::Meaning),
+        }
+    }
+
+    /// Counts a frame that neither is nor completes a packet.
+    fn refuse(&mut self, own: bool, frame: &Frame, no_packet: NoPacket, pending: Pending) {
+        let (id, event) = match no_packet {
+            NoPacket::NotData => {
+                let is_error = frame.is_error();
+                return self.counters.count(if is_error { Event::ErrorFrame } else { Event::Foreign });
+            }
+            NoPacket::Segment(id) if pending.before == 0 || self.is_used(id) => return,
+            // Each foreign frame counts as such, not as an incomplete packet.
+            NoPacket::Segment(id) => (id, Event::Foreign),
+            NoPacket::AfterLost(id) => (id, Event::Incomplete),
+            NoPacket::Damaged(id, error) => (id, Event::from(error)),
+        };
+        if !own && !self.is_used(id) {
+            return self.counters.count(Event::Foreign);
+        }
+        self.counters.frame(id.kind, own);
+        self.reject(id, own, event);
+    }
+
+    /// Returns true if the skin describes a sender with this identifier on this bus.
+    fn is_used(&self, id: Id) -> bool {
+        let is_cell = |cell: CellId| self.place(cell).is_some();
+        match (id.kind, Node::from_byte(id.node)) {
+            (Kind::Command, _) => Command::from_byte(id.node).is_some(),
+            (Kind::Network, Node::Gateway) | (Kind::Configure | Kind::Stimulus, Node::Everyone) => true,
+            (_, Node::Cell(cell)) => is_cell(cell),
+            (_, Node::Gateway | Node::Everyone) => false,
+        }
+    }
+
+    /// Counts an unusable frame, for the bus and for the cell with its identifier.
+    fn reject(&mut self, id: Id, own: bool, event: Event) {
+        self.counters.count(event);
+        if let (false, Some(cell)) = (own, self.sender(id)) {
+            cell.tracked.account.reject();
+        }
+    }
+
     /// Handles a frame of this gateway, read back from the bus.
     pub(super) fn receive_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
         if let Message::Joints { epoch, joints } = *message {

@@ -28,9 +28,8 @@ mod switched;
 
 use std::collections::VecDeque;
 
-use protocol::can::Frame;
 use protocol::fixed::TorqueFormat;
-use protocol::id::{CellId, Command, Id, Kind, Node};
+use protocol::id::{CellId, Id};
 use protocol::message::{Heartbeat, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::{Events, MAX_JOINTS, Sensing};
@@ -39,7 +38,7 @@ use protocol::time::Micros;
 
 use crate::central::Central;
 use crate::network::check::ObservedCell;
-use crate::packets::{Content, PacketReader, Received};
+use crate::packets::PacketReader;
 
 use epoch::Broadcast;
 use held::{Change, to_nm};
@@ -304,69 +303,6 @@ impl Table {
     /// Removes and returns the notices, oldest first.
     pub fn notices(&mut self) -> impl Iterator<Item = Notice> {
         self.notices.drain(..)
-    }
-
-    /// Reassembles and decodes a frame of this bus, for [`receive`](Self::receive) and other consumers.
-    pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> Received<'f> {
-        self.packets.read(at, frame)
-    }
-
-    /// Handles a frame that was on the bus at `at`; `own` is true if this gateway sent it. For a broadcast of this
-    /// gateway, `positions` returns the positions in rad or m from which its words were rounded, if they are known.
-    pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut Positions<'_>) {
-        let received = self.read(at, frame);
-        self.receive(at, own, &received, positions);
-    }
-
-    /// Does [`handle_frame`](Self::handle_frame) for a frame that has been [`read`](Self::read).
-    pub fn receive(&mut self, at: Micros, own: bool, received: &Received<'_>, positions: &mut Positions<'_>) {
-        let (id, event) = match received.content {
-            Content::Message(id, _, ref message) => {
-                self.counters.frame(id.kind, own);
-                return if own {
-                    self.receive_own(at, message, positions)
-                } else {
-                    self.receive_foreign(at, id, message)
-                };
-            }
-            Content::NotData => {
-                let is_error = received.frame.is_error();
-                return self.counters.count(if is_error { Event::ErrorFrame } else { Event::Foreign });
-            }
-            Content::Segment(id) if received.waited == 0 || self.is_used(id) => return,
-            // Each foreign frame counts as such, not as an incomplete packet.
-            Content::Segment(id) => (id, Event::Foreign),
-            Content::AfterLost(id) => (id, Event::Incomplete),
-            Content::Meaningless(id, ..) => {
-                self.counters.frame(id.kind, own);
-                return self.reject(id, own, Event::Meaning);
-            }
-            Content::Damaged(id, error) => (id, Event::from(error)),
-        };
-        if !own && !self.is_used(id) {
-            return self.counters.count(Event::Foreign);
-        }
-        self.counters.frame(id.kind, own);
-        self.reject(id, own, event);
-    }
-
-    /// Returns true if the skin describes a sender with this identifier on this bus.
-    fn is_used(&self, id: Id) -> bool {
-        let is_cell = |cell: CellId| self.place(cell).is_some();
-        match (id.kind, Node::from_byte(id.node)) {
-            (Kind::Command, _) => Command::from_byte(id.node).is_some(),
-            (Kind::Network, Node::Gateway) | (Kind::Configure | Kind::Stimulus, Node::Everyone) => true,
-            (_, Node::Cell(cell)) => is_cell(cell),
-            (_, Node::Gateway | Node::Everyone) => false,
-        }
-    }
-
-    /// Counts an unusable frame, for the bus and for the cell with its identifier.
-    fn reject(&mut self, id: Id, own: bool, event: Event) {
-        self.counters.count(event);
-        if let (false, Some(cell)) = (own, self.sender(id)) {
-            cell.tracked.account.reject();
-        }
     }
 
     /// Returns the cell that sends frames with this identifier.

@@ -1,7 +1,8 @@
 //! Tests of the table of a bus whose cells answer with torques.
 
 use super::*;
-use protocol::can::Format;
+use protocol::can::{Format, Frame};
+use protocol::id::Node;
 use protocol::message::{Answer, Joints, Message, NetworkPage, ReceivedCounts, Request, SensorPage, State};
 use protocol::packet::{self, Packet};
 use protocol::parameters::Parameter;

@@ -2,6 +2,7 @@
 
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10};
+use protocol::id::Node;
 use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, ReceivedCounts, SensorPage, State, Tree};
 use protocol::packet::{self, Length, Words};
 use protocol::time::Span;

@@ -4,7 +4,6 @@ use analysis::fit::rates::RequestedRates;
 use bench::view::CellView;
 use model::central::Central;
 use model::decode::wired;
-use model::packets::Content;
 use model::table::{CellState, Status, Table};
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, TorqueFormat};
@@ -91,8 +90,7 @@ impl LiveBus {
     pub(super) fn apply_frame(&mut self, at: Micros, frame: &Frame) -> bool {
         let received = self.table.read(at, frame);
         let message = received.message().copied();
-        let is_wire = received.content == Content::NotData && wired(frame).is_some();
-        if !is_wire && !matches!(message, Some(Message::Stimulus { .. })) {
+        if wired(frame).is_none() && !matches!(message, Some(Message::Stimulus { .. })) {
             // On a bench, wire states and stimuli are frames of the same bus, but a real bus would not carry them.
             let busy =
                 self.rates.zip(Bits::from_frame(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
