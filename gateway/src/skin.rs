@@ -38,7 +38,7 @@ enum Command {
 
 /// Describe a skin of hexagonal cells on the arm of a UR5
 ///
-/// The same options give the same text, whose first line is the command that generates it.
+/// Equal options give equal texts, whose first line is the command that generates it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus skin generate -o skin.toml

@@ -105,7 +105,7 @@ impl Plan {
                 named @ (Profile::HalfSine | Profile::Step | Profile::Ramp) => json!(named.name()),
             };
             let mut how = map([("force_n", json!(touch.force_n)), ("profile", profile)]);
-            how.extend(touch.felt.listed().map(|(key, value)| (key.to_owned(), value)));
+            how.extend(touch.values.listed().map(|(key, value)| (key.to_owned(), value)));
             events.extend(on_cells(skin, touch.at, length(touch.length), "touch", &touch.cells, &how));
         }
         for fault in &scenario.faults {

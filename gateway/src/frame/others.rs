@@ -11,7 +11,7 @@ const OF_SKIN: [&str; 3] = ["force", "proximity", "temperature"];
 
 /// The values of one page.
 #[derive(Clone, Debug, Default)]
-pub(super) struct OtherDatagrams {
+pub(super) struct OtherPages {
     /// Each given field, with its texts.
     given: Vec<(&'static Layout, &'static Field, Vec<String>)>,
 }
@@ -27,7 +27,7 @@ fn fields() -> impl Iterator<Item = (&'static Layout, &'static Field)> {
     others.flat_map(|layout| layout.fields.iter().map(move |field| (layout, field)))
 }
 
-impl OtherDatagrams {
+impl OtherPages {
     /// Returns the number and the words of the page, if one is given.
     pub(super) fn page(&self) -> Result<Option<(u8, [i16; WORDS])>, String> {
         let Some((layout, ..)) = self.given.first() else { return Ok(None) };
@@ -42,7 +42,7 @@ impl OtherDatagrams {
     }
 }
 
-impl FromArgMatches for OtherDatagrams {
+impl FromArgMatches for OtherPages {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, Error> {
         let texts = |field: &Field| {
             let texts = matches.get_many::<String>(field.bare_name())?;
@@ -58,7 +58,7 @@ impl FromArgMatches for OtherDatagrams {
     }
 }
 
-impl Args for OtherDatagrams {
+impl Args for OtherPages {
     fn augment_args(command: Command) -> Command {
         fields().fold(command, |command, (layout, field)| {
             let name = field.bare_name();

@@ -10,7 +10,7 @@ use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 
 use super::addressee::addressee;
-use super::others::{OtherDatagrams, layouts};
+use super::others::{OtherPages, layouts};
 use super::sensing;
 
 #[derive(Debug, Subcommand)]
@@ -80,7 +80,7 @@ pub(super) struct Stimulus {
     #[arg(long, num_args = 2, value_names = ["T1", "T2"], allow_negative_numbers = true)]
     temperature: Option<Vec<String>>,
     #[command(flatten)]
-    others: OtherDatagrams,
+    others: OtherPages,
     /// Take effect with the joints of this epoch [default: with the next joints]
     #[arg(long, value_name = "E")]
     epoch: Option<u8>,

@@ -7,7 +7,6 @@
 mod check;
 mod curve;
 mod faults;
-mod felt;
 mod force;
 mod measured;
 mod names;
@@ -16,6 +15,7 @@ mod raw;
 mod remarks;
 mod sensors;
 mod times;
+mod touch_values;
 mod touches;
 
 use core::f64::consts::TAU;
@@ -28,9 +28,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::accelerometer::RobotState;
 
-pub use felt::Felt;
 pub use force::{MAX_FORCE_N, contact_words};
 pub use sensors::{ForceErrors, REFERENCE_C, Sensors};
+pub use touch_values::TouchValues;
 pub use touches::{Stimulus, Touches};
 
 /// The default duration of a run without events.
@@ -164,7 +164,7 @@ pub struct Touch {
     /// The course of the force.
     pub profile: Profile,
     /// The values besides the force.
-    pub felt: Felt,
+    pub values: TouchValues,
 }
 
 /// The course of a touch's force over time.

@@ -6,7 +6,7 @@ use protocol::time::Span;
 use super::force::MAX_FORCE_N;
 use super::names::{CellSelection, NameTable};
 use super::times::{EndS, LONGEST_S, length};
-use super::{Felt, Profile, Touch, raw};
+use super::{Profile, Touch, TouchValues, raw};
 
 /// Checks the touches; returns them in the file's order.
 pub(super) fn touches(raw: &[raw::Touch], end: EndS, names: &NameTable<'_>) -> Checked<Vec<Touch>> {
@@ -24,7 +24,7 @@ fn touch(at: &KeyPath, raw: &raw::Touch, end: EndS, names: &NameTable<'_>) -> Ch
         raw::Profile::Word(word) => named(at, raw, word)?,
         raw::Profile::Points(points) => drawn(at, raw, points)?,
     };
-    let felt = Felt::check(at, raw)?;
+    let values = TouchValues::check(at, raw)?;
     let given = CellSelection { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all };
     Ok(Touch {
         at: end.moment(&at.key("at_s"), raw.at_s)?,
@@ -32,7 +32,7 @@ fn touch(at: &KeyPath, raw: &raw::Touch, end: EndS, names: &NameTable<'_>) -> Ch
         cells: names.cells(given)?,
         force_n,
         profile,
-        felt,
+        values,
     })
 }
 

@@ -32,7 +32,7 @@ fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
 /// Returns a warning if the force and the proximity of a touch are below the thresholds of all its cells.
 fn weak(touch: &Touch, skin: &Skin) -> Option<String> {
     let mut readings = Readings::default();
-    touch.felt.apply(&mut readings);
+    touch.values.apply(&mut readings);
     let sensors = SkinSensors { contact: contact_words(touch.force_n), ..readings.skin };
     let mut cells = touch.cells.iter().filter_map(|&cell| skin.cells.get(cell));
     let in_vain = touch.force_n > 0.0 && cells.all(|cell| force(&cell.contact, &sensors) <= 0.0);

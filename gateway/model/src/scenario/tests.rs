@@ -107,7 +107,7 @@ fn a_good_scenario_is_read() {
     assert_eq!(scenario.mode_at(Micros(5_699_999)), Mode::Compare);
     assert_eq!(scenario.mode_at(Micros(5_700_000)), Mode::Distributed);
     assert_eq!(scenario.touches[0].cells, [0, 2]);
-    assert_eq!(scenario.touches[1].felt.temperature.unwrap()[1].to_f64(), 31.5);
+    assert_eq!(scenario.touches[1].values.temperature.unwrap()[1].to_f64(), 31.5);
     let [kill, delay] = scenario.faults.as_slice() else { panic!("{:?}", scenario.faults) };
     let action = ProcessAction::Kill;
     assert_eq!(kill.kind, FaultKind::Process { action, cells: vec![0] }, "in the order of time");

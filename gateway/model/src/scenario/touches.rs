@@ -109,9 +109,9 @@ impl Touches {
         if measured.is_none() {
             cells.retain(|touched| !touched.touches.is_empty() || !touched.faults.is_empty());
         }
-        let mut felt = Readings::default();
-        scenario.touches.iter().for_each(|touch| touch.felt.apply(&mut felt));
-        let mut set = differing(&Readings::default(), &felt);
+        let mut readings = Readings::default();
+        scenario.touches.iter().for_each(|touch| touch.values.apply(&mut readings));
+        let mut set = differing(&Readings::default(), &readings);
         let [of_skin, ..] = &mut set;
         *of_skin = true;
         Self {
@@ -187,8 +187,8 @@ impl Touches {
         for touch in touched.touches.iter().filter_map(|&index| self.touches.get(index)) {
             let Some(level) = self.level(touch, time) else { continue };
             there.force_n += level;
-            touch.felt.apply(&mut there.readings);
-            there.is_warmed |= touch.felt.temperature.is_some();
+            touch.values.apply(&mut there.readings);
+            there.is_warmed |= touch.values.temperature.is_some();
         }
         for wrong in touched.faults.iter().filter(|wrong| wrong.holds_at(time)) {
             match wrong.fault {
@@ -308,13 +308,13 @@ impl Touches {
         self.words(levels, drift.sum())
     }
 
-    /// Combines touches: forces add up, the other values as by [`super::Felt`].
+    /// Combines touches: forces add up, the other values as by [`super::TouchValues`].
     fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> Readings {
         let mut readings = Readings::default();
         for (index, level) in levels {
             let (Some(touch), Some(level)) = (self.touches.get(index), level) else { continue };
             force_n += level;
-            touch.felt.apply(&mut readings);
+            touch.values.apply(&mut readings);
         }
         readings.skin.contact = contact_words(force_n);
         readings
