@@ -4,12 +4,12 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
-use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use quote::ToTokens;
 use syn::{Attribute, Item};
+
+use crate::tree::files;
 
 const DOCUMENT: &str = include_str!("../../docs/explanation/architecture.md");
 
@@ -117,26 +117,9 @@ fn only_the_papers_experiments_and_tests_have_the_cells_oracle() {
 
 /// Returns the Rust sources of the workspace, each with its path from the top.
 fn sources() -> Vec<(String, String)> {
-    fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
-        for entry in fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            let hidden = path.file_name().unwrap().to_str().unwrap().starts_with('.');
-            if path.is_dir() && !hidden && !path.ends_with("target") {
-                walk(&path, found);
-            } else if path.extension().is_some_and(|extension| extension == "rs") {
-                found.push(path);
-            }
-        }
-    }
-    let top = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    let mut found = Vec::new();
-    walk(top, &mut found);
+    let found = files("rs");
     assert!(found.len() > 300, "there is something to look at");
-    let read = |path: PathBuf| {
-        let name = path.strip_prefix(top).unwrap().display().to_string();
-        (name, fs::read_to_string(path).unwrap())
-    };
-    found.into_iter().map(read).collect()
+    found
 }
 
 #[test]

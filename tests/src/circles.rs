@@ -26,6 +26,8 @@ use std::path::Path;
 
 use modules::Modules;
 
+use crate::tree::top;
+
 /// Accepted circles, each with the reason.
 const KNOWN: &[(&[&str], &str)] = &[];
 
@@ -66,7 +68,7 @@ fn circles(modules: &Modules) -> Vec<Vec<&Path>> {
 
 #[test]
 fn files_of_one_crate_use_each_other_in_one_direction() {
-    let top = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let top = top();
     let manifest: String = fs::read_to_string(top.join("Cargo.toml")).unwrap();
     let (_, members) = manifest.split_once("members = [").unwrap();
     let members = members.split_once(']').unwrap().0.split('"').skip(1).step_by(2);

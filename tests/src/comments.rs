@@ -1,7 +1,6 @@
 //! A test of doc comments: nearly all begin with a noun or a verb, and state what a thing is instead of what it is not.
-#![allow(clippy::unwrap_used, reason = "a test may stop")]
 
-use std::path::{Path, PathBuf};
+use crate::tree::files;
 
 /// Words that begin a clause without a subject.
 const HEADLESS: &[&str] = &["What", "Whether", "So many", "Of", "The same", "How many", "Who"];
@@ -51,24 +50,10 @@ fn begins_with(text: &str, words: &str) -> bool {
     rest.is_some_and(|rest| !rest.starts_with(|next: char| next.is_alphanumeric() || next == '_'))
 }
 
-fn add_folder(folder: &Path, counts: &mut Counts) {
-    let mut paths: Vec<PathBuf> = folder.read_dir().unwrap().map(|entry| entry.unwrap().path()).collect();
-    paths.sort();
-    for path in paths {
-        let name = path.file_name().unwrap().to_string_lossy().into_owned();
-        if path.is_dir() && !name.starts_with('.') && name != "target" {
-            add_folder(&path, counts);
-        } else if name.ends_with(".rs") {
-            counts.add(&std::fs::read_to_string(&path).unwrap());
-        }
-    }
-}
-
 #[test]
 fn doc_comments_begin_with_a_noun_or_a_verb() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let mut counts = Counts::default();
-    add_folder(root, &mut counts);
+    files("rs").iter().for_each(|(_, source)| counts.add(source));
     println!("{counts:?}");
     assert!(counts.comments > 10_000, "{counts:?}");
     assert!(counts.headless * 100 < counts.comments * MAX_PERCENT, "{counts:?}");

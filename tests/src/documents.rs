@@ -4,7 +4,8 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::fs;
-use std::path::{Path, PathBuf};
+
+use crate::tree::{files, top};
 
 /// The pages with requirements; their length is not limited.
 const NORMATIVE: [&str; 6] = [
@@ -20,10 +21,6 @@ const MAX_WORDS: usize = 40_000;
 /// The page whose blocks of commands the test `process_readme` runs.
 const RUN_AS_A_WHOLE: &str = "README.md";
 
-fn root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap()
-}
-
 /// A document of the project.
 struct Page {
     /// The path from the top of the project.
@@ -33,26 +30,9 @@ struct Page {
 
 /// Returns the documents of all folders, except hidden ones and build output.
 fn pages() -> Vec<Page> {
-    fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
-        for entry in fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            let is_hidden = path.file_name().unwrap().to_string_lossy().starts_with('.');
-            if path.is_dir() && !is_hidden && !path.ends_with("target") {
-                walk(&path, found);
-            } else if path.extension().is_some_and(|extension| extension == "md") {
-                found.push(path);
-            }
-        }
-    }
-    let mut found = Vec::new();
-    walk(root(), &mut found);
-    found.sort();
+    let found: Vec<_> = files("md").into_iter().map(|(name, text)| Page { name, text }).collect();
     assert!(found.len() > 40, "{} documents", found.len());
-    let read = |path: PathBuf| Page {
-        name: path.strip_prefix(root()).unwrap().display().to_string(),
-        text: fs::read_to_string(path).unwrap(),
-    };
-    found.into_iter().map(read).collect()
+    found
 }
 
 /// A fenced block of a page.
@@ -126,7 +106,7 @@ fn links_lead_to_files_and_headings() {
     let pages = pages();
     let anchors_of: HashMap<_, _> = pages
         .iter()
-        .map(|page| (root().join(&page.name).canonicalize().unwrap(), anchors(&page.text)))
+        .map(|page| (top().join(&page.name).canonicalize().unwrap(), anchors(&page.text)))
         .collect();
     let mut wrong = Vec::new();
     let mut count = 0;
@@ -137,7 +117,7 @@ fn links_lead_to_files_and_headings() {
             }
             count += 1;
             let (file, anchor) = link.split_once('#').unwrap_or((&link, ""));
-            let from = root().join(&page.name);
+            let from = top().join(&page.name);
             let target = if file.is_empty() { from } else { from.parent().unwrap().join(file) };
             let exists = target.canonicalize().is_ok_and(|target| {
                 anchor.is_empty() || anchors_of.get(&target).is_some_and(|anchors| anchors.contains(anchor))
@@ -174,7 +154,7 @@ fn check_mark(page: &str, mark: &str) -> Result<(), String> {
     let Some(test) = comment.strip_prefix("run by: ") else {
         return Err("neither `<!-- not run: REASON -->` nor `<!-- run by: TEST -->` is before it".to_owned());
     };
-    match fs::read_to_string(root().join(test)) {
+    match fs::read_to_string(top().join(test)) {
         Err(error) => Err(format!("{test}: {error}")),
         Ok(text) if !text.contains(page) => Err(format!("{test} does not read {page}")),
         Ok(_) => Ok(()),

@@ -35,4 +35,6 @@ pub mod oracle;
 pub mod process;
 pub mod real_bus;
 pub mod skins;
+#[cfg(test)]
+mod tree;
 pub mod workshop;

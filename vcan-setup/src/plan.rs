@@ -37,7 +37,7 @@ pub struct InterfaceTarget {
     pub skin: Option<SkinBus>,
 }
 
-/// What a skin states about a bus that may be hardware.
+/// The statements of a skin about a bus that may be hardware.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct SkinBus {
     /// The path of the skin, quoted for a shell.

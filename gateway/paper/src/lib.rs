@@ -9,9 +9,9 @@
 //! All computations here are pure, except that they read a clock. The implementation of [`Lab`] runs benches of
 //! processes. Each verdict is computed from the measurements of its run.
 //!
-//! Of all crates of the gateway, only this one uses the code of the cells: it counts the operations of that code, and
-//! computes sums along a tree without a bus. In every other crate the gateway communicates with cells only over the
-//! bus, which `tests/cells.rs` checks.
+//! This crate and `reference` use the code of the cells: it counts the operations of that code, and computes sums along
+//! a tree without a bus. In every other crate the gateway communicates with cells only over the bus, which
+//! `tests/src/architecture.rs` checks.
 
 pub mod arithmetic;
 pub mod arm;
@@ -172,7 +172,7 @@ pub enum Effort {
     Full,
 }
 
-/// What experiments need from outside: a clock, and a way to run benches.
+/// The environment of experiments: a clock, and a way to run benches.
 pub trait Lab {
     /// The error of a bench that failed.
     type Error;

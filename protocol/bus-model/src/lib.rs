@@ -12,7 +12,7 @@
 //! part. No frame is interrupted. With a bit-error rate, some frames are damaged: a damaged frame occupies the bus for
 //! the bits sent before the error and for an error frame, and then takes part in arbitration again.
 //!
-//! The same requests give the same attempts on every machine, in whatever steps the time is advanced. Times are in ns
+//! Equal requests give equal attempts on every machine, in whatever steps the time is advanced. Times are in ns
 //! from an arbitrary origin.
 //!
 //! The model does not include bus-off and its error counters, overload frames, clock differences, the

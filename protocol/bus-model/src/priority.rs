@@ -11,7 +11,7 @@ use protocol::can::{Format, Frame};
 ///   29-bit    its upper 11    SRR 1     IDE 1    its lower 18     RTR
 /// ```
 ///
-/// Of two identifiers with the same first 11 bits, the 11-bit one wins, and a data frame wins over a remote
+/// An 11-bit identifier wins over a longer one with the same first 11 bits, and a data frame wins over a remote
 /// frame.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct Priority(u32);

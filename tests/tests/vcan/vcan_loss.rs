@@ -1,6 +1,6 @@
 //! Deliberate losses, by receive buffers that are far too small, which must be counted exactly.
 //!
-//! The same rule is tested on a real kernel's vcan and on the embedded bus; the embedded bus needs no preparation.
+//! One rule is tested on a real kernel's vcan and on the embedded bus; the embedded bus needs no preparation.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 

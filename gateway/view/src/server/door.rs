@@ -50,7 +50,7 @@ struct Visitor {
     until: Instant,
 }
 
-/// What becomes of a visitor after its data was read and written.
+/// The next step for a visitor after its data was read and written.
 enum NextStep {
     /// The visitor stays, because its request or answer is not complete.
     Stays(Visitor),
