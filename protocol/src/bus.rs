@@ -1,13 +1,13 @@
 //! A CAN bus: SocketCAN or the embedded bus, behind one type.
 //!
 //! ```no_run
-//! use protocol::bus::{Bus, Choice, Filter, Inbox, Options};
+//! use protocol::bus::{Bus, BusOptions, Filter, Inbox, KindChoice};
 //! use protocol::can::Frame;
 //! use protocol::id::{Command, Id};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let options = Options { filters: vec![Filter::exact(Id::command(Command::Joints))], ..Options::default() };
-//! let bus = Bus::open("vcan0", Choice::Auto, &options)?;
+//! let options = BusOptions { filters: vec![Filter::exact(Id::command(Command::Joints))], ..BusOptions::default() };
+//! let bus = Bus::open("vcan0", KindChoice::Auto, &options)?;
 //! let mut inbox = Inbox::new();
 //! while bus.wait(None)? {
 //!     bus.receive(&mut inbox)?;

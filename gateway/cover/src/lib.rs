@@ -7,12 +7,12 @@
 //!
 //! ```
 //! use cover::mesh::Mesh;
-//! use cover::{Link, Options, Part, cover};
+//! use cover::{CoverOptions, LinkMesh, RobotLink, cover};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let tube = Part::new(Mesh::cylinder(0.05, 0.2)?);
-//! let forearm = Link { name: "forearm".to_owned(), parts: vec![tube], ..Link::default() };
-//! let skin = cover(&[forearm], &[], &Options { pitch: 0.04, ..Options::default() })?;
+//! let tube = LinkMesh::new(Mesh::cylinder(0.05, 0.2)?);
+//! let forearm = RobotLink { name: "forearm".to_owned(), parts: vec![tube], ..RobotLink::default() };
+//! let skin = cover(&[forearm], &[], &CoverOptions { pitch: 0.04, ..CoverOptions::default() })?;
 //! let [figures] = skin.links.as_slice() else { return Err("one link".into()) };
 //! assert!(figures.covered > 0.95 && skin.buses == 1);
 //! # Ok(())

@@ -19,12 +19,12 @@ impl Display for CellRange {
 /// The reason for the end of a cell process.
 ///
 /// ```
-/// use protocol::last_words::{CellRange, LastWords};
+/// use protocol::last_words::{CellRange, ExitReason};
 ///
-/// let words = LastWords { cells: CellRange(1, 4), bus: "vcan0".to_owned(), why: "cannot send".to_owned() };
-/// let line = words.to_string();
+/// let reason = ExitReason { cells: CellRange(1, 4), bus: "vcan0".to_owned(), why: "cannot send".to_owned() };
+/// let line = reason.to_string();
 /// assert_eq!(line, "cells 1 to 4 on vcan0 end: cannot send");
-/// assert_eq!(LastWords::parse(&line), Some(words));
+/// assert_eq!(ExitReason::parse(&line), Some(reason));
 /// ```
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct ExitReason {

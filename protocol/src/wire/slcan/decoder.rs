@@ -86,11 +86,11 @@ impl RejectedLines {
 ///
 /// ```
 /// use protocol::can::Frame;
-/// use protocol::slcan::{Decoder, Line};
+/// use protocol::slcan::{Decoder, SlcanLine};
 ///
 /// let mut decoder = Decoder::new();
 /// let lines: Vec<_> = b"?!\rt1232AABB\r".iter().filter_map(|&byte| decoder.push(byte)).collect();
-/// assert_eq!(lines, [Line::Other, Line::Frame(Frame::classic(0x123, &[0xAA, 0xBB]).unwrap())]);
+/// assert_eq!(lines, [SlcanLine::Other, SlcanLine::Frame(Frame::classic(0x123, &[0xAA, 0xBB]).unwrap())]);
 /// ```
 #[derive(Clone, Debug, Default)]
 pub struct Decoder {
