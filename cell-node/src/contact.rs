@@ -24,14 +24,14 @@ impl Force {
     /// threshold.
     #[must_use]
     pub fn fuse(contact: [Q5_10; 3], proximity: Q1_14, rule: &Contact) -> Self {
-        let touch = contact.into_iter().fold(Acc::<10>::ZERO, |sum, word| sum.plus(word.widen()));
+        let touch = contact.into_iter().fold(Acc::<10>::ZERO, |sum, word| sum.saturating_add(word.widen()));
         let touch = if touch < rule.contact_threshold.widen() { Acc::ZERO } else { touch };
         let near = if proximity < rule.proximity_threshold { Q1_14::ZERO } else { proximity };
 
         // At most 2^18 * 2^15 * 2^2 + 2^30 steps.
         let weighed = Acc::<22>::from_steps(touch.steps() * rule.alpha_c.widen().steps());
-        let fused = weighed.finer::<24>().plus(rule.alpha_p.mul_wide::<14, 24>(near));
-        if fused < rule.force_threshold.widen().finer() {
+        let fused = weighed.with_fraction_bits::<24>().saturating_add(rule.alpha_p.mul_wide::<14, 24>(near));
+        if fused < rule.force_threshold.widen().with_fraction_bits() {
             return Self::ZERO;
         }
         Self::from_steps((fused.steps() + (1 << 7)) >> 8)

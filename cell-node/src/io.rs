@@ -22,7 +22,7 @@ use crate::identity::Identity;
 use crate::node::Node;
 use clock::Clock;
 use outbox::Outbox;
-use sockets::{Arrived, ReceiveFilters};
+use sockets::{ReceiveFilters, ReceivedFrame};
 use subscriptions::Subscriptions;
 
 pub use flash_file::FlashFile;
@@ -43,11 +43,11 @@ const MAX_UNSENT_AGE: Duration = Duration::from_millis(250);
 const MAX_RESTING_CELLS: usize = 8;
 
 /// The link ids that a cell sends with, by port; the last one is the uplink to the gateway's side.
-pub type LinkIds = [Option<LinkId>; PORTS + 1];
+pub type PortLinkIds = [Option<LinkId>; PORTS + 1];
 
 /// The cells of one process, which share a socket.
 #[derive(Debug)]
-pub struct Cells {
+pub struct HostedCells {
     cells: Vec<HostedCell>,
     format: Format,
     clock: Clock,
@@ -68,7 +68,7 @@ pub struct Cells {
 struct HostedCell {
     node: Node,
     file: FlashFile,
-    link_ids: LinkIds,
+    link_ids: PortLinkIds,
 }
 
 /// The reason for which the cells of a process stop.
@@ -101,7 +101,7 @@ pub enum StopReason {
     Bus(#[from] BusError),
 }
 
-impl Cells {
+impl HostedCells {
     /// Creates an empty set of cells for a bus with this frame format.
     #[must_use]
     pub fn new(format: Format) -> Self {
@@ -120,7 +120,7 @@ impl Cells {
 
     /// Adds a cell that starts with the contents of its flash and has wires with these link ids. A simulated cell has
     /// no sensors, so it uses stimuli.
-    pub fn start(&mut self, identity: Identity, flash: &FlashState, file: FlashFile, link_ids: LinkIds) {
+    pub fn start(&mut self, identity: Identity, flash: &FlashState, file: FlashFile, link_ids: PortLinkIds) {
         let mut wired = 0;
         for (port, link_id) in
             link_ids.iter().enumerate().filter_map(|(port, link_id)| Some((port, (*link_id)?)))
@@ -174,7 +174,7 @@ impl Cells {
         let (cells, rest) = (self.cells.iter().enumerate(), self.cells.len() <= MAX_RESTING_CELLS);
         self.subscriptions.replace(cells.flat_map(|(place, HostedCell { node, link_ids, .. })| {
             let may_defer = rest || link_ids.iter().any(Option::is_some);
-            node.received_ids().map(move |id| (place, id, may_defer && node.defers(id)))
+            node.received_ids().map(move |id| (place, id, may_defer && node.may_defer(id)))
         }));
         let hearing = self.subscriptions.filters();
         (hearing != self.filters).then(|| core::mem::replace(&mut self.filters, hearing))
@@ -202,7 +202,7 @@ impl Cells {
                 Err(error) => return Err(error),
             }
             now = self.clock.now();
-            for &Arrived { ref received, waited } in sockets.frames() {
+            for &ReceivedFrame { ref received, waited } in sockets.frames() {
                 let age = self.clock.age(now, received.at_nanos);
                 // A frame that a resting cell only counts is processed as if it had woken the process. With
                 // sums, its epoch is as old as its joints.
@@ -232,7 +232,7 @@ impl Cells {
 
     /// Drops the pending frames and subtracts their packets from the counters of sent packets.
     fn drop_outbox(&mut self) {
-        for place in self.outbox.lose() {
+        for place in self.outbox.drop_all() {
             if let Some(hosted_cell) = self.cells.get_mut(place) {
                 hosted_cell.node.handle_unsent();
             }
@@ -271,7 +271,7 @@ impl Cells {
         let frames = self.outbox.frames();
         let sent = sockets.send(frames);
         let count = sent.as_ref().map_or_else(|error| error.sent, |()| frames.len());
-        self.outbox.sent(count);
+        self.outbox.mark_sent(count);
         sent.map_err(|error| error.cause)?;
         self.unsent_since = None;
         Ok(sockets.wait(Duration::from_micros(next.elapsed_since(now).0))?)

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail, ensure};
 use cell_node::flash::{FlashContent, FlashState};
 use cell_node::identity::Identity;
-use cell_node::io::{BusPort, Cells, FlashFile, LinkIds, Sockets, StopReason};
+use cell_node::io::{BusPort, FlashFile, HostedCells, PortLinkIds, Sockets, StopReason};
 use clap::Parser;
 use protocol::bus::{BusKind, KindChoice};
 use protocol::id::CellId;
@@ -119,7 +119,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, BusPort)> {
+fn prepare(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
     if let Some(parent) = arguments.with_parent {
         // A stopped process would not receive SIGTERM before it is continued.
         set_parent_process_death_signal(Some(Signal::KILL))?;
@@ -140,7 +140,7 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, BusPort)> {
         SkinReply::Sum { .. } => Some(skin.wires(bus_index)),
     };
     let (first, last) = arguments.nodes().context("--node or --nodes is needed")?;
-    let mut cells = Cells::new(bus.format);
+    let mut cells = HostedCells::new(bus.format);
     for number in first..=last {
         start(&mut cells, arguments, &skin, bus_index, wires.as_ref(), CellId::new(number.into())?)?;
     }
@@ -165,7 +165,7 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, BusPort)> {
 
 /// Starts a cell with the contents of its flash, which is first initialised from the skin.
 fn start(
-    cells: &mut Cells,
+    cells: &mut HostedCells,
     arguments: &Arguments,
     skin: &Skin,
     bus_index: usize,
@@ -197,7 +197,7 @@ fn start(
             FlashState::Damaged
         }
     };
-    let link_ids = wires.map_or_else(LinkIds::default, |wires| wires.link_ids_of(cell));
+    let link_ids = wires.map_or_else(PortLinkIds::default, |wires| wires.link_ids_of(cell));
     cells.start(identity, &flash, file, link_ids);
     Ok(())
 }

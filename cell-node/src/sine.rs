@@ -34,14 +34,14 @@ pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
 ///
 /// The coefficients were found by search. Among all integers whose sum is one (so that the sine of a quarter turn is
 /// one), they have the smallest mean error when every intermediate result is truncated.
-const SEVENTH: [i32; 4] = [ONE + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
+const SEVENTH_ORDER: [i32; 4] = [ONE + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
 
 /// Returns the sine of an angle in quarter turns, in [-1, 1].
 ///
 /// Seventh order; the mean error over all angles is below 1.6e-5, and the maximum below 6.2e-5.
 #[must_use]
 pub fn sine(angle: Q1_14) -> Q1_14 {
-    odd_polynomial(angle, SEVENTH)
+    odd_polynomial(angle, SEVENTH_ORDER)
 }
 
 /// Returns the cosine of an angle in quarter turns: the [`sine`] a quarter turn later (Eq. 19).
@@ -54,14 +54,14 @@ pub fn cosine(angle: Q1_14) -> Q1_14 {
 /// functions, but take less time.
 #[inline]
 pub(crate) fn sine_cosine(angle: Q1_14) -> [i32; 2] {
-    both(angle, SEVENTH)
+    evaluate(angle, SEVENTH_ORDER)
 }
 
 /// Returns sine and cosine, computed with an odd polynomial whose coefficients add up to one. The angle is folded to
 /// |z| within one quarter turn. |sin z| is the polynomial of |z|, and |cos z| is the polynomial of 1 - |z|.
 /// Intermediate results can be negative only because coefficients are.
 #[inline]
-fn both<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2] {
+fn evaluate<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2] {
     let quarter = 1 << 14;
     let z = i32::from(angle.to_bits());
     let negative = z >> 31;
@@ -107,7 +107,7 @@ fn product(lhs: i32, rhs: i32) -> i32 {
 }
 
 /// Number of fraction bits of [`fine_sine_cosine`].
-pub(crate) const FINE: u32 = 28;
+pub(crate) const FINE_FRACTION_BITS: u32 = 28;
 
 /// Returns sine and cosine with 28 fraction bits, for constants that are computed once. They are exact at the quarter
 /// turns; elsewhere the error is at most 1e-8.
@@ -218,13 +218,13 @@ mod tests {
 
     #[test]
     fn the_fine_ones_are_exact_at_quarter_turns_and_fine_between() {
-        let one = 1 << FINE;
+        let one = 1 << FINE_FRACTION_BITS;
         for (angle, target) in
             [(0, [0, one]), (1 << 14, [one, 0]), (-1 << 14, [-one, 0]), (i16::MIN, [0, -one])]
         {
             assert_eq!(fine_sine_cosine(Q1_14::from_bits(angle)), target, "at {angle}");
         }
-        let real = |fine: i64| Acc::<FINE>::from_steps(fine).to_f64();
+        let real = |fine: i64| Acc::<FINE_FRACTION_BITS>::from_steps(fine).to_f64();
         for (index, oracle) in [f64::sin, f64::cos].into_iter().enumerate() {
             let (_, max) = errors(|z| real(fine_sine_cosine(z)[index]), oracle);
             assert!(max <= 1e-8, "{max:e}");

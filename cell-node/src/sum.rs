@@ -33,7 +33,7 @@ pub struct SumWords {
 
 impl SumWords {
     /// The sum with which a cell ends its lease.
-    const END: Self = Self { torque: [Q7_8::ZERO; MAX_JOINTS], count: 0 };
+    const LEASE_END: Self = Self { torque: [Q7_8::ZERO; MAX_JOINTS], count: 0 };
 
     /// Returns true if the sum ends the lease of its sender.
     #[must_use]
@@ -119,7 +119,7 @@ impl Sum {
     }
 
     /// Returns true if the cell sends sums.
-    pub(crate) const fn is_on(&self) -> bool {
+    pub(crate) const fn is_enabled(&self) -> bool {
         self.slots.is_some()
     }
 
@@ -258,7 +258,7 @@ impl Sum {
     }
 
     /// Ends the lease of the child at a port, which is not a child any more.
-    pub(crate) fn disown(&mut self, port: usize) {
+    pub(crate) fn remove_child(&mut self, port: usize) {
         if let Some(child) = self.children.get_mut(port) {
             // A sum of this epoch is kept, because its sender sends no other one for it.
             child.last = None;
@@ -308,7 +308,7 @@ impl Sum {
     fn words(&self) -> Option<SumWords> {
         let count = self.count();
         if count == 0 {
-            return self.ends.then_some(SumWords::END);
+            return self.ends.then_some(SumWords::LEASE_END);
         }
         let mut sums = self.own.unwrap_or_default().map(|own| (i64::from(own), false));
         for words in self.children.iter().filter_map(|child| child.taken) {
@@ -359,7 +359,7 @@ impl Sum {
     }
 
     /// Returns the lateness of the check for missing sums; `None` if the check is not due.
-    pub(crate) fn check(&mut self, now: Micros) -> Option<Span> {
+    pub(crate) fn poll_check(&mut self, now: Micros) -> Option<Span> {
         self.check.take_if(|check| *check <= now).map(|check| now.elapsed_since(check))
     }
 

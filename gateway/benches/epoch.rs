@@ -10,7 +10,7 @@ use std::process::{Command, exit};
 use std::time::{Duration, Instant};
 
 use criterion::{Criterion, Throughput};
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use model::table::Table;
 use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
@@ -24,7 +24,7 @@ use vcan_setup::embedded::ServerThread;
 
 const CELLS: usize = 253;
 /// Identifier of a frame that shows the delivery of all replies before it.
-const AFTER: u32 = 0x7FF;
+const END_MARKER_ID: u32 = 0x7FF;
 
 /// An embedded bus with replies, their sender, and their receiver.
 struct Wire {
@@ -44,21 +44,23 @@ impl Wire {
             Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).expect("it is served")
         };
         let gateway = open(vec![Filter { id: 0x200, mask: 0x700 }]);
-        let bell = open(vec![Filter { id: AFTER, mask: Filter::EXACT_MASK }]);
+        let bell = open(vec![Filter { id: END_MARKER_ID, mask: Filter::EXACT_MASK }]);
         Self { cells: open(Vec::new()), gateway, bell, inbox: Inbox::new(), _served: served }
     }
 
     /// Queues all these frames in the gateway's socket.
     fn put(&mut self, replies: &[Frame]) {
         self.cells.send(replies).expect("there is room");
-        self.cells.send(&[Frame::classic(AFTER, &[]).expect("an empty frame")]).expect("there is room");
+        self.cells
+            .send(&[Frame::classic(END_MARKER_ID, &[]).expect("an empty frame")])
+            .expect("there is room");
         // The server sends frames to its clients in the order of arrival.
         assert!(self.bell.wait(Some(Duration::from_secs(10))).expect("it is served"), "it is delivered");
         self.bell.receive(&mut self.inbox).expect("it is served");
     }
 
     /// Receives all waiting frames, and passes them to `hear`. Returns the time.
-    fn take(&mut self, mut hear: impl FnMut(u64, &Frame)) -> Duration {
+    fn receive_epoch(&mut self, mut hear: impl FnMut(u64, &Frame)) -> Duration {
         let (mut taken, began) = (0, Instant::now());
         while taken < CELLS {
             let more = self.gateway.receive(&mut self.inbox).expect("it is served");
@@ -87,7 +89,7 @@ struct Listener {
 
 impl Listener {
     fn new() -> Self {
-        let text = generate(&Target { cells: CELLS, ..Target::default() }).expect("a UR5 has room");
+        let text = generate(&SkinRequest { cells: CELLS, ..SkinRequest::default() }).expect("a UR5 has room");
         let skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
         let mut table = Table::new(&skin, 0);
         table.set_comparing(false);
@@ -158,7 +160,7 @@ fn main() {
             let mut sum = 0;
             let took = (0..epochs).map(|_| {
                 wire.put(&frames);
-                wire.take(|at_nanos, frame| sum += u64::from(frame.len()) + (at_nanos & 1))
+                wire.receive_epoch(|at_nanos, frame| sum += u64::from(frame.len()) + (at_nanos & 1))
             });
             let took = took.sum();
             assert!(sum >= epochs * 253 * 16, "every frame was taken");
@@ -171,7 +173,7 @@ fn main() {
             for _ in 0..epochs {
                 let epoch = listener.open();
                 wire.put(&replies(epoch));
-                took += wire.take(|_, frame| listener.receive(frame));
+                took += wire.receive_epoch(|_, frame| listener.receive(frame));
                 assert_eq!(listener.table.snapshot().sums.contributing, 253, "every reply counts");
             }
             took

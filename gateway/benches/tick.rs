@@ -14,8 +14,8 @@ use control::cycle::turn::{BusPort, Shared, TickDriver, TimedRecord};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use criterion::{BenchmarkId, Criterion};
-use model::generate::{Target, generate};
-use model::scenario::{Mode, ModeChange, Scenario};
+use model::generate::{SkinRequest, generate};
+use model::scenario::{ModeChange, Scenario, TorqueSource};
 use model::table::{BusTotals, Snapshot};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::message::SkinSensors;
@@ -26,9 +26,9 @@ use protocol::skin::{Skin, SkinBus};
 use protocol::time::{Micros, Span};
 
 /// Maximum number of cells per bus.
-const ON_A_BUS: usize = 253;
+const CELLS_PER_BUS: usize = 253;
 /// Number of ticks per broadcast.
-const EPOCH: u64 = 8;
+const TICKS_PER_EPOCH: u64 = 8;
 
 /// Work of the loop, and the contact states.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -63,10 +63,11 @@ impl Case {
 
 /// A UR5 with `cells` cells; further buses repeat the cells of the first one.
 fn skin(cells: usize) -> Skin {
-    let text = generate(&Target { cells: cells.min(ON_A_BUS), ..Target::default() }).expect("a UR5 has room");
+    let text = generate(&SkinRequest { cells: cells.min(CELLS_PER_BUS), ..SkinRequest::default() })
+        .expect("a UR5 has room");
     let mut skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
     let first = skin.clone();
-    for bus in 1..cells.div_ceil(ON_A_BUS) {
+    for bus in 1..cells.div_ceil(CELLS_PER_BUS) {
         let more = first.buses.iter().map(|first| SkinBus { name: format!("vcan{bus}"), ..first.clone() });
         skin.buses.extend(more);
         let room = cells - skin.cells.len();
@@ -104,7 +105,7 @@ impl Bench {
             lines.push(BusPort { format: bus.format, snapshot, positions: producer, state: Arc::default() });
             buses.push(Receiver { snapshots, positions });
         }
-        let mode = if case == Case::Distributed { Mode::Distributed } else { Mode::Compare };
+        let mode = if case == Case::Distributed { TorqueSource::Distributed } else { TorqueSource::Compare };
         let modes = vec![ModeChange { at: Micros(0), mode }];
         let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
         let controller = Box::new(Kinesthetic::new(skin).expect("a generated skin has one"));
@@ -116,7 +117,7 @@ impl Bench {
 
     /// Runs eight ticks, of which the first sends joints. Returns their duration and the number of active cells.
     fn epoch(&mut self) -> (Duration, u32) {
-        let last = (self.tick / EPOCH).checked_sub(1).map(|epoch| Epoch(epoch.to_le_bytes()[0]));
+        let last = (self.tick / TICKS_PER_EPOCH).checked_sub(1).map(|epoch| Epoch(epoch.to_le_bytes()[0]));
         for Receiver { snapshots, .. } in &mut self.buses {
             let next = snapshots.input_buffer_mut();
             next.sums.read_back = last;
@@ -126,15 +127,15 @@ impl Bench {
         }
         let mut sent = 0;
         let began = Instant::now();
-        for number in self.tick..self.tick + EPOCH {
+        for number in self.tick..self.tick + TICKS_PER_EPOCH {
             let tick = Tick { number, time: Micros(number * 2_000) };
-            self.turn.turn(tick, 0, realtime::now(), realtime::now, |_, frames| {
+            self.turn.run_tick(tick, 0, realtime::now(), realtime::now, |_, frames| {
                 sent += black_box(frames).len();
                 true
             });
         }
         let took = began.elapsed();
-        self.tick += EPOCH;
+        self.tick += TICKS_PER_EPOCH;
         assert_eq!(sent, self.buses.len(), "one broadcast on every bus");
         self.buses.iter_mut().for_each(|bus| assert!(bus.positions.pop().is_ok(), "its positions"));
         let mut active = 0;
@@ -161,10 +162,10 @@ fn main() {
                 let (_, active) = bench.epoch();
                 assert_eq!(active, if case == Case::CentralAllActive { cells } else { 0 });
                 bencher.iter_custom(|ticks| {
-                    let epochs = ticks.div_ceil(EPOCH);
+                    let epochs = ticks.div_ceil(TICKS_PER_EPOCH);
                     let took: Duration = (0..epochs).map(|_| bench.epoch().0).sum();
                     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-                    took.mul_f64(ticks as f64 / (epochs * EPOCH) as f64)
+                    took.mul_f64(ticks as f64 / (epochs * TICKS_PER_EPOCH) as f64)
                 });
             });
         }

@@ -34,7 +34,7 @@ use trace::recording::series::{FileHead, SplitLimits};
 
 const SKIN: &str = include_str!("ur5-253.toml");
 /// Time for which frames are pushed.
-const PUSHED: Duration = Duration::from_secs(10);
+const PUSH_TIME: Duration = Duration::from_secs(10);
 /// Interval between flushes of a run in ns.
 const FLUSH_NANOS: u64 = 40_000_000;
 
@@ -62,7 +62,7 @@ fn of_run(skin: &Skin, seconds: u32) -> Vec<ReceivedFrame> {
     let central = Central::new(skin);
     let (hz, began) = (skin.timing.broadcast_hz(), 1_700_000_000_000_000_000_u64);
     let mut frames = Vec::new();
-    let mut say = |at_nanos, own, message: &Message| {
+    let mut add_message = |at_nanos, own, message: &Message| {
         frames.extend(message.encode().frames(Format::Fd).map(|frame| ReceivedFrame {
             at_nanos,
             from_gateway: own,
@@ -80,7 +80,7 @@ fn of_run(skin: &Skin, seconds: u32) -> Vec<ReceivedFrame> {
         let swings = [(0.3, 0.0), (-1.2, 0.4), (1.0, 0.9), (-1.4, 1.3), (-1.57, 2.0), (0.2, 2.7)];
         let q: [f64; WORDS] = swings.map(|(middle, phase): (f64, f64)| middle + (time + phase).sin() * 0.4);
         let positions = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
-        say(
+        add_message(
             at,
             true,
             &Message::Joints { epoch, joints: Joints { positions: padded(&positions), in_use: 6 } },
@@ -93,7 +93,7 @@ fn of_run(skin: &Skin, seconds: u32) -> Vec<ReceivedFrame> {
             let after = 150_000
                 + place as u64 * 22_000
                 + (u64::from(number) * 7_919 + place as u64 * 104_729) % 9_973;
-            say(at + after, false, &Message::Torque { from: cell.node, epoch, torque });
+            add_message(at + after, false, &Message::Torque { from: cell.node, epoch, torque });
         }
         number += 1;
     }
@@ -129,7 +129,7 @@ fn speed(skin: &Skin, folder: &std::path::Path, frames: &[ReceivedFrame]) -> Res
     let mut count = 0_u64;
     'pushed: loop {
         for chunk in frames.chunks(1_024) {
-            if began.elapsed() >= PUSHED {
+            if began.elapsed() >= PUSH_TIME {
                 break 'pushed;
             }
             // A bus never waits; this loop does, so that it measures the sustainable rate.

@@ -42,7 +42,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for spin in [0, 20, 50, 100, 150, 300] {
         let options = ReplayOptions {
             files: vec![file.clone()],
-            kinds: KindChoices::all(kind),
+            kinds: KindChoices::same_for_all(kind),
             only: SenderFilter::All,
             buses: Vec::new(),
             map: Vec::new(),

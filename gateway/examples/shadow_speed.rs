@@ -31,7 +31,7 @@ const CELLS: i64 = 253;
 /// Writes the frames of one epoch as candump does.
 fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) -> u64 {
     let mut frames = 0;
-    let mut say = |micros: u64, id: Id, word: i16| {
+    let mut write_packet = |micros: u64, id: Id, word: i16| {
         let epoch = Epoch(number.to_le_bytes()[0]);
         // Page 0 of the network is a heartbeat.
         let count = u8::from(id.kind != id::Kind::Network);
@@ -46,17 +46,21 @@ fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) ->
             frames += 1;
         }
     };
-    say(0, Id::command(id::Command::Joints), 0);
+    write_packet(0, Id::command(id::Command::Joints), 0);
     for (cell, place) in (1..=CELLS).zip(0_u64..) {
         let node = id::Node::Cell(CellId::new(cell).unwrap());
         let word = (number * 31 + place * 977).to_le_bytes();
-        say(100 + place * 23, Id::new(id::Kind::Torque, node), i16::from_le_bytes([word[0], word[1]]));
+        write_packet(
+            100 + place * 23,
+            Id::new(id::Kind::Torque, node),
+            i16::from_le_bytes([word[0], word[1]]),
+        );
     }
     // Two heartbeats per epoch make 16 thousand frames per second.
     for beat in 0..2 {
         let cell = i64::try_from((number * 2 + beat) % 253).unwrap() + 1;
         let node = id::Node::Cell(CellId::new(cell).unwrap());
-        say(9_000 + beat * 500, Id::new(id::Kind::Network, node), 0);
+        write_packet(9_000 + beat * 500, Id::new(id::Kind::Network, node), 0);
     }
     frames
 }

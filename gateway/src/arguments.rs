@@ -19,7 +19,7 @@ pub(crate) const FORMATS: &[OptionValue<Format>] =
     &[("fd", "One CAN FD frame", Format::Fd), ("classic", "Two to four classic frames", Format::Classic)];
 
 /// Creates a parser that accepts one of these words.
-pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
+pub(crate) fn one_of_values<T: Copy + Send + Sync + 'static>(
     words: &'static [OptionValue<T>],
 ) -> impl TypedValueParser<Value = T> {
     let allowed = words.iter().map(|(word, about, _)| match *about {
@@ -33,7 +33,7 @@ pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
 }
 
 /// Parses a time in seconds: a number, with or without a unit.
-pub(crate) fn time(text: &str) -> Option<f64> {
+pub(crate) fn parse_time(text: &str) -> Option<f64> {
     let units = [("ms", 1e-3), ("min", 60.0), ("h", 3_600.0), ("s", 1.0)];
     let given = units.iter().find_map(|(unit, each)| Some((text.strip_suffix(unit)?, *each)));
     let (number, each) = given.unwrap_or((text, 1.0));
@@ -41,15 +41,15 @@ pub(crate) fn time(text: &str) -> Option<f64> {
 }
 
 /// Parses a time above 0 s, up to 1e7 s.
-pub(crate) fn seconds(text: &str) -> Result<f64, String> {
-    let seconds = time(text).filter(|seconds| *seconds > 0.0 && *seconds <= 1e7);
+pub(crate) fn parse_duration(text: &str) -> Result<f64, String> {
+    let seconds = parse_time(text).filter(|seconds| *seconds > 0.0 && *seconds <= 1e7);
     seconds.ok_or_else(|| "a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h)".to_owned())
 }
 
 /// Parses a time from 0 s to 1e9 s, and returns it in ns.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e18: checked")]
-pub(crate) fn nanos(text: &str) -> Result<u64, String> {
-    let seconds = time(text).filter(|seconds| (0.0..=1e9).contains(seconds));
+pub(crate) fn parse_time_ns(text: &str) -> Result<u64, String> {
+    let seconds = parse_time(text).filter(|seconds| (0.0..=1e9).contains(seconds));
     let nanos = seconds.map(|seconds| (seconds * 1e9).round() as u64);
     nanos.ok_or_else(|| "a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h)".to_owned())
 }
@@ -71,7 +71,7 @@ fn kinds_help() -> String {
 
 impl BusKinds {
     /// Returns the kinds that the option names, for any buses.
-    pub(crate) fn of_any(&self) -> Result<KindChoices, Failure> {
+    pub(crate) fn any_kinds(&self) -> Result<KindChoices, Failure> {
         self.kinds_or(KindChoice::Auto)
     }
 
@@ -86,12 +86,12 @@ impl BusKinds {
         &self,
         buses: impl IntoIterator<Item = &'a str>,
     ) -> Result<KindChoices, Failure> {
-        self.of_any()?.restrict_to(buses).map_err(Failure::usage)
+        self.any_kinds()?.restrict_to(buses).map_err(Failure::usage)
     }
 }
 
 /// Reads a whole number from the environment variable `name`, for settings that few users need.
-pub(crate) fn of_environment(name: &str, allowed: RangeInclusive<u32>) -> Result<Option<u32>, Failure> {
+pub(crate) fn environment_number(name: &str, allowed: RangeInclusive<u32>) -> Result<Option<u32>, Failure> {
     let Some(given) = std::env::var_os(name).filter(|given| !given.is_empty()) else { return Ok(None) };
     let number = given.to_str().and_then(|text| text.parse().ok()).filter(|number| allowed.contains(number));
     number.map(Some).ok_or_else(|| {
@@ -102,7 +102,7 @@ pub(crate) fn of_environment(name: &str, allowed: RangeInclusive<u32>) -> Result
 
 /// Reads the number of cells per process from the environment, for the few users who need it.
 pub(crate) fn cells_per_process() -> Result<usize, Failure> {
-    Ok(of_environment("SKINBUS_CELLS_PER_PROCESS", 1..=254)?.unwrap_or(1) as usize)
+    Ok(environment_number("SKINBUS_CELLS_PER_PROCESS", 1..=254)?.unwrap_or(1) as usize)
 }
 
 /// The option for the number of cells per process.
@@ -119,7 +119,7 @@ pub(crate) fn bus_names(skin: &Skin) -> impl Iterator<Item = &str> {
 }
 
 /// Returns the index of the bus with this name in the skin that `file` describes.
-pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
+pub(crate) fn find_bus(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
     skin.bus_named(name).ok_or_else(|| {
         let names = comma_separated(bus_names(skin));
         Failure::usage(format!("bus {name} is not in {file}, which has {names}"))
@@ -128,7 +128,7 @@ pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failu
 
 /// Returns the index into [`Skin::cells`] of the cell with this name, if there is exactly one. `option` names the
 /// option in errors.
-pub(crate) fn cell_of(skin: &Skin, name: &CellName, option: &str) -> Result<usize, Failure> {
+pub(crate) fn find_cell(skin: &Skin, name: &CellName, option: &str) -> Result<usize, Failure> {
     let CellName { bus, node } = name;
     let names = || comma_separated(bus_names(skin));
     if bus.as_ref().is_some_and(|bus| skin.bus_named(bus).is_none()) {

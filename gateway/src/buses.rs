@@ -4,13 +4,13 @@ use std::fs::{File, Permissions};
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
 
-use protocol::bus::embedded::mark;
+use protocol::bus::embedded::write_marker;
 use protocol::usage::Failure;
 use tempfile::{Builder, TempDir};
 
 /// Creates a directory `skinbus-WHAT-` plus some letters in the directory for temporary files. Dropping the returned
 /// value removes the directory with its content.
-pub(super) fn directory(what: &str) -> Result<TempDir, Failure> {
+pub(super) fn private_directory(what: &str) -> Result<TempDir, Failure> {
     // The path of a socket has at most 107 bytes, and a directory for temporary files may be longer.
     let fits = |folder: &PathBuf| folder.as_os_str().len() <= 50;
     let folder = Some(std::env::temp_dir()).filter(fits).unwrap_or_else(|| PathBuf::from("/tmp"));
@@ -19,7 +19,7 @@ pub(super) fn directory(what: &str) -> Result<TempDir, Failure> {
     let failed = |error| Failure::run(format!("{error}; set SKINBUS_DIR to a directory of your own"));
     let made = made.map_err(failed)?;
     // If this program is killed, the last bus server removes the directory.
-    let marked = File::open(made.path()).and_then(|directory| Ok(mark(directory)?));
+    let marked = File::open(made.path()).and_then(|directory| Ok(write_marker(directory)?));
     marked.map_err(failed)?;
     Ok(made)
 }

@@ -9,14 +9,14 @@ use std::thread;
 use bench::record::{self, Mcap};
 use bench::run::{self, RunOptions};
 use bench::summary::Outcome;
-use calibration::motion::Motion;
+use calibration::motion::MotionPlan;
 use calibration::neighbors::Spacing;
 use calibration::observe::Observations;
 use calibration::plan::{Bounds, plan};
-use calibration::write::calibrated;
+use calibration::write::calibrated_text;
 use calibration::{Calibration, Settings, calibrate};
 use clap::Args;
-use model::accelerometer::kinematics::UPRIGHT;
+use model::accelerometer::kinematics::UPRIGHT_GRAVITY;
 use model::accelerometer::sensor::{DataSheet, DataSheetInput};
 use model::decode::{Decoded, Decoder};
 use model::scenario::Scenario;
@@ -31,11 +31,11 @@ use protocol::usage::{Failure, print_text};
 use trace::capture::{Entry, Reader};
 use trace::recording::series::{AttachedFile, SplitLimits};
 
-use super::arguments::{BusKinds, bus_names, seconds};
+use super::arguments::{BusKinds, bus_names, parse_duration};
 use super::input::no_frame;
-use super::output::{Overwrite, apart, note, print_beside};
+use super::output::{Overwrite, check_distinct, note, print_beside};
 use super::print::{count, json};
-use super::robot_file::{RobotOfSkin, urdf_of};
+use super::robot_file::{SkinRobot, urdf_path};
 
 /// Find the poses of cells from their accelerometers
 ///
@@ -72,7 +72,7 @@ pub(crate) struct Calibrate {
     #[arg(long, value_name = "RAD", default_value_t = 1.0)]
     within: f64,
     /// Maximum duration of the motion
-    #[arg(long, value_name = "TIME", default_value = "150s", value_parser = seconds)]
+    #[arg(long, value_name = "TIME", default_value = "150s", value_parser = parse_duration)]
     duration: f64,
     /// Distance between wired cells in mm: improves positions
     #[arg(long, value_name = "MM")]
@@ -112,7 +112,10 @@ impl Calibrate {
             ("--record", self.record.as_deref()),
             ("--page", self.page.as_deref()),
         ];
-        apart(written, [self.skin.as_path()].into_iter().chain(self.recording.iter().map(PathBuf::as_path)))?;
+        check_distinct(
+            written,
+            [self.skin.as_path()].into_iter().chain(self.recording.iter().map(PathBuf::as_path)),
+        )?;
         for (option, path) in written {
             path.map_or(Ok(()), |path| self.overwrite.check(option, path))?;
         }
@@ -122,15 +125,15 @@ impl Calibrate {
             if self.dry_run {
                 return print_text(&json(&motion)?);
             }
-            self.live(&skin, &text, &settings, motion)?
+            self.record_run(&skin, &text, &settings, motion)?
         } else {
-            read(&self.recording, &skin, &settings)?
+            calibrate_capture(&self.recording, &skin, &settings)?
         };
         if let Some(path) = &self.output {
-            let new = calibrated(&skin, &text, &calibration).map_err(Failure::usage)?;
+            let new = calibrated_text(&skin, &text, &calibration).map_err(Failure::usage)?;
             self.overwrite.write("-o", path, &new)?;
         }
-        let shown = if self.json { json(&calibration)? } else { report(&skin, &calibration) };
+        let shown = if self.json { json(&calibration)? } else { report_text(&skin, &calibration) };
         print_beside([self.output.as_deref(), self.page.as_deref()], &shown)?;
         if let Some(path) = &self.page {
             let page = picture::page(&self.skin, &skin, &calibration);
@@ -148,7 +151,7 @@ impl Calibrate {
     }
 
     fn settings(&self, skin: &Skin) -> Result<Settings, Failure> {
-        let mut bounds = Bounds { within: self.within, length_s: self.duration, ..Bounds::of(skin) };
+        let mut bounds = Bounds { within: self.within, length_s: self.duration, ..Bounds::from_skin(skin) };
         if !(0.05..=6.3).contains(&self.within) {
             return Err(Failure::usage(format!("--within {}: 0.05 to 6.3 is allowed", self.within)));
         }
@@ -172,20 +175,20 @@ impl Calibrate {
         let spacing = self.spacing.map(|mm| {
             let fits = (1.0..=1_000.0).contains(&mm);
             let wrong = || Failure::usage(format!("--spacing {mm}: 1 to 1000 mm are allowed"));
-            fits.then(|| Spacing::of(mm * 1e-3)).ok_or_else(wrong)
+            fits.then(|| Spacing::with_distance(mm * 1e-3)).ok_or_else(wrong)
         });
         let threads = thread::available_parallelism().map_or(1, usize::from);
         let (spacing, zero_offsets) = (spacing.transpose()?, self.zero_offsets);
-        Ok(Settings { sheet, gravity: UPRIGHT, spacing, zero_offsets, threads, bounds })
+        Ok(Settings { sheet, gravity: UPRIGHT_GRAVITY, spacing, zero_offsets, threads, bounds })
     }
 
     /// Moves the robot, and evaluates the recording.
-    fn live(
+    fn record_run(
         &self,
         skin: &Skin,
         text: &str,
         settings: &Settings,
-        motion: Motion,
+        motion: MotionPlan,
     ) -> Result<Calibration, Failure> {
         if matches!(skin.controller.kind, ControllerKind::External { .. }) {
             return Err(Failure::usage(
@@ -203,7 +206,7 @@ impl Calibrate {
             .push(format!("the robot moves for {seconds} s about its start, each joint by {within} at most"));
         let summary =
             run::run(&options, None).map_err(|error| Failure::with_code(error.exit_code(), error))?;
-        let mut complaints = summary.complaints(self.quiet);
+        let mut complaints = summary.end_messages(self.quiet);
         if summary.outcome != Outcome::Done {
             let last = complaints.pop().unwrap_or_else(|| "the run did not come to its end".to_owned());
             return Err(Failure::run(last));
@@ -213,7 +216,7 @@ impl Calibrate {
             let (ticks, broadcasts) = (summary.control.ticks_skipped, summary.control.broadcasts_skipped);
             note(format_args!("the loop skipped {ticks} ticks, and {broadcasts} broadcasts with them"));
         }
-        read(&[path], skin, settings)
+        calibrate_capture(&[path], skin, settings)
     }
 
     /// Returns the options of a run in which each cell sends all its accelerations.
@@ -222,11 +225,11 @@ impl Calibrate {
         skin: &Skin,
         text: &str,
         settings: &Settings,
-        motion: Motion,
+        motion: MotionPlan,
         path: PathBuf,
     ) -> Result<RunOptions, Failure> {
-        let urdf = skin.robot.urdf.as_deref().map(|urdf| urdf_of(&self.skin, urdf));
-        let robot = RobotOfSkin::read(skin, urdf.as_deref())?;
+        let urdf = skin.robot.urdf.as_deref().map(|urdf| urdf_path(&self.skin, urdf));
+        let robot = SkinRobot::read(skin, urdf.as_deref())?;
         let attached = |name: &str, media_type, text: String| AttachedFile {
             name: name.to_owned(),
             media_type,
@@ -240,7 +243,7 @@ impl Calibrate {
         let length_us = (motion.length_s() * 1e6).round();
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "20 to 3600 s: checked")]
         let mut scenario = Scenario::idle(Span(length_us as u64));
-        scenario.motion.start = motion.at(0.0).position;
+        scenario.motion.start = motion.state_at(0.0).position;
         scenario.sensors.acceleration = (!self.no_spawn).then_some(settings.sheet);
         let mut sensing = skin.clone();
         sensing.buses.iter_mut().for_each(|bus| bus.sensing = Sensing::Event);
@@ -277,11 +280,11 @@ impl Calibrate {
 }
 
 /// Reads the accelerations of a skin's cells from a capture, and calibrates the skin.
-fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibration, Failure> {
+fn calibrate_capture(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibration, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     let name = reader.name().to_owned();
     if let Some(Ok(own)) = reader.extras().skin() {
-        recorded::check(&name, skin, &own)?;
+        recorded::check_same_skin(&name, skin, &own)?;
     }
     let mut seen = Observations::new(skin);
     let mut decoder = Decoder::new(None);
@@ -293,7 +296,7 @@ fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibrati
         if let (Decoded::Message(message), Some(bus)) =
             (decoder.decode(at, record.interface, &record.frame), skin.bus_named(record.interface))
         {
-            seen.take(bus, at, &message);
+            seen.record(bus, at, &message);
         }
     }
     if !has_frames {
@@ -309,7 +312,7 @@ fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibrati
 }
 
 /// Returns the result as text.
-fn report(skin: &Skin, calibration: &Calibration) -> String {
+fn report_text(skin: &Skin, calibration: &Calibration) -> String {
     let summary = &calibration.summary;
     let mut lines = vec![format!(
         "{}: {}, {} found, {} not to be trusted",

@@ -13,14 +13,14 @@ use protocol::skin::Skin;
 use protocol::usage::{Failure, ignore_broken_pipe, print_text, printable_lines, write_stdout};
 
 use self::show::{CellList, DescribedBus};
-use super::arguments::{BusKinds, bus_of, seconds};
+use super::arguments::{BusKinds, find_bus, parse_duration};
 use super::input;
 use super::print::{json, json_line};
 
 /// Default listening time in s.
-const LISTEN_S: f64 = 1.0;
+const DEFAULT_LISTEN_S: f64 = 1.0;
 /// Interval between updates of the list.
-const DRAW: Duration = Duration::from_millis(500);
+const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
 /// List the cells on a bus with their reports
 ///
@@ -46,7 +46,7 @@ pub(crate) struct Cells {
     #[arg(long, short)]
     json: bool,
     /// Listen for this time [default: 1s; no limit with --watch]
-    #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
+    #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     #[command(flatten)]
     kinds: BusKinds,
@@ -54,9 +54,9 @@ pub(crate) struct Cells {
 
 impl Cells {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let known = self.known()?;
+        let known = self.described_bus()?;
         let kind = self.kinds.kinds_of([self.bus.as_str()])?.kind_of(&self.bus);
-        let stopped = input::stopped()?;
+        let stopped = input::stop_flag()?;
         let format = known.as_ref().map(|known| known.format);
         if Path::new(&self.bus).is_file() {
             return Err(Failure::usage(format!(
@@ -65,7 +65,7 @@ impl Cells {
             )));
         }
         let mut watch = CellWatch::open(&self.bus, kind, format).map_err(Failure::usage)?;
-        let seconds = self.duration.or_else(|| (!self.watch).then_some(LISTEN_S));
+        let seconds = self.duration.or_else(|| (!self.watch).then_some(DEFAULT_LISTEN_S));
         let show = |watch: &CellWatch| {
             let shown = CellList::of(watch, known.as_ref());
             match (self.json, self.watch) {
@@ -80,11 +80,11 @@ impl Cells {
             && !stopped.load(Ordering::Relaxed)
         {
             watch.request(self.watch).and_then(|()| watch.receive(&stopped)).map_err(Failure::run)?;
-            if self.watch && drawn.elapsed() >= DRAW {
+            if self.watch && drawn.elapsed() >= UPDATE_INTERVAL {
                 drawn = Instant::now();
                 let text = show(&watch)?;
                 let shown = if terminal {
-                    write_stdout(&show::screen(&printable_lines(&text)))
+                    write_stdout(&show::redraw(&printable_lines(&text)))
                 } else {
                     write_stdout(&text)
                 };
@@ -98,7 +98,7 @@ impl Cells {
         }
         if watch.listing().cells().len() == 0 {
             let (name, seconds) = (&self.bus, watch.elapsed().as_secs_f64());
-            let others = match watch.others() {
+            let others = match watch.non_packets() {
                 0 => String::new(),
                 others => format!(" ({others} frames are not from cells; `skinbus dump` shows them)"),
             };
@@ -110,11 +110,11 @@ impl Cells {
     }
 
     /// Returns this bus as the skin of `--skin` describes it, if there is one.
-    fn known(&self) -> Result<Option<DescribedBus>, Failure> {
+    fn described_bus(&self) -> Result<Option<DescribedBus>, Failure> {
         let Some(path) = &self.skin else { return Ok(None) };
         let skin = Skin::read(path).map_err(Failure::usage)?;
         let file = path.display().to_string();
-        let index = bus_of(&skin, &file, &self.bus)?;
+        let index = find_bus(&skin, &file, &self.bus)?;
         Ok(Some(DescribedBus::from_skin(&skin, index, file)))
     }
 }

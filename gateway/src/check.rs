@@ -51,7 +51,7 @@ enum Described {
 impl Check {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let has_skin = self.skin.is_some() || self.files.len() > 1;
-        let described = self.files.iter().map(|file| Ok((file, described(file, has_skin)?)));
+        let described = self.files.iter().map(|file| Ok((file, read_description(file, has_skin)?)));
         let described = described.collect::<Result<Vec<_>, Failure>>()?;
         let named = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         let mut skins = described.iter().filter_map(|(_, described)| match described {
@@ -71,8 +71,8 @@ impl Check {
                 Described::Scenario(text) => {
                     let skin = match (&named, beside) {
                         (Some(skin), _) | (None, (Some(skin), None)) => skin,
-                        (None, (None, _)) => return Err(ambiguous(file, "no skin is")),
-                        (None, (Some(_), Some(_))) => return Err(ambiguous(file, "several skins are")),
+                        (None, (None, _)) => return Err(ambiguous_skin(file, "no skin is")),
+                        (None, (Some(_), Some(_))) => return Err(ambiguous_skin(file, "several skins are")),
                     };
                     let (text, refusal) = scenario::plan(file, text, skin, self.json)?;
                     refused = refused.or(refusal);
@@ -85,7 +85,7 @@ impl Check {
     }
 }
 
-fn ambiguous(file: &Path, found: &str) -> Failure {
+fn ambiguous_skin(file: &Path, found: &str) -> Failure {
     let file = file.display();
     Failure::usage(format!(
         "{file} is a scenario, and {found} among the files: name the skin that it is for with --skin"
@@ -94,7 +94,7 @@ fn ambiguous(file: &Path, found: &str) -> Failure {
 
 /// Reads a skin, or recognises a scenario by its tables, which differ from those of a skin. A file without any of these
 /// tables counts as a scenario if `has_skin`, else as a skin.
-fn described(file: &Path, has_skin: bool) -> Result<Described, Failure> {
+fn read_description(file: &Path, has_skin: bool) -> Result<Described, Failure> {
     const OF_SKINS: [&str; 8] =
         ["robot", "chain", "bus", "cell", "timing", "controller", "contact", "safety"];
     const OF_SCENARIOS: [&str; 5] = ["motion", "mode", "touch", "fault", "sensors"];

@@ -6,7 +6,7 @@ use protocol::usage::Failure;
 use super::print::{comma_separated, count};
 
 /// Maximum number of characters of a first line that an error quotes.
-const REPEATED: usize = 60;
+const MAX_REPEATED_CHARS: usize = 60;
 
 /// Columns of a file, in any order.
 #[derive(Clone, Copy, Debug)]
@@ -17,7 +17,7 @@ pub(crate) struct Columns {
 
 impl Columns {
     /// Returns true for a valid header, which has each needed column once and no unknown column.
-    fn are(self, names: &StringRecord) -> bool {
+    fn match_header(self, names: &StringRecord) -> bool {
         let is_known = |name: &str| self.needed.contains(&name) || self.optional.contains(&name);
         let once = |name: &str| names.iter().filter(|other| *other == name).count() == 1;
         self.needed.iter().all(|name| once(name)) && names.iter().all(|name| is_known(name) && once(name))
@@ -29,7 +29,7 @@ pub(crate) struct Table<'a> {
     file: String,
     names: StringRecord,
     rows: StringRecordsIntoIter<&'a [u8]>,
-    lines: Lines<'a>,
+    lines: LineCounter<'a>,
 }
 
 /// A row of a file.
@@ -49,10 +49,10 @@ impl<'a> Table<'a> {
             .comment(Some(b'#'))
             .flexible(true)
             .from_reader(text.as_bytes());
-        let mut lines = Lines { text, at: 0, line: 1 };
+        let mut lines = LineCounter { text, at: 0, line: 1 };
         let names = reader.headers().map_err(|error| Failure::usage(format!("{file}: {error}")))?.clone();
-        if !columns.are(&names) {
-            let line = lines.of(0);
+        if !columns.match_header(&names) {
+            let line = lines.line_at(0);
             let header = columns.needed.join(",");
             let optional = if columns.optional.is_empty() {
                 String::new()
@@ -61,7 +61,8 @@ impl<'a> Table<'a> {
             };
             let is_row = !names.iter().any(|name| columns.needed.contains(&name));
             let hint = if is_row { "write the header above it" } else { "correct it" };
-            let got: String = names.iter().collect::<Vec<_>>().join(",").chars().take(REPEATED).collect();
+            let got: String =
+                names.iter().collect::<Vec<_>>().join(",").chars().take(MAX_REPEATED_CHARS).collect();
             return Err(Failure::usage(format!(
                 "{file}: line {line}: the first line must be the header {header}{optional}, and it is {got:?}: {hint}"
             )));
@@ -70,12 +71,12 @@ impl<'a> Table<'a> {
     }
 
     /// Returns the next row.
-    pub(crate) fn row(&mut self) -> Result<Option<Row<'_>>, Failure> {
+    pub(crate) fn next_row(&mut self) -> Result<Option<Row<'_>>, Failure> {
         let Some(values) = self.rows.next() else { return Ok(None) };
         let file = self.file.as_str();
         let values = values.map_err(|error| Failure::usage(format!("{file}: {error}")))?;
         let byte = values.position().map_or(0, csv::Position::byte);
-        let line = self.lines.of(usize::try_from(byte).unwrap_or_default());
+        let line = self.lines.line_at(usize::try_from(byte).unwrap_or_default());
         if values.len() != self.names.len() {
             let (got, names) = (count(values.len(), "value"), comma_separated(&self.names));
             return Err(Failure::usage(format!(
@@ -96,26 +97,26 @@ impl Row<'_> {
     /// Returns the number in a column.
     pub(crate) fn number(&self, column: &str) -> Result<f64, Failure> {
         let number = self.text(column).parse().ok().filter(|number: &f64| number.is_finite());
-        number.ok_or_else(|| self.wrong(column, "a finite number is needed"))
+        number.ok_or_else(|| self.value_error(column, "a finite number is needed"))
     }
 
     /// Returns the error for a wrong value in a column; `needed` names the allowed values.
-    pub(crate) fn wrong(&self, column: &str, needed: &str) -> Failure {
+    pub(crate) fn value_error(&self, column: &str, needed: &str) -> Failure {
         let (file, line, value) = (self.file, self.line, self.text(column));
         Failure::usage(format!("{file}: line {line}: {column} = {value:?}: {needed}"))
     }
 }
 
 /// Counts the lines of a text up to increasing positions.
-struct Lines<'a> {
+struct LineCounter<'a> {
     text: &'a str,
     at: usize,
     line: usize,
 }
 
-impl Lines<'_> {
+impl LineCounter<'_> {
     /// Returns the line number of the row that begins at this byte, or after the empty lines and comments there.
-    fn of(&mut self, byte: usize) -> usize {
+    fn line_at(&mut self, byte: usize) -> usize {
         self.line += self.text.get(self.at..byte).unwrap_or_default().matches('\n').count();
         self.at = byte;
         let rest = self.text.get(byte..).unwrap_or_default().split_inclusive('\n');
@@ -141,11 +142,11 @@ mod tests {
             let text = "# first\n\nb,a\n1,2\n\n# two\n# three\n\"4\", 3\n5,6".replace('\n', end);
             let mut table = Table::new("t.csv", &text, COLUMNS).unwrap();
             for (line, a, b) in [(4, "2", 1.0), (8, "3", 4.0), (9, "6", 5.0)] {
-                let row = table.row().unwrap().unwrap();
+                let row = table.next_row().unwrap().unwrap();
                 assert_eq!((row.line, row.text("a"), row.text("c")), (line, a, ""));
                 assert_eq!(row.number("b").unwrap().to_bits(), f64::to_bits(b));
             }
-            assert!(table.row().unwrap().is_none());
+            assert!(table.next_row().unwrap().is_none());
         }
     }
 
@@ -166,9 +167,9 @@ mod tests {
     #[test]
     fn values_are_named_with_their_line() {
         let mut table = Table::new("t.csv", "a,b\n1\n# x\n2,inf\n", COLUMNS).unwrap();
-        let short = table.row().err().unwrap().to_string();
+        let short = table.next_row().err().unwrap().to_string();
         assert_eq!(short, "t.csv: line 2 has 1 value: one is needed for each of the columns a, b");
-        let row = table.row().unwrap().unwrap();
+        let row = table.next_row().unwrap().unwrap();
         let infinite = row.number("b").unwrap_err().to_string();
         assert_eq!(infinite, "t.csv: line 4: b = \"inf\": a finite number is needed");
     }

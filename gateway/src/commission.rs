@@ -15,8 +15,8 @@ use protocol::document;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 
-use super::arguments::{BusKinds, bus_names, bus_of};
-use super::output::{Overwrite, apart, print_beside};
+use super::arguments::{BusKinds, bus_names, find_bus};
+use super::output::{Overwrite, check_distinct, print_beside};
 use super::print::{abbreviated, comma_separated};
 use super::{input, output};
 
@@ -66,25 +66,25 @@ impl Commission {
         let file = self.skin.display().to_string();
         let skin = Skin::parse(&file, &text).map_err(Failure::usage)?;
         let target = match &self.bus {
-            Some(name) => vec![bus_of(&skin, &file, name)?],
+            Some(name) => vec![find_bus(&skin, &file, name)?],
             None => (0..skin.buses.len()).collect(),
         };
-        apart([("--node-ids", self.node_ids.as_deref())], [self.skin.as_path()])?;
+        check_distinct([("--node-ids", self.node_ids.as_deref())], [self.skin.as_path()])?;
         // Open the file before cells are written, so that an error of the file is reported first.
         let begun =
             self.node_ids.as_ref().map(|path| self.overwrite.create("--node-ids", path)).transpose()?;
         let wish = CommissionOptions { dry_run: self.dry_run, verify: self.verify };
-        let stopped = input::stopped()?;
+        let stopped = input::stop_flag()?;
         let kinds = self.kinds.kinds_of(bus_names(&skin))?;
         // Open all buses before anything is sent.
         let benches = target.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
         let benches = benches.map_err(Failure::usage)?;
         let began = Instant::now();
         let mut line = Line::new(self.quiet);
-        let done = commission(benches, &skin, wish, &stopped, |far| line.show(|_width| how_far(far)));
+        let done = commission(benches, &skin, wish, &stopped, |far| line.show(|_width| progress_text(far)));
         line.clear();
         let interrupted = stopped.load(Ordering::Relaxed);
-        check_begun(&file, &done, interrupted)?;
+        check_reached(&file, &done, interrupted)?;
         let whole = show::CommissionResult {
             skin: &skin.name,
             file: &file,
@@ -111,7 +111,7 @@ impl Commission {
 }
 
 /// Formats the progress of all buses in one line.
-fn how_far(all: &[Progress]) -> String {
+fn progress_text(all: &[Progress]) -> String {
     let sum = |part: fn(&Progress) -> usize| all.iter().map(part).sum::<usize>();
     let [cells, found] = [sum(|it| it.cells), sum(|it| it.found)];
     let [done, failed] = [sum(|it| it.done), sum(|it| it.failed)];
@@ -122,7 +122,7 @@ fn how_far(all: &[Progress]) -> String {
 }
 
 /// Returns an error with the reason if no cell could be reached on any bus.
-fn check_begun(file: &str, done: &[CommissionedBus], interrupted: bool) -> Result<(), Failure> {
+fn check_reached(file: &str, done: &[CommissionedBus], interrupted: bool) -> Result<(), Failure> {
     let begun = done.iter().any(|done| {
         let is_well = |outcome| !matches!(outcome, Outcome::Failed(_));
         done.report.requests > 0 || done.report.cells.iter().any(|cell| is_well(cell.outcome))

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use analysis::compare::{Both, CaptureSide, Comparison, Options, Report};
+use analysis::compare::{Both, CaptureSide, CompareOptions, CompareReport, Comparison};
 use analysis::explain::NotFound;
 use clap::Args;
 use model::decode::Decoder;
@@ -19,10 +19,10 @@ use protocol::usage::Failure;
 use serde::Serialize;
 use trace::capture::{CaptureFormat, Entry, NoteKind, Reader};
 
-use self::files::{parts, starts};
+use self::files::{first_numbers, recording_parts};
 use super::input;
-use super::input::{captures, difference, format, needs_frames, no_frame, place, skin_of};
-use super::output::{self, Overwrite, apart, print_beside};
+use super::input::{captures, difference, format, location, needs_frames, no_frame, skin_of};
+use super::output::{self, Overwrite, check_distinct, print_beside};
 use super::print::{count, json};
 
 /// Compare two recordings or logs of one skin, epoch by epoch
@@ -91,7 +91,7 @@ struct CompareOutput<'a> {
     joints_tolerance: u16,
     allow_missing: u64,
     #[serde(flatten)]
-    report: &'a Report,
+    report: &'a CompareReport,
 }
 
 /// A capture that is being read.
@@ -115,17 +115,17 @@ impl Input {
     }
 
     /// Passes the frames that are latched at the start of the capture to the comparison.
-    fn begin(&mut self, which: CaptureSide, comparison: &mut Comparison<'_>) {
+    fn pass_latched(&mut self, which: CaptureSide, comparison: &mut Comparison<'_>) {
         for before in &self.reader.extras().latched {
             let at = Micros(before.nanos / 1_000);
             if let Some(message) = self.decoder.decode(at, &before.bus, &before.frame).message() {
-                comparison.begin(which, before.nanos, &before.bus, message);
+                comparison.receive_latched(which, before.nanos, &before.bus, message);
             }
         }
     }
 
     /// Passes the next entry to the comparison.
-    fn read(&mut self, which: CaptureSide, comparison: &mut Comparison<'_>) {
+    fn read_entry(&mut self, which: CaptureSide, comparison: &mut Comparison<'_>) {
         match self.reader.next() {
             Ok(Some(Entry::Frame(record))) => {
                 self.has_frames = true;
@@ -136,9 +136,9 @@ impl Input {
             Ok(Some(Entry::Note(note))) => {
                 self.missing.count(&note);
                 match note.kind {
-                    NoteKind::Dropped(frames) => comparison.dropped(which, frames),
+                    NoteKind::Dropped(frames) => comparison.record_dropped(which, frames),
                     NoteKind::Unreadable(why) if self.missing.unreadable() == 1 => {
-                        output::note(format_args!("{}: {why}", place(&self.name, note.line)));
+                        output::note(format_args!("{}: {why}", location(&self.name, note.line)));
                     }
                     NoteKind::Text | NoteKind::CanXl | NoteKind::Unreadable(_) => {}
                 }
@@ -161,29 +161,29 @@ impl Compare {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let began = Instant::now();
         let read = [&self.a, &self.b].into_iter().chain(&self.skin).map(PathBuf::as_path);
-        apart([("--junit", self.junit.as_deref())], read)?;
+        check_distinct([("--junit", self.junit.as_deref())], read)?;
         if [&self.a, &self.b].iter().all(|file| is_standard_input(file)) {
             return Err(Failure::usage(
                 "- and -: standard input is read once: name a file for one of the two",
             ));
         }
-        let files = Both { a: parts(&self.a)?, b: parts(&self.b)? };
+        let files = Both { a: recording_parts(&self.a)?, b: recording_parts(&self.b)? };
         let skin = self.skin(&files)?;
         let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;
-        let mut comparison = Comparison::new(&skin, self.options(), starts(&files, &skin)?);
+        let mut comparison = Comparison::new(&skin, self.options(), first_numbers(&files, &skin)?);
         let Both { a, b } = files;
         let mut inputs = Both { a: Input::open(a)?, b: Input::open(b)? };
         for which in [CaptureSide::A, CaptureSide::B] {
-            inputs.of_mut(which).begin(which, &mut comparison);
+            inputs.get_mut(which).pass_latched(which, &mut comparison);
         }
-        while let Some(which) = comparison.next() {
-            inputs.of_mut(which).read(which, &mut comparison);
+        while let Some(which) = comparison.next_side() {
+            inputs.get_mut(which).read_entry(which, &mut comparison);
         }
         if stop::stop_flag().load(Ordering::Relaxed) {
             return Err(Failure::run("stopped before all was compared"));
         }
         for which in [CaptureSide::A, CaptureSide::B] {
-            self.check(inputs.of_mut(which), which, &mut comparison, &skin)?;
+            self.check(inputs.get_mut(which), which, &mut comparison, &skin)?;
         }
         let report = comparison.report();
         for which in [CaptureSide::A, CaptureSide::B] {
@@ -217,8 +217,8 @@ impl Compare {
         }
     }
 
-    fn options(&self) -> Options {
-        Options {
+    fn options(&self) -> CompareOptions {
+        CompareOptions {
             tolerance: self.tolerance.into(),
             joints_tolerance: self.joints_tolerance.into(),
             missing: self.allow_missing,

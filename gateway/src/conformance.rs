@@ -18,7 +18,7 @@ use protocol::time::Span;
 use protocol::usage::Failure;
 
 use self::show::ConformanceResult;
-use super::arguments::{BusKinds, FORMATS, one_of};
+use super::arguments::{BusKinds, FORMATS, one_of_values};
 use super::output::{Overwrite, print_beside};
 use super::{input, output};
 
@@ -47,7 +47,7 @@ pub(crate) struct Conformance {
     #[command(flatten)]
     kinds: BusKinds,
     /// Frame format of the bus [default: the format of the cell's heartbeats]
-    #[arg(long, value_parser = one_of(FORMATS))]
+    #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
     /// Test only these requirements: CONF-7, or CONF for all that begin so
     #[arg(long, value_name = "ID", value_delimiter = ',')]
@@ -81,7 +81,7 @@ impl Conformance {
                 "--requirement {word}: no requirement has this id; CONF-7 and CONF are examples"
             ))
         })?;
-        let stopped = input::stopped()?;
+        let stopped = input::stop_flag()?;
         let name = match (&self.bus, &self.cell.bus) {
             (None, None) => return Err(Failure::usage("--bus is missing: name the bus of the cell")),
             (Some(bus), Some(other)) if bus != other => {
@@ -110,14 +110,14 @@ impl Conformance {
             .map_err(Failure::run)?;
         let mut session = Session::new(&mut live, name, node, format, MAX_TEST_DURATION);
         if let Some(path) = &self.restore {
-            return put_back(&mut session, &read(path)?, path);
+            return restore_cell(&mut session, &read_saved(path)?, path);
         }
         let began = Instant::now();
         let saved = session.save().map_err(Failure::run)?;
         let saved = saved.map_err(|why| Failure::run(format!("cell {} on {name}: {why}", node)))?;
         Overwrite { overwrite: false }.write("--save", &path, &super::print::json(&saved)?)?;
         let stopped = conformance::run(&mut session, &only).err();
-        let back = put_back(&mut session, &saved, &path);
+        let back = restore_cell(&mut session, &saved, &path);
         let whole = ConformanceResult::new(
             &saved,
             format,
@@ -143,7 +143,7 @@ impl Conformance {
 }
 
 /// Reads the configuration that an earlier test saved.
-fn read(path: &Path) -> Result<SavedCell, Failure> {
+fn read_saved(path: &Path) -> Result<SavedCell, Failure> {
     let wrong =
         |error: &dyn std::fmt::Display| Failure::usage(format!("--restore {}: {error}", path.display()));
     let text = protocol::document::read_text(path).map_err(Failure::usage)?;
@@ -151,7 +151,7 @@ fn read(path: &Path) -> Result<SavedCell, Failure> {
 }
 
 /// Restores the cell's configuration, and deletes the file on success.
-fn put_back(session: &mut Session<'_>, saved: &SavedCell, path: &PathBuf) -> Result<(), Failure> {
+fn restore_cell(session: &mut Session<'_>, saved: &SavedCell, path: &PathBuf) -> Result<(), Failure> {
     let keep = |why: &dyn std::fmt::Display| {
         let path = path.display();
         Failure::run(format!(

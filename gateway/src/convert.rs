@@ -24,12 +24,12 @@ use trace::capture::{CaptureFormat, Entry, NoteKind, Reader};
 use trace::files::WholeFile;
 
 use self::live::GrowingCapture;
-use super::arguments::{OptionValue, one_of};
-use super::input::{captures, no_frame, others, place, skin_for};
-use super::output::{Overwrite, apart, is_standard_output, note, refused};
+use super::arguments::{OptionValue, one_of_values};
+use super::input::{captures, location, no_frame, other_contents, skin_for};
+use super::output::{Overwrite, check_distinct, is_standard_output, note, write_refused};
 
 /// Maximum number of unreadable lines that are reported one by one.
-const NAMED: u64 = 100;
+const MAX_NAMED_LINES: u64 = 100;
 /// Number of bytes written at once.
 const WRITE_BYTES: usize = 1 << 18;
 
@@ -63,7 +63,7 @@ pub(crate) struct Convert {
     #[arg(long)]
     strict: bool,
     /// Digits of a second in a log [default: as many as IN has]
-    #[arg(long, value_parser = one_of(DIGITS), value_name = "N")]
+    #[arg(long, value_parser = one_of_values(DIGITS), value_name = "N")]
     digits: Option<Digits>,
     /// Write the direction, T or R, behind each frame of a log, which Wireshark cannot read. Without this option, only
     /// a log that has directions keeps them
@@ -104,10 +104,10 @@ impl Convert {
         }
         let to = self.to.display();
         if !is_standard_output(&self.to) {
-            apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
+            check_distinct([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
             self.overwrite.check("", &self.to)?;
-            if !text && size(&self.from).is_none() {
-                live::check(&self.to).map_err(|error| refused("", &self.to, &error))?;
+            if !text && input_bytes(&self.from).is_none() {
+                live::check_part_file(&self.to).map_err(|error| write_refused("", &self.to, &error))?;
             }
         }
         if is_standard_output(&self.to) {
@@ -121,10 +121,10 @@ impl Convert {
             return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
         }
         let digits = self.digits.unwrap_or(if self.plain { Digits::Six } else { Digits::Own });
-        let directions = !self.plain && (self.direction || reader.is_of_a_log());
+        let directions = !self.plain && (self.direction || reader.is_from_log());
         let style = Style { digits, plain: self.plain, directions };
         let mut sink = if live && self.is_new() {
-            let refused = |error: io::Error| refused("", &self.to, &error);
+            let refused = |error: io::Error| write_refused("", &self.to, &error);
             Sink::Live(
                 GrowingCapture::create(&self.to, self.overwrite.overwrite, (format, style, of_log), stopped)
                     .map_err(refused)?,
@@ -133,21 +133,21 @@ impl Convert {
             let (whole, out) = self.create(stopped)?;
             let output = match format {
                 CaptureFormat::Candump => CaptureWriter::new(out, format, style),
-                CaptureFormat::Mcap => CaptureWriter::recording(out, Origin { of_log, file: None }),
+                CaptureFormat::Mcap => CaptureWriter::new_mcap(out, Origin { of_log, file: None }),
             };
             Sink::Whole(whole, output.map_err(|error| Failure::run(format!("{to}: {error}")))?)
         };
         let mut named = 0;
         let done = convert(&mut reader, &mut sink, |line, why| {
             named += 1;
-            let place = place(&name, line.line);
+            let place = location(&name, line.line);
             if self.strict {
                 return Err(format!("{place}: {why}; without --strict it would be kept as it is"));
             }
-            if named <= NAMED {
+            if named <= MAX_NAMED_LINES {
                 bar.suspend(|| note(format_args!("{place}: {why}")));
             }
-            if named == NAMED {
+            if named == MAX_NAMED_LINES {
                 bar.suspend(|| note(format_args!("{name}: further lines of that kind are counted")));
             }
             Ok(())
@@ -155,7 +155,7 @@ impl Convert {
         bar.finish_and_clear();
         let done = match done {
             Ok(done) => done,
-            Err(ConvertError::Write(error)) => return self.not_written(&sink, error),
+            Err(ConvertError::Write(error)) => return self.write_failure(&sink, error),
             Err(error @ ConvertError::Strict(_)) => return Err(sink.discard(Failure::run(error))),
             Err(error) => return Err(sink.close(Failure::run(error))),
         };
@@ -173,7 +173,7 @@ impl Convert {
             }
             note(said);
         }
-        sink.finish().or_else(|(left, error)| written(&self.to, &left, error))?;
+        sink.finish().or_else(|(left, error)| write_error(&self.to, &left, error))?;
         for line in remarks(&reader, &done, &style, text) {
             note(format_args!("{name}: {line}"));
         }
@@ -193,9 +193,9 @@ impl Convert {
             match reader.next() {
                 Ok(Some(Entry::Note(line))) => {
                     if let NoteKind::Unreadable(why) = &line.kind
-                        && (unreadable.len() as u64) < NAMED
+                        && (unreadable.len() as u64) < MAX_NAMED_LINES
                     {
-                        unreadable.push(format!("{}: {why}", place(&name, line.line)));
+                        unreadable.push(format!("{}: {why}", location(&name, line.line)));
                     }
                 }
                 Ok(None)
@@ -216,9 +216,9 @@ impl Convert {
         !is_standard_output(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
     }
 
-    fn not_written(&self, sink: &Sink, error: io::Error) -> Result<(), Failure> {
-        let left = sink.left();
-        written(&self.to, &left, error)
+    fn write_failure(&self, sink: &Sink, error: io::Error) -> Result<(), Failure> {
+        let left = sink.remaining_file();
+        write_error(&self.to, &left, error)
     }
 
     /// Writes the torque of every epoch to a CSV file.
@@ -229,7 +229,7 @@ impl Convert {
         if let Some((option, _)) = options.iter().find(|(_, given)| *given) {
             return Err(Failure::usage(format!("{option} is for a candump log, and {to} is a CSV file")));
         }
-        apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
+        check_distinct([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
         self.overwrite.check("", &self.to)?;
         let skin = skin_for(&self.from, self.skin.as_deref())?;
         let (mut reader, bar, live) = self.open()?;
@@ -239,7 +239,7 @@ impl Convert {
         let done = torques::write(&mut reader, &skin, out);
         bar.finish_and_clear();
         let (epochs, missing) = done.map_err(|error| match error {
-            SeriesError::Taken(error) => Failure::run(format!("{to}: {error}; no file was kept")),
+            SeriesError::Consumer(error) => Failure::run(format!("{to}: {error}; no file was kept")),
             error @ (SeriesError::Capture(_) | SeriesError::NotFound { .. }) => Failure::run(error),
         })?;
         if stopped.load(Ordering::Relaxed) && !live {
@@ -252,7 +252,7 @@ impl Convert {
             whole.finish().map_err(|error| Failure::run(format!("{to}: {error}")))?;
         }
         missing.report(&reader, "left out");
-        if let Some(buses) = torques::summed(&skin) {
+        if let Some(buses) = torques::summed_buses(&skin) {
             note(format_args!("{name}: {buses} answers with sums: distributed torques and errors are empty"));
         }
         note(format_args!("{name} -> {to}: {epochs} epochs"));
@@ -261,8 +261,8 @@ impl Convert {
 
     /// Opens the capture. Returns it with its progress bar, and true if it comes from a live pipe.
     fn open(&self) -> Result<(Reader, ProgressBar, bool), Failure> {
-        let size = size(&self.from);
-        let bar = bar(size);
+        let size = input_bytes(&self.from);
+        let bar = progress_bar(size);
         let progress = bar.clone();
         let reader = captures(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
         Ok((reader, bar, size.is_none()))
@@ -279,7 +279,7 @@ impl Convert {
             WholeFile::create_unless(&self.to, self.overwrite.overwrite, stopped)
                 .map(|(whole, file)| (Some(whole), file))
         };
-        let (whole, file) = begun.map_err(|error| refused("", &self.to, &error))?;
+        let (whole, file) = begun.map_err(|error| write_refused("", &self.to, &error))?;
         Ok((whole, BufWriter::with_capacity(WRITE_BYTES, InterruptibleWriter::new(file))))
     }
 
@@ -306,14 +306,14 @@ impl Convert {
 }
 
 /// Returns the total size of the inputs in bytes, if known.
-fn size(from: &[PathBuf]) -> Option<u64> {
+fn input_bytes(from: &[PathBuf]) -> Option<u64> {
     let of = |path: &PathBuf| fs::metadata(path).ok().filter(fs::Metadata::is_file).map(|about| about.len());
     from.iter().map(of).sum()
 }
 
 /// Returns the failure for an error of the output; `left` gives the state of the file. A closed pipe is not an error,
 /// because its reader may have read enough, as `head` does.
-fn written(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
+fn write_error(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
     if is_standard_output(to) {
         return protocol::usage::ignore_broken_pipe(Err(error));
     }
@@ -328,10 +328,10 @@ enum Sink {
 
 impl Sink {
     /// Returns text that names the file which holds the frames after an error.
-    fn left(&self) -> String {
+    fn remaining_file(&self) -> String {
         match self {
             Self::Whole(..) => "no file was kept".to_owned(),
-            Self::Live(live) => live.left(),
+            Self::Live(live) => live.remaining_file(),
         }
     }
 
@@ -340,9 +340,9 @@ impl Sink {
         match self {
             Self::Whole(..) => why,
             Self::Live(live) => {
-                let left = live.left();
+                let left = live.remaining_file();
                 live.close();
-                why.and(left)
+                why.append(left)
             }
         }
     }
@@ -357,7 +357,7 @@ impl Sink {
 
     /// Finishes the output. An error comes with text on the state of the file.
     fn finish(self) -> Result<(), (String, io::Error)> {
-        let left = self.left();
+        let left = self.remaining_file();
         let finished = match self {
             Self::Whole(whole, mut output) => {
                 output.finish().and_then(|()| whole.map_or(Ok(()), WholeFile::finish))
@@ -385,7 +385,7 @@ impl EntrySink for Sink {
 }
 
 /// Creates a progress bar in bytes of the input, which only terminals show.
-fn bar(size: Option<u64>) -> ProgressBar {
+fn progress_bar(size: Option<u64>) -> ProgressBar {
     let Some(size) = size.filter(|_| io::stderr().is_terminal()) else { return ProgressBar::hidden() };
     let bar = ProgressBar::with_draw_target(Some(size), ProgressDrawTarget::stderr());
     let style = "{wide_bar} {bytes} of {total_bytes}, {binary_bytes_per_sec}, {eta} left";
@@ -425,7 +425,7 @@ fn remarks(reader: &Reader, done: &ConversionCounts, style: &Style, text: bool) 
             lines.push(format!("{count} {}{what}", if count == 1 { one } else { more }));
         }
     }
-    match others(reader) {
+    match other_contents(reader) {
         others if others.is_empty() => {}
         others if text => lines.push(format!("a log has no place for {others}")),
         others => lines.push(format!("frames alone are written, without {others}")),

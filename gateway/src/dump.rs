@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use analysis::stats::Report;
+use analysis::stats::StatsReport;
 use bench::bus::listen::now;
 use clap::Args;
 use model::decode::pick::{FrameFilter, IdMask, Party, Selector};
@@ -22,10 +22,10 @@ use serde::Serialize;
 use trace::capture::{Entry, NoteKind, Reader, RecordingExtras, Topic};
 
 use self::show::{FrameOutput, OutputStyle};
-use super::arguments::{BusKinds, OptionValue, nanos, one_of};
+use super::arguments::{BusKinds, OptionValue, one_of_values, parse_time_ns};
 use super::input::{
-    self, LossCounts, POLL_TIMEOUT, ReceiveEnd, captures, is_file, is_path, no_frame, place, remark_another,
-    skin_beside, stopped,
+    self, LossCounts, POLL_TIMEOUT, ReceiveEnd, captures, is_file, is_path, location, no_frame,
+    note_other_skin, skin_so_far, stop_flag,
 };
 use super::output;
 use super::print::{comma_separated, json};
@@ -72,10 +72,10 @@ pub(crate) struct Dump {
     #[arg(long)]
     contact: bool,
     /// Only from this second of the run on; counted from the first frame if there is no run
-    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
+    #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     from: Option<u64>,
     /// Only before this second, counted like --from; ends a live dump
-    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
+    #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     to: Option<u64>,
     /// End after this many frames that are shown or counted
     #[arg(long, short = 'n', value_name = "COUNT")]
@@ -94,8 +94,8 @@ pub(crate) struct Dump {
     #[arg(long, conflicts_with_all = ["kind", "cell", "id", "contact"])]
     stats: bool,
     /// Frame format of packets; auto accepts both
-    #[arg(long, value_parser = one_of(ANY_FORMAT), default_value = "auto")]
-    format: Packets,
+    #[arg(long, value_parser = one_of_values(ANY_FORMAT), default_value = "auto")]
+    format: PacketFormat,
     /// The skin, which gives torques and positions their units [default: the skin in the recording]
     ///
     /// Without a skin, torques are read as Q3.12, and joints as revolute.
@@ -109,9 +109,9 @@ pub(crate) struct Dump {
 }
 
 /// Frame format of packets, or `None` if unknown in advance.
-type Packets = Option<Format>;
+type PacketFormat = Option<Format>;
 
-const ANY_FORMAT: &[OptionValue<Packets>] = &[
+const ANY_FORMAT: &[OptionValue<PacketFormat>] = &[
     ("auto", "Both", None),
     ("fd", "One CAN FD frame", Some(Format::Fd)),
     ("classic", "Two to four classic frames", Some(Format::Classic)),
@@ -156,32 +156,32 @@ impl Dump {
         let mut show = FrameOutput::new(to_out, self.format, pick, self.contact, how, max);
         if let Some(path) = &self.skin {
             let skin = Skin::read(path).map_err(Failure::usage)?;
-            remark_another(&self.sources, path, &skin);
-            show.describe(&skin);
+            note_other_skin(&self.sources, path, &skin);
+            show.set_units(&skin);
         }
         let (what, extras, done) = if is_capture {
             let mut reader = captures(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
             if self.skin.is_none() && !self.stats {
                 let instead = "torques are read as Q3.12 and joints as revolute: name the skin with --skin";
-                if let Some(skin) = skin_beside(&reader, instead) {
-                    show.describe(&skin);
+                if let Some(skin) = skin_so_far(&reader, instead) {
+                    show.set_units(&skin);
                 }
             }
             reader.extras().run_began().into_iter().for_each(|zero| show.count_from(zero));
-            let done = captured(&mut reader, &mut show);
+            let done = show_capture(&mut reader, &mut show);
             if let (Ok(()), Some(absent)) = (&done, show.absent_buses()) {
                 output::note(format_args!("{title}: no frame comes from {absent}"));
             }
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {
             // Signals must be caught before the dump reports that it listens.
-            let stopped = stopped()?;
-            let kinds = self.kinds.of_any()?;
+            let stopped = stop_flag()?;
+            let kinds = self.kinds.any_kinds()?;
             let until = self.wait.then_some(&*stopped);
             let mut receive_ends =
                 input::receive_ends(&self.sources, &kinds, self.format, &BusOptions::default(), until)?;
-            ("live", None, live(&mut receive_ends, &mut show, self.to, &stopped))
+            ("live", None, show_live(&mut receive_ends, &mut show, self.to, &stopped))
         };
         ignore_broken_pipe(show.finish().and_then(|()| show.flush()))?;
         let report = show.report();
@@ -218,7 +218,7 @@ impl Dump {
 fn as_json(
     source: &str,
     format: &str,
-    report: &Report,
+    report: &StatsReport,
     extras: Option<&RecordingExtras>,
 ) -> Result<String, Failure> {
     #[derive(Serialize)]
@@ -226,7 +226,7 @@ fn as_json(
         source: &'a str,
         format: &'a str,
         #[serde(flatten)]
-        report: &'a Report,
+        report: &'a StatsReport,
         other_topics: &'a [Topic],
         attachments: Vec<&'a str>,
     }
@@ -237,7 +237,7 @@ fn as_json(
 }
 
 /// Shows the frames of a capture.
-fn captured(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(), Failure> {
+fn show_capture(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(), Failure> {
     let name = reader.name().to_owned();
     let (mut frames, mut missing) = (0_u64, LossCounts::default());
     let done = loop {
@@ -259,7 +259,7 @@ fn captured(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(
             }
             Some(Entry::Note(note)) => {
                 missing.count(&note);
-                let place = place(&name, note.line);
+                let place = location(&name, note.line);
                 match note.kind {
                     NoteKind::Text | NoteKind::CanXl => {}
                     NoteKind::Dropped(lost) => {
@@ -290,7 +290,7 @@ fn captured(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(
 const SETTLE_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Shows buses until a signal, or until one is closed.
-fn live(
+fn show_live(
     receive_ends: &mut [ReceiveEnd],
     show: &mut FrameOutput<impl Write>,
     to: Option<u64>,
@@ -301,7 +301,7 @@ fn live(
         if stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
             break Ok(());
         }
-        match received(receive_ends, show) {
+        match show_received(receive_ends, show) {
             // Report the frames that were lost until then before returning the error.
             Err(failure) => break Err(failure),
             // If the reader of the output has read enough, end the dump without an error.
@@ -326,7 +326,7 @@ fn live(
 }
 
 /// Waits for frames and shows them. Returns true if any arrived, or the error of the output.
-fn received(
+fn show_received(
     receive_ends: &mut [ReceiveEnd],
     show: &mut FrameOutput<impl Write>,
 ) -> Result<io::Result<bool>, Failure> {

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use analysis::report::figure::{Finding, Page, Section, Verdict};
+use analysis::report::figure::{Finding, FindingVerdict, Page, Section};
 use analysis::report::{page, svg};
 use bench::bus::realtime;
 use bench::record::facts;
@@ -24,11 +24,11 @@ use paper::{Effort, Experiment as Named, Lab, Session, files};
 use protocol::usage::{Failure, print_text, shell_quoted_os};
 use serde_json::Value;
 
-use super::input::stopped;
+use super::input::stop_flag;
 use super::output::{Overwrite, note};
 use super::print::{KeyValueTable, json};
 use benches::Benches;
-use folder::Folder;
+use folder::ResultFolder;
 
 /// Repeat the paper's experiments, and draw and rate the results
 ///
@@ -89,20 +89,20 @@ impl Experiment {
         let Some(output) = &self.output else {
             return Err(Failure::usage("-o DIR is missing: name the folder for report.html and the figures"));
         };
-        let target = |named: &Named| {
+        let is_selected = |named: &Named| {
             self.names.iter().any(|word| {
                 matches!(word, ExperimentArgument::All) || *word == ExperimentArgument::One(*named)
             })
         };
-        let named: Vec<Named> = Named::ALL.into_iter().filter(target).collect();
-        let stop = stopped()?;
+        let named: Vec<Named> = Named::ALL.into_iter().filter(is_selected).collect();
+        let stop = stop_flag()?;
         // Create the directory before any measurement, so that an error of the directory is reported first.
-        let folder = Folder::create(output, self.overwrite)?;
+        let folder = ResultFolder::create(output, self.overwrite)?;
         let page = self.perform(&named, &folder, stop)?;
-        keep(&page, &folder)?;
+        write_results(&page, &folder)?;
         // Keep the measured data even if it cannot be drawn.
         draw(&page, folder).map_err(|failure| {
-            failure.and(format_args!(
+            failure.append(format_args!(
                 "{} has the results, the data of the figures and the recordings",
                 output.display()
             ))
@@ -110,11 +110,16 @@ impl Experiment {
         if self.quiet { Ok(()) } else { print_findings(&page, &output.join("report.html")) }
     }
 
-    fn perform(&self, named: &[Named], folder: &Folder, stop: Arc<AtomicBool>) -> Result<Page, Failure> {
+    fn perform(
+        &self,
+        named: &[Named],
+        folder: &ResultFolder,
+        stop: Arc<AtomicBool>,
+    ) -> Result<Page, Failure> {
         let effort = if self.quick { Effort::Quick } else { Effort::Full };
         let progress = Progress::new(named.iter().map(|named| named.seconds(effort)).sum(), self.quiet);
-        let benches = Benches { folder: folder.inside(), stop: Arc::clone(&stop) };
-        let mut lab = Here { benches, stop, idle: None };
+        let benches = Benches { folder: folder.staging_directory(), stop: Arc::clone(&stop) };
+        let mut lab = LocalLab { benches, stop, idle: None };
         let mut session = Session::new(effort);
         let mut sections = Vec::with_capacity(named.len());
         for named in named {
@@ -122,7 +127,7 @@ impl Experiment {
             sections.push(session.perform(*named, &mut lab)?);
             progress.end(named.seconds(effort));
         }
-        lab.go_on()?;
+        lab.check_stopped()?;
         progress.clear();
         Ok(self.page(sections, lab.idle))
     }
@@ -157,14 +162,14 @@ impl Experiment {
 }
 
 /// Runs the measurements of experiments on this machine.
-struct Here {
+struct LocalLab {
     benches: Benches,
     stop: Arc<AtomicBool>,
     /// Wake-up lateness of the idle machine before a bench, as text.
     idle: Option<String>,
 }
 
-impl Lab for Here {
+impl Lab for LocalLab {
     type Error = Failure;
 
     fn now(&self) -> u64 {
@@ -174,7 +179,7 @@ impl Lab for Here {
     fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
         let run = self.benches.run(reply, effort);
         // If a signal has ended the bench, return that it was interrupted, not that it failed.
-        self.go_on()?;
+        self.check_stopped()?;
         let run = run?;
         let late = |key: &str| run.figure(&["loop", "idle_late_us", key]);
         self.idle.get_or_insert_with(|| {
@@ -185,11 +190,11 @@ impl Lab for Here {
 
     fn scaled(&mut self, bench: &ScaleBench) -> Result<Value, Failure> {
         let summary = self.benches.scaled(bench);
-        self.go_on()?;
+        self.check_stopped()?;
         summary
     }
 
-    fn go_on(&mut self) -> Result<(), Failure> {
+    fn check_stopped(&mut self) -> Result<(), Failure> {
         if self.stop.load(Ordering::Relaxed) {
             return Err(Failure::run("ended by a signal: nothing was written"));
         }
@@ -214,12 +219,12 @@ fn machine() -> String {
 }
 
 fn list() -> Result<(), Failure> {
-    let line = |named: Named| format!("{:12} {}\n", named.name(), named.about());
+    let line = |named: Named| format!("{:12} {}\n", named.name(), named.description());
     print_text(&Named::ALL.into_iter().map(line).collect::<String>())
 }
 
 /// Writes the findings and the data of the figures, and publishes them with the recordings.
-fn keep(page: &Page, folder: &Folder) -> Result<(), Failure> {
+fn write_results(page: &Page, folder: &ResultFolder) -> Result<(), Failure> {
     folder.write("results.json", &json(&files::results(page))?)?;
     for figure in page.sections.iter().flat_map(|section| &section.figures) {
         folder.write(&format!("{}.csv", figure.name), &files::csv(figure))?;
@@ -228,7 +233,7 @@ fn keep(page: &Page, folder: &Folder) -> Result<(), Failure> {
 }
 
 /// Writes the HTML page and the figures.
-fn draw(page: &Page, folder: Folder) -> Result<(), Failure> {
+fn draw(page: &Page, folder: ResultFolder) -> Result<(), Failure> {
     folder.write("report.html", &page::html(page))?;
     for figure in page.sections.iter().flat_map(|section| &section.figures) {
         folder.write(&format!("{}.svg", figure.name), &svg::draw(figure))?;
@@ -245,14 +250,16 @@ fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
             let beside = [paper.as_ref().map(|paper| format!("paper {paper}")), bar.clone()];
             let beside = beside.into_iter().flatten().collect::<Vec<_>>().join("; ");
             let verdict = match verdict {
-                Verdict::Stated => String::new(),
-                Verdict::Better | Verdict::Same | Verdict::Worse => format!("  {verdict}"),
+                FindingVerdict::Stated => String::new(),
+                FindingVerdict::Better | FindingVerdict::Same | FindingVerdict::Worse => {
+                    format!("  {verdict}")
+                }
             };
             rows.row(what, ours, format!("{beside}{verdict}"));
         }
     }
     let worse = page.sections.iter().flat_map(|section| &section.findings);
-    let worse = worse.filter(|finding| finding.verdict == Verdict::Worse).count();
+    let worse = worse.filter(|finding| finding.verdict == FindingVerdict::Worse).count();
     let worse = if worse == 0 {
         String::new()
     } else {
@@ -283,7 +290,7 @@ impl Progress {
     fn begin(&self, named: Named) {
         self.bar.set_message(named.name());
         if self.lines {
-            note(format_args!("{named}: {}", named.about()));
+            note(format_args!("{named}: {}", named.description()));
         }
     }
 

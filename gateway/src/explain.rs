@@ -5,7 +5,7 @@ mod torque;
 
 use std::path::PathBuf;
 
-use analysis::explain::{CellExplained, Explanation, RequestedJoints, explain, find};
+use analysis::explain::{CellExplained, Explanation, RequestedJoints, explain, read_to_joints};
 use clap::Args;
 use protocol::id::CellId;
 use protocol::packet::Epoch;
@@ -14,8 +14,8 @@ use protocol::usage::{Failure, print_text};
 use serde::Serialize;
 use trace::capture::Reader;
 
-use super::arguments::{cell_of, nanos};
-use super::input::{is_file, is_path, no_frame, remark_another, skin_of};
+use super::arguments::{find_cell, parse_time_ns};
+use super::input::{is_file, is_path, no_frame, note_other_skin, skin_of};
 use super::output;
 use super::print::json;
 
@@ -50,7 +50,7 @@ pub(crate) struct Explain {
     #[arg(long, value_name = "E", required_unless_present_any = ["force", "batch"])]
     epoch: Option<u8>,
     /// Only joints from this second of the run on; counted from the first frame if there is no run
-    #[arg(long, value_name = "S", value_parser = nanos, default_value = "0", conflicts_with_all = ["force", "batch"])]
+    #[arg(long, value_name = "S", value_parser = parse_time_ns, default_value = "0", conflicts_with_all = ["force", "batch"])]
     at: u64,
     /// Use the Nth joints of this epoch, if there are several
     #[arg(long, value_name = "K", default_value_t = 1, conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u32).range(1..))]
@@ -100,7 +100,7 @@ impl Explain {
         let name = reader.name().to_owned();
         let requested =
             RequestedJoints { epoch: Epoch(epoch), from_ns: self.at, occurrence: self.occurrence };
-        let found = find(&mut reader, &skin, requested).map_err(Failure::run)?;
+        let found = read_to_joints(&mut reader, &skin, requested).map_err(Failure::run)?;
         for (count, what) in [
             (found.dropped, "frames are missing before this point; contact states may be out of date"),
             (found.unreadable, "lines before this point could not be read"),
@@ -118,7 +118,7 @@ impl Explain {
         let moments = found.moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
         // An error above, which may be due to a different skin, is returned without this note.
         if let Some(path) = &self.skin {
-            remark_another(&self.files, path, &skin);
+            note_other_skin(&self.files, path, &skin);
         }
         let mut explanation = explain(&skin, &moments);
         if let Some(target) = &self.cell {
@@ -142,7 +142,7 @@ impl Explain {
             (false, Some(_)) => show::ExplainDetail::Joint,
             (false, None) => show::ExplainDetail::All,
         };
-        print_text(&show::text(&name, epoch, (found.zero_ns, found.is_of_run), &explanation, what))
+        print_text(&show::text(&name, epoch, (found.zero_ns, found.counts_from_run), &explanation, what))
     }
 
     /// Checks that the skin has the cell and the joint.
@@ -154,6 +154,6 @@ impl Explain {
                 skin.robot.name
             )));
         }
-        self.cell.as_ref().map_or(Ok(()), |cell| cell_of(skin, cell, "--cell").map(|_| ()))
+        self.cell.as_ref().map_or(Ok(()), |cell| find_cell(skin, cell, "--cell").map(|_| ()))
     }
 }

@@ -13,7 +13,7 @@ use protocol::usage::Failure;
 use protocol::wire_time::{BitRates, parse_bit_rate};
 use trace::capture::{CaptureFormat, Reader};
 
-use super::arguments::{BusKinds, FORMATS, one_of, seconds};
+use super::arguments::{BusKinds, FORMATS, one_of_values, parse_duration};
 use super::input::{is_file, read_skin};
 use super::print::comma_separated;
 
@@ -51,7 +51,7 @@ pub(crate) struct Fit {
     #[arg(long, conflicts_with = "nominal")]
     table: bool,
     /// For a skin: frame format of packets on all buses, whatever format the skin has
-    #[arg(long, value_parser = one_of(FORMATS))]
+    #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
     /// For a skin: longest time of a cell from joints to its answer, in µs [the paper's cell: 68.5]
     #[arg(long, value_name = "US", value_parser = computation)]
@@ -73,7 +73,7 @@ pub(crate) struct Fit {
     #[arg(long, value_name = "N", requires = "ber")]
     seed: Option<u64>,
     /// For live buses: end after this time
-    #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
+    #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Print one JSON object; for traffic, one per frame instead of tables, in the order of the file
     ///

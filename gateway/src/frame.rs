@@ -22,7 +22,7 @@ use protocol::message::{Answer, Message};
 use protocol::skin::{CellName, Skin};
 use protocol::usage::{Failure, print_text};
 
-use super::arguments::{BusKinds, FORMATS, bus_of, cell_of, one_of};
+use super::arguments::{BusKinds, FORMATS, find_bus, find_cell, one_of_values};
 use super::output;
 use super::print::comma_separated;
 use addressee::only_cell;
@@ -47,7 +47,7 @@ pub(crate) struct Frame {
     #[command(subcommand)]
     what: PacketCommand,
     /// Frame format of the packet [default: with --skin the format of each bus, else fd]
-    #[arg(long, value_parser = one_of(FORMATS))]
+    #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
     /// Send the frame on these buses instead of printing it
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
@@ -64,7 +64,7 @@ impl Frame {
         let message = self.what.message().map_err(Failure::usage)?;
         let (targets, kinds) = self.targets()?;
         if targets.is_empty() {
-            return print_text(&text(&message, self.format.unwrap_or(Format::Fd)));
+            return print_text(&cansend_lines(&message, self.format.unwrap_or(Format::Fd)));
         }
         // Open all buses before anything is sent.
         let open = |(name, format): &(String, Format)| {
@@ -75,24 +75,24 @@ impl Frame {
             buses.into_iter().zip(&targets).map(|(bus, (_, format))| self.send(bus, *format, &message));
         let failures: Vec<_> = done.filter_map(Result::err).collect();
         let mut failures = failures.into_iter();
-        failures.next().map_or(Ok(()), |first| Err(failures.fold(first, Failure::and)))
+        failures.next().map_or(Ok(()), |first| Err(failures.fold(first, Failure::append)))
     }
 
     /// Returns the buses on which the frame is sent, with their formats, and the kinds of the buses. Without buses, the
     /// frame is printed.
     fn targets(&self) -> Result<(Vec<(String, Format)>, KindChoices), Failure> {
         let format = |of_skin: Format| self.format.unwrap_or(of_skin);
-        let to = self.what.to();
+        let to = self.what.addressee();
         let of_cell = to.and_then(|to| to.bus.as_ref());
         let mut targets: Vec<_> = match &self.skin {
             Some(path) => {
                 let skin = Skin::read(path).map_err(Failure::usage)?;
                 let file = path.display().to_string();
-                self.bus.iter().chain(of_cell).try_for_each(|name| bus_of(&skin, &file, name).map(drop))?;
+                self.bus.iter().chain(of_cell).try_for_each(|name| find_bus(&skin, &file, name).map(drop))?;
                 // A node id on several buses names several cells.
                 let only = match to.filter(|_| self.bus.is_empty() && of_cell.is_none()).and_then(only_cell) {
                     Some(node) => {
-                        let index = cell_of(&skin, &CellName { bus: None, node }, "--cell")?;
+                        let index = find_cell(&skin, &CellName { bus: None, node }, "--cell")?;
                         skin.cells.get(index).map(|cell| cell.bus)
                     }
                     None => None,
@@ -122,7 +122,7 @@ impl Frame {
 
     /// Opens a bus for sending, and for receiving if answers are awaited.
     fn open(&self, name: &str, kind: KindChoice, format: Format) -> Result<Bus, BusError> {
-        match self.what.to() {
+        match self.what.addressee() {
             // A socket that only sends cannot show whether a cell is present.
             Some(_) => switching::open(name, kind, format),
             None => {
@@ -134,7 +134,7 @@ impl Frame {
 
     /// Sends the frame on a bus, and waits for the cells' answers.
     fn send(&self, bus: Bus, format: Format, message: &Message) -> Result<(), Failure> {
-        let (name, only) = (bus.name().to_owned(), self.what.to().and_then(only_cell));
+        let (name, only) = (bus.name().to_owned(), self.what.addressee().and_then(only_cell));
         if let PacketCommand::Sensing(switch) = &self.what {
             return switch.send(bus, format);
         }
@@ -147,13 +147,17 @@ impl Frame {
         } else {
             return Ok(());
         };
-        let answers = wait(Listener::new(bus, Some(format)), only, tag).map_err(Failure::run)?;
+        let answers = wait_for_answers(Listener::new(bus, Some(format)), only, tag).map_err(Failure::run)?;
         verdict(&answers, only, tag, (&name, format))
     }
 }
 
 /// Waits for answers. A request to all cells waits for the whole time limit, because the number of cells is unknown.
-fn wait(mut listener: Listener, only: Option<CellId>, tag: Option<u8>) -> Result<Answers, BusError> {
+fn wait_for_answers(
+    mut listener: Listener,
+    only: Option<CellId>,
+    tag: Option<u8>,
+) -> Result<Answers, BusError> {
     let mut answers = Answers::new(only, tag);
     let are_complete = |answers: &Answers| match (only, tag) {
         (_, None) => !answers.present().is_empty(),
@@ -204,7 +208,7 @@ fn verdict(
 }
 
 /// Returns the lines for cansend.
-fn text(message: &Message, format: Format) -> String {
+fn cansend_lines(message: &Message, format: Format) -> String {
     let mut text = String::new();
     for frame in message.encode().frames(format) {
         // cansend needs only the flag of the bit-rate switch: `##1`, as documented.

@@ -16,7 +16,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
 ];
 
 /// Text at the end of the help.
-const AFTER: &str =
+const HELP_END: &str =
     "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
 `skinbus COMMAND -h` lists the options of a command, `--help` explains them.
 
@@ -27,7 +27,7 @@ Examples:
 /// Replaces the list of commands in the help by groups.
 pub(crate) fn grouped(program: Command) -> Command {
     let help = format!(
-        "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n{}\nOptions:\n{{options}}\n\n{AFTER}\n",
+        "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n{}\nOptions:\n{{options}}\n\n{HELP_END}\n",
         list(&program)
     );
     program.help_template(help)
@@ -46,7 +46,7 @@ fn list(program: &Command) -> String {
 }
 
 /// Returns the error for an unknown command, which suggests a similar name or lists all commands.
-pub(crate) fn unknown(program: &Command, name: &str) -> String {
+pub(crate) fn unknown_command(program: &Command, name: &str) -> String {
     let names: Vec<_> = program.get_subcommands().map(Command::get_name).collect();
     let likely = names.iter().map(|it| (strsim::jaro_winkler(name, it), it));
     let best = likely.max_by(|one, other| one.0.total_cmp(&other.0)).filter(|(likeness, _)| *likeness > 0.75);
@@ -143,10 +143,11 @@ mod tests {
     #[test]
     fn a_name_that_is_nearly_a_command_is_asked_about() {
         let program = program();
-        assert_eq!(unknown(&program, "dmup"), "there is no command dmup; did you mean dump?");
-        assert_eq!(unknown(&program, "reply"), "there is no command reply; did you mean replay?");
+        assert_eq!(unknown_command(&program, "dmup"), "there is no command dmup; did you mean dump?");
+        assert_eq!(unknown_command(&program, "reply"), "there is no command reply; did you mean replay?");
         assert!(
-            unknown(&program, "xyz").starts_with("there is no command xyz; the commands are demo, run, view")
+            unknown_command(&program, "xyz")
+                .starts_with("there is no command xyz; the commands are demo, run, view")
         );
     }
 

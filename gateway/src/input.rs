@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use bench::bus::follow::{FollowStep, Follower, OpenedOnce};
 use bench::bus::listen;
-use bench::signals::caught;
+use bench::signals::catch_signals;
 use protocol::bus::{Bus, BusError, BusOptions, KindChoice, KindChoices, Received};
 use protocol::can::{self, EXTENDED_MASK};
 use protocol::input::{can_be_read_again, is_standard_input};
@@ -33,8 +33,8 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 pub(crate) const POLL_TIMEOUT: Duration = Duration::from_millis(200);
 
 /// Catches SIGINT and SIGTERM, and returns the flag that they set.
-pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
-    caught(&[SIGINT, SIGTERM]).map_err(Failure::run)
+pub(crate) fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
+    catch_signals(&[SIGINT, SIGTERM]).map_err(Failure::run)
 }
 
 /// Returns true for the name of a capture, false for that of a bus.
@@ -48,7 +48,7 @@ pub(crate) fn is_path(name: &Path) -> bool {
 }
 
 /// Returns the error for a source that is neither a file nor a bus that can be opened.
-pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
+pub(crate) fn no_such_source(name: &str, error: &BusError) -> Failure {
     let is_absent = matches!(
         error,
         BusError::Name(_)
@@ -69,12 +69,12 @@ pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
 pub(crate) fn skin_for(files: &[PathBuf], named: Option<&Path>) -> Result<Skin, Failure> {
     let Some(path) = named else { return skin_of(files) };
     let skin = Skin::read(path).map_err(Failure::usage)?;
-    remark_another(files, path, &skin);
+    note_other_skin(files, path, &skin);
     Ok(skin)
 }
 
 /// Prints a note if a skin differs from the one at the beginning of a recording.
-pub(crate) fn remark_another(files: &[PathBuf], path: &Path, skin: &Skin) {
+pub(crate) fn note_other_skin(files: &[PathBuf], path: &Path, skin: &Skin) {
     if !files.iter().all(|file| can_be_read_again(file)) {
         return;
     }
@@ -127,17 +127,17 @@ pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
 
 /// Reads a skin file. If the file is a capture, the error says so, as far as that can be recognised.
 pub(crate) fn read_skin(file: &Path) -> Result<Skin, Failure> {
-    Skin::read(file).map_err(|error| as_capture(file).unwrap_or_else(|| Failure::usage(error)))
+    Skin::read(file).map_err(|error| capture_error(file).unwrap_or_else(|| Failure::usage(error)))
 }
 
 /// Returns the error for a file that is a capture or other text instead of a skin, by its name or content, or `None`
 /// for a skin.
-fn as_capture(file: &Path) -> Option<Failure> {
+fn capture_error(file: &Path) -> Option<Failure> {
     if file.extension().is_some_and(|end| end == "toml") || !can_be_read_again(file) {
         return None;
     }
     let mut reader = match Reader::open(file) {
-        Err(error @ CaptureError::Other { .. }) => return Some(Failure::usage(error)),
+        Err(error @ CaptureError::OtherFormat { .. }) => return Some(Failure::usage(error)),
         opened => opened.ok()?,
     };
     let name = file.display();
@@ -197,7 +197,7 @@ pub(crate) fn needs_frames(files: &[PathBuf]) -> Result<(), Failure> {
 
 /// Returns the skin that a reader has found so far. If the skin is unreadable, prints a note that says what is used
 /// `instead`.
-pub(crate) fn skin_beside(reader: &Reader, instead: &str) -> Option<Skin> {
+pub(crate) fn skin_so_far(reader: &Reader, instead: &str) -> Option<Skin> {
     let name = reader.name();
     let skin = reader.extras().skin()?;
     skin.inspect_err(|error| output::note(format_args!("{name}, {error}; {instead}"))).ok()
@@ -212,7 +212,7 @@ pub(crate) fn format(reader: &Reader) -> &'static str {
 }
 
 /// Returns the location of an entry as text: the capture, and the line if the capture has lines.
-pub(crate) fn place(name: &str, line: u64) -> String {
+pub(crate) fn location(name: &str, line: u64) -> String {
     if line > 0 { format!("{name}:{line}") } else { name.to_owned() }
 }
 
@@ -222,14 +222,14 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
     if let Some((what, hint)) = reader.text_kind() {
         return Failure::usage(format!("{name} is {what}, and no candump log or MCAP recording: {hint}"));
     }
-    let what = match (reader.format(), reader.lines()) {
+    let what = match (reader.format(), reader.line_count()) {
         (CaptureFormat::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
         (CaptureFormat::Candump, lines) => format!(
             "there is no frame in {}; the output of candump is expected: lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
             count(lines, "line")
         ),
-        (CaptureFormat::Mcap, _) => match others(reader) {
+        (CaptureFormat::Mcap, _) => match other_contents(reader) {
             others if others.is_empty() => "there is no frame in it".to_owned(),
             others => format!("there is no frame in it, only {others}"),
         },
@@ -238,7 +238,7 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
 }
 
 /// Describes the contents of a recording other than frames and notes.
-pub(crate) fn others(reader: &Reader) -> String {
+pub(crate) fn other_contents(reader: &Reader) -> String {
     let extras = reader.extras();
     let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
     let topics = topics.map(|topic| format!("{} ({} messages)", topic.name, topic.messages));
@@ -282,7 +282,7 @@ impl LossCounts {
     pub(crate) fn report(&self, reader: &Reader, can_xl: &str) {
         let name = reader.name();
         // In a recording, candump lines are notes.
-        let unread = match reader.lines() {
+        let unread = match reader.line_count() {
             0 => format!("{} of a log could not be read", count(self.lines, "line")),
             lines => format!("{} of {lines} lines could not be read", self.lines),
         };
@@ -326,7 +326,7 @@ pub(crate) fn receive_ends(
                 (Ok(receive_end), _) => break opened.push(receive_end),
                 (Err(_), Some(stopped)) if stopped.load(Ordering::Relaxed) => return Ok(opened),
                 (Err(error), Some(_)) if error.may_open_later() => thread::sleep(RETRY_INTERVAL),
-                (Err(error), _) => return Err(neither(&name, &error)),
+                (Err(error), _) => return Err(no_such_source(&name, &error)),
             }
         }
     }
@@ -404,7 +404,7 @@ pub(crate) fn captures(
     let flag = OnceLock::new();
     let interruptible = move |file| {
         // All parts share one flag. If signals cannot be caught, they end the program at once.
-        let caught = || stopped().unwrap_or_else(|_| Arc::clone(stop::stop_flag()));
+        let caught = || stop_flag().unwrap_or_else(|_| Arc::clone(stop::stop_flag()));
         through(Interruptible { file, stopped: Arc::clone(flag.get_or_init(caught)) })
     };
     Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)

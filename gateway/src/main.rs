@@ -118,13 +118,13 @@ fn main() -> ExitCode {
         // Print requested help and version unchanged.
         Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => Err(Failure::usage(refusal(&wrong))),
+        Err(wrong) => Err(Failure::usage(usage_error(&wrong))),
     };
     exit_code("skinbus", done)
 }
 
 /// Formats clap's error in one line. Replaces clap's suggestion where it would mislead.
-fn refusal(wrong: &clap::Error) -> String {
+fn usage_error(wrong: &clap::Error) -> String {
     let text = |kind| match wrong.get(kind) {
         Some(ContextValue::String(text)) => Some(text.as_str()),
         _ => None,
@@ -132,20 +132,19 @@ fn refusal(wrong: &clap::Error) -> String {
     let words: Vec<_> = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
     let first = words.first().map(String::as_str).unwrap_or_default();
     if let Some(name) = text(ContextKind::InvalidSubcommand) {
-        if let Some(now) = former::command(&words, name) {
+        if let Some(now) = former::former_command(&words, name) {
             return now;
         }
         if first == name {
-            return groups::unknown(&program(), name);
+            return groups::unknown_command(&program(), name);
         }
     }
     match text(ContextKind::InvalidArg) {
         Some(file) if first == "run" && file.ends_with(".toml") => {
             format!("{file} comes after the skin: a scenario is given by --scenario {file}")
         }
-        Some(option) => {
-            former::option(&words, option).unwrap_or_else(|| one_line_error(&wrong.render().to_string()))
-        }
+        Some(option) => former::former_option(&words, option)
+            .unwrap_or_else(|| one_line_error(&wrong.render().to_string())),
         None => one_line_error(&wrong.render().to_string()),
     }
 }

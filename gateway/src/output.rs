@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use protocol::usage::{Failure, eprint_line, eprint_lines, ignore_broken_pipe, print_raw, print_text};
-use trace::files::{STANDARD_OUTPUT, WholeFile, check, folder_of, with_hint};
+use trace::files::{STANDARD_OUTPUT, WholeFile, check, parent_folder, with_hint};
 
 /// The option that allows existing files to be overwritten.
 #[derive(Args, Clone, Copy, Debug)]
@@ -20,12 +20,12 @@ pub(crate) struct Overwrite {
 impl Overwrite {
     /// Creates the file that an option names, so that errors show up before there is anything to write.
     pub(crate) fn create(self, option: &str, path: &Path) -> Result<(WholeFile, File), Failure> {
-        WholeFile::create(path, self.overwrite).map_err(|error| refused(option, path, &error))
+        WholeFile::create(path, self.overwrite).map_err(|error| write_refused(option, path, &error))
     }
 
     /// Checks that the file which an option names can be written, before its content is computed.
     pub(crate) fn check(self, option: &str, path: &Path) -> Result<(), Failure> {
-        check(path, self.overwrite).map_err(|error| refused(option, path, &error))
+        check(path, self.overwrite).map_err(|error| write_refused(option, path, &error))
     }
 
     /// Writes the file that an option names. On an error, a former file stays unchanged.
@@ -74,35 +74,35 @@ pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str)
     if is_standard_output(whole.path()) {
         return ignore_broken_pipe(file.write_all(text.as_bytes()));
     }
-    let name = named(option, whole.path());
+    let name = option_and_path(option, whole.path());
     let written = file.write_all(text.as_bytes()).and_then(|()| whole.finish());
     written.map_err(|error: io::Error| Failure::run(format!("{name}: {}", with_hint(error))))
 }
 
 /// Returns the error for a file that cannot be written, which counts as wrong use.
-pub(crate) fn refused(option: &str, path: &Path, error: &io::Error) -> Failure {
-    Failure::usage(format!("{}: {error}", named(option, path)))
+pub(crate) fn write_refused(option: &str, path: &Path, error: &io::Error) -> Failure {
+    Failure::usage(format!("{}: {error}", option_and_path(option, path)))
 }
 
-fn named(option: &str, path: &Path) -> String {
+fn option_and_path(option: &str, path: &Path) -> String {
     format!("{option} {}", path.display()).trim_start().to_owned()
 }
 
 /// Checks that the files to be written differ from each other and from all files that the command reads, because
 /// `--overwrite` must not replace those.
-pub(crate) fn apart<'a>(
+pub(crate) fn check_distinct<'a>(
     written: impl IntoIterator<Item = (&'a str, Option<&'a Path>)>,
     read: impl IntoIterator<Item = &'a Path>,
 ) -> Result<(), Failure> {
     // Two of the names may be the same terminal.
     let is_stream = |path: &Path| fs::metadata(path).is_ok_and(|about| !about.is_file() && !about.is_dir());
-    let read: Vec<_> = read.into_iter().filter(|path| !is_standard_output(path)).map(place).collect();
+    let read: Vec<_> = read.into_iter().filter(|path| !is_standard_output(path)).map(absolute_path).collect();
     let mut before = Vec::new();
     for (option, path) in written {
         let Some(path) = path.filter(|path| !is_stream(path)) else { continue };
-        let there = place(path);
+        let there = absolute_path(path);
         if read.contains(&there) {
-            let name = named(option, path);
+            let name = option_and_path(option, path);
             return Err(Failure::usage(format!(
                 "{name} is a file that this command reads: name another file"
             )));
@@ -116,8 +116,8 @@ pub(crate) fn apart<'a>(
 }
 
 /// Returns the absolute path of a file, which need not exist. Two names of the same file give the same path.
-fn place(path: &Path) -> PathBuf {
-    let inside = || Some(fs::canonicalize(folder_of(path)).ok()?.join(path.file_name()?));
+fn absolute_path(path: &Path) -> PathBuf {
+    let inside = || Some(fs::canonicalize(parent_folder(path)).ok()?.join(path.file_name()?));
     fs::canonicalize(path).ok().or_else(inside).unwrap_or_else(|| path.to_owned())
 }
 

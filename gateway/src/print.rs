@@ -17,24 +17,24 @@ pub(crate) const PLAIN: &str = "\x1b[0m";
 /// Indent of a name that is kept when the name takes two lines.
 const INDENT: &str = "\u{a0}";
 /// Maximum width of a table in columns.
-const WIDTH: u16 = 110;
+const MAX_TABLE_WIDTH: u16 = 110;
 /// Maximum width of a row's name in one line.
-const NAME: u16 = 36;
+const MAX_NAME_WIDTH: u16 = 36;
 /// Maximum number of names in a line. Of more names, the first few are shown with the total number.
-const NAMES: usize = 12;
+const MAX_NAMES: usize = 12;
 
 /// Formats a value as JSON in several lines.
 pub(crate) fn json(value: &impl Serialize) -> Result<String, Failure> {
-    serde_json::to_string_pretty(value).map(|text| harmless(text) + "\n").map_err(Failure::run)
+    serde_json::to_string_pretty(value).map(|text| escape_controls(text) + "\n").map_err(Failure::run)
 }
 
 /// Formats a value as JSON in one line.
 pub(crate) fn json_line(value: &impl Serialize) -> Result<String, Failure> {
-    serde_json::to_string(value).map(|text| harmless(text) + "\n").map_err(Failure::run)
+    serde_json::to_string(value).map(|text| escape_controls(text) + "\n").map_err(Failure::run)
 }
 
 /// Replaces terminal control characters in the strings of a JSON text by JSON escapes such as `\u009b`.
-pub(crate) fn harmless(json: String) -> String {
+pub(crate) fn escape_controls(json: String) -> String {
     // JSON text has line feeds of its own, but no tabs.
     if matches!(printable_lines(&json), Cow::Borrowed(_)) {
         return json;
@@ -62,7 +62,7 @@ fn joined(between: &str, items: impl IntoIterator<Item: Display>) -> String {
 
 /// Joins all names, or the first few of many names with the total number.
 pub(crate) fn abbreviated(names: &[String]) -> String {
-    let few = names.get(..NAMES).filter(|_| names.len() > NAMES);
+    let few = names.get(..MAX_NAMES).filter(|_| names.len() > MAX_NAMES);
     few.map_or_else(
         || comma_separated(names),
         |few| format!("{}, ... ({} in all)", comma_separated(few), names.len()),
@@ -117,7 +117,7 @@ pub(crate) fn table<H: Into<String>>(
 
 /// Limits a table to the width of the terminal, and to a readable width.
 pub(crate) fn readable(mut table: Table) -> Table {
-    let width = table.width().map_or(WIDTH, |width| width.min(WIDTH));
+    let width = table.width().map_or(MAX_TABLE_WIDTH, |width| width.min(MAX_TABLE_WIDTH));
     table.set_width(width);
     table
 }
@@ -167,7 +167,7 @@ impl KeyValueTable {
             table.set_width(columns);
         }
         let mut table = readable(table);
-        let width = (table.width().unwrap_or(WIDTH) * 2 / 5).min(NAME);
+        let width = (table.width().unwrap_or(MAX_TABLE_WIDTH) * 2 / 5).min(MAX_NAME_WIDTH);
         if let Some(names) = table.column_mut(0) {
             names.set_constraint(ColumnConstraint::ContentWidth);
         }
@@ -194,7 +194,7 @@ impl KeyValueTable {
 
     /// Width of the table in columns.
     pub(crate) fn columns(&self) -> usize {
-        self.table.width().unwrap_or(WIDTH).into()
+        self.table.width().unwrap_or(MAX_TABLE_WIDTH).into()
     }
 
     /// Breaks names into lines of this width.
@@ -210,7 +210,7 @@ impl KeyValueTable {
 
     pub(crate) fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
         let [name, value, beside] = line(name, value, beside);
-        self.table.add_row([folded(&name, self.name_width), value, beside]);
+        self.table.add_row([fold_name(&name, self.name_width), value, beside]);
     }
 
     pub(crate) fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
@@ -226,21 +226,26 @@ impl KeyValueTable {
         colour: Color,
     ) {
         let [name, value, beside] = line(format!("  {name}"), value, beside);
-        let name = Cell::new(folded(&name, self.name_width));
+        let name = Cell::new(fold_name(&name, self.name_width));
         self.table.add_row([name, Cell::new(value), Cell::new(beside).fg(colour)]);
     }
 
     /// Adds a row whose last text is kept in one line.
     pub(crate) fn row_in_one_line(&mut self, name: impl Display, value: impl Display, beside: &str) {
         self.row(name, value, beside);
-        let width = u16::try_from(beside.chars().count() + 2).unwrap_or(WIDTH);
+        let width = u16::try_from(beside.chars().count() + 2).unwrap_or(MAX_TABLE_WIDTH);
         if let Some(texts) = self.table.column_mut(2) {
             texts.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(width)));
         }
     }
 
     /// Adds a row unless the count is zero.
-    pub(crate) fn any(&mut self, name: impl Display, count: impl TryInto<u64>, beside: impl Display) {
+    pub(crate) fn row_unless_zero(
+        &mut self,
+        name: impl Display,
+        count: impl TryInto<u64>,
+        beside: impl Display,
+    ) {
         if let Some(count) = count.try_into().ok().filter(|&count| count > 0) {
             self.row(name, count, beside);
         }
@@ -254,14 +259,14 @@ fn line(name: impl Display, value: impl Display, beside: impl Display) -> [Strin
 
 /// Breaks a text into lines of `columns` columns. The first line begins with `begin`; the others are indented by its
 /// width.
-pub(crate) fn hanging(begin: &str, text: &str, columns: usize) -> String {
+pub(crate) fn hanging_indent(begin: &str, text: &str, columns: usize) -> String {
     let indent = begin.chars().count();
-    let lines = folded(&format!("{}{text}", " ".repeat(indent)), Some(columns)).replace(INDENT, " ");
+    let lines = fold_name(&format!("{}{text}", " ".repeat(indent)), Some(columns)).replace(INDENT, " ");
     format!("{begin}{}", lines.get(indent..).unwrap_or_default())
 }
 
 /// Breaks a name into lines of this width; all lines but the first are indented further. Longer words are broken too.
-fn folded(name: &str, width: Option<usize>) -> String {
+fn fold_name(name: &str, width: Option<usize>) -> String {
     let words = name.trim_start_matches(' ');
     let indent = name.len() - words.len();
     let mut folded = INDENT.repeat(indent);
@@ -297,13 +302,16 @@ mod tests {
 
     #[test]
     fn a_long_text_hangs_under_its_begin() {
-        assert_eq!(hanging("look at: ", "a few words of it", 20), "look at: a few words\n           of it");
-        assert_eq!(hanging("", "a few words", 80), "a few words");
+        assert_eq!(
+            hanging_indent("look at: ", "a few words of it", 20),
+            "look at: a few words\n           of it"
+        );
+        assert_eq!(hanging_indent("", "a few words", 80), "a few words");
     }
 
     #[test]
     fn a_long_name_is_folded_between_words_and_keeps_its_indent() {
-        let of = |width| folded("  joints not yet taken at heartbeats, µs", width).replace(INDENT, ".");
+        let of = |width| fold_name("  joints not yet taken at heartbeats, µs", width).replace(INDENT, ".");
         assert_eq!(of(None), "..joints not yet taken at heartbeats, µs");
         assert_eq!(of(Some(24)), "..joints not yet taken\n....at heartbeats, µs");
         assert_eq!(

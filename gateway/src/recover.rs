@@ -9,7 +9,7 @@ use trace::files::with_hint;
 use trace::recording::recover::RecoverError;
 use trace::recording::{names, repair};
 
-use super::output::{Overwrite, apart, print_beside};
+use super::output::{Overwrite, check_distinct, print_beside};
 
 /// Repair a recording that was cut off
 ///
@@ -33,15 +33,15 @@ impl Recover {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = self.file.display();
         let file = input::open(&self.file).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
-        if names::is_held(&file) {
+        if names::is_locked(&file) {
             return Err(Failure::usage(format!("{name} is being recorded: wait for the run's end")));
         }
         if self.output.is_none() && self.file.as_os_str() == "-" {
             return Err(Failure::usage("-: standard input has no name for a new file: name one with -o"));
         }
-        let output = self.output.unwrap_or_else(|| names::recovered(&names::goal_of(&self.file)));
+        let output = self.output.unwrap_or_else(|| names::recovered_name(&names::final_name(&self.file)));
         let out = output.display();
-        apart([("-o", Some(output.as_path()))], [self.file.as_path()])?;
+        check_distinct([("-o", Some(output.as_path()))], [self.file.as_path()])?;
         self.overwrite.check("-o", &output)?;
         let failure = |error| {
             if let RecoverError::Write(error) = error {
@@ -53,7 +53,7 @@ impl Recover {
             repair::copy_unless_sound(&file, &output, self.overwrite.overwrite).map_err(failure)?;
         let line = match bytes {
             None if recovered.is_sound() => {
-                let rename = if names::goal_of(&self.file) == self.file { "" } else { "; rename it" };
+                let rename = if names::final_name(&self.file) == self.file { "" } else { "; rename it" };
                 format!(
                     "{name} is intact, there is nothing to recover: {} messages{rename}",
                     recovered.messages
@@ -62,7 +62,7 @@ impl Recover {
             None => return Err(Failure::run(format!("{name}: no message could be recovered: {recovered}"))),
             Some(bytes) => format!("{out}, {bytes} bytes: {recovered}"),
         };
-        if recovered.is_little() {
+        if recovered.lost_more_than_kept() {
             return Err(Failure::run(format!("more of {name} is lost than was recovered: {line}")));
         }
         print_beside([Some(output.as_path())], &format!("{}\n", printable(&line)))

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use bench::replay::comparator::Steps;
+use bench::replay::comparator::StepHistogram;
 use bench::replay::player::Pace;
 use bench::replay::replay_plan::SenderFilter;
 use bench::replay::report::{Expect, Summary};
@@ -12,10 +12,13 @@ use bench::replay::{ReplayError, ReplayOptions, SpawnOptions, replay};
 use clap::Args;
 use protocol::usage::{Failure, printable, printable_lines};
 
-use super::arguments::{BusKinds, OptionValue, cells_per_process, nanos, of_environment, one_of};
-use super::output::{self, Overwrite, apart, print_table};
+use super::arguments::{
+    BusKinds, OptionValue, cells_per_process, environment_number, one_of_values, parse_time_ns,
+};
+use super::output::{self, Overwrite, check_distinct, print_table};
 use super::print::{
-    GREEN, KeyValueTable, PLAIN, YELLOW, comma_separated, count, hanging, json, or_else_text, quantiles,
+    GREEN, KeyValueTable, PLAIN, YELLOW, comma_separated, count, hanging_indent, json, or_else_text,
+    quantiles,
 };
 
 /// Receive buffer in bytes: all cells may answer a report at once.
@@ -50,7 +53,7 @@ pub(crate) struct Replay {
     #[command(flatten)]
     kinds: BusKinds,
     #[command(flatten)]
-    frames: Frames,
+    frames: FrameOptions,
     /// Repeat N times; 0 repeats until Ctrl-C
     #[arg(long = "loop", value_name = "N", default_value_t = 1)]
     passes: u32,
@@ -81,12 +84,12 @@ pub(crate) struct Replay {
     #[command(flatten)]
     overwrite: Overwrite,
     #[command(flatten)]
-    shown: Shown,
+    shown: OutputOptions,
 }
 
 /// Output options of a replay.
 #[derive(Args, Debug)]
-struct Shown {
+struct OutputOptions {
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
@@ -94,7 +97,7 @@ struct Shown {
 
 /// Options for the selection and the destination of frames.
 #[derive(Args, Debug)]
-struct Frames {
+struct FrameOptions {
     /// Send the frames of one of the capture's buses on another bus
     #[arg(long, value_name = "FROM=TO", value_parser = route)]
     map: Vec<(String, String)>,
@@ -103,14 +106,14 @@ struct Frames {
     bus: Vec<String>,
     /// Send only these frames: inputs are commands, configuration and stimuli. Default: inputs with --expect,
     /// --lockstep or --spawn, else all
-    #[arg(long, value_parser = one_of(ONLY))]
+    #[arg(long, value_parser = one_of_values(ONLY))]
     only: Option<SenderFilter>,
     /// Begin at this second of the run, counted from the first frame if there is no run; with inputs only, in the state
     /// that was latched there
-    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
+    #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     from: Option<u64>,
     /// End before this second, counted like --from
-    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
+    #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     to: Option<u64>,
 }
 
@@ -139,7 +142,7 @@ impl Replay {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let options = self.options()?;
         let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
-        apart([("--summary", self.summary.as_deref())], read)?;
+        check_distinct([("--summary", self.summary.as_deref())], read)?;
         // Create the file before the replay, so that an error of the file is reported first.
         let file = self.summary.as_ref().map(|path| self.overwrite.create("--summary", path)).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
@@ -171,10 +174,10 @@ impl Replay {
             (None, Some(_)) => SenderFilter::Inputs,
             (only, _) => only.unwrap_or(SenderFilter::All),
         };
-        let timeout_ms = of_environment("SKINBUS_SEND_TIMEOUT_MS", 1..=60_000)?;
+        let timeout_ms = environment_number("SKINBUS_SEND_TIMEOUT_MS", 1..=60_000)?;
         Ok(ReplayOptions {
             files: self.files.clone(),
-            kinds: self.kinds.of_any()?,
+            kinds: self.kinds.any_kinds()?,
             only,
             buses: self.frames.bus.clone(),
             map: self.frames.map.clone(),
@@ -204,7 +207,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
     };
     let mut rows = KeyValueTable::new(&summary.file, format!("{:.1} s, {ended}", summary.duration_s), "");
     let (is_well, first) = summary.first_line();
-    let first_line = hanging("", &printable(&first), rows.columns());
+    let first_line = hanging_indent("", &printable(&first), rows.columns());
     let first_line = match is_coloured {
         true if is_well => format!("{GREEN}{first_line}{PLAIN}\n"),
         true => format!("{YELLOW}{first_line}{PLAIN}\n"),
@@ -212,12 +215,12 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
     };
     rows.section("frames", "", "");
     rows.row("sent", summary.sent, "");
-    rows.any("refused", summary.refused, "a bus stayed full");
-    rows.any("lost", summary.lost, "a bus was down");
+    rows.row_unless_zero("refused", summary.refused, "a bus stayed full");
+    rows.row_unless_zero("lost", summary.lost, "a bus was down");
     for (reason, count) in &summary.skipped {
         rows.row("not sent", count, reason);
     }
-    rows.any("sent at once", summary.sent_at_once, "older than frames sent before");
+    rows.row_unless_zero("sent at once", summary.sent_at_once, "older than frames sent before");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
         rows.section("lateness", "50 % / 90 % / 99 % / max, µs", "");
         rows.row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));
@@ -234,7 +237,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         rows.section("lockstep", silent, format!("{} joints retried", lockstep.retried));
     }
     if let Some(expect) = &summary.expect {
-        expectation(&mut rows, expect);
+        comparison_rows(&mut rows, expect);
     }
     let first = summary.expect.as_ref().and_then(|expect| expect.first.as_ref());
     first_line
@@ -242,31 +245,39 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         + &or_else_text(first.map(|first| format!("{}\n", printable_lines(&first.text))), "")
 }
 
-fn expectation(rows: &mut KeyValueTable, expect: &Expect) {
+fn comparison_rows(rows: &mut KeyValueTable, expect: &Expect) {
     let tally = &expect.tally;
     rows.section("replies", "against the recording", "");
     let within = format!("{} of them within the tolerance of {} steps", tally.tolerated, expect.tolerance);
     rows.row("equal", tally.equal, if tally.tolerated > 0 { &within } else { "bit for bit" });
     rows.row("different", tally.different, "");
-    off(rows, "torque", &tally.torque_words, 0);
-    off(rows, "sum", &tally.sum_words, 1);
+    difference_rows(rows, "torque", &tally.torque_words, 0);
+    difference_rows(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
         skipped => format!("cells received joints too late {}", count(skipped, "time")),
     };
     rows.row("missing", tally.missing, late);
     rows.row("extra", tally.extra, "");
-    rows.any("not requested", tally.not_requested, "a bus refused the joints");
+    rows.row_unless_zero("not requested", tally.not_requested, "a bus refused the joints");
     for (reason, count) in tally.lacking.reasons() {
         rows.row("not in the recording", count, reason);
     }
-    rows.any("lost by the recorder", expect.recording_dropped, "inputs among them are missing here");
-    rows.any("unknown configurations", expect.unchecked_cells, "not recorded before they were changed");
+    rows.row_unless_zero(
+        "lost by the recorder",
+        expect.recording_dropped,
+        "inputs among them are missing here",
+    );
+    rows.row_unless_zero(
+        "unknown configurations",
+        expect.unchecked_cells,
+        "not recorded before they were changed",
+    );
 }
 
 /// Adds rows on words that differ by more than `usual` steps, if there are any: the number of words for each
 /// difference.
-fn off(rows: &mut KeyValueTable, what: &str, steps: &Steps, usual: usize) {
+fn difference_rows(rows: &mut KeyValueTable, what: &str, steps: &StepHistogram, usual: usize) {
     let counts = steps.by_steps.iter().enumerate().skip(1);
     let found: Vec<_> = counts.filter(|(_, count)| **count > 0).collect();
     let Some((worst, _)) = found.last().filter(|(worst, _)| *worst > usual) else { return };

@@ -12,7 +12,7 @@ use protocol::usage::{Failure, command_line, ignore_broken_pipe, print_text, pri
 use protocol::wire_time::parse_bit_rate;
 
 use super::input::{difference, read_skin};
-use super::output::{Overwrite, apart, is_standard_output, note};
+use super::output::{Overwrite, check_distinct, is_standard_output, note};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
@@ -61,9 +61,9 @@ impl Report {
         let read = |file: &Path| Ok::<_, Failure>((file.display().to_string(), read_skin(file)?));
         let skin = self.skin.as_deref().map(read).transpose()?;
         let command = command_line().join(" ");
-        let options = run::Options { command, nominal: self.nominal, data: self.data, skin };
+        let options = run::ReportOptions { command, nominal: self.nominal, data: self.data, skin };
         let refused = |error| refused(error, options.skin.as_ref());
-        if let Err(taken) = self.is_free(&output, "-o") {
+        if let Err(taken) = self.check_writable(&output, "-o") {
             // Report errors of the input before those of an existing output.
             return Err(run::check(&self.files, &options).err().map_or(taken, refused));
         }
@@ -79,12 +79,12 @@ impl Report {
                             folder.display()
                         )));
                     }
-                    self.is_free(&path, "--svg")?;
+                    self.check_writable(&path, "--svg")?;
                 }
                 files.push(("--svg", path, drawing));
             }
         }
-        let made = self.svg.as_deref().map(make).transpose()?.unwrap_or(false);
+        let made = self.svg.as_deref().map(create_folder).transpose()?.unwrap_or(false);
         if let Err(failure) = write(&files, self.overwrite) {
             if let Some(folder) = self.svg.filter(|_| made) {
                 // This call fails unless the directory is empty, as intended.
@@ -112,8 +112,8 @@ impl Report {
     }
 
     /// Checks that a file may be written: existing files need `--overwrite`.
-    fn is_free(&self, path: &Path, option: &str) -> Result<(), Failure> {
-        apart([(option, Some(path))], self.files.iter().map(PathBuf::as_path))?;
+    fn check_writable(&self, path: &Path, option: &str) -> Result<(), Failure> {
+        check_distinct([(option, Some(path))], self.files.iter().map(PathBuf::as_path))?;
         self.overwrite.check(option, path)
     }
 }
@@ -145,7 +145,7 @@ fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
 }
 
 /// Creates a directory. Returns true if it is new.
-fn make(folder: &Path) -> Result<bool, Failure> {
+fn create_folder(folder: &Path) -> Result<bool, Failure> {
     let new = !folder.is_dir();
     let made = fs::create_dir_all(folder).map(|()| new);
     made.map_err(|error| {

@@ -8,19 +8,19 @@ use protocol::input;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use robots::Urdf;
-use trace::files::folder_of;
+use trace::files::parent_folder;
 use trace::recording::robot::RecordedRobot;
 
 use super::output::note;
 
 /// Robot of a skin: its geometry for recordings, and the text of the URDF that the skin names.
 #[derive(Default)]
-pub(crate) struct RobotOfSkin {
+pub(crate) struct SkinRobot {
     pub(crate) robot: Option<RecordedRobot>,
     pub(crate) urdf: Option<String>,
 }
 
-impl RobotOfSkin {
+impl SkinRobot {
     /// Reads the robot from a URDF file if the skin names one, else from the skin's rows. Prints a note if the URDF is
     /// for another robot.
     ///
@@ -28,7 +28,7 @@ impl RobotOfSkin {
     /// Returns [`Failure`] if the file cannot be read or is not a URDF.
     pub(crate) fn read(skin: &Skin, file: Option<&Path>) -> Result<Self, Failure> {
         let of_rows = || {
-            RecordedRobot::of_rows(skin)
+            RecordedRobot::from_rows(skin)
                 .map_err(|error| note(format_args!("the robot is not shown: {error}")))
                 .ok()
         };
@@ -36,7 +36,7 @@ impl RobotOfSkin {
         let hint = "correct the skin's path, or take the key out";
         let wrong = |error: &dyn Display| Failure::usage(format!("robot.urdf: {error}; {hint}"));
         let (urdf, text) = read_urdf(path).map_err(|error| wrong(&error))?;
-        let robot = RecordedRobot::of_urdf(skin, urdf, text.clone());
+        let robot = RecordedRobot::from_urdf(skin, urdf, text.clone());
         let robot = robot.or_else(|error| {
             note(format_args!("robot.urdf: {error}; the robot is shown by the skin's rows"));
             of_rows().ok_or(())
@@ -58,15 +58,15 @@ pub(crate) fn read_urdf(path: &Path) -> Result<(Urdf, String), String> {
 }
 
 /// Returns the path of the URDF that a skin's file names.
-pub(crate) fn urdf_of(skin: &Path, urdf: &str) -> PathBuf {
+pub(crate) fn urdf_path(skin: &Path, urdf: &str) -> PathBuf {
     skin.parent().unwrap_or_else(|| Path::new("")).join(urdf)
 }
 
 /// Returns the path of a file relative to the directory of another file, which need not exist. Returns `None` if a
 /// directory does not exist, or if a name is not UTF-8.
-pub(crate) fn path_from(file: &Path, to: &Path) -> Option<String> {
+pub(crate) fn relative_path(file: &Path, to: &Path) -> Option<String> {
     let real = |path: &Path| {
-        let folder = folder_of(path);
+        let folder = parent_folder(path);
         folder.canonicalize().ok()
     };
     let (from, folder) = (real(file)?, real(to)?);
@@ -95,9 +95,9 @@ mod tests {
             ("robots/arm.toml", "arm.urdf"),
             ("skins/new/arm.toml", "../../robots/arm.urdf"),
         ] {
-            assert_eq!(path_from(&at(skin), &at("robots/arm.urdf")).as_deref(), Some(path));
-            assert_eq!(fs::read_to_string(urdf_of(&at(skin), path)).unwrap(), "x");
+            assert_eq!(relative_path(&at(skin), &at("robots/arm.urdf")).as_deref(), Some(path));
+            assert_eq!(fs::read_to_string(urdf_path(&at(skin), path)).unwrap(), "x");
         }
-        assert_eq!(path_from(&at("nowhere/arm.toml"), &at("robots/arm.urdf")), None);
+        assert_eq!(relative_path(&at("nowhere/arm.toml"), &at("robots/arm.urdf")), None);
     }
 }

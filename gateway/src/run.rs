@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bench::emulate::Emulated;
-use bench::processes::in_memory;
+use bench::processes::memory_file;
 use bench::record::{self, Candump};
 use bench::remote::JsonPipe;
 use bench::run::{self, RunOptions};
@@ -24,12 +24,13 @@ use protocol::usage::{Failure, command_line, shell_quoted_os};
 use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{
-    BusKinds, Processes, bus_names, cell_of, cells_per_process, of_environment, seconds, time,
+    BusKinds, Processes, bus_names, cells_per_process, environment_number, find_cell, parse_duration,
+    parse_time,
 };
 use super::buses;
-use super::output::{self, Overwrite, apart, note, print_table};
+use super::output::{self, Overwrite, check_distinct, note, print_table};
 use super::print::json;
-use super::robot_file::{RobotOfSkin, urdf_of};
+use super::robot_file::{SkinRobot, urdf_path};
 use super::view::{Page, PageOptions};
 use show::TableStyle;
 
@@ -38,7 +39,7 @@ const SKIN: &str = include_str!("../examples/ur5-253.toml");
 const SCENARIO: &str = include_str!("../examples/demo.toml");
 
 /// Maximum duration in s of a run with `--view`.
-const UNTIL_STOPPED: f64 = 24.0 * 3600.0;
+const MAX_VIEW_DURATION_S: f64 = 24.0 * 3600.0;
 
 /// Log of the demonstration's frames.
 const DEMO_LOG: &str = "skinbus-demo.log";
@@ -47,7 +48,7 @@ const DEMO_LOG: &str = "skinbus-demo.log";
 #[derive(Args, Debug)]
 struct Common {
     /// End after this time: 10, 10s or 2min [default: the scenario's duration, or 10s]
-    #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
+    #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Write the final figures as JSON, also if the run fails; docs/reference/summary.md explains the keys
     #[arg(long, value_name = "FILE")]
@@ -70,10 +71,10 @@ struct Common {
 }
 
 /// Texts of the skin and the scenario as they were read, and the robot of the skin.
-struct Files {
+struct RunTexts {
     skin: String,
     scenario: Option<String>,
-    robot: RobotOfSkin,
+    robot: SkinRobot,
 }
 
 /// Options for a recording, besides candump text.
@@ -89,34 +90,39 @@ struct Recording {
 
 /// Limit of size or age at which a new file of a recording is started.
 #[derive(Clone, Copy, Debug)]
-enum Limit {
+enum SplitLimit {
     Bytes(u64),
     Age(Duration),
 }
 
-fn limit(text: &str) -> Result<Limit, String> {
+fn limit(text: &str) -> Result<SplitLimit, String> {
     let allowed = "a size from 1MB on (500MB, 2GiB) or a time from 1s on (90s, 10min, 2h)";
     let unit = text.trim_start_matches(|letter: char| letter.is_ascii_digit());
     let number: Option<u64> = text.strip_suffix(unit).and_then(|number| number.parse().ok());
     let bytes = [("MB", 1_000_000), ("MiB", 1 << 20), ("GB", 1_000_000_000), ("GiB", 1 << 30)];
     let each = bytes.iter().find(|(name, _)| *name == unit).map(|(_, each)| each);
     if let Some(bytes) = each.and_then(|each| number?.checked_mul(*each)).filter(|bytes| *bytes > 0) {
-        return Ok(Limit::Bytes(bytes));
+        return Ok(SplitLimit::Bytes(bytes));
     }
     // Refuse a number without a unit, because it may mean either.
-    let age = time(text).filter(|seconds| *seconds >= 1.0 && !unit.is_empty());
+    let age = parse_time(text).filter(|seconds| *seconds >= 1.0 && !unit.is_empty());
     let age = age.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
-    age.map(Limit::Age).ok_or_else(|| allowed.to_owned())
+    age.map(SplitLimit::Age).ok_or_else(|| allowed.to_owned())
 }
 
 impl Recording {
     /// Returns the outputs of the recording, with the files attached.
-    fn options(&self, candump: Option<Candump>, files: Files, limits: &[Limit]) -> record::RecordOptions {
+    fn options(
+        &self,
+        candump: Option<Candump>,
+        files: RunTexts,
+        limits: &[SplitLimit],
+    ) -> record::RecordOptions {
         let mut split = SplitLimits::default();
         for &limit in limits {
             match limit {
-                Limit::Bytes(bytes) => split.bytes = bytes,
-                Limit::Age(age) => split.age = age,
+                SplitLimit::Bytes(bytes) => split.bytes = bytes,
+                SplitLimit::Age(age) => split.age = age,
             }
         }
         let mcap = self.record.clone().map(|path| {
@@ -183,7 +189,7 @@ pub(crate) struct Run {
     /// Start a new file of the recording (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given
     /// twice
     #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
-    record_split: Vec<Limit>,
+    record_split: Vec<SplitLimit>,
     #[command(flatten)]
     processes: Processes,
     #[command(flatten)]
@@ -216,7 +222,7 @@ pub(crate) struct Run {
 
 impl Demo {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let (_file, skin_file) = in_memory(SKIN.as_bytes()).map_err(Failure::run)?;
+        let (_file, skin_file) = memory_file(SKIN.as_bytes()).map_err(Failure::run)?;
         let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
         let scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
@@ -230,7 +236,7 @@ impl Demo {
         let kind = options.kinds.kind_of("vcan0").resolve("vcan0");
         let given = std::env::var_os("SKINBUS_DIR").filter(|given| !given.is_empty()).map(PathBuf::from);
         let own = given.is_none() && !kind.is_interface();
-        let buses = own.then(|| buses::directory("demo")).transpose()?;
+        let buses = own.then(|| buses::private_directory("demo")).transpose()?;
         options.directory = buses.as_ref().map(|buses| buses.path().to_owned()).or(given);
         let place = options.directory.as_ref();
         let place = place.map(|path| format!("SKINBUS_DIR={} ", shell_quoted_os(path.as_os_str())));
@@ -241,13 +247,13 @@ impl Demo {
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
         let robot = match recording.record {
-            Some(_) => RobotOfSkin::read(&options.skin, None)?,
-            None => RobotOfSkin::default(),
+            Some(_) => SkinRobot::read(&options.skin, None)?,
+            None => SkinRobot::default(),
         };
-        let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
+        let files = RunTexts { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
         options.record = recording.options(candump, files, &[]);
         let page = view.then(|| Page::of(&options, listen, &PageOptions::default())).transpose()?;
-        bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], page)
+        run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], page)
     }
 }
 
@@ -263,10 +269,10 @@ impl Run {
             _ => Scenario::idle(DEFAULT_DURATION),
         };
         let urdf = self.common.recording.record.as_ref().and(skin.robot.urdf.as_deref());
-        let urdf = urdf.map(|urdf| urdf_of(&self.skin, urdf));
+        let urdf = urdf.map(|urdf| urdf_path(&self.skin, urdf));
         let robot = match self.common.recording.record {
-            Some(_) => RobotOfSkin::read(&skin, urdf.as_deref())?,
-            None => RobotOfSkin::default(),
+            Some(_) => SkinRobot::read(&skin, urdf.as_deref())?,
+            None => SkinRobot::default(),
         };
         let read = [Some(self.skin.clone()), self.scenario.clone(), urdf];
         let read: Vec<_> = read.into_iter().flatten().collect();
@@ -274,27 +280,27 @@ impl Run {
         let (_file, skin_file) = if can_be_read_again(&self.skin) {
             (None, self.skin)
         } else {
-            let (file, path) = in_memory(skin_text.as_bytes()).map_err(Failure::run)?;
+            let (file, path) = memory_file(skin_text.as_bytes()).map_err(Failure::run)?;
             (Some(file), path)
         };
-        for remark in scenario.remarks(&skin) {
+        for remark in scenario.warnings(&skin) {
             note(format_args!("remark: {remark}"));
         }
         let mut options = self.common.options(skin_file, skin, scenario);
         let Common { recording, summary, verbose, view, listen, .. } = self.common;
         options.kinds = self.kinds.kinds_of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
-        let files = Files { skin: skin_text, scenario: scenario_text, robot };
+        let files = RunTexts { skin: skin_text, scenario: scenario_text, robot };
         options.record = recording.options(candump, files, &self.record_split);
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
         // The kernel grants twice the size, or less without the privilege.
-        let bytes = of_environment("SKINBUS_RECEIVE_BUFFER", 0..=1 << 30)?;
+        let bytes = environment_number("SKINBUS_RECEIVE_BUFFER", 0..=1 << 30)?;
         options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER) as usize;
         options.cells_per_process = self.processes.cells_per_process.into();
         let page = view.then(|| Page::of(&options, listen, &self.page)).transpose()?;
-        bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, page)
+        run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, page)
     }
 }
 
@@ -303,7 +309,7 @@ fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Resul
     let Some(firmware) = firmware else { return Ok(None) };
     let mut cells = Vec::new();
     for named in named {
-        let cell = cell_of(skin, named, "--emulate")?;
+        let cell = find_cell(skin, named, "--emulate")?;
         if cells.contains(&cell) {
             return Err(Failure::usage(format!("--emulate {named} is given twice: name each cell once")));
         }
@@ -315,7 +321,7 @@ fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Resul
 impl Common {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
     fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> RunOptions {
-        let until_stopped = self.view.then_some(UNTIL_STOPPED);
+        let until_stopped = self.view.then_some(MAX_VIEW_DURATION_S);
         if let Some(seconds) = self.duration.or(until_stopped) {
             scenario.duration = Span((seconds * 1e6) as u64);
         }
@@ -338,7 +344,7 @@ impl Common {
     }
 }
 
-fn bench(
+fn run_bench(
     options: &RunOptions,
     (summary_file, overwrite): (Option<&Path>, Overwrite),
     is_verbose: bool,
@@ -350,7 +356,7 @@ fn bench(
         ("--record", options.record.mcap.as_ref().map(|mcap| mcap.path.as_path())),
         ("--summary", summary_file),
     ];
-    apart(written, read.iter().map(PathBuf::as_path))?;
+    check_distinct(written, read.iter().map(PathBuf::as_path))?;
     // Create the file before the run, so that an error of the file is reported first.
     let summary = summary_file.map(|path| overwrite.create("--summary", path)).transpose()?;
     // The summary reports a panic too.
@@ -371,7 +377,7 @@ fn bench(
     let table = |is_coloured| show::text(&ended, TableStyle { is_verbose, is_coloured, columns: None });
     let printed = if ended.control.ticks > 0 { print_table(files, table) } else { Ok(()) };
     // The failure prints the last line itself; each other message is one line.
-    let mut lines = ended.complaints(options.quiet);
+    let mut lines = ended.end_messages(options.quiet);
     let lost: Vec<_> = unwritten.into_iter().chain(printed.err()).collect();
     let code = if lost.is_empty() { ended.outcome.exit_code() } else { 1 };
     lines.extend(lost.iter().map(ToString::to_string));

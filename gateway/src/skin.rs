@@ -9,13 +9,13 @@ mod urdf;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use model::generate::{Reply as Answers, Target, generate};
+use model::generate::{Reply as Answers, SkinRequest, generate};
 use protocol::can::Format;
 use protocol::usage::{Failure, print_text};
 
-use super::arguments::{FORMATS, OptionValue, one_of};
+use super::arguments::{FORMATS, OptionValue, one_of_values};
 use super::output::Overwrite;
-pub(crate) use show::still;
+pub(crate) use show::still_view;
 
 const REPLIES: &[OptionValue<Answers>] =
     &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];
@@ -54,10 +54,10 @@ struct Generate {
     #[arg(long, default_value_t = 62.5)]
     broadcast_hz: f64,
     /// Kind of reply that the cells send
-    #[arg(long, value_parser = one_of(REPLIES), default_value = "torque")]
+    #[arg(long, value_parser = one_of_values(REPLIES), default_value = "torque")]
     reply: Answers,
     /// Frame format of the cells' packets
-    #[arg(long, value_parser = one_of(FORMATS), default_value = "fd")]
+    #[arg(long, value_parser = one_of_values(FORMATS), default_value = "fd")]
     format: Format,
     /// The file to write, completely or not at all [default: standard output]
     #[arg(long, short, value_name = "FILE")]
@@ -81,7 +81,7 @@ impl Skin {
 impl Generate {
     fn run(self) -> Result<(), Failure> {
         let Self { cells, buses, broadcast_hz, reply, format, output, overwrite } = self;
-        let target = Target { cells, buses, broadcast_hz, reply, format, ..Target::default() };
+        let target = SkinRequest { cells, buses, broadcast_hz, reply, format, ..SkinRequest::default() };
         let text = generate(&target).map_err(Failure::usage)?;
         match output {
             Some(path) => overwrite.write("-o", &path, &text),

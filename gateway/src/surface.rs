@@ -11,11 +11,11 @@ use view::RowMesh;
 
 use super::output::note;
 use super::print::count;
-use super::robot_file::{read_urdf, urdf_of};
+use super::robot_file::{read_urdf, urdf_path};
 use super::visuals::{Packages, Visuals};
 
 /// A part of a link's shape, placed on a row of a chain.
-struct Placed {
+struct PlacedPart {
     /// Index of the chain in the skin.
     chain: usize,
     /// Row in whose frame the part is, from 1; 0 is the start of the chain.
@@ -27,12 +27,12 @@ struct Placed {
 /// Returns the drawing of the robot that a skin's file describes: triangles for each row, simplified to at most `most`
 /// in all. The list is empty if the skin names no URDF. Prints a note on parts that cannot be drawn.
 pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize) -> Vec<RowMesh> {
-    let Some(path) = skin.robot.urdf.as_deref().map(|urdf| urdf_of(file, urdf)) else { return Vec::new() };
+    let Some(path) = skin.robot.urdf.as_deref().map(|urdf| urdf_path(file, urdf)) else { return Vec::new() };
     let parts = read_urdf(&path).and_then(|(urdf, _)| parts(&urdf, &path, skin, packages));
     let parts =
         parts.map_err(|error| note(format_args!("the robot is not drawn: {error}"))).unwrap_or_default();
     let mut rows = BTreeMap::<_, Vec<_>>::new();
-    for Placed { chain, row, part } in parts {
+    for PlacedPart { chain, row, part } in parts {
         rows.entry((chain, row)).or_default().extend(part.triangles(&Isometry3::identity()));
     }
     let (places, triangles): (Vec<_>, Vec<_>) = rows.into_iter().unzip();
@@ -43,7 +43,7 @@ pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize)
     shells.map(|((chain, row), all)| RowMesh { chain, row, triangles: points(all) }).collect()
 }
 
-fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<Vec<Placed>, String> {
+fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<Vec<PlacedPart>, String> {
     let found = skin.robot.chains.iter().map(|chain| {
         chain_of(urdf, chain).ok_or_else(|| {
             format!(
@@ -56,12 +56,12 @@ fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<V
     let visuals = Visuals::new(urdf, file, packages);
     let (mut parts, mut missing) = (Vec::new(), Vec::new());
     for link in urdf.links() {
-        match visuals.parts(link) {
+        match visuals.link_parts(link) {
             Err(error) => missing.push(error),
             Ok(all) => {
-                let Some((chain, row, frame)) = place(urdf, &chains, link) else { continue };
+                let Some((chain, row, frame)) = attachment(urdf, &chains, link) else { continue };
                 let put = |part: LinkMesh| LinkMesh { pose: frame * part.pose, ..part };
-                parts.extend(all.into_iter().map(|part| Placed { chain, row, part: put(part) }));
+                parts.extend(all.into_iter().map(|part| PlacedPart { chain, row, part: put(part) }));
             }
         }
     }
@@ -93,7 +93,11 @@ fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::UrdfChain> {
 
 /// Returns the index of the chain and the row to which a link is fixed, and the pose of the link in the row's frame.
 /// Joints outside all chains are at rest. Links that no chain moves are fixed to the start of the first chain.
-fn place(urdf: &Urdf, chains: &[robots::UrdfChain], link: &str) -> Option<(usize, usize, Isometry3<f64>)> {
+fn attachment(
+    urdf: &Urdf,
+    chains: &[robots::UrdfChain],
+    link: &str,
+) -> Option<(usize, usize, Isometry3<f64>)> {
     let pose = |link: &str| urdf.pose(link, &|joint| urdf.rest(joint)).ok();
     let at = pose(link)?;
     let mut above = Some(link);

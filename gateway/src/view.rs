@@ -24,15 +24,15 @@ use view::player::PlayError;
 use view::serve::{Options, ServeError, serve};
 use view::server::{Access, url};
 
-use super::arguments::{BusKinds, bus_names, bus_of, nanos};
-use super::input::{no_frame, read_skin, remark_another, skin_of, stopped};
+use super::arguments::{BusKinds, bus_names, find_bus, parse_time_ns};
+use super::input::{no_frame, note_other_skin, read_skin, skin_of, stop_flag};
 use super::output::note;
 use super::surface::shells;
 use super::visuals::Packages;
 use address::AddressFile;
 
 /// Maximum number of triangles of a robot that a page draws; larger meshes are simplified.
-const TRIANGLES: usize = 20_000;
+const MAX_TRIANGLES: usize = 20_000;
 
 /// Default address of a page.
 const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
@@ -63,7 +63,7 @@ pub(crate) struct View {
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Show this second of the recorded run, counted from the first frame of a log, instead of playing
-    #[arg(long, value_name = "S", value_parser = nanos)]
+    #[arg(long, value_name = "S", value_parser = parse_time_ns)]
     at: Option<u64>,
     /// Address of the page; port 0 is any free port
     #[arg(long, value_name = "ADDRESS:PORT", default_value_t = DEFAULT_ADDRESS)]
@@ -104,7 +104,7 @@ pub(crate) struct PageOptions {
 }
 
 /// The page to be served, and how.
-struct Served {
+struct PageServer {
     listener: TcpListener,
     access: Access,
     /// Address of the page, if this program prints it; `None` if the run prints it.
@@ -116,24 +116,24 @@ impl View {
         let is_recording = self.is_recording()?;
         let may_act = !self.read_only && !is_recording;
         let (listener, token) = if self.of_run {
-            (listener_of_run().map_err(|error| failed(&error))?, token::chosen(None)?)
+            (listener_of_run().map_err(|error| failed(&error))?, token::chosen_token(None)?)
         } else {
             let listen = self.listen;
-            let token = token::chosen(self.token_file.as_deref())?;
+            let token = token::chosen_token(self.token_file.as_deref())?;
             let bound = TcpListener::bind(listen);
-            let listener = bound.map_err(|error| unbound(listen, &error))?;
-            (listener, token::needed(token, may_act, listen)?)
+            let listener = bound.map_err(|error| bind_error(listen, &error))?;
+            (listener, token::required_token(token, may_act, listen)?)
         };
         let address = listener.local_addr().map_err(|error| failed(&error))?;
         let url = (!self.of_run).then(|| url(address, token.as_ref()));
         let of_file = self.address_file.as_deref().zip(url.as_deref());
         let _file = of_file.map(|(path, url)| AddressFile::write(path, url)).transpose()?;
-        let served = Served { listener, access: Access { may_act, may_play: is_recording, token }, url };
+        let served = PageServer { listener, access: Access { may_act, may_play: is_recording, token }, url };
         if is_recording { self.recorded(served) } else { self.live(served) }
     }
 
     /// Serves the page of live buses.
-    fn live(self, served: Served) -> Result<(), Failure> {
+    fn live(self, served: PageServer) -> Result<(), Failure> {
         let (skin, surface) = match self.sources.as_slice() {
             [one, ..] if !one.exists() => self.on_buses()?,
             [one] if self.skin.is_none() && self.at.is_none() => self.read(one)?,
@@ -147,9 +147,9 @@ impl View {
             }
         };
         let kinds = self.kinds.kinds_of(bus_names(&skin))?;
-        let stop = stopped()?;
-        let bench = self.of_run.then(run_of_this).transpose().map_err(|error| failed(&error))?;
-        let Served { listener, access, url } = served;
+        let stop = stop_flag()?;
+        let bench = self.of_run.then(connect_to_run).transpose().map_err(|error| failed(&error))?;
+        let PageServer { listener, access, url } = served;
         let options = Options {
             skin,
             surface,
@@ -176,7 +176,7 @@ impl View {
             return Err(Failure::usage("--at is for a recording, not for live buses"));
         }
         let (skin, surface) = self.read(file)?;
-        let of = |source: &PathBuf| bus_of(&skin, &file.display().to_string(), &source.to_string_lossy());
+        let of = |source: &PathBuf| find_bus(&skin, &file.display().to_string(), &source.to_string_lossy());
         let mut buses = self.sources.iter().map(of).collect::<Result<Vec<_>, _>>()?;
         buses.sort_unstable();
         buses.dedup();
@@ -184,13 +184,13 @@ impl View {
     }
 
     /// Serves the page of a recording.
-    fn recorded(self, served: Served) -> Result<(), Failure> {
+    fn recorded(self, served: PageServer) -> Result<(), Failure> {
         let (skin, surface) = self.recorded_skin()?;
         #[expect(clippy::cast_precision_loss, reason = "to the µs")]
         let at_s = self.at.map(|nanos| nanos as f64 / 1e9);
-        let stop = stopped()?;
+        let stop = stop_flag()?;
         let warns = |what: &str| note(format_args!("{what}"));
-        let Served { listener, access, url } = served;
+        let PageServer { listener, access, url } = served;
         let options = play::Options { paths: self.sources, skin, surface, listener, access, at_s };
         play(options, &stop, || print_address(url), warns).map_err(|error| match error {
             ServeError::Play(PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. })) => {
@@ -206,7 +206,7 @@ impl View {
     /// Reads a skin with the meshes of its robot, as far as they are found.
     fn read(&self, path: &Path) -> Result<(Skin, Vec<RowMesh>), Failure> {
         let skin = read_skin(path)?;
-        let surface = shells(path, &skin, &self.packages, TRIANGLES);
+        let surface = shells(path, &skin, &self.packages, MAX_TRIANGLES);
         Ok((skin, surface))
     }
 
@@ -215,7 +215,7 @@ impl View {
         match &self.skin {
             Some(path) => {
                 let (skin, shells) = self.read(path)?;
-                remark_another(&self.sources, path, &skin);
+                note_other_skin(&self.sources, path, &skin);
                 Ok((skin, shells))
             }
             None => {
@@ -253,7 +253,7 @@ impl View {
 }
 
 /// Returns the error for an address at which no page can be served.
-fn unbound(listen: SocketAddr, error: &io::Error) -> Failure {
+fn bind_error(listen: SocketAddr, error: &io::Error) -> Failure {
     let is = |kind| error.kind() == kind;
     let hint = if is(io::ErrorKind::AddrNotAvailable) {
         "name an address of this machine"
@@ -273,7 +273,7 @@ fn print_address(url: Option<String>) {
 }
 
 /// Returns the connection to the run that has started this program: a socket that is this program's standard output.
-fn run_of_this() -> io::Result<JsonPipe> {
+fn connect_to_run() -> io::Result<JsonPipe> {
     let socket = || io::stdout().as_fd().try_clone_to_owned();
     JsonPipe::new(socket()?, socket()?)
 }
@@ -314,13 +314,13 @@ impl Page {
             command.env("SKINBUS_DIR", directory);
         }
         let listen = listen.unwrap_or(DEFAULT_ADDRESS);
-        let token = token::needed(token::chosen(options.token_file.as_deref())?, true, listen)?;
+        let token = token::required_token(token::chosen_token(options.token_file.as_deref())?, true, listen)?;
         // Only this user can read the environment of a process, but everyone can read its command line.
         match &token {
             Some(token) => command.env(token::VARIABLE, token.as_str()),
             None => command.env_remove(token::VARIABLE),
         };
-        let listener = TcpListener::bind(listen).map_err(|error| unbound(listen, &error))?;
+        let listener = TcpListener::bind(listen).map_err(|error| bind_error(listen, &error))?;
         let address = listener.local_addr().map_err(|error| failed(&error))?;
         let url = url(address, token.as_ref());
         let address_file = options.address_file.as_deref();

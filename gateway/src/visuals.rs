@@ -6,7 +6,7 @@ use clap::Args;
 use cover::LinkMesh;
 use cover::mesh::{Mesh, MeshError, UpAxis};
 use robots::{Geometry, Shape, Urdf};
-use trace::files::folder_of;
+use trace::files::parent_folder;
 
 /// Directories of the packages that a URDF refers to.
 #[derive(Args, Clone, Debug, Default)]
@@ -22,7 +22,7 @@ pub(crate) struct Packages {
 
 impl Packages {
     /// Creates a search in the directory of the URDF and those above it, for commands without the option.
-    pub(crate) fn beside() -> Self {
+    pub(crate) fn beside_urdf() -> Self {
         Self { package: Vec::new(), only_beside: true }
     }
 }
@@ -47,14 +47,14 @@ pub(crate) struct Visuals<'a> {
 impl<'a> Visuals<'a> {
     /// Creates the shapes of the URDF in this file.
     pub(crate) fn new(urdf: &'a Urdf, file: &Path, packages: &'a Packages) -> Self {
-        let folder = folder_of(file);
+        let folder = parent_folder(file);
         // Resolve the path, because `.` has no parent directories.
         let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
         Self { urdf, folder, packages }
     }
 
     /// Returns the parts of a link's shape. The list is empty if the URDF has no visual for the link.
-    pub(crate) fn parts(&self, link: &str) -> Result<Vec<LinkMesh>, String> {
+    pub(crate) fn link_parts(&self, link: &str) -> Result<Vec<LinkMesh>, String> {
         let shapes = self.urdf.visuals(link).map_err(|error| error.to_string())?;
         let part =
             |shape| self.part(shape).map_err(|error| format!("{}: link {link}: {error}", self.urdf.file));
@@ -66,7 +66,7 @@ impl<'a> Visuals<'a> {
             |mesh: Result<Mesh, MeshError>| mesh.map(LinkMesh::new).map_err(|error| error.to_string());
         let part = match &shape.geometry {
             Geometry::Mesh { path, scale } => {
-                let mesh = Mesh::load(&self.find(path)?, UpAxis::Ignore);
+                let mesh = Mesh::load(&self.find_file(path)?, UpAxis::Ignore);
                 LinkMesh { scale: *scale, ..plain(mesh)? }
             }
             Geometry::Box { size } => plain(Mesh::cuboid(*size))?,
@@ -83,7 +83,7 @@ impl<'a> Visuals<'a> {
     }
 
     /// Finds the file that a URI or a path of the URDF names.
-    fn find(&self, uri: &str) -> Result<PathBuf, String> {
+    fn find_file(&self, uri: &str) -> Result<PathBuf, String> {
         let of_package = uri.strip_prefix("package://").or_else(|| uri.strip_prefix("model://"));
         let Some((name, rest)) = of_package.map(|path| path.split_once('/').unwrap_or((path, ""))) else {
             let local = path_of_uri(uri);
@@ -166,10 +166,12 @@ mod tests {
     fn a_command_without_the_option_does_not_name_it() {
         let urdf = Urdf::parse("r.urdf", "<robot><link name=\"a\"/></robot>").unwrap();
         let hint = |packages: &Packages| {
-            Visuals::new(&urdf, Path::new("none/r.urdf"), packages).find("package://p/a.stl").unwrap_err()
+            Visuals::new(&urdf, Path::new("none/r.urdf"), packages)
+                .find_file("package://p/a.stl")
+                .unwrap_err()
         };
         assert!(hint(&Packages::default()).ends_with("name its directory with --package p=DIR"));
-        let beside = hint(&Packages::beside());
+        let beside = hint(&Packages::beside_urdf());
         assert!(beside.ends_with("put the folder of package p beside the URDF, or above it"), "{beside}");
     }
 

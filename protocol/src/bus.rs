@@ -204,7 +204,7 @@ impl Bus {
         if self.has_error() {
             return Ok(true);
         }
-        self.poll(PollFlags::IN, timeout).map_err(|errno| self.error("wait for", errno))
+        self.poll(PollFlags::IN, timeout).map_err(|errno| self.bus_error("wait for", errno))
     }
 
     /// Waits until [`Bus::receive`] has a frame or an error to return, on this bus or on `other`. Returns false after
@@ -217,7 +217,7 @@ impl Bus {
             return Ok(true);
         }
         let mut both = [self, other].map(|bus| PollFd::new(&bus.socket, PollFlags::IN));
-        wait_on(&mut both, Some(timeout)).map_err(|errno| self.error("wait for", errno))
+        poll_descriptors(&mut both, Some(timeout)).map_err(|errno| self.bus_error("wait for", errno))
     }
 
     /// Returns true if the next receive will report a stored error.
@@ -255,7 +255,7 @@ impl Bus {
         let is_kept = set == millis || (0 < set && set < millis && !self.expired.load(Ordering::Relaxed));
         if !is_kept {
             sockopt::set_socket_timeout(&self.socket, Timeout::Recv, Some(wait))
-                .map_err(|errno| self.error("set the timeout of", errno))?;
+                .map_err(|errno| self.bus_error("set the timeout of", errno))?;
             self.receive_timeout.store(millis, Ordering::Relaxed);
         }
         let count = self.receive_with(inbox, |batch, socket| batch.receive_one(socket))?;
@@ -296,7 +296,7 @@ impl Bus {
         self.failed.store(inbox.failure.is_some(), Ordering::Relaxed);
         let over = inbox.decode(self.carrier());
         match inbox.frames().len() {
-            0 if over => Err(self.closed()),
+            0 if over => Err(self.closed_error()),
             count => Ok(count),
         }
     }
@@ -307,7 +307,7 @@ impl Bus {
     /// # Errors
     /// Returns the cause and the number of frames that were sent before the failure.
     pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
-        if !self.carries(frames) {
+        if !self.accepts_formats(frames) {
             let cause = BusError::FdFrame(self.name.clone());
             return Err(SendError { sent: 0, total: frames.len(), cause });
         }
@@ -315,7 +315,7 @@ impl Bus {
     }
 
     /// Returns true if the bus was opened for the formats of all these frames: FD frames need [`Options::fd`].
-    fn carries(&self, frames: &[Frame]) -> bool {
+    fn accepts_formats(&self, frames: &[Frame]) -> bool {
         self.fd || frames.iter().all(|frame| frame.format() == Format::Classic)
     }
 
@@ -353,11 +353,11 @@ impl Bus {
         }
         let waited = if interface {
             // The queue is shared and nothing signals room in it, so retry soon.
-            wait_on(&mut [], Some(left.min(RETRY_INTERVAL)))
+            poll_descriptors(&mut [], Some(left.min(RETRY_INTERVAL)))
         } else {
             self.poll(PollFlags::OUT, Some(left))
         };
-        waited.map(|_| ()).map_err(|errno| self.error("wait for", errno))
+        waited.map(|_| ()).map_err(|errno| self.bus_error("wait for", errno))
     }
 
     /// Sends at most 64 frames if the bus accepts all of them at once, and returns true if it did. Never waits or
@@ -365,7 +365,7 @@ impl Bus {
     /// down, the next [`Bus::receive`] returns the error.
     #[must_use]
     pub fn try_send_all(&self, frames: &[Frame]) -> bool {
-        if !self.carries(frames) {
+        if !self.accepts_formats(frames) {
             return false;
         }
         let sent = self.send_batch(frames);
@@ -409,15 +409,15 @@ impl Bus {
     }
 
     fn poll(&self, what: PollFlags, timeout: Option<Duration>) -> Result<bool, Errno> {
-        wait_on(&mut [PollFd::new(&self.socket, what)], timeout)
+        poll_descriptors(&mut [PollFd::new(&self.socket, what)], timeout)
     }
 
     /// Returns the error for a connection to an embedded bus that has ended.
-    fn closed(&self) -> BusError {
+    fn closed_error(&self) -> BusError {
         embedded::closed_error(&self.name, self.directory.as_deref())
     }
 
-    fn error(&self, doing: &'static str, errno: Errno) -> BusError {
+    fn bus_error(&self, doing: &'static str, errno: Errno) -> BusError {
         self.io_error(doing, errno.into())
     }
 
@@ -426,7 +426,7 @@ impl Bus {
         let cause = Errno::from_io_error(&source).and_then(|errno| self.carrier().bus_error(errno));
         let Some(cause) = cause else { return BusError::Io { name, doing, source } };
         let error = cause(name);
-        if matches!(error, BusError::Closed(_)) { self.closed() } else { error }
+        if matches!(error, BusError::Closed(_)) { self.closed_error() } else { error }
     }
 }
 
@@ -441,7 +441,7 @@ const RETRY_INTERVAL: Duration = Duration::from_micros(500);
 /// Maximum time for which a call is retried when the system lacks memory.
 const MAX_SHORTAGE: Duration = Duration::from_millis(100);
 
-fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, Errno> {
+fn poll_descriptors(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, Errno> {
     let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
     match poll(what, timeout.as_ref()) {
         Ok(ready) => Ok(ready > 0),

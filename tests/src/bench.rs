@@ -38,10 +38,10 @@ use crate::oracle::{Oracle, Truth};
 use crate::real_bus::{RealBus, Requested};
 use wire::{Delivery, Inlet, Sent};
 
-pub use wire::OnTheWire;
+pub use wire::WireFrame;
 
 /// The interval at which the gateway advances its time and sends the stimuli that its scenario schedules.
-const LOOK: Span = Span::from_millis(4);
+const POLL_INTERVAL: Span = Span::from_millis(4);
 
 /// An action that a test schedules.
 #[derive(Clone, Copy, Debug)]
@@ -53,13 +53,13 @@ pub enum Act {
     /// The cell in this slot hangs.
     Hang(usize),
     /// The hung cell in this slot continues.
-    GoOn(usize),
+    Continue(usize),
     /// The gateway sends this message.
-    Say(Message),
+    SendFromGateway(Message),
     /// Another client sends this message.
     Inject(Message),
     /// Another client sends this frame, which need not be a packet.
-    Babble(Frame),
+    InjectFrame(Frame),
 }
 
 #[derive(Debug)]
@@ -88,14 +88,14 @@ pub struct Bench {
     /// A second, simpler gateway with the same input, whose results must be equal.
     pub oracle: Oracle,
     /// All frames that were on the wire.
-    pub wire: Vec<OnTheWire>,
+    pub wire: Vec<WireFrame>,
     agenda: Agenda<Event>,
     format: Format,
     packets: u64,
     free: Micros,
     held: Option<Sent>,
     /// The indices of the cell slots that receive each identifier.
-    hearers: HashMap<u32, Vec<usize>>,
+    subscribers: HashMap<u32, Vec<usize>>,
     inlets: Vec<Inlet>,
     gateway_inlet: Inlet,
     dice: Pcg64Mcg,
@@ -130,7 +130,7 @@ impl Bench {
             packets: 0,
             free: Micros(0),
             held: None,
-            hearers: HashMap::new(),
+            subscribers: HashMap::new(),
             inlets: Vec::new(),
             gateway_inlet: Inlet::default(),
             dice: Pcg64Mcg::seed_from_u64(seed ^ 0x5EED),
@@ -169,7 +169,7 @@ impl Bench {
     pub fn add(&mut self, identity: Identity, flash: FlashState) -> usize {
         let cell_slot = self.cell_slots.len();
         for id in identity.received_ids().into_iter().flatten() {
-            self.hearers.entry(u32::from(id.to_bits())).or_default().push(cell_slot);
+            self.subscribers.entry(u32::from(id.to_bits())).or_default().push(cell_slot);
         }
         self.cell_slots.push(CellSlot::new(identity, flash, self.format));
         self.inlets.push(Inlet::default());
@@ -218,7 +218,7 @@ impl Bench {
     /// Panics if the skin does not have the cell.
     pub fn press_from(&mut self, place: usize, newtons: f64, from: AppliesFrom) {
         let message = self.gateway.stimulus(place, from, touch(newtons)).expect("a cell of the skin");
-        self.act(Act::Say(message));
+        self.act(Act::SendFromGateway(message));
     }
 
     /// Runs until every running cell of the skin is expected to answer.
@@ -229,7 +229,7 @@ impl Bench {
         let give_up = self.agenda.now + Span::from_millis(2_000);
         while !self.is_settled() {
             assert!(self.agenda.now < give_up, "cells that never settle: {:?}", self.gateway.table.cells());
-            self.run(LOOK);
+            self.run(POLL_INTERVAL);
         }
     }
 
@@ -273,9 +273,9 @@ impl Bench {
     pub fn finish(&mut self) {
         self.ticking = false;
         self.run(Span(2 * self.epoch().0));
-        self.act(Act::Say(Message::Report));
+        self.act(Act::SendFromGateway(Message::Report));
         self.run(Span::from_millis(100));
-        self.act(Act::Say(Message::Sync));
+        self.act(Act::SendFromGateway(Message::Sync));
         self.run(Span::from_millis(150));
         self.gateway.table.handle_time(self.agenda.now);
         self.gateway.table.finish();
@@ -287,29 +287,29 @@ impl Bench {
             Event::Deliver(delivery) => self.deliver(delivery),
             Event::Wake(cell_slot) => self.wake(cell_slot),
             Event::Tick if self.ticking => {
-                let messages = self.gateway.turn(self.agenda.now);
+                let messages = self.gateway.run_tick(self.agenda.now);
                 self.oracle.check_sum(self.agenda.now, &self.gateway.table.snapshot().sums);
-                self.say(&messages);
+                self.send_messages(&messages);
                 self.agenda.enter_in(self.gateway.period(), Event::Tick);
             }
             Event::Tick => {}
             Event::Look => {
                 let known = self.gateway.notices.len();
-                let messages = self.gateway.look(self.agenda.now);
+                let messages = self.gateway.poll(self.agenda.now);
                 for (_, notice) in self.gateway.notices.iter().skip(known) {
                     self.oracle.notice(*notice);
                 }
-                self.say(&messages);
-                self.agenda.enter_in(LOOK, Event::Look);
+                self.send_messages(&messages);
+                self.agenda.enter_in(POLL_INTERVAL, Event::Look);
             }
             Event::Bus => {
                 let now = self.agenda.now;
-                self.real.iter_mut().for_each(|real| real.look = None);
+                self.real.iter_mut().for_each(|real| real.next_advance = None);
                 let ended = self.real.as_mut().map(|real| real.ended(now)).unwrap_or_default();
                 for (stood, sent) in ended {
-                    self.reach(stood, &sent);
+                    self.distribute(stood, &sent);
                 }
-                self.look_at_the_bus();
+                self.schedule_bus_advance();
             }
             Event::Act(act) => self.perform(*act),
         }
@@ -318,9 +318,9 @@ impl Bench {
     fn perform(&mut self, act: Act) {
         let of = |bench: &mut Self, cell_slot: usize, packets: Vec<Packet>| bench.sends(cell_slot, &packets);
         match act {
-            Act::Say(message) => self.say(&[message]),
+            Act::SendFromGateway(message) => self.send_messages(&[message]),
             Act::Inject(message) => self.packets(Party::UnknownNode, 0, self.agenda.now, &[message.encode()]),
-            Act::Babble(frame) => {
+            Act::InjectFrame(frame) => {
                 let from = Party::UnknownNode;
                 let truth = Truth { from, life: 0, packet: None, number: 0, segment: 0, damage: None };
                 self.agenda.enter_in(Span(0), Event::Send(Sent { frame, truth }, true));
@@ -332,7 +332,7 @@ impl Bench {
                 self.cell_slots.get_mut(cell_slot).into_iter().for_each(|cell_slot| cell_slot.start(now));
                 of(self, cell_slot, Vec::new());
             }
-            Act::GoOn(cell_slot) => {
+            Act::Continue(cell_slot) => {
                 let now = self.agenda.now;
                 let packets = self
                     .cell_slots
@@ -352,7 +352,7 @@ impl Bench {
         if there.wake.take_if(|at| *at == now).is_none() {
             return;
         }
-        let packets = there.time(now);
+        let packets = there.handle_time(now);
         self.sends(cell_slot, &packets);
     }
 
@@ -372,7 +372,7 @@ impl Bench {
         self.packets(Party::CellSlot(cell_slot), life, at, &packets);
     }
 
-    fn say(&mut self, messages: &[Message]) {
+    fn send_messages(&mut self, messages: &[Message]) {
         let packets: Vec<_> = messages.iter().map(Message::encode).collect();
         self.packets(Party::Gateway, 0, self.agenda.now, &packets);
     }

@@ -8,13 +8,13 @@ use protocol::id::Kind;
 use protocol::packet::{Packet, Words};
 use protocol::time::{Micros, Span};
 
-use crate::life::Life;
+use crate::life::PowerState;
 
 /// The number of frames that the shell reads from its socket at once, before it sends the results.
 const BATCH: usize = 64;
 
 /// A frame that waits in a socket, with its time on the wire.
-pub(crate) type Waiting = (Micros, Frame);
+pub(crate) type WaitingFrame = (Micros, Frame);
 
 /// A cell, or an empty slot for one.
 #[derive(Debug)]
@@ -32,7 +32,7 @@ pub struct CellSlot {
     first: Option<Words>,
     format: Format,
     /// The power state of the cell; while it hangs, frames collect in its socket.
-    life: Life<Waiting>,
+    life: PowerState<WaitingFrame>,
     /// The serial number of the cell to which this cell gave its node id.
     gave_up: Option<u32>,
     /// The time of the cell's next timer.
@@ -52,7 +52,7 @@ impl CellSlot {
             is_stuck: false,
             first: None,
             format,
-            life: Life::Off,
+            life: PowerState::Off,
             gave_up: None,
             wake: None,
         }
@@ -87,13 +87,13 @@ impl CellSlot {
     /// Switches the cell on. A simulated cell obeys stimuli from the start.
     pub(crate) fn start(&mut self, now: Micros) {
         self.lives += 1;
-        self.life = Life::Runs(Box::new(Node::new(self.identity, self.format, &self.flash, true, now)));
+        self.life = PowerState::Runs(Box::new(Node::new(self.identity, self.format, &self.flash, true, now)));
         (self.gave_up, self.wake) = (None, None);
     }
 
     /// Switches the cell off. Only its flash keeps its content.
     pub(crate) fn kill(&mut self) {
-        (self.life, self.gave_up) = (Life::Off, None);
+        (self.life, self.gave_up) = (PowerState::Off, None);
     }
 
     pub(crate) fn hang(&mut self) {
@@ -104,43 +104,43 @@ impl CellSlot {
     /// Returns the packets to send.
     pub(crate) fn go_on(&mut self, now: Micros) -> Vec<Packet> {
         let Some(mut waiting) = self.life.go_on() else { return Vec::new() };
-        let mut packets = self.time(now);
+        let mut packets = self.handle_time(now);
         while !waiting.is_empty() {
             let batch: Vec<_> = waiting.drain(..waiting.len().min(BATCH)).collect();
-            packets.extend(self.take(now, &batch));
+            packets.extend(self.receive_batch(now, &batch));
         }
         packets
     }
 
     /// Advances the cell's time, and returns the packets to send.
-    pub(crate) fn time(&mut self, now: Micros) -> Vec<Packet> {
-        if let Life::Runs(node) = &mut self.life {
+    pub(crate) fn handle_time(&mut self, now: Micros) -> Vec<Packet> {
+        if let PowerState::Runs(node) = &mut self.life {
             node.handle_timeout(now);
         }
-        self.sends()
+        self.take_packets()
     }
 
     /// Receives a frame that was on the wire at `stood`, and returns the packets to send.
-    pub(crate) fn hear(&mut self, now: Micros, stood: Micros, frame: Frame) -> Vec<Packet> {
-        if let Life::Hangs(_, waiting) = &mut self.life {
+    pub(crate) fn receive(&mut self, now: Micros, stood: Micros, frame: Frame) -> Vec<Packet> {
+        if let PowerState::Hangs(_, waiting) = &mut self.life {
             waiting.push_back((stood, frame));
         }
-        self.take(now, &[(stood, frame)])
+        self.receive_batch(now, &[(stood, frame)])
     }
 
-    fn take(&mut self, now: Micros, batch: &[Waiting]) -> Vec<Packet> {
+    fn receive_batch(&mut self, now: Micros, batch: &[WaitingFrame]) -> Vec<Packet> {
         for &(stood, frame) in batch {
-            let Life::Runs(node) = &mut self.life else { break };
+            let PowerState::Runs(node) = &mut self.life else { break };
             node.handle_frame(now, now.elapsed_since(stood), &frame);
             if let Some(serial) = node.other_owner() {
-                (self.life, self.gave_up) = (Life::Off, Some(serial));
+                (self.life, self.gave_up) = (PowerState::Off, Some(serial));
             }
         }
-        self.sends()
+        self.take_packets()
     }
 
-    fn sends(&mut self) -> Vec<Packet> {
-        let Life::Runs(node) = &mut self.life else { return Vec::new() };
+    fn take_packets(&mut self) -> Vec<Packet> {
+        let PowerState::Runs(node) = &mut self.life else { return Vec::new() };
         if let Some(kept) = node.poll_store() {
             self.flash = kept.parameters.map_or(FlashState::Empty, FlashState::Valid);
             node.handle_stored(true);

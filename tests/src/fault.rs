@@ -51,7 +51,7 @@ impl Harm {
 
 /// The receivers that a fault affects.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Hits {
+enum FaultScope {
     /// The fault hits the frame on the wire, so all receivers get the same.
     Wire,
     /// The fault hits each receiver with its own chance.
@@ -65,7 +65,7 @@ enum Hits {
 pub struct Fault {
     harm: Harm,
     probability: f64,
-    hits: Hits,
+    hits: FaultScope,
     from: Option<Party>,
     kind: Option<Kind>,
     during: Range<Micros>,
@@ -76,19 +76,19 @@ impl Fault {
     #[must_use]
     pub const fn new(harm: Harm, probability: f64) -> Self {
         let during = Micros(0)..Micros(u64::MAX);
-        Self { harm, probability, hits: Hits::Each, from: None, kind: None, during }
+        Self { harm, probability, hits: FaultScope::Each, from: None, kind: None, during }
     }
 
     /// Moves the fault to the wire: all receivers get the same frame.
     #[must_use]
     pub fn on_the_wire(self) -> Self {
-        Self { hits: Hits::Wire, ..self }
+        Self { hits: FaultScope::Wire, ..self }
     }
 
     /// Limits the fault to one receiver.
     #[must_use]
-    pub fn at(self, receiver: Party) -> Self {
-        Self { hits: Hits::Only(receiver), ..self }
+    pub fn at_receiver(self, receiver: Party) -> Self {
+        Self { hits: FaultScope::Only(receiver), ..self }
     }
 
     /// Limits the fault to frames of one sender.
@@ -99,7 +99,7 @@ impl Fault {
 
     /// Limits the fault to frames of one kind.
     #[must_use]
-    pub fn of(self, kind: Kind) -> Self {
+    pub fn of_kind(self, kind: Kind) -> Self {
         Self { kind: Some(kind), ..self }
     }
 
@@ -111,9 +111,9 @@ impl Fault {
 
     fn may_hit(&self, now: Micros, from: Party, to: Option<Party>, kind: Kind) -> bool {
         let hits = match self.hits {
-            Hits::Wire => to.is_none(),
-            Hits::Each => to.is_some(),
-            Hits::Only(party) => to == Some(party),
+            FaultScope::Wire => to.is_none(),
+            FaultScope::Each => to.is_some(),
+            FaultScope::Only(party) => to == Some(party),
         };
         let of_kind = self.kind.is_none_or(|expected| expected == kind);
         hits && of_kind && self.from.is_none_or(|expected| expected == from) && self.during.contains(&now)

@@ -18,7 +18,7 @@ use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
 /// The number of epochs by which a stimulus is sent ahead of its first epoch.
-const LEAD: u64 = 5;
+const STIMULUS_LEAD_EPOCHS: u64 = 5;
 
 /// A gateway: the table of its cells, its control loop, and the stimuli of its scenario.
 #[derive(Debug)]
@@ -112,7 +112,7 @@ impl Gateway {
     }
 
     /// Receives a frame; `stood` is the kernel's time stamp.
-    pub(crate) fn hear(&mut self, stood: Micros, own: bool, frame: &Frame) {
+    pub(crate) fn receive(&mut self, stood: Micros, own: bool, frame: &Frame) {
         let queue = &mut self.positions;
         let mut positions = |epoch| {
             while let Some((of, q)) = queue.pop_front() {
@@ -126,7 +126,7 @@ impl Gateway {
     }
 
     /// Runs one tick of the loop, and returns the messages to send.
-    pub(crate) fn turn(&mut self, now: Micros) -> Vec<Message> {
+    pub(crate) fn run_tick(&mut self, now: Micros) -> Vec<Message> {
         if self.skip > 0 {
             self.skip -= 1;
             self.tick += 1;
@@ -144,7 +144,7 @@ impl Gateway {
         self.broadcasts_skipped += outcome.broadcasts_skipped;
         let mut messages = Vec::new();
         if let Some(epoch) = outcome.broadcast {
-            self.positions.push_back((epoch, self.cycle.positions_of(0)));
+            self.positions.push_back((epoch, self.cycle.chain_positions(0)));
             messages.push(Message::Joints { epoch, joints: self.cycle.joints(0) });
         }
         match outcome.command {
@@ -157,10 +157,10 @@ impl Gateway {
 
     /// Advances the table's time and collects its notices. Returns the stimuli that are due, and the messages for
     /// restarted cells.
-    pub(crate) fn look(&mut self, now: Micros) -> Vec<Message> {
+    pub(crate) fn poll(&mut self, now: Micros) -> Vec<Message> {
         self.table.handle_time(now);
         let mut messages = Vec::new();
-        let until = self.cycle.broadcasts() + LEAD;
+        let until = self.cycle.broadcasts() + STIMULUS_LEAD_EPOCHS;
         while self.script_epoch < until {
             let from = AppliesFrom::Epoch(epoch_of(self.script_epoch));
             for stimulus in self.touches.stimuli_for(self.script_epoch) {

@@ -6,7 +6,7 @@ use cell_node::node::Node;
 
 /// The power state of a cell. While the cell hangs, its input collects.
 #[derive(Debug)]
-pub(crate) enum Life<W> {
+pub(crate) enum PowerState<W> {
     /// The cell has no power.
     Off,
     /// The cell works normally.
@@ -15,7 +15,7 @@ pub(crate) enum Life<W> {
     Hangs(Box<Node>, VecDeque<W>),
 }
 
-impl<W> Life<W> {
+impl<W> PowerState<W> {
     /// Returns the cell, unless it is off.
     pub(crate) const fn node(&self) -> Option<&Node> {
         match self {

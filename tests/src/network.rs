@@ -35,18 +35,18 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::agenda::Agenda;
-use crate::life::Life;
+use crate::life::PowerState;
 use place::Inlet;
 use protocol::packet::padded;
 
-pub use place::Place;
+pub use place::WiredCell;
 
 /// The interval between two broadcasts.
 pub const PERIOD: Span = Span(16_000);
 /// The minimum and the maximum time from sending a message to receiving it, in us.
 const LATENCY: (u64, u64) = (10, 60);
 /// The time that a cell takes from receiving a message to answering it.
-const THINKS: Span = Span(30);
+const THINKING_TIME: Span = Span(30);
 /// Returns the joint positions in quarter turns, the same in every epoch.
 fn positions() -> [Q1_14; WORDS] {
     let positions = [0.1, -0.7, 0.6, -0.4, 0.3, 0.2].map(Q1_14::nearest);
@@ -55,7 +55,7 @@ fn positions() -> [Q1_14; WORDS] {
 
 /// The far end of the wire at a cell's port.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum End {
+pub enum PortEnd {
     /// The port of a cell: the index of the cell, and that of the port.
     Cell(usize, usize),
     /// The gateway's side, with the index of the root.
@@ -73,7 +73,7 @@ enum Event {
 
 /// The sums of one epoch that the gateway received.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Took {
+pub struct EpochSums {
     /// The cells in the sums: bit i is set for cell i.
     pub cells: u128,
     /// The number of sums that were received.
@@ -84,11 +84,11 @@ pub struct Took {
 #[derive(Debug)]
 pub struct Wiring {
     /// The cells.
-    pub cells: Vec<Place>,
+    pub cells: Vec<WiredCell>,
     /// The cells that are wired to the gateway's side.
     pub roots: Vec<usize>,
     /// The sums that the gateway received in the epoch of each broadcast.
-    pub took: Vec<Took>,
+    pub took: Vec<EpochSums>,
     /// The probability that a message over a wire is lost.
     pub loss: f64,
     /// The maximum depth in the tree for which cells have a slot to send sums.
@@ -107,7 +107,7 @@ impl Wiring {
     #[must_use]
     pub fn new(cells: usize, seed: u64) -> Self {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
-        let cells = (0..cells).map(|index| Place::new(index, &mut dice)).collect();
+        let cells = (0..cells).map(|index| WiredCell::new(index, &mut dice)).collect();
         let mut wiring = Self {
             cells,
             roots: Vec::new(),
@@ -157,7 +157,7 @@ impl Wiring {
     }
 
     fn wire_some(&mut self, a: usize, b: usize, dice: &mut Pcg64Mcg) {
-        let mut free = |cell: &Place| {
+        let mut free = |cell: &WiredCell| {
             let free: Vec<usize> = (0..PORTS).filter(|&port| cell.wires[port].is_none()).collect();
             free.choose(dice).copied()
         };
@@ -168,20 +168,20 @@ impl Wiring {
 
     /// Adds a wire between port `p` of cell `a` and port `q` of cell `b`.
     pub fn wire(&mut self, a: usize, p: usize, b: usize, q: usize) {
-        self.cells[a].wires[p] = Some(End::Cell(b, q));
-        self.cells[b].wires[q] = Some(End::Cell(a, p));
+        self.cells[a].wires[p] = Some(PortEnd::Cell(b, q));
+        self.cells[b].wires[q] = Some(PortEnd::Cell(a, p));
     }
 
     /// Makes a cell a root: adds a wire from it to the gateway's side.
     pub fn add_root(&mut self, cell: usize) {
-        self.cells[cell].wires[UPLINK] = Some(End::Gateway(self.roots.len()));
+        self.cells[cell].wires[UPLINK] = Some(PortEnd::Gateway(self.roots.len()));
         self.roots.push(cell);
         self.uplinks = Uplinks::new(self.roots.len(), 0, self.agenda.now);
     }
 
     /// Takes one direction of a wire down, or brings it up: messages of `cell` through `port` do not arrive.
     pub fn set_link_down(&mut self, cell: usize, port: usize, is_down: bool) {
-        if let Some(End::Cell(other, at)) = self.cells[cell].wires[port] {
+        if let Some(PortEnd::Cell(other, at)) = self.cells[cell].wires[port] {
             self.cells[other].deaf[at] = is_down;
             self.send_links_down(other);
         }
@@ -214,7 +214,7 @@ impl Wiring {
         let wired = place.wires.iter().enumerate().filter(|(_, wire)| wire.is_some());
         let wired = wired.map(|(port, _)| 1 << port).sum();
         let node = Node::new(identity, Format::Fd, &FlashState::Valid(place.parameters), true, now);
-        place.life = Life::Runs(Box::new(node.with_ports(wired)));
+        place.life = PowerState::Runs(Box::new(node.with_ports(wired)));
         place.wake = None;
         place.deferred.clear();
         (place.tree, place.ports) = (None, None);
@@ -223,7 +223,7 @@ impl Wiring {
 
     /// Switches a cell off.
     pub fn kill(&mut self, cell: usize) {
-        self.cells[cell].life = Life::Off;
+        self.cells[cell].life = PowerState::Off;
         self.cells[cell].wake = None;
     }
 
@@ -260,7 +260,7 @@ impl Wiring {
             }
             Event::Deliver(cell, inlet) => self.deliver(cell, inlet),
             Event::ToGateway(root, message) => {
-                self.uplinks.handle(self.agenda.now, root, message);
+                self.uplinks.handle_message(self.agenda.now, root, message);
                 self.gateway_sends();
             }
             Event::GatewayWake => {
@@ -277,7 +277,7 @@ impl Wiring {
     /// Delivers input to a cell, or collects it while the cell hangs.
     fn deliver(&mut self, cell: usize, inlet: Inlet) {
         let now = self.agenda.now;
-        if let Life::Hangs(_, waiting) = &mut self.cells[cell].life {
+        if let PowerState::Hangs(_, waiting) = &mut self.cells[cell].life {
             waiting.push_back((now, inlet));
         } else {
             self.hand(cell, now, inlet);
@@ -287,7 +287,7 @@ impl Wiring {
     fn pass(&mut self, cell: usize) {
         self.receive_deferred(cell);
         let now = self.agenda.now;
-        if let Life::Runs(node) = &mut self.cells[cell].life {
+        if let PowerState::Runs(node) = &mut self.cells[cell].life {
             node.handle_timeout(now);
         }
         self.after(cell);
@@ -298,7 +298,7 @@ impl Wiring {
         let now = self.agenda.now;
         loop {
             let place = &mut self.cells[cell];
-            let Life::Runs(node) = &mut place.life else { return };
+            let PowerState::Runs(node) = &mut place.life else { return };
             let Some((stood, frame)) = place.deferred.pop_front() else { return };
             node.handle_frame(now, now.elapsed_since(stood), &frame);
             self.after(cell);
@@ -308,15 +308,15 @@ impl Wiring {
     fn hand(&mut self, cell: usize, stood: Micros, inlet: Inlet) {
         let now = self.agenda.now;
         let place = &mut self.cells[cell];
-        if let (Life::Runs(node), Inlet::Frame(frame)) = (&place.life, inlet)
-            && packet::data_id(&frame).is_ok_and(|id| node.defers(id))
+        if let (PowerState::Runs(node), Inlet::Frame(frame)) = (&place.life, inlet)
+            && packet::data_id(&frame).is_ok_and(|id| node.may_defer(id))
         {
             place.deferred.push_back((stood, frame));
             return;
         }
         self.receive_deferred(cell);
         let place = &mut self.cells[cell];
-        if let Life::Runs(node) = &mut place.life {
+        if let PowerState::Runs(node) = &mut place.life {
             match inlet {
                 Inlet::Frame(frame) => node.handle_frame(now, now.elapsed_since(stood), &frame),
                 Inlet::Port(port, _) if place.deaf[port] => {}
@@ -329,7 +329,7 @@ impl Wiring {
     /// Sends the messages of a cell after an input, and schedules its next timeout.
     fn after(&mut self, cell: usize) {
         let place = &mut self.cells[cell];
-        let Life::Runs(node) = &mut place.life else { return };
+        let PowerState::Runs(node) = &mut place.life else { return };
         if let Some(kept) = node.poll_store() {
             place.node_id = kept.number;
             node.handle_stored(true);
@@ -356,11 +356,11 @@ impl Wiring {
                 continue;
             }
             match end {
-                End::Cell(other, at) => {
+                PortEnd::Cell(other, at) => {
                     let at_time = self.arrival(Some(other));
                     self.agenda.enter(at_time, Event::Deliver(other, Inlet::Port(at, message)));
                 }
-                End::Gateway(root) => {
+                PortEnd::Gateway(root) => {
                     let at = self.arrival(None);
                     self.agenda.enter(at, Event::ToGateway(root, message));
                 }
@@ -371,14 +371,15 @@ impl Wiring {
             match message {
                 Message::Sum { from, epoch, torque, count } => {
                     let torque = torque.padded().map(Q7_8::from_bits);
-                    self.hear_sum(cell, from, epoch, SumWords { torque, count });
+                    self.handle_sum(cell, from, epoch, SumWords { torque, count });
                 }
                 Message::Network { page: NetworkPage::Tree(tree), .. } => self.cells[cell].tree = Some(tree),
                 Message::Network { page: NetworkPage::Ports(ports), .. } => {
                     self.cells[cell].ports = Some(ports);
                 }
                 Message::Network { page: NetworkPage::Heartbeat(_), .. } => {
-                    self.uplinks.claimed(self.cells[cell].node_id.expect("a cell that sends has a node id"));
+                    self.uplinks
+                        .mark_used(self.cells[cell].node_id.expect("a cell that sends has a node id"));
                 }
                 _ => {}
             }
@@ -387,7 +388,7 @@ impl Wiring {
 
     /// Returns the arrival time of a message that is sent now, so that messages keep their order.
     fn arrival(&mut self, at: Option<usize>) -> Micros {
-        let arrives = self.agenda.now + THINKS + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
+        let arrives = self.agenda.now + THINKING_TIME + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
         let newest = at.map_or(&mut self.gateway_newest, |cell| &mut self.cells[cell].newest);
         *newest = arrives.max(*newest);
         *newest
@@ -405,7 +406,7 @@ impl Wiring {
     }
 
     /// Sends a message from the gateway to every cell that receives it.
-    pub fn say(&mut self, message: &Message) {
+    pub fn send(&mut self, message: &Message) {
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         for cell in 0..self.cells.len() {
             let at = self.arrival(Some(cell));
@@ -417,9 +418,9 @@ impl Wiring {
         let epoch = self.epoch.map_or(Epoch(0), Epoch::next);
         self.epoch = Some(epoch);
         self.root_sums.clear();
-        self.took.push(Took::default());
+        self.took.push(EpochSums::default());
         let joints = Joints { positions: padded(&positions()), in_use: 6 };
-        self.say(&Message::Joints { epoch, joints });
+        self.send(&Message::Joints { epoch, joints });
         self.agenda.enter_in(PERIOD, Event::Joints);
     }
 
@@ -440,7 +441,7 @@ impl Wiring {
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).expect("a slot");
         let reply = Reply::Sum(Slots { slot_us, deepest, carry });
         let request = Request::Write { number: Parameter::Reply.number(), words: reply.words() };
-        self.say(&Message::Configure { to: protocol::id::Node::Everyone, tag: 0, request });
+        self.send(&Message::Configure { to: protocol::id::Node::Everyone, tag: 0, request });
     }
 
     /// Presses or releases a cell from the next joints on.
@@ -449,6 +450,10 @@ impl Wiring {
         let word = Q5_10::from_bits(i16::try_from(self.cells[cell].force.steps() >> 6).expect("a word"));
         let contact = if pressed { [word, Q5_10::ZERO, Q5_10::ZERO] } else { [Q5_10::ZERO; 3] };
         let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-        self.say(&Message::Stimulus { to: protocol::id::Node::Cell(node_id), from: AppliesFrom::Next, page });
+        self.send(&Message::Stimulus {
+            to: protocol::id::Node::Cell(node_id),
+            from: AppliesFrom::Next,
+            page,
+        });
     }
 }

@@ -13,7 +13,7 @@ use protocol::time::Micros;
 use crate::fault::{Harm, Party};
 
 /// The number of newest broadcasts that a torque may answer.
-const LATEST: usize = 4;
+const ANSWERABLE_BROADCASTS: usize = 4;
 
 /// The true origin, content and damage of a frame.
 #[derive(Clone, Copy, Debug)]
@@ -73,7 +73,7 @@ pub struct Tally {
 
 /// The oracle's state of a cell.
 #[derive(Clone, Debug, Default)]
-struct Mirror {
+struct OracleCell {
     /// The index of the broadcast that the cell's newest torque answered.
     answered: Option<usize>,
     held: Option<[i32; MAX_JOINTS]>,
@@ -94,7 +94,7 @@ pub struct Oracle {
     pub compares: bool,
     format: Format,
     safety: Safety,
-    mirrors: Vec<Mirror>,
+    mirrors: Vec<OracleCell>,
     /// The index of the cell with each node id.
     places: [Option<usize>; 256],
     broadcasts: Vec<Epoch>,
@@ -117,7 +117,7 @@ impl Oracle {
             compares: true,
             format: skin.buses.first().map_or(Format::Fd, |bus| bus.format),
             safety: skin.safety,
-            mirrors: vec![Mirror::default(); skin.cells.len()],
+            mirrors: vec![OracleCell::default(); skin.cells.len()],
             places,
             broadcasts: Vec::new(),
             segments: vec![None; 1 << 11],
@@ -137,7 +137,7 @@ impl Oracle {
     }
 
     /// Receives a frame that is delivered to the gateway.
-    pub(crate) fn hear(&mut self, stood: Micros, truth: &Truth, frame: &Frame) {
+    pub(crate) fn receive(&mut self, stood: Micros, truth: &Truth, frame: &Frame) {
         let truth = &truth.on_arrival(frame);
         self.tally.frames += 1;
         match truth.damage {
@@ -148,11 +148,11 @@ impl Oracle {
         let Some(packet) = truth.packet.filter(|_| self.is_whole(stood, truth, frame)) else { return };
         let Ok(message) = Message::decode(&packet) else { return };
         if truth.from == Party::Gateway {
-            return self.hear_own(&message);
+            return self.receive_own(&message);
         }
         self.tally.packets += 1;
         if message == Message::Halt {
-            self.mirrors.iter_mut().for_each(Mirror::release);
+            self.mirrors.iter_mut().for_each(OracleCell::release);
         }
         let node = match Node::from_byte(packet.id.node) {
             Node::Cell(cell) => cell.get(),
@@ -163,10 +163,10 @@ impl Oracle {
         match message {
             Message::Torque { epoch, torque, .. } => {
                 mirror.arrived += 1;
-                mirror.torques.push((epoch.0, torque.six()));
+                mirror.torques.push((epoch.0, torque.first_six()));
                 let words = torque.padded();
                 // The newest broadcast of this epoch, if it is not too old.
-                let recent = self.broadcasts.iter().enumerate().rev().take(LATEST);
+                let recent = self.broadcasts.iter().enumerate().rev().take(ANSWERABLE_BROADCASTS);
                 let answers = recent.into_iter().find(|(_, of)| **of == epoch).map(|(number, _)| number);
                 match answers {
                     Some(number) if mirror.answered.is_none_or(|last| last < number) => {
@@ -205,17 +205,17 @@ impl Oracle {
         }
     }
 
-    fn hear_own(&mut self, message: &Message) {
+    fn receive_own(&mut self, message: &Message) {
         match *message {
             // A frame repeated on the way: cells drop it, and it is not an epoch.
             Message::Joints { epoch, .. } if self.broadcasts.last() == Some(&epoch) => {}
             Message::Joints { epoch, .. } => {
                 self.tally.broadcasts += 1;
                 // After that many broadcasts that were not on the bus, all torques have decayed in the loop.
-                let recent = self.broadcasts.iter().rev().take(LATEST);
+                let recent = self.broadcasts.iter().rev().take(ANSWERABLE_BROADCASTS);
                 let passed = recent.map(|&before| epoch.epochs_since(before)).min().unwrap_or(1);
                 if i64::from(passed) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1 {
-                    self.mirrors.iter_mut().for_each(Mirror::release);
+                    self.mirrors.iter_mut().for_each(OracleCell::release);
                 }
                 self.broadcasts.push(epoch);
                 let newest = self.broadcasts.len() - 1;
@@ -223,7 +223,7 @@ impl Oracle {
                     mirror.decay(newest, &self.safety);
                 }
             }
-            Message::Halt => self.mirrors.iter_mut().for_each(Mirror::release),
+            Message::Halt => self.mirrors.iter_mut().for_each(OracleCell::release),
             Message::Sync
             | Message::Resume
             | Message::Report
@@ -297,7 +297,7 @@ impl Oracle {
     }
 }
 
-impl Mirror {
+impl OracleCell {
     fn release(&mut self) {
         self.held = None;
         self.value = [0; MAX_JOINTS];

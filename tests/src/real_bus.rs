@@ -16,7 +16,7 @@ pub(crate) struct RealBus<T> {
     model: BusModel,
     waiting: BTreeMap<u64, T>,
     /// The time at which the bus is advanced next, if that is scheduled.
-    pub(crate) look: Option<Micros>,
+    pub(crate) next_advance: Option<Micros>,
     pub(crate) requested: Vec<Requested>,
     pub(crate) attempts: Vec<Attempt>,
 }
@@ -26,7 +26,7 @@ impl<T> RealBus<T> {
         Self {
             model: BusModel::new(rates),
             waiting: BTreeMap::new(),
-            look: None,
+            next_advance: None,
             requested: Vec::new(),
             attempts: Vec::new(),
         }

@@ -25,7 +25,7 @@ const TIMEOUT: Span = Span::from_millis(60_000);
 
 /// A cell in the workshop.
 #[derive(Debug)]
-pub struct Piece {
+pub struct WorkshopCell {
     /// The identity of the cell.
     pub identity: Identity,
     /// The content of the cell's flash.
@@ -39,7 +39,7 @@ pub struct Piece {
     newest: Micros,
 }
 
-impl Piece {
+impl WorkshopCell {
     /// Returns the cell, while it is on.
     #[must_use]
     pub const fn node(&self) -> Option<&Node> {
@@ -63,17 +63,17 @@ pub type Forger = fn(Packet) -> Packet;
 #[derive(Debug)]
 pub struct Workshop {
     /// The cells.
-    pub pieces: Vec<Piece>,
+    pub pieces: Vec<WorkshopCell>,
     /// The probability that a frame is lost.
     pub loss: f64,
     /// The probability that a frame arrives twice.
-    pub twice: f64,
+    pub duplication: f64,
     /// The probability that a bit of a frame is flipped.
     pub damage: f64,
     /// The functions that replace packets to cells, and packets from cells.
     pub forgers: Option<(Forger, Forger)>,
     /// The number of messages that cells and the gateway's side have sent.
-    pub said: u64,
+    pub messages_sent: u64,
     agenda: Agenda<Event>,
     format: Format,
     gateway_newest: Micros,
@@ -87,10 +87,10 @@ impl Workshop {
         Self {
             pieces: Vec::new(),
             loss: 0.0,
-            twice: 0.0,
+            duplication: 0.0,
             damage: 0.0,
             forgers: None,
-            said: 0,
+            messages_sent: 0,
             agenda: Agenda::default(),
             format,
             gateway_newest: Micros(0),
@@ -100,7 +100,7 @@ impl Workshop {
 
     /// Creates a workshop with a skin's cells, switched on now, with the content of flash that `flash` returns.
     #[must_use]
-    pub fn of(skin: &Skin, seed: u64, flash: impl Fn(usize) -> FlashState) -> Self {
+    pub fn with_cells(skin: &Skin, seed: u64, flash: impl Fn(usize) -> FlashState) -> Self {
         let mut workshop = Self::new(skin.buses.first().map_or(Format::Fd, |bus| bus.format), seed);
         for (place, cell) in skin.cells.iter().enumerate() {
             workshop.add(Identity { cell: Some(cell.node), serial: cell.serial }, flash(place));
@@ -112,7 +112,7 @@ impl Workshop {
     pub fn add(&mut self, identity: Identity, flash: FlashState) -> usize {
         let place = self.pieces.len();
         let (history, newest) = (vec![flash], Micros(0));
-        self.pieces.push(Piece { identity, flash, history, worn: false, node: None, newest });
+        self.pieces.push(WorkshopCell { identity, flash, history, worn: false, node: None, newest });
         self.switch_on(place);
         place
     }
@@ -165,7 +165,7 @@ impl Workshop {
         loop {
             commission.handle_time(self.agenda.now);
             while let Some(message) = commission.poll_transmit() {
-                self.say(&message);
+                self.send(&message);
             }
             let Some(timeout) = commission.poll_timeout() else { return commission.report() };
             let at = timeout.min(self.next().unwrap_or(timeout)).max(self.agenda.now);
@@ -241,7 +241,7 @@ impl Workshop {
     }
 
     /// Sends a message from the gateway's side to the cells.
-    pub fn say(&mut self, message: &Message) {
+    pub fn send(&mut self, message: &Message) {
         let packet = message.encode();
         let packet = self.forgers.map_or(packet, |(to, _)| to(packet));
         for frame in packet.frames(self.format) {
@@ -250,7 +250,7 @@ impl Workshop {
     }
 
     /// Sends a message of another client, which the gateway's side receives too.
-    pub fn overhear(&mut self, message: &Message) {
+    pub fn send_from_other(&mut self, message: &Message) {
         for frame in message.encode().frames(self.format) {
             self.pass(frame, Some(usize::MAX));
         }
@@ -258,9 +258,9 @@ impl Workshop {
 
     /// Passes a frame from a cell, or from the gateway's side, to all receivers, each with its own chances of faults.
     fn pass(&mut self, frame: Frame, from: Option<usize>) {
-        self.said += 1;
+        self.messages_sent += 1;
         let id = frame.id();
-        let hears = |piece: &Piece| {
+        let hears = |piece: &WorkshopCell| {
             let node = piece.node.as_ref();
             node.is_some_and(|node| node.received_ids().any(|heard| u32::from(heard.to_bits()) == id))
         };
@@ -291,7 +291,7 @@ impl Workshop {
         if self.dice.random_bool(self.loss) {
             return Vec::new();
         }
-        let mut frames = vec![frame; if self.dice.random_bool(self.twice) { 2 } else { 1 }];
+        let mut frames = vec![frame; if self.dice.random_bool(self.duplication) { 2 } else { 1 }];
         for frame in &mut frames {
             if self.dice.random_bool(self.damage) {
                 *frame = damaged(*frame, self.dice.random_range(0..64));
@@ -303,7 +303,8 @@ impl Workshop {
     /// Returns the number of cells whose flash holds exactly the expected parameters.
     #[must_use]
     pub fn holding(&self, expected: impl Fn(usize) -> Parameters) -> usize {
-        let holds = |(place, piece): &(usize, &Piece)| piece.flash == FlashState::Valid(expected(*place));
+        let holds =
+            |(place, piece): &(usize, &WorkshopCell)| piece.flash == FlashState::Valid(expected(*place));
         self.pieces.iter().enumerate().filter(holds).count()
     }
 }

@@ -22,7 +22,7 @@ mod interface;
 pub use facts::{BusFacts, Facts, ObservedTraffic, Program, User};
 
 /// The size that the kernel counts for one frame in a receive buffer, in bytes.
-const FRAME: usize = 1_024;
+const FRAME_BYTES: usize = 1_024;
 /// The number of replies from every cell that a receive buffer should hold.
 const BUFFERED_ANSWERS: usize = 4;
 
@@ -139,7 +139,7 @@ impl Facts {
     }
 
     /// Returns the `vcan-setup up` command that makes a bus, named by its skin or by its own name.
-    fn up(&self, target: &InterfaceTarget) -> String {
+    fn up_command(&self, target: &InterfaceTarget) -> String {
         let what = target.skin.as_ref().map_or(&target.name, |skin| &skin.file);
         self.own_command(&format!("up {what}"))
     }
@@ -215,14 +215,14 @@ impl Facts {
         let all = usize::from(CellId::MAX.get());
         let frames = |bus: &BusFacts| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_of(&bus.target);
         let frames = self.buses.iter().map(frames).max().unwrap_or(all);
-        let needed = BUFFERED_ANSWERS * frames * FRAME;
+        let needed = BUFFERED_ANSWERS * frames * FRAME_BYTES;
         let (has, wants) = (granted >> 10, needed >> 10);
         let hint = self.sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
         Some(if granted >= needed {
             Finding::ok(format!(
                 "receive buffers of {has} KiB hold all answers, {frames} frames, {BUFFERED_ANSWERS} times over"
             ))
-        } else if granted >= frames * FRAME {
+        } else if granted >= frames * FRAME_BYTES {
             Finding::note(format!(
                 "receive buffers are limited to {has} KiB; to hold all answers, {frames} frames, {BUFFERED_ANSWERS} times over \
                  takes {wants} KiB, and a gateway that is held up loses some"

@@ -9,7 +9,7 @@ use protocol::bus::has_socketcan;
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum ModuleState {
     /// The module is built in or loaded.
-    There,
+    Available,
     /// The module is on the disk and can be loaded.
     Loadable,
     /// The module is neither built in nor among the modules on the disk.
@@ -71,7 +71,7 @@ impl Kernel {
     pub fn hints(&self, module: ModuleState) -> Vec<String> {
         let modprobe = "sudo modprobe -a can_raw vcan vxcan";
         let here = match module {
-            ModuleState::There => None,
+            ModuleState::Available => None,
             ModuleState::Loadable => Some(modprobe.to_owned()),
             ModuleState::Missing => Some(self.other_kernel(modprobe)),
             ModuleState::Unknown => {
@@ -128,7 +128,7 @@ impl Lists {
     fn module(&self, name: &str, works: bool) -> ModuleState {
         let lists = |list: &Option<String>| list.as_deref().is_some_and(|list| lists_module(list, name));
         if works || lists(&self.built_in) {
-            ModuleState::There
+            ModuleState::Available
         } else if lists(&self.on_disk) {
             ModuleState::Loadable
         } else if self.on_disk.is_some() || !self.takes_modules {
@@ -178,9 +178,9 @@ mod tests {
             on_disk: Some(DEP.into()),
             takes_modules: true,
         };
-        assert_eq!(lists.module("can", false), ModuleState::There);
+        assert_eq!(lists.module("can", false), ModuleState::Available);
         assert_eq!(lists.module("vcan", false), ModuleState::Loadable);
-        assert_eq!(lists.module("vcan", true), ModuleState::There);
+        assert_eq!(lists.module("vcan", true), ModuleState::Available);
         assert_eq!(lists.module("vxcan", false), ModuleState::Missing);
         let none = |takes_modules| Lists { built_in: None, on_disk: None, takes_modules };
         assert_eq!(none(true).module("vcan", false), ModuleState::Unknown);
@@ -217,6 +217,6 @@ mod tests {
         assert!(first("6.12.1", "ID=arch\n", ModuleState::Missing).starts_with(strange));
         assert!(first("5.15.0-microsoft-WSL2", debian, ModuleState::Missing).starts_with(strange));
         assert_eq!(first("6.1.0", debian, ModuleState::Loadable), "sudo modprobe -a can_raw vcan vxcan");
-        assert!(first("6.1.0", debian, ModuleState::There).starts_with("tests/lab/run "));
+        assert!(first("6.1.0", debian, ModuleState::Available).starts_with("tests/lab/run "));
     }
 }

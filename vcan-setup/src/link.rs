@@ -108,7 +108,7 @@ impl HardwareRates {
     /// Returns true if both rates are within half a percent of those of `target`. A rate that `target` does not have
     /// may have any value.
     #[must_use]
-    pub fn meet(self, target: Self) -> bool {
+    pub fn matches(self, target: Self) -> bool {
         // A controller derives bit rates from its clock by whole-number division, so the actual rate may differ a
         // little from the requested one. The nodes of a bus tolerate more than this difference.
         let near = |target: Option<u32>, has: Option<u32>| {
@@ -224,7 +224,7 @@ impl Interface {
 
     /// Describes the interface in an error: `a vcan`, `CAN hardware (kvaser_pci)`, `an ethernet interface`.
     #[must_use]
-    pub fn what(&self) -> String {
+    pub fn description(&self) -> String {
         match &self.kind {
             InterfaceKind::Vcan => "a vcan".to_owned(),
             InterfaceKind::Vxcan(_) => "a vxcan".to_owned(),

@@ -32,7 +32,7 @@ pub fn facts(mut buses: Vec<BusFacts>, choice: KindChoice, no_spawn: bool, prese
     for bus in &mut buses {
         bus.interface = present.iter().find(|interface| interface.name == bus.target.name).cloned();
     }
-    let all_heard = listen_to_all(&buses, choice);
+    let all_heard = observe_all(&buses, choice);
     for (bus, heard) in buses.iter_mut().zip(all_heard) {
         if let Some(heard) = heard {
             bus.traffic = heard;
@@ -60,7 +60,7 @@ fn usable(target: &InterfaceTarget, interface: &Interface) -> bool {
 }
 
 /// Observes all buses that can be opened, at the same time. Returns the result for each bus, in their order.
-fn listen_to_all(
+fn observe_all(
     buses: &[BusFacts],
     choice: KindChoice,
 ) -> Vec<Option<Result<Option<ObservedTraffic>, String>>> {
@@ -75,7 +75,7 @@ fn listen_to_all(
     thread::scope(|scope| {
         let begin = |bus: &'_ BusFacts| {
             let (target, kind) = (bus.target.clone(), kind_of(bus));
-            is_open(&bus).then(|| thread::Builder::new().spawn_scoped(scope, move || listen(&target, kind)))
+            is_open(&bus).then(|| thread::Builder::new().spawn_scoped(scope, move || observe(&target, kind)))
         };
         let begun: Vec<_> = buses.iter().map(begin).collect();
         let end = |thread: io::Result<ScopedJoinHandle<'_, _>>| match thread.map(ScopedJoinHandle::join) {
@@ -89,7 +89,7 @@ fn listen_to_all(
 
 /// Observes a bus and returns the gateway and the cells that send on it. Returns `None` if the embedded bus is not
 /// served.
-fn listen(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTraffic>, String> {
+fn observe(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTraffic>, String> {
     let options = BusOptions { fd: target.format == Format::Fd, ..BusOptions::default() };
     let until = Instant::now() + OBSERVATION_TIME;
     let hear = || {

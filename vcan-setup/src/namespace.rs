@@ -56,7 +56,7 @@ impl Namespace {
     /// Parses an argument. If it contains a `/`, it is a path. A number is the name of a namespace if that exists, and
     /// a process id otherwise.
     #[must_use]
-    pub fn named(word: &OsStr) -> Self {
+    pub fn parse(word: &OsStr) -> Self {
         let Some(word) = word.to_str().filter(|word| !word.contains('/')) else {
             let is_path = word.as_encoded_bytes().contains(&b'/');
             return Self::Path(if is_path {
@@ -96,7 +96,7 @@ impl Namespace {
 
     /// Returns the beginning of a shell command that runs `ip` in the namespace.
     #[must_use]
-    pub fn ip(&self) -> String {
+    pub fn ip_command(&self) -> String {
         match self {
             Self::Name(name) => format!("ip -n {name}"),
             Self::Process(pid) => format!("nsenter -t {pid} -n ip"),
@@ -127,19 +127,19 @@ mod tests {
             ("77", Namespace::Process(77), "/proc/77/ns/net", "nsenter -t 77 -n ip"),
             ("./ns", Namespace::Path("./ns".into()), "./ns", "nsenter --net=./ns ip"),
         ] {
-            assert_eq!(Namespace::named(OsStr::new(word)), namespace);
-            assert_eq!((namespace.path(), namespace.ip()), (PathBuf::from(path), ip.to_owned()));
+            assert_eq!(Namespace::parse(OsStr::new(word)), namespace);
+            assert_eq!((namespace.path(), namespace.ip_command()), (PathBuf::from(path), ip.to_owned()));
             assert_eq!(namespace.to_string(), word);
         }
     }
 
     #[test]
     fn one_that_is_not_there_says_how_to_make_it() {
-        let error = Namespace::named(OsStr::new("nosuchspace")).open().unwrap_err().to_string();
+        let error = Namespace::parse(OsStr::new("nosuchspace")).open().unwrap_err().to_string();
         assert!(error.contains("`sudo ip netns add nosuchspace` makes it"), "{error}");
-        let error = Namespace::named(OsStr::new("4294967295")).open().unwrap_err().to_string();
+        let error = Namespace::parse(OsStr::new("4294967295")).open().unwrap_err().to_string();
         assert!(error.contains("no process 4294967295"), "{error}");
-        let error = Namespace::named(OsStr::new("/nowhere/ns")).open().unwrap_err().to_string();
+        let error = Namespace::parse(OsStr::new("/nowhere/ns")).open().unwrap_err().to_string();
         assert!(error.starts_with("cannot open the network namespace /nowhere/ns: No such file"), "{error}");
     }
 }

@@ -263,9 +263,9 @@ impl Netlink {
 
     /// Checks that the actual bit rates are close enough to the requested ones, because drivers accept deviations of up
     /// to 5 %.
-    fn see_rates(&mut self, index: u32, target: HardwareRates) -> io::Result<()> {
+    fn check_rates(&mut self, index: u32, target: HardwareRates) -> io::Result<()> {
         let nearest = self.query(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
-        match nearest.filter(|nearest| !nearest.meet(target)) {
+        match nearest.filter(|nearest| !nearest.matches(target)) {
             Some(nearest) => Err(io::Error::other(format!("the nearest that its clock gives is {nearest}"))),
             None => Ok(()),
         }
@@ -283,7 +283,7 @@ impl Netlink {
     ///
     /// # Errors
     /// Returns the kernel's error. The part of the step that was already executed is then undone.
-    pub fn carry_out(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
+    pub fn execute(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
         let restore = |index, mtu, up| Undo::Restore { index, mtu, rates: None, up };
         let Step { name, action } = step;
         match *action {
@@ -304,7 +304,7 @@ impl Netlink {
                 let down = if was_up { self.set_up(index, false) } else { Ok(()) };
                 let done = down
                     .and_then(|()| self.set_rates(index, rates))
-                    .and_then(|()| self.see_rates(index, rates))
+                    .and_then(|()| self.check_rates(index, rates))
                     .and_then(|()| self.set_up(index, true));
                 self.or_undo(done, undo).map(Some)
             }

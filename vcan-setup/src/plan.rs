@@ -23,7 +23,7 @@ mod refusal;
 mod step;
 
 pub use refusal::Refusal;
-pub(crate) use step::widen;
+pub(crate) use step::set_fd_mtu_command;
 pub use step::{Step, StepAction};
 
 /// An interface that the user wants, by itself or as a bus of a skin.
@@ -55,7 +55,7 @@ impl InterfaceTarget {
 
     /// Returns a target for each bus of a skin.
     #[must_use]
-    pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
+    pub fn from_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
         let target = |bus: &protocol::skin::SkinBus| Self {
             name: bus.name.clone(),
             format: bus.format,
@@ -82,7 +82,7 @@ impl InterfaceTarget {
     }
 
     /// Returns a refusal if another skin states different bit rates for the same bus.
-    fn at_odds(&self, others: &[Self]) -> Option<Refusal> {
+    fn conflict(&self, others: &[Self]) -> Option<Refusal> {
         let own = self.hardware()?;
         let mut skins = others.iter().filter(|other| other.name == self.name).filter_map(Self::hardware);
         let other = skins.find(|skin| skin.rates != own.rates)?;
@@ -137,7 +137,7 @@ fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
 /// Returns [`Refusal`] if an interface would have to be changed that this program has not made.
 pub fn up(target: &[InterfaceTarget], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
-    if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.at_odds(target.get(..at)?)) {
+    if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.conflict(target.get(..at)?)) {
         return Err(refusal);
     }
     for target in target {
@@ -157,7 +157,7 @@ pub fn up(target: &[InterfaceTarget], present: &[Interface], set_bit_rates: bool
                 plan.hardware(target, skin, interface, hardware, set_bit_rates)?;
             }
             (InterfaceKind::Hardware(_), None) | (InterfaceKind::Other(_), _) => {
-                return Err(Refusal::real(interface));
+                return Err(Refusal::not_virtual(interface));
             }
         }
     }
@@ -193,11 +193,11 @@ pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, R
         return Ok(plan);
     };
     // In the other namespace, nothing is changed except that a missing pair is made.
-    let ip = there.name.ip();
+    let ip = there.name.ip_command();
     let (what, command) = match (other.up, other.mtu >= FD_MTU) {
         (true, true) => return Ok(plan),
         (false, true) => ("down".to_owned(), format!("{ip} link set {peer} up")),
-        (_, false) => (format!("of MTU {}", other.mtu), format!("sh -c '{}'", widen(&ip, peer))),
+        (_, false) => (format!("of MTU {}", other.mtu), format!("sh -c '{}'", set_fd_mtu_command(&ip, peer))),
     };
     let end = format!("{peer} in {}, is {what}", there.name);
     Err(Refusal::OtherEnd { name: name.to_owned(), end, command })
@@ -215,17 +215,17 @@ fn are_a_pair(here: &Interface, other: &Interface, there: Option<&OtherNamespace
 fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&OtherNamespace>) -> Refusal {
     let Interface { name, .. } = in_the_way;
     if !in_the_way.is_virtual() {
-        return Refusal::real(in_the_way);
+        return Refusal::not_virtual(in_the_way);
     }
     let hint = match (in_the_way.ours, there) {
         (true, None) => format!("`sudo vcan-setup down {name}` removes it, or choose another name"),
         (true, Some(there)) => {
-            format!("`sudo {} link del {name}` removes it, or choose another name", there.name.ip())
+            format!("`sudo {} link del {name}` removes it, or choose another name", there.name.ip_command())
         }
         (false, _) => "choose another name".to_owned(),
     };
     let at = there.map(|there| format!(" in {}", there.name)).unwrap_or_default();
-    let what = format!("{}{at}", in_the_way.what());
+    let what = format!("{}{at}", in_the_way.description());
     Refusal::OtherPair { name: name.clone(), what, peer: peer.to_owned(), hint }
 }
 
@@ -236,7 +236,7 @@ impl Plan {
     }
 
     /// Adds a line for an interface that needs no change, unless the plan already has it.
-    fn leave(&mut self, line: String) {
+    fn add_unchanged(&mut self, line: String) {
         if !self.unchanged.contains(&line) {
             self.unchanged.push(line);
         }
@@ -250,7 +250,10 @@ impl Plan {
         let action = match (wide, interface.up, interface.ours) {
             (true, true, ours) => {
                 let whose = if ours { "" } else { ", made by another program" };
-                self.leave(format!("{name} is there already, and fits ({}{whose})", interface.what()));
+                self.add_unchanged(format!(
+                    "{name} is there already, and fits ({}{whose})",
+                    interface.description()
+                ));
                 return Ok(());
             }
             (false, _, false) => return Err(Refusal::Narrow { name, mtu }),
@@ -271,13 +274,13 @@ impl Plan {
         hardware: &Hardware,
         set: bool,
     ) -> Result<(), Refusal> {
-        let (name, file, what) = (interface.name.clone(), skin.file.clone(), interface.what());
+        let (name, file, what) = (interface.name.clone(), skin.file.clone(), interface.description());
         let (before, rates) = (hardware.rates(), skin.rates);
-        let agrees = before.meet(rates);
+        let agrees = before.matches(rates);
         let wide = target.carried_by(interface.mtu);
         if agrees && wide && interface.up {
             let checked = if rates.bitrate.is_some() { ", as the skin says" } else { "" };
-            self.leave(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
+            self.add_unchanged(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
             return Ok(());
         }
         let needs_data = target.format == Format::Fd;
@@ -322,15 +325,17 @@ pub fn down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, R
             continue;
         }
         match (find(present, &name), &target.skin) {
-            (None, _) => plan.leave(format!("{name} is not there")),
+            (None, _) => plan.add_unchanged(format!("{name} is not there")),
             (Some(interface), _) if interface.ours && interface.is_virtual() => {
                 if !removed_with(&plan, interface, present) {
                     plan.steps.push(Step { name, action: StepAction::Remove { index: interface.index } });
                 }
             }
             (Some(interface), Some(_)) => {
-                let what = interface.what();
-                plan.leave(format!("{name} is {what} that vcan-setup has not made, and is left alone"));
+                let what = interface.description();
+                plan.add_unchanged(format!(
+                    "{name} is {what} that vcan-setup has not made, and is left alone"
+                ));
             }
             (Some(interface), None) => {
                 let hint = if interface.is_virtual() {
@@ -338,7 +343,7 @@ pub fn down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, R
                 } else {
                     String::new()
                 };
-                return Err(Refusal::NotOurs { name, what: interface.what(), hint });
+                return Err(Refusal::NotOurs { name, what: interface.description(), hint });
             }
         }
     }

@@ -8,7 +8,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use protocol::input::{self, folder_of};
+use protocol::input::{self, parent_folder};
 use rustix::fs::{CWD, FlockOperation, RenameFlags, flock, renameat_with};
 use rustix::io::Errno;
 
@@ -90,7 +90,7 @@ impl FlashFile {
                 }
             }
             // Make the rename durable, where the file system supports that.
-            let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
+            let _ = File::open(parent_folder(path)).and_then(|folder| folder.sync_all());
             Ok(file)
         };
         // The file may not exist if its creation failed.

@@ -32,13 +32,13 @@ impl Outbox {
     }
 
     /// Removes the first `count` frames, which have been sent.
-    pub(super) fn sent(&mut self, count: usize) {
+    pub(super) fn mark_sent(&mut self, count: usize) {
         self.frames.drain(..count);
         self.ends.drain(..count);
     }
 
     /// Removes all frames, which are lost. Returns, for each packet among them, the index of the cell that counted it.
-    pub(super) fn lose(&mut self) -> impl Iterator<Item = usize> {
+    pub(super) fn drop_all(&mut self) -> impl Iterator<Item = usize> {
         self.frames.clear();
         self.ends.drain(..).flatten()
     }
@@ -60,9 +60,9 @@ mod tests {
         };
         for (sent, lost) in [(0, vec![7, 8]), (1, vec![7, 8]), (2, vec![8]), (3, vec![8]), (4, vec![])] {
             let mut outbox = filled();
-            outbox.sent(sent);
+            outbox.mark_sent(sent);
             assert_eq!(outbox.frames().len(), 4 - sent);
-            assert_eq!(outbox.lose().collect::<Vec<_>>(), lost, "{sent}");
+            assert_eq!(outbox.drop_all().collect::<Vec<_>>(), lost, "{sent}");
             assert!(outbox.frames().is_empty());
         }
     }

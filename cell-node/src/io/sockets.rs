@@ -47,12 +47,12 @@ pub struct Sockets {
     /// Frames from the socket that wakes the process.
     woke: Inbox,
     /// Frames from both sockets, in the order of the kernel's time stamps.
-    arrived: Vec<Arrived>,
+    arrived: Vec<ReceivedFrame>,
 }
 
 /// A received frame.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Arrived {
+pub(super) struct ReceivedFrame {
     pub(super) received: Received,
     /// True if the frame was deferred and is older than all frames that woke the process.
     pub(super) waited: bool,
@@ -93,8 +93,10 @@ impl Sockets {
         before: &ReceiveFilters,
     ) -> Result<(), BusError> {
         // A filter that moves between the sockets is set on both for a moment, so that no frame is lost.
-        let (update, old) =
-            (only_in(&hearing.deferred, &before.deferred), only_in(&before.deferred, &hearing.deferred));
+        let (update, old) = (
+            difference(&hearing.deferred, &before.deferred),
+            difference(&before.deferred, &hearing.deferred),
+        );
         if !update.is_empty() {
             self.deferred.set_filters(&[&before.deferred[..], &update].concat())?;
         }
@@ -173,15 +175,15 @@ impl Sockets {
     /// first waking frame and than `until` are marked as having waited.
     fn order(&mut self, until: u64) {
         let until = self.woke.frames().next().map_or(until, |first| first.at_nanos.min(until));
-        let mut earlier = |than: u64, came: &mut Vec<Arrived>| {
+        let mut earlier = |than: u64, came: &mut Vec<ReceivedFrame>| {
             while let Some(&received) = self.deferred_frames.front().filter(|first| first.at_nanos < than) {
                 self.deferred_frames.pop_front();
-                came.push(Arrived { received, waited: received.at_nanos < until });
+                came.push(ReceivedFrame { received, waited: received.at_nanos < until });
             }
         };
         for received in self.woke.frames() {
             earlier(received.at_nanos, &mut self.arrived);
-            self.arrived.push(Arrived { received, waited: false });
+            self.arrived.push(ReceivedFrame { received, waited: false });
         }
         // If the waking socket has more pending frames, those come first.
         if self.woke.frames().len() < BATCH {
@@ -190,12 +192,12 @@ impl Sockets {
     }
 
     /// Returns the frames of the last receive.
-    pub(super) fn frames(&self) -> &[Arrived] {
+    pub(super) fn frames(&self) -> &[ReceivedFrame] {
         &self.arrived
     }
 }
 
 /// Returns the elements of the first list that are not in the second.
-fn only_in(these: &[Filter], those: &[Filter]) -> Vec<Filter> {
+fn difference(these: &[Filter], those: &[Filter]) -> Vec<Filter> {
     these.iter().filter(|filter| !those.contains(filter)).copied().collect()
 }

@@ -37,7 +37,7 @@ pub use wrench::Wrench;
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
-use crate::sine::FINE;
+use crate::sine::FINE_FRACTION_BITS;
 
 /// A method to compute the Jacobian J of the contact force on a cell.
 pub trait Kernel<S: Scalar = Q1_14>: Sized {
@@ -66,7 +66,7 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
 /// in parameters that [`Parameters::check`] rejects.
 fn chain(parameters: &Parameters) -> &[Row] {
     let chain = parameters.chain();
-    let joints = chain.iter().filter(|row| row.moves()).count();
+    let joints = chain.iter().filter(|row| row.has_joint()).count();
     if joints == usize::from(parameters.joint) && joints <= MAX_JOINTS { chain } else { &[] }
 }
 
@@ -83,7 +83,7 @@ const fn cold_path() {}
 /// Returns sine and cosine of a constant angle.
 fn settled_turn<N: Number>(angle: Q1_14) -> [N; 2] {
     let [sine, cosine, _] = N::fine_turn(angle);
-    [N::settle::<FINE>(sine), N::settle::<FINE>(cosine)]
+    [N::round_constant::<FINE_FRACTION_BITS>(sine), N::round_constant::<FINE_FRACTION_BITS>(cosine)]
 }
 
 /// The rotation of the y and z axes by the twist alpha of a link, by the operations that it needs.

@@ -6,7 +6,7 @@ use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::{Acc, Q1_14};
 
-use crate::sine::{FINE, fine_sine_cosine, sine_cosine};
+use crate::sine::{FINE_FRACTION_BITS, fine_sine_cosine, sine_cosine};
 
 /// The result type of a kernel, and the number type of its computation.
 pub trait Scalar: Copy {
@@ -24,7 +24,7 @@ pub trait Number: Copy + Debug + PartialEq {
     /// A sum of products before rounding.
     type Wide: Copy;
     /// The type for constants, which are computed once when a kernel is created. For integers a constant is a number of
-    /// steps; the size of a step is passed to [`Number::settle`].
+    /// steps; the size of a step is passed to [`Number::round_constant`].
     type Fine: Copy
         + Add<Output = Self::Fine>
         + Sub<Output = Self::Fine>
@@ -105,7 +105,7 @@ pub trait Number: Copy + Debug + PartialEq {
     /// Returns the sine and cosine of an angle in quarter turns, and one, all in the same steps: 2^-28 for integers.
     fn fine_turn(angle: Q1_14) -> [Self::Fine; 3];
     /// Rounds a computed constant to a number. For integers, the constant is in steps of 2^-F.
-    fn settle<const F: u32>(constant: Self::Fine) -> Self;
+    fn round_constant<const F: u32>(constant: Self::Fine) -> Self;
 }
 
 /// A 16-bit number in the format Q1.14, for computations with [`Steps`].
@@ -328,10 +328,10 @@ impl<W: Word> Number for Steps<W> {
 
     fn fine_turn(angle: Q1_14) -> [i64; 3] {
         let [sine, cosine] = fine_sine_cosine(angle);
-        [sine, cosine, 1 << FINE]
+        [sine, cosine, 1 << FINE_FRACTION_BITS]
     }
 
-    fn settle<const F: u32>(constant: i64) -> Self {
+    fn round_constant<const F: u32>(constant: i64) -> Self {
         Self::word(Acc::<F>::from_steps(constant).round())
     }
 }

@@ -41,7 +41,7 @@ pub struct Wrench<S: Scalar = Q1_14> {
     /// Force and moment of the contact in the frame below the row of joint k, before the turn of that joint.
     contact: PerComponent<S::Number>,
     /// The links from joint k's row down to the base. Only the first `rows` are in use.
-    links: [Link<S::Number>; MAX_ROWS],
+    links: [ChainLink<S::Number>; MAX_ROWS],
     rows: usize,
     /// Upper bound of |J| in steps of 2^-14, for any joint positions. If it is below [`MAX_J`], no intermediate number
     /// can leave the range of a word, and saturation is omitted.
@@ -58,14 +58,14 @@ struct PerComponent<T> {
 }
 
 /// For each component of a wrench, true if it is used.
-type Live = PerComponent<bool>;
+type UsedComponents = PerComponent<bool>;
 
-impl Live {
+impl UsedComponents {
     const NOTHING: Self = Self { force: [false; 3], moment: [false; 3] };
     const ALL: Self = Self { force: [true; 3], moment: [true; 3] };
 
     /// Applies a function to the components of the force and to those of the moment.
-    fn each(self, before: impl Fn([bool; 3]) -> [bool; 3]) -> Self {
+    fn map(self, before: impl Fn([bool; 3]) -> [bool; 3]) -> Self {
         Self { force: before(self.force), moment: before(self.moment) }
     }
 }
@@ -74,7 +74,7 @@ impl Live {
 // In this order, the fields that are read first are in reach of a short instruction of a Cortex-M0.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Link<N> {
+struct ChainLink<N> {
     /// The values to compute for this row: bits of [`due`].
     due: u32,
     /// The joint of the row; for a fixed row, the next joint above it.
@@ -98,7 +98,7 @@ mod due {
     pub(super) const MX: u32 = 4;
     pub(super) const MY: u32 = 8;
     /// All results of the turn.
-    pub(super) const TURN: u32 = FX | FY | MX | MY;
+    pub(super) const ALL_ROTATION: u32 = FX | FY | MX | MY;
     /// The shift of moments by d.
     pub(super) const D: u32 = 16;
     /// The shift of moments by a.
@@ -109,15 +109,15 @@ mod due {
     pub(super) const TWISTED_MY: u32 = 256;
     pub(super) const TWISTED_MZ: u32 = 512;
     /// Bits for twists by multiples of quarter turns.
-    pub(super) const AHEAD: u32 = 1 << 11;
-    pub(super) const BACK: u32 = 1 << 12;
-    pub(super) const HALF: u32 = 1 << 13;
+    pub(super) const QUARTER_TURN: u32 = 1 << 11;
+    pub(super) const QUARTER_TURN_BACK: u32 = 1 << 12;
+    pub(super) const HALF_TURN: u32 = 1 << 13;
     /// The row has no joint.
-    pub(super) const PASS: u32 = 1 << 14;
+    pub(super) const NO_JOINT: u32 = 1 << 14;
     /// All results of the turn are read.
     pub(super) const ALL: u32 = 1 << 15;
     /// The row has a twist or no joint.
-    pub(super) const MORE: u32 = 1 << 16;
+    pub(super) const TWIST_OR_NO_JOINT: u32 = 1 << 16;
 }
 
 impl<S: Scalar> Wrench<S> {
@@ -138,7 +138,7 @@ impl<S: Scalar> Wrench<S> {
         Self {
             joint: 0,
             contact: PerComponent { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] },
-            links: const { [Link::NOTHING; MAX_ROWS] },
+            links: const { [ChainLink::NOTHING; MAX_ROWS] },
             rows: 0,
             bound: MAX_J,
             rounding: TorqueRounding::new(TorqueFormat::default(), MAX_J),
@@ -149,12 +149,12 @@ impl<S: Scalar> Wrench<S> {
     /// stack.
     pub(crate) fn prepare(&mut self, parameters: &Parameters) {
         let chain = chain(parameters);
-        let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
+        let mut read = UsedComponents::NOTHING; // by the rows further down: nothing below joint 1
         let mut joints = Joint::ALL.into_iter().peekable();
         for (index, link) in self.links.iter_mut().enumerate() {
             let row = chain.get(index).copied().unwrap_or_default();
-            (*link, read) = Link::new(&row, read);
-            let joint = if row.moves() { joints.next() } else { joints.peek().copied() };
+            (*link, read) = ChainLink::new(&row, read);
+            let joint = if row.has_joint() { joints.next() } else { joints.peek().copied() };
             link.joint = joint.unwrap_or(Joint::J14);
         }
         let nothing = PerComponent { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
@@ -163,13 +163,13 @@ impl<S: Scalar> Wrench<S> {
         let mut rows = chain.len();
         let is_fixed = |row: Option<&Row>| row.is_some_and(|row| row.kind == RowKind::Fixed);
         while is_fixed(rows.checked_sub(1).and_then(|last| chain.get(last))) {
-            let above: Link<S::Number> =
-                Link::new(&chain.get(rows - 1).copied().unwrap_or_default(), Live::ALL).0;
+            let above: ChainLink<S::Number> =
+                ChainLink::new(&chain.get(rows - 1).copied().unwrap_or_default(), UsedComponents::ALL).0;
             rows -= 1;
             above.turn_by_offset(&mut contact);
             if let Some(row) = rows.checked_sub(1).and_then(|last| chain.get(last)) {
                 // Without the position of a prismatic joint.
-                let link = Link::new(row, Live::ALL).0;
+                let link = ChainLink::new(row, UsedComponents::ALL).0;
                 link.twist_and_shift::<Saturating>(&mut contact, length(row.d));
             }
         }
@@ -199,7 +199,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
             let moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
             let positions = joints.get(..self.joint).unwrap_or_default().iter().rev();
             cold_path();
-            down(self.contact, links, moving, positions);
+            down_saturating(self.contact, links, moving, positions);
         }
     }
 }
@@ -209,7 +209,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
 #[inline(always)]
 fn down_bounded<S: Scalar>(
     mut wrench: PerComponent<S::Number>,
-    links: &[Link<S::Number>],
+    links: &[ChainLink<S::Number>],
     joints: &[Q1_14; MAX_JOINTS],
     jacobian: &mut [S; MAX_JOINTS],
 ) {
@@ -224,8 +224,8 @@ fn down_bounded<S: Scalar>(
         let Some(next) = links.next() else { return };
         link.turn::<Bounded>(&mut wrench, *position);
         link = next;
-        if link.is_due(due::MORE) {
-            while link.is_due(due::PASS) {
+        if link.is_due(due::TWIST_OR_NO_JOINT) {
+            while link.is_due(due::NO_JOINT) {
                 cold_path();
                 link.apply_fixed(&mut wrench);
                 let Some(next) = links.next() else { return };
@@ -234,15 +234,15 @@ fn down_bounded<S: Scalar>(
             link.twist_by_alpha::<Bounded>(&mut wrench);
         }
         // Only now, because it would delay the twist.
-        Link::shift::<Bounded>(&mut wrench, link.own_d(), link.own_a());
+        ChainLink::shift::<Bounded>(&mut wrench, link.own_d(), link.own_a());
     }
 }
 
 /// Like [`down_bounded`], with saturation, for any chain.
 #[inline(never)]
-fn down<'a, S: Scalar + 'a>(
+fn down_saturating<'a, S: Scalar + 'a>(
     mut wrench: PerComponent<S::Number>,
-    links: &[Link<S::Number>],
+    links: &[ChainLink<S::Number>],
     mut moving: impl Iterator<Item = &'a mut S>,
     mut positions: impl Iterator<Item = &'a Q1_14>,
 ) {
@@ -259,21 +259,23 @@ fn down<'a, S: Scalar + 'a>(
         } else if let Some(slide) = slide {
             // The own row is folded without the position of its joint.
             let d = Some(S::Number::word(slide));
-            Link::shift::<Saturating>(&mut wrench, d, None);
+            ChainLink::shift::<Saturating>(&mut wrench, d, None);
         }
         let PerComponent { force: [.., force], moment: [.., moment] } = wrench;
         if let Some(row) = &mut row {
             **row = S::from_number(if slide.is_some() { force } else { moment });
         }
         match link.kind {
-            RowKind::Revolute if link.is_due(due::TURN) => link.turn::<Saturating>(&mut wrench, position),
+            RowKind::Revolute if link.is_due(due::ALL_ROTATION) => {
+                link.turn::<Saturating>(&mut wrench, position)
+            }
             RowKind::Revolute => {}
             RowKind::Prismatic | RowKind::Fixed => link.turn_by_offset(&mut wrench),
         }
     }
 }
 
-impl<N: Number> Link<N> {
+impl<N: Number> ChainLink<N> {
     /// The initial value of links that are not in use.
     const NOTHING: Self = {
         let (joint, kind, zero) = (Joint::J1, RowKind::Revolute, Q1_14::ZERO);
@@ -282,7 +284,7 @@ impl<N: Number> Link<N> {
 
     /// Creates the computation for a row, given the components that the rows below read. Also returns the components
     /// that this row reads.
-    fn new(row: &Row, read: Live) -> (Self, Live) {
+    fn new(row: &Row, read: UsedComponents) -> (Self, UsedComponents) {
         let twist = Twist::new(row.alpha);
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
         let turns = row.kind == RowKind::Revolute;
@@ -290,11 +292,11 @@ impl<N: Number> Link<N> {
         let slides = row.kind == RowKind::Prismatic;
 
         // Backwards: the turn, the shift (whose m_z is J), the twist.
-        let shifted = if turns || constant.is_some() { read.each(before_turn) } else { read };
+        let shifted = if turns || constant.is_some() { read.map(before_turn) } else { read };
         let ([fx, fy, mut fz], [mx, my, mut mz]) = (shifted.force, shifted.moment);
         (fz, mz) = (fz || slides, mz || turns);
         let moves = slides || d;
-        let twisted = Live {
+        let twisted = UsedComponents {
             force: [fx || (my && moves), fy || (mx && moves) || (mz && a), fz || (my && a)],
             moment: [mx, my, mz],
         };
@@ -311,17 +313,17 @@ impl<N: Number> Link<N> {
             (twisted_fz, due::TWISTED_FZ),
             (my, due::TWISTED_MY),
             (mz, due::TWISTED_MZ),
-            (twist == Twist::Ahead, due::AHEAD),
-            (twist == Twist::Back, due::BACK),
-            (twist == Twist::Half, due::HALF),
-            (row.kind == RowKind::Fixed, due::PASS),
-            (row.kind == RowKind::Fixed || twist != Twist::None, due::MORE),
+            (twist == Twist::Ahead, due::QUARTER_TURN),
+            (twist == Twist::Back, due::QUARTER_TURN_BACK),
+            (twist == Twist::Half, due::HALF_TURN),
+            (row.kind == RowKind::Fixed, due::NO_JOINT),
+            (row.kind == RowKind::Fixed || twist != Twist::None, due::TWIST_OR_NO_JOINT),
             (turned_fx && turned_fy && turned_mx && turned_my, due::ALL),
         ];
         let due = due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all });
         let (kind, offset) = (row.kind, row.theta_offset);
         let link = Self { kind, joint: Joint::J1, due, twist, a: row.a, d: row.d, offset, constant };
-        (link, twisted.each(|live| before_twist(twist, live)))
+        (link, twisted.map(|live| before_twist(twist, live)))
     }
 
     fn is_due(&self, bit: u32) -> bool {
@@ -351,13 +353,13 @@ impl<N: Number> Link<N> {
     #[inline(always)]
     fn twist_by_alpha<R: Rounding>(&self, wrench: &mut PerComponent<N>) {
         let PerComponent { force: [_, fy, fz], moment: [_, my, mz] } = wrench;
-        if self.is_due(due::AHEAD) {
+        if self.is_due(due::QUARTER_TURN) {
             (*fy, *fz) = (R::negative(*fz), *fy);
             (*my, *mz) = (R::negative(*mz), *my);
-        } else if self.is_due(due::BACK) {
+        } else if self.is_due(due::QUARTER_TURN_BACK) {
             (*fy, *fz) = (*fz, R::negative(*fy));
             (*my, *mz) = (*mz, R::negative(*my));
-        } else if self.is_due(due::HALF) {
+        } else if self.is_due(due::HALF_TURN) {
             (*fy, *fz) = (R::negative(*fy), R::negative(*fz));
             (*my, *mz) = (R::negative(*my), R::negative(*mz));
         } else if let Twist::Other { sine, cosine } = self.twist {
@@ -416,18 +418,18 @@ impl<N: Number> Link<N> {
     fn turn<R: Rounding>(&self, wrench: &mut PerComponent<N>, position: Q1_14) {
         let turn = Rotation(N::sine_cosine(N::plus_angle(position, self.offset)));
         if self.is_due(due::ALL) {
-            turn.all::<R>(wrench);
+            turn.apply_all::<R>(wrench);
         } else {
-            turn.some::<R>(wrench, self.due);
+            turn.apply_due::<R>(wrench, self.due);
         }
     }
 
     /// Transforms the wrench by `Rz(theta_offset)` of a row without a revolute joint.
     fn turn_by_offset(&self, wrench: &mut PerComponent<N>) {
         if let Some(turn) = self.constant
-            && self.is_due(due::TURN)
+            && self.is_due(due::ALL_ROTATION)
         {
-            Rotation(turn).some::<Saturating>(wrench, self.due);
+            Rotation(turn).apply_due::<Saturating>(wrench, self.due);
         }
     }
 
@@ -456,7 +458,7 @@ impl<N: Number> Rotation<N> {
     }
 
     #[inline(always)]
-    fn all<R: Rounding>(
+    fn apply_all<R: Rounding>(
         &self,
         PerComponent { force: [fx, fy, _], moment: [mx, my, _] }: &mut PerComponent<N>,
     ) {
@@ -466,7 +468,7 @@ impl<N: Number> Rotation<N> {
 
     /// Computes only the results of the turn whose bits are set in `due`.
     #[inline(always)]
-    fn some<R: Rounding>(&self, wrench: &mut PerComponent<N>, due: u32) {
+    fn apply_due<R: Rounding>(&self, wrench: &mut PerComponent<N>, due: u32) {
         let PerComponent { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
         let PerComponent { force: [new_fx, new_fy, _], moment: [new_mx, new_my, _] } = wrench;
         if due & due::FX != 0 {

@@ -122,13 +122,13 @@ impl Network {
     }
 
     /// Sets the ports that have wires. The serial number spreads the hellos of many cells over time.
-    pub(crate) fn wire(&mut self, wired: u8, number: Option<CellId>, serial: u32) {
+    pub(crate) fn set_wired_ports(&mut self, wired: u8, number: Option<CellId>, serial: u32) {
         (self.wired, self.node_ids.own) = (wired, number);
         self.next_hello = self.next_hello + phase::by_serial(HELLO_INTERVAL, serial);
     }
 
     /// Returns true if the cell has wires.
-    pub(crate) const fn exists(&self) -> bool {
+    pub(crate) const fn has_wires(&self) -> bool {
         self.wired != 0
     }
 
@@ -138,7 +138,7 @@ impl Network {
     }
 
     /// Returns the port that leads to the parent; `None` without a parent.
-    pub(crate) fn up(&self) -> Option<usize> {
+    pub(crate) fn parent_port(&self) -> Option<usize> {
         self.parent.map(|parent| parent.port)
     }
 
@@ -149,7 +149,7 @@ impl Network {
 
     /// Returns the rank that this cell announces to cells below it.
     fn rank(&self) -> Option<Rank> {
-        self.parent.map(|parent| parent.rank.below())
+        self.parent.map(|parent| parent.rank.child())
     }
 
     /// Returns the round of the cell's rank.
@@ -159,15 +159,15 @@ impl Network {
 
     /// Returns the parent's node id, 0 for the gateway's side; `None` without a parent.
     pub(crate) fn parent_node(&self) -> Option<u8> {
-        match self.up()? {
+        match self.parent_port()? {
             UPLINK => Some(0),
-            port => self.number_at(port).map(CellId::get),
+            port => self.node_id_at(port).map(CellId::get),
         }
     }
 
     /// Returns the node id of the cell at a port; `None` if it is unknown.
-    pub(crate) fn number_at(&self, port: usize) -> Option<CellId> {
-        self.ports.get(port)?.number()
+    pub(crate) fn node_id_at(&self, port: usize) -> Option<CellId> {
+        self.ports.get(port)?.node_id()
     }
 
     /// Returns true if the cell at a port is a child.
@@ -177,7 +177,7 @@ impl Network {
 
     /// Returns the port of the child with this node id.
     pub(crate) fn child_with(&self, number: CellId) -> Option<usize> {
-        (0..PORTS).find(|&port| self.is_child(port) && self.number_at(port) == Some(number))
+        (0..PORTS).find(|&port| self.is_child(port) && self.node_id_at(port) == Some(number))
     }
 
     /// Returns true if no former parent can accept sums of this cell any more: there is none, or it has acknowledged
@@ -196,15 +196,15 @@ impl Network {
 
     /// Returns a mask of the children: bit p is set if the cell at port p is a child.
     pub(crate) fn children(&self) -> u8 {
-        self.bits(Port::is_child)
+        self.port_mask(Port::is_child)
     }
 
     /// Returns a mask of the working ports: bit p is set if port p works in both directions.
     pub(crate) fn working(&self, now: Micros) -> u8 {
-        self.bits(|port| port.works(now))
+        self.port_mask(|port| port.works(now))
     }
 
-    fn bits(&self, target: impl Fn(&Port) -> bool) -> u8 {
+    fn port_mask(&self, target: impl Fn(&Port) -> bool) -> u8 {
         let bit = |(place, port): (usize, &Port)| u8::from(target(port)) << place;
         self.ports.iter().take(PORTS).enumerate().map(bit).sum()
     }
@@ -232,12 +232,12 @@ impl Network {
 
     /// Returns the time at which [`Network::handle_time`] must be called next.
     pub(crate) fn poll_timeout(&self) -> Micros {
-        if !self.exists() {
+        if !self.has_wires() {
             return Micros(u64::MAX);
         }
         let join = self.joining.map(|(_, requested)| requested + JOIN_TIMEOUT);
         let repair = self.repair.map(|(at, _)| at).filter(|_| self.joining.is_none());
-        let silent = self.parent.and_then(|parent| self.ports.get(parent.port)?.silent_at());
+        let silent = self.parent.and_then(|parent| self.ports.get(parent.port)?.disconnect_time());
         let leave = self.unacknowledged_former_parent().map(|former_parent| former_parent.resend_at);
         [join, repair, silent, leave].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
@@ -251,14 +251,14 @@ impl Network {
         }
     }
 
-    fn hello(&mut self, now: Micros, port: usize) {
+    fn send_hello(&mut self, now: Micros, port: usize) {
         let hears = self.ports.get(port).is_some_and(|port| port.hello(now).is_some());
         let hello = Hello {
             version: VERSION,
             number: self.node_ids.own.map_or(0, CellId::get),
             port: port.to_le_bytes()[0],
             receives: hears,
-            is_parent: self.up() == Some(port),
+            is_parent: self.parent_port() == Some(port),
             unnumbered: self.is_unnumbered(),
             rank: self.rank(),
         };
@@ -268,10 +268,10 @@ impl Network {
         self.send(port, PortMessage::Hello(hello));
     }
 
-    fn hello_to_all(&mut self, now: Micros) {
+    fn send_hellos(&mut self, now: Micros) {
         self.announced = self.rank();
         for port in 0..ALL_PORTS {
-            self.hello(now, port);
+            self.send_hello(now, port);
         }
     }
 
@@ -281,9 +281,11 @@ impl Network {
             PortMessage::Hello(hello) => self.handle_hello(now, port, hello),
             PortMessage::Join => self.handle_join(now, port),
             PortMessage::Grant(rank) => self.handle_grant(now, port, rank),
-            PortMessage::Refuse if self.up() == Some(port) => self.lose_parent(now, LossReason::Done),
+            PortMessage::Refuse if self.parent_port() == Some(port) => {
+                self.lose_parent(now, LossReason::Done)
+            }
             PortMessage::Refuse if self.joining.is_some_and(|(requested, _)| requested == port) => {
-                self.distrust(now, port);
+                self.reject_port(now, port);
                 self.joining = None;
                 self.search(now);
             }
@@ -296,8 +298,8 @@ impl Network {
                 .iter_mut()
                 .for_each(|former_parent| former_parent.acknowledged |= former_parent.port == port),
             PortMessage::Repair(round) => self.forward_repair(now, port, round),
-            PortMessage::Probe => self.hello(now, port),
-            PortMessage::NodeId(walk) if self.up() == Some(port) => self.begin_walk(now, walk),
+            PortMessage::Probe => self.send_hello(now, port),
+            PortMessage::NodeId(walk) if self.parent_port() == Some(port) => self.begin_walk(now, walk),
             PortMessage::Return(walk) => self.continue_walk(port, walk),
             PortMessage::Refuse | PortMessage::NodeId(_) | PortMessage::State(_) | PortMessage::Nack(_) => {}
         }
@@ -306,16 +308,16 @@ impl Network {
 
     fn handle_hello(&mut self, now: Micros, port: usize, hello: Hello) {
         let Some(there) = self.ports.get_mut(port) else { return };
-        let number = there.number();
+        let number = there.node_id();
         let restarted = there.record_hello(now, hello);
         let is_child = there.is_child();
         self.tree_changed |=
-            there.number() != number && (is_child || self.parent.is_some_and(|it| it.port == port));
+            there.node_id() != number && (is_child || self.parent.is_some_and(|it| it.port == port));
         if hello.version != VERSION {
             return;
         }
         if restarted || !hello.receives {
-            self.hello(now, port);
+            self.send_hello(now, port);
         }
         if hello.is_parent && !is_child {
             self.send(port, PortMessage::Refuse);
@@ -337,28 +339,29 @@ impl Network {
     }
 
     /// Sends now the hellos that would be due by the time `until`, so that the cell need not wake up for them.
-    pub(crate) fn hello_by(&mut self, now: Micros, until: Micros) {
-        if self.exists() && until >= self.next_hello {
+    pub(crate) fn send_hellos_due_by(&mut self, now: Micros, until: Micros) {
+        if self.has_wires() && until >= self.next_hello {
             self.next_hello = phase::next(self.next_hello, HELLO_INTERVAL, now);
             let before = self.children();
             self.ports.iter_mut().for_each(|port| port.expire(now));
             self.tree_changed |= before != self.children();
-            self.hello_to_all(now);
+            self.send_hellos(now);
         }
     }
 
     /// Returns the former parent if it has not acknowledged the leave.
     fn unacknowledged_former_parent(&self) -> Option<FormerParent> {
-        self.former_parent
-            .filter(|former_parent| !former_parent.acknowledged && self.up() != Some(former_parent.port))
+        self.former_parent.filter(|former_parent| {
+            !former_parent.acknowledged && self.parent_port() != Some(former_parent.port)
+        })
     }
 
     /// Handles timers that are due at `now`. Does nothing if called early.
     pub(crate) fn handle_time(&mut self, now: Micros) {
-        if !self.exists() {
+        if !self.has_wires() {
             return;
         }
-        self.hello_by(now, now);
+        self.send_hellos_due_by(now, now);
         if let Some(former_parent) =
             self.unacknowledged_former_parent().filter(|former_parent| now >= former_parent.resend_at)
         {
@@ -370,7 +373,7 @@ impl Network {
         }
         let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());
         if self.parent.as_ref().is_some_and(silent) {
-            if self.up() == Some(UPLINK) {
+            if self.parent_port() == Some(UPLINK) {
                 // The gateway's side may notice it later, and accepts sums until then.
                 self.joining = Some((UPLINK, now + HELLO_INTERVAL));
             }
@@ -386,7 +389,7 @@ impl Network {
 
     /// Announces to the parent that it is to receive the sums from this epoch on.
     pub(crate) fn state(&mut self, epoch: Epoch) {
-        if let Some(up) = self.up().filter(|up| *up != UPLINK) {
+        if let Some(up) = self.parent_port().filter(|up| *up != UPLINK) {
             self.send(up, PortMessage::State(epoch));
         }
     }

@@ -38,7 +38,7 @@ impl Network {
             self.node_ids.own = Some(number);
             self.node_ids.given = Some(number);
             walk.first += 1;
-            self.hello_to_all(now);
+            self.send_hellos(now);
         }
         self.walk_from(0, walk);
     }
@@ -53,7 +53,7 @@ impl Network {
         let wants = |port: &usize| self.ports.get(*port).is_some_and(Port::is_unnumbered);
         let next = (first..PORTS).find(wants).filter(|_| walk.first <= walk.last);
         self.node_ids.walking = next.map(|at| (walk, at));
-        match (next, self.up()) {
+        match (next, self.parent_port()) {
             (Some(port), _) => self.send(port, PortMessage::NodeId(walk)),
             (None, Some(up)) => self.send(up, PortMessage::Return(walk)),
             (None, None) => {}
@@ -63,9 +63,9 @@ impl Network {
     pub(super) fn report_unnumbered(&mut self, now: Micros) {
         let unnumbered = self.is_unnumbered();
         if core::mem::replace(&mut self.node_ids.was_unnumbered, unnumbered) != unnumbered
-            && let Some(up) = self.up()
+            && let Some(up) = self.parent_port()
         {
-            self.hello(now, up);
+            self.send_hello(now, up);
         }
     }
 }

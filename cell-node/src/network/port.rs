@@ -58,7 +58,7 @@ impl Port {
     }
 
     /// Returns the node id of the cell at the other end; `None` if it is unknown.
-    pub(super) fn number(&self) -> Option<CellId> {
+    pub(super) fn node_id(&self) -> Option<CellId> {
         CellId::new(self.last_hello?.0.number.into()).ok()
     }
 
@@ -87,7 +87,7 @@ impl Port {
     }
 
     /// Returns the time at which the port will count as disconnected if no further hello arrives.
-    pub(super) fn silent_at(&self) -> Option<Micros> {
+    pub(super) fn disconnect_time(&self) -> Option<Micros> {
         self.last_hello.map(|(_, at)| at + HELLO_TIMEOUT + Span(1))
     }
 

@@ -29,33 +29,33 @@ impl Network {
         if before == self.parent {
             return;
         }
-        let own = rank.below();
+        let own = rank.child();
         self.best = Some(own);
         self.parent_unreachable = false;
         let offered = self.announced.replace(own);
         let is_as_deep = offered.is_some_and(|offered| offered.depth == own.depth);
         self.tree_changed |= !is_as_deep || before.is_none_or(|before| before.port != port);
         if !is_as_deep && !self.busy {
-            return self.hello_to_all(now);
+            return self.send_hellos(now);
         }
         for port in (0..ALL_PORTS).filter(|_| offered != Some(own)) {
             if self.ports.get(port).is_some_and(|port| port.needs_round(now)) {
-                self.hello(now, port);
+                self.send_hello(now, port);
             }
         }
     }
 
     /// Handles a join, in which the cell at a port requests to become a child.
     pub(super) fn handle_join(&mut self, now: Micros, port: usize) {
-        let Some(rank) = self.rank().filter(|_| self.up() != Some(port)) else {
+        let Some(rank) = self.rank().filter(|_| self.parent_port() != Some(port)) else {
             return self.send(port, PortMessage::Refuse);
         };
-        let number = self.number_at(port);
+        let number = self.node_id_at(port);
         // Two wires may lead to the same cell, whose sums use one of them.
         for (other, there) in self.ports.iter_mut().enumerate() {
             if other == port {
                 there.child = Some(now);
-            } else if number.is_some() && there.number() == number {
+            } else if number.is_some() && there.node_id() == number {
                 there.child = None;
             }
         }
@@ -69,7 +69,7 @@ impl Network {
 
     /// Handles a grant, with which the cell at a port becomes the parent.
     pub(super) fn handle_grant(&mut self, now: Micros, port: usize, rank: Rank) {
-        if self.up() == Some(port) {
+        if self.parent_port() == Some(port) {
             return;
         }
         let moves = self.parent.is_none_or(|parent| self.may_move() && rank.is_better_than(parent.rank));
@@ -86,7 +86,7 @@ impl Network {
         self.follow(now, port, rank);
         if port == UPLINK {
             // The gateway's side accepts sums from then on.
-            self.hello(now, port);
+            self.send_hello(now, port);
         }
     }
 
@@ -97,11 +97,11 @@ impl Network {
         self.parent_unreachable = false;
         self.former_parent = Some(FormerParent::new(parent.port, how == LossReason::Done, now));
         self.send(parent.port, PortMessage::Leave);
-        self.distrust(now, parent.port);
+        self.reject_port(now, parent.port);
         self.search(now);
     }
 
-    pub(super) fn distrust(&mut self, now: Micros, port: usize) {
+    pub(super) fn reject_port(&mut self, now: Micros, port: usize) {
         self.ports.get_mut(port).into_iter().for_each(|port| port.distrusted = Some(now));
     }
 
@@ -116,7 +116,7 @@ impl Network {
                 return;
             }
             self.joining = None;
-            self.distrust(now, requested);
+            self.reject_port(now, requested);
         }
         let ranked = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.rank(now)?)));
         let good = ranked().filter(|(_, rank)| self.is_good(*rank));
@@ -156,7 +156,7 @@ impl Network {
     pub(super) fn forward_repair(&mut self, now: Micros, port: usize, round: u8) {
         let Some(parent) = self.parent else { return };
         if parent.rank.round.wrapping_sub(round).cast_signed() > 0 {
-            return self.hello(now, port);
+            return self.send_hello(now, port);
         }
         self.ports.get_mut(port).into_iter().for_each(|port| port.round_requested = true);
         let is_deserted = parent.port == port;

@@ -6,7 +6,7 @@ const MS: u64 = 1_000;
 /// Returns the network part of a cell with a node id and wires at the ports in this mask.
 fn network(wired: u8) -> Network {
     let mut network = Network::new(Micros(0));
-    network.wire(wired, CellId::new(12).ok(), 0);
+    network.set_wired_ports(wired, CellId::new(12).ok(), 0);
     network
 }
 
@@ -35,7 +35,7 @@ fn below(at: u64, parent: Rank) -> Network {
     network.handle(Micros(at * MS), 0, PortMessage::Hello(neighbour(1, Some(parent))));
     assert_eq!(asked(&mut network), [(0, PortMessage::Join)]);
     network.handle(Micros(at * MS), 0, PortMessage::Grant(parent));
-    assert_eq!((asked(&mut network), network.up()), (vec![], Some(0)));
+    assert_eq!((asked(&mut network), network.parent_port()), (vec![], Some(0)));
     network
 }
 
@@ -75,11 +75,11 @@ fn only_the_parent_refuses_a_child_and_begins_a_walk() {
     let walk = Walk { walk: 1, first: 20, last: 30 };
     network.handle(now, 1, PortMessage::Refuse);
     network.handle(now, 1, PortMessage::NodeId(walk));
-    assert_eq!((said(&mut network), network.up()), (vec![], Some(0)));
+    assert_eq!((said(&mut network), network.parent_port()), (vec![], Some(0)));
     network.handle(now, 0, PortMessage::NodeId(walk));
     assert_eq!(said(&mut network), [(0, PortMessage::Return(walk))]);
     network.handle(now, 0, PortMessage::Refuse);
-    assert_eq!((asked(&mut network).first(), network.up()), (Some(&(0, PortMessage::Leave)), None));
+    assert_eq!((asked(&mut network).first(), network.parent_port()), (Some(&(0, PortMessage::Leave)), None));
 }
 
 // JOIN-1, LOSS-1
@@ -133,7 +133,7 @@ fn a_grant_is_taken_while_it_is_good_enough_and_no_sums_are_sent() {
         let mut network = below(100, rank(1, 3));
         network.busy = busy;
         network.handle(now, 1, PortMessage::Grant(granted));
-        (asked(&mut network), network.up())
+        (asked(&mut network), network.parent_port())
     };
     assert_eq!(after(false, rank(1, 2)), (vec![(0, PortMessage::Leave)], Some(1)), "nearer");
     assert_eq!(after(true, rank(1, 2)), (vec![(1, PortMessage::Leave)], Some(0)), "sums are sent");
@@ -144,7 +144,7 @@ fn a_grant_is_taken_while_it_is_good_enough_and_no_sums_are_sent() {
         network.handle(now, 0, PortMessage::Refuse);
         said(&mut network);
         network.handle(now, 1, PortMessage::Grant(granted));
-        assert_eq!(network.up(), up);
+        assert_eq!(network.parent_port(), up);
     }
 }
 

@@ -128,15 +128,15 @@ impl Node {
     /// the gateway's side.
     #[must_use]
     pub fn with_ports(mut self, wired: u8) -> Self {
-        self.wire(wired);
+        self.set_wired_ports(wired);
         self
     }
 
     /// Like [`Node::with_ports`], without moving the node, which takes more than half of a small microcontroller's
     /// memory. It must be called before any other method.
-    pub fn wire(&mut self, wired: u8) {
+    pub fn set_wired_ports(&mut self, wired: u8) {
         let Identity { cell, serial } = self.identity;
-        self.summing.network.wire(wired, cell, serial);
+        self.summing.network.set_wired_ports(wired, cell, serial);
     }
 
     /// Returns the next message for a port, and the port. Such messages must be sent before the packets that
@@ -210,9 +210,9 @@ impl Node {
     /// holds for joints, while the cell must wait for its children's sums after them anyway, or while it is not
     /// touched.
     #[must_use]
-    pub fn defers(&self, id: Id) -> bool {
+    pub fn may_defer(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {
-            return self.summing.waits_for_children || self.rest.rests();
+            return self.summing.waits_for_children || self.rest.is_deferring();
         }
         self.summing.received_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
@@ -233,7 +233,7 @@ impl Node {
         self.summing.handle_time(now);
         self.after_network(now);
         self.handle_sums(now);
-        self.sense_in_time(now);
+        self.send_due_pages(now);
         self.send_due_heartbeat(now);
     }
 
@@ -263,10 +263,10 @@ impl Node {
                 self.handle_joints(now, age, epoch, &joints);
                 // Stimuli latched at joints that were too old are sent with the next ones.
                 if self.received.joints != taken {
-                    self.sense(now);
+                    self.send_changed_pages(now);
                     self.report_zero();
                 }
-                self.sense_before_the_next_joints(now);
+                self.send_pages_before_next_joints(now);
                 self.send_before_next_joints(now);
             }
             Message::Halt => {
@@ -288,7 +288,7 @@ impl Node {
                 self.push_network(NetworkPage::Rejected(self.receiver.refused));
                 self.push_sensors(Pages::ALL);
                 self.push_zero();
-                if self.summing.network.exists() {
+                if self.summing.network.has_wires() {
                     self.push_tree(now);
                     self.push_ports(now);
                 }
@@ -296,7 +296,7 @@ impl Node {
             Message::Configure { tag, request, .. } => {
                 self.configure(now, tag, request);
                 // A new mode starts from the present state, and a cell that leaves test mode has no contact.
-                self.sense(now);
+                self.send_changed_pages(now);
                 self.report_zero();
             }
             Message::Sum { torque, .. } if self.length().is_some_and(|length| torque.length() != length) => {
@@ -351,7 +351,7 @@ impl Node {
         } else {
             None
         };
-        if self.summing.sum.is_on() {
+        if self.summing.sum.is_enabled() {
             self.active = torque.is_some();
             self.summing.begin(now, age, (epoch, in_use.period()), torque);
             return self.handle_sums(now);
@@ -370,9 +370,9 @@ impl Node {
             None if core::mem::take(&mut self.active) => Default::default(),
             // A pending stimulus, or a zero that follows the sensor, may change the contact state at any
             // joints.
-            None if self.stimuli.are_pending() || self.baseline.is_on() => return,
+            None if self.stimuli.has_pending() || self.baseline.is_on() => return,
             // A cell of a network stays awake for its neighbours.
-            None if self.summing.network.exists() => return,
+            None if self.summing.network.has_wires() => return,
             None => return self.rest.count_quiet(),
         };
         let torque = packet::Words::new(in_use.length(), torque);
@@ -386,7 +386,7 @@ impl Node {
     fn send_before_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
         let next_joints = now + in_use.period();
-        self.summing.network.hello_by(now, next_joints);
+        self.summing.network.send_hellos_due_by(now, next_joints);
         self.report_tree(now);
         if self.claim.is_settled() && next_joints > self.claim.next_heartbeat {
             self.regular_heartbeat(now);

@@ -41,7 +41,7 @@ impl Node {
             Request::Write { number, .. } => (true, number),
         };
         let words = match (Parameter::from_number(number), request) {
-            (None, _) => Err(Answer::UNKNOWN),
+            (None, _) => Err(Answer::UNKNOWN_PARAMETER),
             (Some(parameter), Request::Read { .. }) => Ok(self.read(parameter)),
             (Some(Parameter::Commit), Request::Write { words, .. }) => {
                 match self.configuration.staged_with(words) {
@@ -107,7 +107,7 @@ impl Node {
     /// Sets a volatile parameter at once, or stages a stored one. Returns the new words, or the reason of a refusal. A
     /// cell without ports refuses sums and `links_down`; links can be interrupted only in test mode.
     fn write(&mut self, now: Micros, parameter: Parameter, words: [i16; WORDS]) -> Result<[i16; WORDS], i16> {
-        let (switches, has_ports) = (&mut self.switches, self.summing.network.exists());
+        let (switches, has_ports) = (&mut self.switches, self.summing.network.has_wires());
         let set = match parameter {
             Parameter::Reply => Reply::from_words(words)
                 .filter(|reply| has_ports || *reply == Reply::Torque)

@@ -25,7 +25,7 @@ impl Rest {
     }
 
     /// Returns true if joints need not wake the cell (deferred receive).
-    pub(super) const fn rests(&self) -> bool {
+    pub(super) const fn is_deferring(&self) -> bool {
         self.rests
     }
 

@@ -73,7 +73,7 @@ impl Sensing {
             return Pages::NONE;
         }
         let Readings { skin, acceleration, .. } = sensed;
-        let turned = self.follow(skin, events);
+        let turned = self.track(skin, events);
         let pages = Pages {
             skin: *skin != self.sent.skin && (turned || has_moved(skin, &self.sent.skin, events)),
             acceleration: is_far(acceleration, &self.sent.acceleration, events.acceleration),
@@ -93,14 +93,14 @@ impl Sensing {
                 self.due = Some(now + period + phase::by_number(period, cell));
             }
             Mode::Event => {
-                self.follow(&sensed.skin, &switches.events);
+                self.track(&sensed.skin, &switches.events);
             }
         }
         self.mark_sent(now, Pages::ALL)
     }
 
     /// Updates the touch states of contact and proximity. Returns true if one of them was touched or released.
-    fn follow(&mut self, skin: &SkinSensors, events: &Events) -> bool {
+    fn track(&mut self, skin: &SkinSensors, events: &Events) -> bool {
         let contact = self.contact.next(contact_force(skin), events.contact.to_bits(), events.hysteresis);
         let proximity = i32::from(skin.proximity.to_bits());
         let proximity = self.proximity.next(proximity, events.proximity.to_bits(), events.hysteresis);
@@ -156,7 +156,7 @@ fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
 
 impl Node {
     /// Sends the pages that changed sensor values or a changed mode require.
-    pub(super) fn sense(&mut self, now: Micros) {
+    pub(super) fn send_changed_pages(&mut self, now: Micros) {
         // Pages are sent only once the cell owns its node id. The comparison with the last sent values
         // ensures that no change is lost.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
@@ -170,7 +170,7 @@ impl Node {
     }
 
     /// Sends the page of continuous mode if it is due.
-    pub(super) fn sense_in_time(&mut self, now: Micros) {
+    pub(super) fn send_due_pages(&mut self, now: Micros) {
         if self.sensing_due().is_some() {
             let pages = self.sensing.due_pages(now, now + Span(1));
             self.push_sensors(pages);
@@ -179,7 +179,7 @@ impl Node {
 
     /// Sends a page now if it is due before the next joints, so that the cell need not wake up again. Does nothing if
     /// the period is not longer than that of joints: otherwise all cells would send at the same time in each epoch.
-    pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
+    pub(super) fn send_pages_before_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
         let joints = in_use.period();
         if let Mode::Continuous { period_ms } = self.switches.sensing

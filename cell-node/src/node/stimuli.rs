@@ -54,7 +54,7 @@ impl Stimuli {
     }
 
     /// Returns true if stimuli wait for their epoch.
-    pub(super) fn are_pending(&self) -> bool {
+    pub(super) fn has_pending(&self) -> bool {
         !self.pending.is_empty()
     }
 

@@ -89,7 +89,7 @@ impl Summing {
 
     /// Returns the parent if its sums are received.
     pub(super) fn received_parent(&self) -> Option<CellId> {
-        self.received.get(self.network.up()?).copied().flatten()
+        self.received.get(self.network.parent_port()?).copied().flatten()
     }
 
     /// Returns true if the identifiers that the cell receives, or those that must wake it, have changed since the last
@@ -115,7 +115,7 @@ impl Summing {
 
     /// Handles a message from a port whose messages are not ignored.
     fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
-        let is_parent = self.network.up() == Some(port);
+        let is_parent = self.network.parent_port() == Some(port);
         self.sum.note_delay(age);
         self.network.busy = self.sum.is_busy();
         if let PortMessage::State(epoch) = message {
@@ -145,7 +145,7 @@ impl Summing {
     /// Applies changes of parent and children to the sums.
     fn follow_network(&mut self) {
         for port in (0..PORTS).filter(|&port| !self.network.is_child(port)) {
-            self.sum.disown(port);
+            self.sum.remove_child(port);
         }
         if core::mem::replace(&mut self.changes, self.network.changes) != self.network.changes {
             self.unanswered = None;
@@ -153,14 +153,14 @@ impl Summing {
             // The previous parent may have accepted what was sent in this epoch.
             self.sum.stop_sending();
         }
-        if self.network.up().is_none() {
+        if self.network.parent_port().is_none() {
             self.sum.stop_sending();
         }
         self.report.due |= core::mem::take(&mut self.network.tree_changed);
         // The sums of the parent and of the children.
         let heard = core::array::from_fn(|port| {
-            let is_ours = self.network.is_child(port) || self.network.up() == Some(port);
-            self.network.number_at(port).filter(|_| is_ours && self.sum.is_on())
+            let is_ours = self.network.is_child(port) || self.network.parent_port() == Some(port);
+            self.network.node_id_at(port).filter(|_| is_ours && self.sum.is_enabled())
         });
         self.received_changed |= core::mem::replace(&mut self.received, heard) != heard;
     }
@@ -174,7 +174,7 @@ impl Summing {
         (epoch, period): (Epoch, Span),
         own: Option<Torque<'_>>,
     ) {
-        let (at, up) = (now - age, self.network.up());
+        let (at, up) = (now - age, self.network.parent_port());
         self.sent_before = self.sum.was_sent_in(epoch.previous());
         // A former parent accepts no sum from a cell that sent none for an epoch.
         if !self.sent_before {
@@ -183,7 +183,7 @@ impl Summing {
         self.parent = match up {
             None => EpochParent::None,
             Some(UPLINK) => EpochParent::Gateway,
-            Some(port) => EpochParent::Cell { port, number: self.network.number_at(port), heard: false },
+            Some(port) => EpochParent::Cell { port, number: self.network.node_id_at(port), heard: false },
         };
         let begin = EpochStart {
             epoch,
@@ -201,7 +201,7 @@ impl Summing {
         if let Some(unanswered) = self.unanswered {
             // Without an answer the parent is lost in this epoch, and a sum not sent yet may go to another
             // parent.
-            if unanswered >= self.tolerated() {
+            if unanswered >= self.tolerance() {
                 self.sum.held = true;
             }
             self.probe_parent();
@@ -241,7 +241,7 @@ impl Summing {
             self.network.send(port, PortMessage::Nack(epoch));
         }
         let said = self.sum.was_sent_in(epoch);
-        let tolerated = self.tolerated();
+        let tolerated = self.tolerance();
         let mut lost = None;
         match (&mut self.unanswered, self.parent) {
             (Some(unanswered), _) => {
@@ -262,7 +262,7 @@ impl Summing {
         if let Some(how) = lost {
             // The parent did not answer.
             self.unanswered = None;
-            self.suspected = self.network.up();
+            self.suspected = self.network.parent_port();
             self.sum.stop_sending();
             self.network.lose_parent(now, how);
             self.follow_network();
@@ -285,13 +285,13 @@ impl Summing {
     }
 
     /// Returns the tolerated number of consecutive epochs without an answer of the parent.
-    const fn tolerated(&self) -> u16 {
+    const fn tolerance(&self) -> u16 {
         self.tolerance.div_ceil(EPOCHS_PER_DECREASE)
     }
 
     /// Sends a probe to the parent. Its answer is checked before the next joints.
     fn probe_parent(&mut self) {
-        if let Some(up) = self.network.up() {
+        if let Some(up) = self.network.parent_port() {
             self.network.send(up, PortMessage::Probe);
         }
         self.sum.schedule_check();
@@ -309,7 +309,7 @@ impl Node {
 
     /// Applies changes of the network to sums and node id, and reports them.
     pub(super) fn after_network(&mut self, now: Micros) {
-        if !self.summing.network.exists() {
+        if !self.summing.network.has_wires() {
             return;
         }
         if let Some(cell) = self.summing.network.take_assigned() {
@@ -335,7 +335,7 @@ impl Node {
             let torque = packet::Words::new(length, torque.map(Q7_8::to_bits));
             self.push(Message::Sum { from, epoch, torque, count });
         }
-        let Some(late) = self.summing.sum.check(now) else { return };
+        let Some(late) = self.summing.sum.poll_check(now) else { return };
         // A late check is left to the next joints, when all frames before them have been received.
         if late <= MAX_CHECK_LATENESS {
             self.check_missing(now);
@@ -358,7 +358,7 @@ impl Node {
     /// Reports the place in the tree if it has changed, at most every 50 ms.
     pub(super) fn report_tree(&mut self, now: Micros) {
         let report = &mut self.summing.report;
-        let may = self.summing.network.exists() && self.claim.is_settled();
+        let may = self.summing.network.has_wires() && self.claim.is_settled();
         if may && report.due && now >= report.next {
             (report.due, report.next) = (false, now + TREE_REPORT_INTERVAL);
             self.push_tree(now);
@@ -368,7 +368,7 @@ impl Node {
     /// Reports changes of the place in the tree and of the ports, with a regular heartbeat.
     pub(super) fn report_with_heartbeat(&mut self, now: Micros) {
         let Summing { network, report, .. } = &mut self.summing;
-        if network.exists() {
+        if network.has_wires() {
             // A new round alone waits for the heartbeat.
             report.due |= report.round != network.round();
             self.report_tree(now);
@@ -383,7 +383,7 @@ impl Node {
         report.round = network.round();
         let tree = Tree {
             parent: network.parent_node(),
-            parent_port: network.up().map_or(0, |up| up.to_le_bytes()[0]),
+            parent_port: network.parent_port().map_or(0, |up| up.to_le_bytes()[0]),
             depth: network.depth().unwrap_or(0),
             round: report.round,
             children: network.children(),

@@ -320,7 +320,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
     assert_eq!(
         request(&mut node, Request::Read { number: 99 }),
-        Some(Answer::Refused { number: 99, reason: Answer::UNKNOWN })
+        Some(Answer::Refused { number: 99, reason: Answer::UNKNOWN_PARAMETER })
     );
 }
 
@@ -449,7 +449,7 @@ fn skipped_joints_leave_active_as_it_is() {
 
 #[test]
 fn joints_need_not_wake_a_cell_that_nothing_touches() {
-    let rests = |node: &Node| node.defers(Id::command(Command::Joints));
+    let rests = |node: &Node| node.may_defer(Id::command(Command::Joints));
     let mut node = settled(FlashState::Valid(wheel()));
     let mut epochs = 0..;
     let mut hear = |node: &mut Node, count| {

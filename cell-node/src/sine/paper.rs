@@ -4,11 +4,11 @@ use core::f64::consts::FRAC_PI_2;
 
 use protocol::fixed::Q1_14;
 
-use super::{ONE, QUARTER, both, odd_polynomial};
+use super::{ONE, QUARTER, evaluate, odd_polynomial};
 
 /// The paper's polynomial (Eq. 13, 16): `a z - b z^3 + c z^5` with a = pi/2, c = pi/2 - 3/2, and b such that
 /// the sum is one.
-const FIFTH: [i32; 3] = {
+const FIFTH_ORDER: [i32; 3] = {
     let (a, c) = (nearest(FRAC_PI_2), nearest(FRAC_PI_2 - 1.5));
     [a, ONE - a - c, c]
 };
@@ -25,7 +25,7 @@ const fn nearest(constant: f64) -> i32 {
 /// [`sine`](super::sine), for one multiplication less.
 #[must_use]
 pub fn paper_sine(angle: Q1_14) -> Q1_14 {
-    odd_polynomial(angle, FIFTH)
+    odd_polynomial(angle, FIFTH_ORDER)
 }
 
 /// Returns the paper's cosine (Eq. 19): [`paper_sine`] a quarter turn later.
@@ -37,5 +37,5 @@ pub fn paper_cosine(angle: Q1_14) -> Q1_14 {
 /// Returns [`paper_sine`] and [`paper_cosine`] of one angle in steps of 2^-14.
 #[inline]
 pub(crate) fn paper_sine_cosine(angle: Q1_14) -> [i32; 2] {
-    both(angle, FIFTH)
+    evaluate(angle, FIFTH_ORDER)
 }

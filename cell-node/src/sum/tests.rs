@@ -111,10 +111,10 @@ fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
     assert_eq!(sum.check_missing(), Some((Epoch(3), 0b10)), "it did not come");
     sum.begin(&begin(4, 2), None);
     assert_eq!(sum.poll_timeout(), Some(at(4, 14_000)), "checked in time");
-    assert_eq!((sum.check(at(4, 13_999)), sum.check(at(4, 14_000))), (None, Some(Span(0))));
+    assert_eq!((sum.poll_check(at(4, 13_999)), sum.poll_check(at(4, 14_000))), (None, Some(Span(0))));
     sum.receive(at(4, 500), 1, Epoch(4), words(10, 1));
     assert_eq!(sum.taken, 2, "after a gap");
-    sum.disown(1);
+    sum.remove_child(1);
     sum.begin(&begin(5, 2), None);
     sum.handle_state(at(5, 0), 1, Epoch(4));
     sum.receive(at(5, 500), 1, Epoch(5), words(10, 1));
@@ -131,7 +131,7 @@ fn a_sum_that_came_before_its_joints_and_without_a_lease_waits_for_its_state() {
     assert_eq!((sum.taken, sum.dropped), (0, 1), "no state yet");
     sum.handle_state(at(2, 100), 1, Epoch(2));
     assert_eq!((sum.taken, sum.dropped), (1, 0));
-    sum.disown(1);
+    sum.remove_child(1);
     sum.receive(at(2, 15_900), 1, Epoch(3), words(10, 1));
     sum.begin(&begin(3, 2), None);
     assert_eq!(sum.check_missing(), Some((Epoch(3), 0b10)), "it does not come");
@@ -159,7 +159,7 @@ fn an_end_closes_the_lease_without_a_nack() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), None);
     sum.handle_state(at(1, 0), 1, Epoch(1));
-    sum.receive(at(1, 100), 1, Epoch(1), SumWords::END);
+    sum.receive(at(1, 100), 1, Epoch(1), SumWords::LEASE_END);
     sum.begin(&begin(2, 2), None);
     assert_eq!((sum.poll_timeout(), sum.check_missing()), (None, Some((Epoch(2), 0))), "nothing is missing");
 }

@@ -195,10 +195,10 @@ fn any_chain() -> impl Strategy<Value = Parameters> {
             let mut joints = 0;
             for (row, kind) in parameters.rows.iter_mut().zip(&kinds) {
                 row.kind = if joints == MAX_JOINTS { RowKind::Fixed } else { *kind };
-                joints += usize::from(row.moves());
+                joints += usize::from(row.has_joint());
             }
             let row = carries.index(kinds.len()) + 1;
-            let joint = parameters.rows[..row].iter().filter(|row| row.moves()).count();
+            let joint = parameters.rows[..row].iter().filter(|row| row.has_joint()).count();
             let byte = |number: usize| u8::try_from(number).unwrap();
             let (joint, joints, row, table_rows) = (byte(joint), byte(joints), byte(row), byte(kinds.len()));
             Parameters { joint, joints, row, table_rows, ..parameters }
@@ -213,7 +213,7 @@ fn chain_in_reach() -> impl Strategy<Value = (Parameters, [Q1_14; MAX_JOINTS])> 
     (in_reach(any_chain()), positions).prop_map(|(mut parameters, positions)| {
         let slides = parameters.chain().iter().filter(|row| row.kind == RowKind::Prismatic).count();
         let moving: Vec<RowKind> =
-            parameters.table().iter().filter(|row| row.moves()).map(|row| row.kind).collect();
+            parameters.all_rows().iter().filter(|row| row.has_joint()).map(|row| row.kind).collect();
         let mut positions = positions.map(Q1_14::from_bits);
         if slides > 0 {
             // Half of the length is for the prismatic joints.

@@ -5,29 +5,29 @@ pub const SINGLE_NM: f64 = 0.0054;
 /// Mean error of summed torques, Q7.8, in Nm (Fig. 6).
 pub const SUMMED_NM: f64 = 0.0356;
 /// Duration of all work in a cycle except the central computation, in s (Fig. 8).
-pub const REST_S: f64 = 0.2e-3;
+pub const OTHER_WORK_S: f64 = 0.2e-3;
 /// Time of a cycle at 500 Hz, in s.
 pub const CYCLE_S: f64 = 2e-3;
 /// Time of the central computation per cell, in s (Eq. 29).
-pub const CELL_S: f64 = 0.827e-6;
+pub const CENTRAL_PER_CELL_S: f64 = 0.827e-6;
 /// Time of the central computation without cells, in s (Eq. 29).
-pub const FIXED_S: f64 = 0.010_73e-3;
+pub const CENTRAL_FIXED_S: f64 = 0.010_73e-3;
 /// Goodness of fit (R squared) of Eq. 29.
 pub const CELLS_QUALITY: f64 = 0.9995;
 /// Time of the central computation per active cell, in s (Eq. 30).
-pub const ACTIVE_S: f64 = 0.798e-6;
+pub const CENTRAL_PER_ACTIVE_CELL_S: f64 = 0.798e-6;
 /// Time of the central computation of 253 inactive cells, in s (Eq. 30).
 pub const NONE_ACTIVE_S: f64 = 0.2e-3;
 /// Goodness of fit (R squared) of Eq. 30.
 pub const ACTIVE_QUALITY: f64 = 0.939;
 /// Maximum number of cells at 500 Hz, none of them active.
-pub const LIMIT: f64 = 2160.0;
+pub const MAX_CELLS: f64 = 2160.0;
 /// Maximum number of cells at 500 Hz, 100 of them active (Eq. 31).
-pub const LIMIT_ACTIVE: f64 = 2067.0;
-/// Number of active cells for which [`LIMIT_ACTIVE`] holds.
-pub const LIMIT_AT: f64 = 100.0;
+pub const MAX_CELLS_WITH_ACTIVE: f64 = 2067.0;
+/// Number of active cells for which [`MAX_CELLS_WITH_ACTIVE`] holds.
+pub const LIMIT_ACTIVE_CELLS: f64 = 100.0;
 /// Mean error of the fifth-order approximation of the sine.
-pub const SINE: f64 = 6.7e-4;
+pub const SINE_MEAN_ERROR: f64 = 6.7e-4;
 /// Numbers of multiplications, additions, sines and cosines in one cell's Jacobian on the last link of six (Eq. 27).
 pub const OPERATIONS: [u32; 4] = [103, 57, 6, 6];
 
@@ -35,8 +35,8 @@ pub const OPERATIONS: [u32; 4] = [103, 57, 6, 6];
 /// paper derives its limits: `(cycle - rest - fixed - active · per active) / per cell`, all in s. Returns NaN if cells
 /// cost nothing.
 #[must_use]
-pub fn most_cells(per_cell: f64, fixed: f64, per_active: f64, active: f64) -> f64 {
-    let room = CYCLE_S - REST_S - fixed - active * per_active;
+pub fn max_cells(per_cell: f64, fixed: f64, per_active: f64, active: f64) -> f64 {
+    let room = CYCLE_S - OTHER_WORK_S - fixed - active * per_active;
     if per_cell > 0.0 { (room / per_cell).floor() } else { f64::NAN }
 }
 
@@ -47,9 +47,14 @@ mod tests {
     /// The first limit is rounded in the paper: its own law gives 2163.
     #[test]
     fn the_papers_laws_lead_to_its_limits() {
-        let none = most_cells(CELL_S, FIXED_S, ACTIVE_S, 0.0);
-        assert!((none - 2163.0).abs() < 0.5 && (none - LIMIT).abs() < 5.0);
-        assert!((most_cells(CELL_S, FIXED_S, ACTIVE_S, LIMIT_AT) - LIMIT_ACTIVE).abs() < 0.5);
-        assert!(most_cells(0.0, FIXED_S, ACTIVE_S, 0.0).is_nan());
+        let none = max_cells(CENTRAL_PER_CELL_S, CENTRAL_FIXED_S, CENTRAL_PER_ACTIVE_CELL_S, 0.0);
+        assert!((none - 2163.0).abs() < 0.5 && (none - MAX_CELLS).abs() < 5.0);
+        assert!(
+            (max_cells(CENTRAL_PER_CELL_S, CENTRAL_FIXED_S, CENTRAL_PER_ACTIVE_CELL_S, LIMIT_ACTIVE_CELLS)
+                - MAX_CELLS_WITH_ACTIVE)
+                .abs()
+                < 0.5
+        );
+        assert!(max_cells(0.0, CENTRAL_FIXED_S, CENTRAL_PER_ACTIVE_CELL_S, 0.0).is_nan());
     }
 }

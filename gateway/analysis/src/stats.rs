@@ -26,9 +26,9 @@ mod foreign;
 pub struct Stats {
     /// Times of the earliest and the latest frame, in ns.
     span: Option<(u64, u64)>,
-    counts: Report,
+    counts: StatsReport,
     bus_stats: Vec<BusStats>,
-    is_untimed: bool,
+    has_no_times: bool,
 }
 
 /// The statistics of one bus.
@@ -36,18 +36,18 @@ pub struct Stats {
 struct BusStats {
     /// Time of the previous frame on the bus, in ns.
     last: u64,
-    all: Count,
+    all: TimedCount,
     /// The counts of the bus that grow with each frame.
     counts: BusReport,
-    kinds: [Count; NAMES.len()],
-    wires: Count,
+    kinds: [TimedCount; PACKET_KINDS.len()],
+    wires: TimedCount,
     foreign: ForeignCounter,
-    joints: Option<Joints>,
+    joints: Option<LastJoints>,
     cells: Vec<Option<Box<CellStats>>>,
 }
 
 /// Names of the packet kinds that are counted, in the order of display.
-const NAMES: [&str; 12] = [
+const PACKET_KINDS: [&str; 12] = [
     "halt",
     "joints",
     "sync",
@@ -64,14 +64,14 @@ const NAMES: [&str; 12] = [
 
 /// Number of packets or frames of one kind, and the times of the first and the last in ns.
 #[derive(Clone, Copy, Debug, Default)]
-struct Count {
+struct TimedCount {
     packets: u64,
     first: u64,
     last: u64,
 }
 
-impl Count {
-    const fn take(&mut self, nanos: u64) {
+impl TimedCount {
+    const fn record(&mut self, nanos: u64) {
         if self.packets == 0 {
             self.first = nanos;
         }
@@ -92,16 +92,16 @@ impl Count {
 
 /// The last joints packet on a bus.
 #[derive(Clone, Copy, Debug)]
-struct Joints {
+struct LastJoints {
     epoch: Epoch,
     /// The number of the joints since the capture began; missing joints are counted, too.
     number: u64,
 }
 
-impl Joints {
+impl LastJoints {
     /// Returns the number of the joints with this epoch, which were sent shortly before the last ones; `None` if there
     /// are no such joints.
-    fn of(self, epoch: Epoch) -> Option<u64> {
+    fn number_of(self, epoch: Epoch) -> Option<u64> {
         let age = u64::try_from(self.epoch.epochs_since(epoch)).ok()?;
         self.number.checked_sub(age)
     }
@@ -118,12 +118,12 @@ struct CellStats {
     /// Time in ns and epoch of the cell's first torque and of its last.
     torque_span: Option<[(u64, Epoch); 2]>,
     /// The number of the joints that the last torque answers, while the cell is in contact.
-    touching: Option<u64>,
+    last_answered: Option<u64>,
 }
 
 /// The result of the statistics.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Report {
+pub struct StatsReport {
     /// Time from the earliest frame to the latest, in s.
     pub duration_s: f64,
     /// Frames of all buses.
@@ -278,7 +278,7 @@ impl Stats {
     }
 
     /// Records that frames were lost before this point; `bus` is empty if unknown.
-    pub fn dropped(&mut self, bus: &str, frames: u64) {
+    pub fn record_dropped(&mut self, bus: &str, frames: u64) {
         let bus_stats = if bus.is_empty() { None } else { self.bus_stats(bus) };
         let dropped = bus_stats.map(|bus_stats| &mut bus_stats.counts.dropped);
         let dropped = match dropped {
@@ -300,14 +300,14 @@ impl Stats {
 
     /// Declares that the times of frames are meaningless and only give the order. Rates are then omitted.
     pub const fn without_times(&mut self) {
-        self.is_untimed = true;
+        self.has_no_times = true;
     }
 
     /// Returns the statistics of all frames so far.
     #[must_use]
-    pub fn report(&self) -> Report {
+    pub fn report(&self) -> StatsReport {
         let mut report = self.timed();
-        if self.is_untimed {
+        if self.has_no_times {
             for bus in &mut report.buses {
                 (bus.frames_per_s, bus.wires_per_s) = (None, None);
                 bus.kinds.iter_mut().for_each(|kind| kind.packets_per_s = None);
@@ -318,9 +318,9 @@ impl Stats {
         report
     }
 
-    fn timed(&self) -> Report {
+    fn timed(&self) -> StatsReport {
         let span @ (earliest, latest) = self.span.unwrap_or_default();
-        Report {
+        StatsReport {
             duration_s: seconds(latest - earliest),
             buses: self.bus_stats.iter().map(|bus_stats| bus_stats.report(span)).collect(),
             ..self.counts.clone()
@@ -343,10 +343,10 @@ impl BusStats {
     fn new(bus: &str) -> Self {
         Self {
             last: 0,
-            all: Count::default(),
+            all: TimedCount::default(),
             counts: BusReport { bus: bus.to_owned(), ..BusReport::default() },
-            kinds: [Count::default(); NAMES.len()],
-            wires: Count::default(),
+            kinds: [TimedCount::default(); PACKET_KINDS.len()],
+            wires: TimedCount::default(),
             foreign: ForeignCounter::default(),
             joints: None,
             cells: (0..CellId::COUNT).map(|_| None).collect(),
@@ -356,11 +356,11 @@ impl BusStats {
     fn take(&mut self, record: &Record<'_>, decoded: &Decoded) {
         let nanos = record.time.nanos;
         if let Decoded::Wire(..) = decoded {
-            self.wires.take(nanos);
+            self.wires.record(nanos);
             return;
         }
         self.counts.frames += 1;
-        self.all.take(nanos);
+        self.all.record(nanos);
         let refused = &mut self.counts.refused;
         match decoded {
             Decoded::Wire(..) | Decoded::Segment { .. } => {}
@@ -379,9 +379,9 @@ impl BusStats {
     fn message(&mut self, nanos: u64, message: &Message) {
         let id = message.id();
         if let Some(count) =
-            NAMES.iter().position(|it| *it == id.name()).and_then(|at| self.kinds.get_mut(at))
+            PACKET_KINDS.iter().position(|it| *it == id.name()).and_then(|at| self.kinds.get_mut(at))
         {
-            count.take(nanos);
+            count.record(nanos);
         }
         if let Message::Joints { epoch, .. } = message {
             self.take_joints(*epoch);
@@ -402,16 +402,16 @@ impl BusStats {
             Err(_) => {
                 epochs.jumps += 1;
                 for cell in self.cells.iter_mut().flatten() {
-                    cell.touching = None;
+                    cell.last_answered = None;
                 }
             }
         }
         let before = self.joints.map_or(0, |last| last.number);
-        self.joints = Some(Joints { epoch, number: before + u64::try_from(step).unwrap_or(1) });
+        self.joints = Some(LastJoints { epoch, number: before + u64::try_from(step).unwrap_or(1) });
     }
 
     fn report(&self, (earliest, latest): (u64, u64)) -> BusReport {
-        let kinds = NAMES.into_iter().zip(self.kinds).filter(|(_, count)| count.packets > 0);
+        let kinds = PACKET_KINDS.into_iter().zip(self.kinds).filter(|(_, count)| count.packets > 0);
         let kinds = kinds.map(|(kind, count)| KindReport {
             kind,
             packets: count.packets,
@@ -433,7 +433,7 @@ impl BusStats {
 }
 
 impl CellStats {
-    fn take(&mut self, nanos: u64, message: &Message, joints: Option<Joints>) {
+    fn take(&mut self, nanos: u64, message: &Message, joints: Option<LastJoints>) {
         self.counts.packets += 1;
         let word = self.tracked.receive(Micros(nanos / 1_000), message, None).word;
         if let Message::Torque { epoch, torque, .. } = message {
@@ -448,28 +448,28 @@ impl CellStats {
             self.counts.heartbeats += 1;
             // A report older than the last torque does not end the contact.
             let is_over = !heartbeat.state.has(State::ACTIVE)
-                && joints.and_then(|joints| joints.of(*epoch)) >= self.touching;
+                && joints.and_then(|joints| joints.number_of(*epoch)) >= self.last_answered;
             if matches!(word, Some(HeartbeatKind::Started { .. }))
                 || is_over && word != Some(HeartbeatKind::Claimant)
             {
-                self.touching = None;
+                self.last_answered = None;
             }
         }
     }
 
-    fn torque(&mut self, nanos: u64, epoch: Epoch, still: bool, joints: Option<Joints>) {
+    fn torque(&mut self, nanos: u64, epoch: Epoch, still: bool, joints: Option<LastJoints>) {
         self.counts.torques += 1;
         let [first, last] = self.torque_span.unwrap_or([(nanos, epoch); 2]);
         let again = self.counts.torques > 1
             && last.1 == epoch
-            && joints.is_some_and(|joints| joints.of(epoch) == self.touching);
+            && joints.is_some_and(|joints| joints.number_of(epoch) == self.last_answered);
         self.counts.repeated += u64::from(again);
         self.torque_span = Some([first, (nanos, epoch)]);
-        let number = joints.and_then(|joints| joints.of(epoch));
-        if let (Some(before), Some(number)) = (self.touching, number) {
+        let number = joints.and_then(|joints| joints.number_of(epoch));
+        if let (Some(before), Some(number)) = (self.last_answered, number) {
             self.counts.unanswered += number.saturating_sub(before + 1);
         }
-        self.touching = if still { number } else { None };
+        self.last_answered = if still { number } else { None };
     }
 
     fn report(&self, node: CellId) -> CellReport {

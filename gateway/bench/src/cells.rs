@@ -11,10 +11,10 @@ use protocol::id::{Command, Id, Kind};
 use protocol::message::Message;
 use protocol::time::Micros;
 
-use crate::bus::listen::{self, Listener, passing, send};
+use crate::bus::listen::{self, Listener, send, tolerate_transient};
 
 /// Time to wait for a heartbeat (sent four times a second), which shows the cells' frame format.
-const FORMAT: Duration = Duration::from_millis(300);
+const FORMAT_TIMEOUT: Duration = Duration::from_millis(300);
 /// Interval between queries to all cells.
 const QUERY_INTERVAL: Duration = Duration::from_secs(2);
 /// Maximum time that one poll of the bus waits for a frame.
@@ -26,7 +26,7 @@ pub struct CellWatch {
     listener: Listener,
     began: Instant,
     listing: Listing,
-    others: u64,
+    non_packets: u64,
     /// Format of packets, if known before the first frame.
     format: Option<Format>,
     requested: Option<Instant>,
@@ -46,7 +46,7 @@ impl CellWatch {
         let options = BusOptions { filters, receive_buffer, ..BusOptions::default() };
         let listener = Listener::new(listen::open(name, kind, None, options)?, None);
         let listing = Listing::new();
-        Ok(Self { listener, began: Instant::now(), listing, others: 0, format, requested: None })
+        Ok(Self { listener, began: Instant::now(), listing, non_packets: 0, format, requested: None })
     }
 
     /// The open bus.
@@ -63,8 +63,8 @@ impl CellWatch {
 
     /// Number of received frames that are not packets of the protocol.
     #[must_use]
-    pub const fn others(&self) -> u64 {
-        self.others
+    pub const fn non_packets(&self) -> u64 {
+        self.non_packets
     }
 
     /// Time since the bus was opened.
@@ -86,7 +86,7 @@ impl CellWatch {
     /// Returns [`BusError`] if the bus is gone or closed.
     pub fn request(&mut self, again: bool) -> Result<(), BusError> {
         let due = self.requested.is_none_or(|requested| again && requested.elapsed() >= QUERY_INTERVAL);
-        let waited = (self.elapsed() >= FORMAT).then_some(Format::Fd);
+        let waited = (self.elapsed() >= FORMAT_TIMEOUT).then_some(Format::Fd);
         let Some(format) = self.format.or_else(|| self.listing.format()).or(waited).filter(|_| due) else {
             return Ok(());
         };
@@ -96,7 +96,7 @@ impl CellWatch {
         match requested {
             // Cells that cannot be queried can still be received.
             Err(BusError::FdFrame { .. }) => Ok(()),
-            requested => passing(requested, Duration::ZERO).map(|_| ()),
+            requested => tolerate_transient(requested, Duration::ZERO).map(|_| ()),
         }
     }
 
@@ -109,14 +109,14 @@ impl CellWatch {
         if stopped.load(Ordering::Relaxed) {
             heard?;
         } else {
-            passing(heard, POLL_TIMEOUT)?;
+            tolerate_transient(heard, POLL_TIMEOUT)?;
         }
         let now = self.now();
         for (received, decoded) in self.listener.decoded() {
             if let Decoded::Message(message) = decoded {
                 self.listing.receive(now, received.frame.format(), &message);
             } else {
-                self.others += 1;
+                self.non_packets += 1;
             }
         }
         Ok(())

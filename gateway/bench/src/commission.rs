@@ -14,7 +14,7 @@ use protocol::id::{Command, Id, Kind};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use crate::bus::listen::{self, Listener, passing, send};
+use crate::bus::listen::{self, Listener, send, tolerate_transient};
 use crate::bus::roots::RootWires;
 
 /// Maximum time between two checks for a signal.
@@ -60,7 +60,7 @@ pub fn open(skin: &Skin, index: usize, kinds: &KindChoices) -> Result<BusCommiss
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
     let mut roots = RootWires::for_bus(skin, index);
     // Start the wires before the first frame arrives, so that no message of a root is missed.
-    roots.iter_mut().for_each(RootWires::explore);
+    roots.iter_mut().for_each(RootWires::start_sending);
     let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::for_kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
     filters.extend(roots.iter().flat_map(RootWires::filters));
@@ -82,12 +82,12 @@ pub fn commission(
     stopped: &AtomicBool,
     mut show: impl FnMut(&[Progress]),
 ) -> Vec<CommissionedBus> {
-    let far = Mutex::new(vec![None; benches.len()]);
+    let progress_by_bus = Mutex::new(vec![None; benches.len()]);
     let waiting: Vec<_> = benches.into_iter().map(|bench| Mutex::new(Some(bench))).collect();
     let work = |(place, bench): (usize, &Mutex<Option<BusCommissioner>>)| {
         let bench = bench.lock().ok()?.take()?;
         Some(bench.work(skin, wish, stopped, |progress| {
-            if let Some(own) = far.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
+            if let Some(own) = progress_by_bus.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
                 *own = Some(progress);
             }
         }))
@@ -106,7 +106,7 @@ pub fn commission(
         };
         while threads.iter().any(is_busy) {
             let now: Vec<Progress> =
-                far.lock().map(|far| far.iter().copied().flatten().collect()).unwrap_or_default();
+                progress_by_bus.lock().map(|far| far.iter().copied().flatten().collect()).unwrap_or_default();
             if !now.is_empty() {
                 show(&now);
             }
@@ -133,13 +133,13 @@ impl BusCommissioner {
         let began = Instant::now();
         let clock = || Micros::since_start(began.elapsed());
         let mut commission = Commission::new(skin, self.index, wish, room, clock());
-        let lost = self.converse(&mut commission, &clock, stopped, tell).err();
+        let lost = self.exchange(&mut commission, &clock, stopped, tell).err();
         if lost.is_some() {
             commission.stop();
         }
         let bus = self.listener.bus();
         let report = commission.report();
-        let trouble = report.trouble.map(|trouble| trouble.on(bus.name()));
+        let trouble = report.trouble.map(|trouble| trouble.describe(bus.name()));
         CommissionedBus {
             name: bus.name().to_owned(),
             kind: bus.kind().to_string(),
@@ -149,12 +149,12 @@ impl BusCommissioner {
         }
     }
 
-    fn converse(
+    fn exchange(
         &mut self,
         commission: &mut Commission,
         clock: &impl Fn() -> Micros,
         stopped: &AtomicBool,
-        mut tell: impl FnMut(Progress),
+        mut on_progress: impl FnMut(Progress),
     ) -> Result<(), BusError> {
         let Self { listener, roots, format, .. } = self;
         loop {
@@ -162,19 +162,19 @@ impl BusCommissioner {
                 commission.stop();
             }
             commission.handle_time(clock());
-            tell(commission.progress());
+            on_progress(commission.progress());
             if let Some(roots) = roots.as_mut().filter(|_| commission.may_send()) {
                 roots.send_due(listener.bus());
             }
             while let Some(message) = commission.poll_transmit() {
                 // A packet that was not sent gets no answer, and is sent again.
-                passing(send(listener.bus(), &message, *format), DOWN_PAUSE)?;
+                tolerate_transient(send(listener.bus(), &message, *format), DOWN_PAUSE)?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
             let quiet =
                 roots.as_ref().filter(|_| commission.may_send()).map_or(POLL_TIMEOUT, RootWires::timeout);
             let wait = Duration::from_micros(next.elapsed_since(clock()).0).min(quiet).min(POLL_TIMEOUT);
-            passing(listener.receive(wait), DOWN_PAUSE)?;
+            tolerate_transient(listener.receive(wait), DOWN_PAUSE)?;
             for (received, decoded) in listener.decoded() {
                 if roots.as_mut().is_some_and(|roots| roots.handle_frame(&received.frame)) {
                     continue;

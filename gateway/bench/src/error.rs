@@ -21,7 +21,7 @@ use crate::threads::ThreadError;
 use control::external::SocketError;
 
 /// Hint on how to separate benches that use embedded buses of the same name.
-const ELSEWHERE: &str = "set SKINBUS_DIR to another directory for this run";
+const OTHER_DIRECTORY_HINT: &str = "set SKINBUS_DIR to another directory for this run";
 
 /// An error that ended a run early.
 #[derive(Debug, Error)]
@@ -88,9 +88,9 @@ pub enum RunError {
     /// Other cells are on a bus on which cells were to be started.
     #[error(
         "cells are on the bus already: {cells}; use them with --no-spawn, {}",
-        if *.embedded { format!("stop them, or {ELSEWHERE}") } else { "or stop them".to_owned() }
+        if *.embedded { format!("stop them, or {OTHER_DIRECTORY_HINT}") } else { "or stop them".to_owned() }
     )]
-    CellsThere {
+    CellsPresent {
         /// The cells found.
         cells: String,
         /// True if the bus is embedded.
@@ -126,7 +126,7 @@ pub enum RunError {
         cells: String,
     },
     /// The process of a cell ended too early.
-    #[error("{cells} ended while starting ({status}){}", why(.said.as_deref()))]
+    #[error("{cells} ended while starting ({status}){}", reason_suffix(.said.as_deref()))]
     Ended {
         /// The cells of the process.
         cells: String,
@@ -186,7 +186,7 @@ impl RunError {
             | Self::Memory(_)
             | Self::Lost(_)
             | Self::OtherGateway(_)
-            | Self::CellsThere { .. }
+            | Self::CellsPresent { .. }
             | Self::Unconfigured(_)
             | Self::NotReady { .. }
             | Self::OtherSkin { .. }
@@ -210,7 +210,7 @@ impl From<ServeError> for RunError {
 
 /// Returns the end of a sentence that gives the reason why a process ended. Without a reason, it refers to the
 /// process's own message.
-pub(crate) fn why(said: Option<&str>) -> String {
+pub(crate) fn reason_suffix(said: Option<&str>) -> String {
     said.map_or_else(|| "; see the message above".to_owned(), |said| format!(": {said}"))
 }
 
@@ -218,7 +218,8 @@ fn other_gateway(link: Option<&(String, BusKind)>) -> String {
     match link {
         None => "another gateway is on the bus".to_owned(),
         Some((name, kind)) => {
-            let elsewhere = if kind.is_interface() { "give this one another bus" } else { ELSEWHERE };
+            let elsewhere =
+                if kind.is_interface() { "give this one another bus" } else { OTHER_DIRECTORY_HINT };
             format!("another gateway is on {name}: stop one of the two, or {elsewhere}")
         }
     }

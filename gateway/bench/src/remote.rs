@@ -60,7 +60,7 @@ pub struct BenchState {
     /// Links that are down, in one direction or in both.
     pub links_down: Vec<LinkDown>,
     /// State of each bus.
-    pub buses: Vec<BusState>,
+    pub buses: Vec<BusStatus>,
     /// Lateness of the ticks.
     pub lateness: Lateness,
     /// Reason for the present halt, if the robot is halted.
@@ -73,8 +73,8 @@ pub struct BenchState {
 impl BenchState {
     /// Returns a copy of the state that contains only the process of one cell, or no process.
     #[must_use]
-    pub fn seen_from(&self, cell: Option<(usize, u8)>) -> Self {
-        let is_its = |process: &&ProcessState| cell.is_some_and(|(bus, node)| process.runs(bus, node));
+    pub fn for_cell(&self, cell: Option<(usize, u8)>) -> Self {
+        let is_its = |process: &&ProcessState| cell.is_some_and(|(bus, node)| process.runs_cell(bus, node));
         let processes = self.processes.iter().filter(is_its).copied().collect();
         Self { processes, ..self.clone() }
     }
@@ -94,7 +94,7 @@ pub struct ProcessState {
 impl ProcessState {
     /// Returns true if the process runs this cell.
     #[must_use]
-    pub const fn runs(&self, bus: usize, node: u8) -> bool {
+    pub const fn runs_cell(&self, bus: usize, node: u8) -> bool {
         self.bus == bus && self.nodes.0 <= node && node <= self.nodes.1
     }
 }
@@ -122,7 +122,7 @@ pub struct LinkDown {
 
 /// State of a bus.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
-pub struct BusState {
+pub struct BusStatus {
     /// True if a command has taken the bus down.
     pub down: bool,
     /// True if the links of its cells can be taken down, which is the case if they answer with sums.
@@ -224,14 +224,14 @@ impl JsonPipe {
 
     /// Reads the bytes that have arrived. Returns true if there were any.
     fn read(&mut self) -> bool {
-        let mut piece = [0; READ_BYTES];
+        let mut chunk = [0; READ_BYTES];
         if self.received.len() > MAX_LINE_BYTES {
             self.received.clear();
         }
-        match read(&self.input, &mut piece) {
+        match read(&self.input, &mut chunk) {
             Ok(0) => self.ended = true,
             Ok(count) => {
-                self.received.extend(piece.iter().take(count));
+                self.received.extend(chunk.iter().take(count));
                 return true;
             }
             Err(Errno::AGAIN | Errno::INTR) => {}

@@ -20,9 +20,9 @@ const DISCOVERY_TIME: Duration = Duration::from_millis(600);
 /// Interval after which a request is sent again to a cell that does not answer.
 const RETRY_INTERVAL: Span = Span::from_millis(250);
 /// Maximum time until all cells have answered.
-const TIMEOUT: Duration = Duration::from_secs(3);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Tag of the requests, by which their answers are told from answers to other senders.
-const TAG: u8 = 0x57;
+const REQUEST_TAG: u8 = 0x57;
 
 /// Opens a bus whose cells are to be switched and whose packets have this format.
 ///
@@ -42,7 +42,7 @@ pub enum SensingError {
     Bus(#[from] BusError),
     /// No cell answered.
     #[error("{who} answers on {bus}: start it, or name the bus' format with --format {other}")]
-    Nobody {
+    NoAnswer {
         /// Description of the addressed cells.
         who: String,
         /// Name of the bus.
@@ -78,20 +78,21 @@ pub enum SensingError {
 /// # Errors
 /// Returns [`SensingError`] if a cell does not confirm, or the bus fails.
 pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> Result<String, SensingError> {
-    let mut answers = Answers::new(only, Some(TAG));
+    let mut answers = Answers::new(only, Some(REQUEST_TAG));
     let mut listener = Listener::new(bus, Some(format));
-    let tell = |bus: &Bus, to| {
+    let request = |bus: &Bus, to| {
         let request = Request::Write { number: Parameter::Sensing.number(), words: mode.words() };
-        send(bus, &Message::Configure { to, tag: TAG, request }, format)
+        send(bus, &Message::Configure { to, tag: REQUEST_TAG, request }, format)
     };
-    tell(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
+    request(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
     let began = Instant::now();
     let mut requests = Repeats::new(RETRY_INTERVAL);
     requests.mark_all_sent(Micros::since_start(began.elapsed()));
-    while began.elapsed() < TIMEOUT && !are_complete(&answers, only, began.elapsed() >= DISCOVERY_TIME) {
+    while began.elapsed() < ANSWER_TIMEOUT && !are_complete(&answers, only, began.elapsed() >= DISCOVERY_TIME)
+    {
         answers.receive(&mut listener)?;
         for cell in requests.due(Micros::since_start(began.elapsed()), answers.missing()) {
-            tell(listener.bus(), Node::Cell(cell))?;
+            request(listener.bus(), Node::Cell(cell))?;
         }
     }
     verdict(&answers, only, listener.bus().name(), format)
@@ -112,7 +113,7 @@ fn verdict(
     let (bus, missing) = (bus.to_owned(), answers.missing());
     if answers.received().is_empty() {
         let who = only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
-        return Err(SensingError::Nobody { who, bus, other: format.other().name() });
+        return Err(SensingError::NoAnswer { who, bus, other: format.other().name() });
     }
     let (mut confirmed, mut refused) = (BTreeSet::new(), BTreeMap::new());
     for &(cell, answer) in answers.received() {
@@ -170,16 +171,22 @@ mod tests {
 
     #[test]
     fn all_cells_that_send_have_to_answer() {
-        let mut answers = Answers::new(None, Some(TAG));
+        let mut answers = Answers::new(None, Some(REQUEST_TAG));
         assert!(!are_complete(&answers, None, true), "no cell is there yet");
-        for message in [beat(1), confirms(1, TAG), confirms(2, TAG), beat(3), confirms(3, TAG ^ 1)] {
+        for message in [
+            beat(1),
+            confirms(1, REQUEST_TAG),
+            confirms(2, REQUEST_TAG),
+            beat(3),
+            confirms(3, REQUEST_TAG ^ 1),
+        ] {
             answers.record(&message);
         }
         assert!(!are_complete(&answers, None, true));
         assert_eq!(answers.missing(), [cell(3)].into(), "the answer to another sender does not count");
         let why = "cell 3 on vcan0 did not answer, 2 did: switch them again when they are back";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
-        answers.record(&confirms(3, TAG));
+        answers.record(&confirms(3, REQUEST_TAG));
         assert!(!are_complete(&answers, None, false) && are_complete(&answers, None, true));
         assert_eq!(says(&answers, None), Ok("3 cells".to_owned()));
     }
@@ -187,21 +194,21 @@ mod tests {
     #[test]
     fn one_cell_is_requested_and_waited_for_alone() {
         let only = Some(cell(7));
-        let mut answers = Answers::new(only, Some(TAG));
-        answers.record(&confirms(1, TAG));
+        let mut answers = Answers::new(only, Some(REQUEST_TAG));
+        answers.record(&confirms(1, REQUEST_TAG));
         assert_eq!(answers.missing(), [cell(7)].into());
         let why = "no cell 7 answers on vcan0: start it, or name the bus' format with --format classic";
         assert_eq!(says(&answers, only), Err(why.to_owned()));
-        answers.record(&confirms(7, TAG));
+        answers.record(&confirms(7, REQUEST_TAG));
         assert!(are_complete(&answers, only, false));
         assert_eq!(says(&answers, only), Ok("cell 7".to_owned()));
     }
 
     #[test]
     fn a_cell_that_refuses_is_named() {
-        let mut answers = Answers::new(None, Some(TAG));
-        let answer = Answer::Refused { number: 7, reason: Answer::UNKNOWN };
-        answers.record(&Message::Configured { from: cell(9), tag: TAG, answer });
+        let mut answers = Answers::new(None, Some(REQUEST_TAG));
+        let answer = Answer::Refused { number: 7, reason: Answer::UNKNOWN_PARAMETER };
+        answers.record(&Message::Configured { from: cell(9), tag: REQUEST_TAG, answer });
         let why = "cell 9 on vcan0 refused with reason 18: docs/reference/protocol.md explains it";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
     }

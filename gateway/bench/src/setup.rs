@@ -8,21 +8,21 @@ use protocol::id::CellId;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Timeout {
     length: Duration,
-    most: usize,
+    best: usize,
     since: Instant,
 }
 
 impl Timeout {
     /// Creates a timeout that is over after `length` without progress.
     pub(crate) fn new(length: Duration) -> Self {
-        Self { length, most: 0, since: Instant::now() }
+        Self { length, best: 0, since: Instant::now() }
     }
 
     /// Takes the progress so far, as a number that grows. Returns true if it has not grown for the length of the
     /// timeout.
     pub(crate) fn is_over(&mut self, far: usize) -> bool {
-        if far > self.most {
-            (self.most, self.since) = (far, Instant::now());
+        if far > self.best {
+            (self.best, self.since) = (far, Instant::now());
         }
         self.since.elapsed() > self.length
     }

@@ -21,7 +21,7 @@ pub struct SignalError {
 ///
 /// # Errors
 /// Returns [`SignalError`] with the signal that cannot be caught.
-pub fn caught(signals: &[i32]) -> Result<Arc<AtomicBool>, SignalError> {
+pub fn catch_signals(signals: &[i32]) -> Result<Arc<AtomicBool>, SignalError> {
     let flag = stop::stop_flag();
     for &signal in signals {
         signal_hook::flag::register(signal, Arc::clone(flag))

@@ -10,11 +10,11 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 pub use self::cells::{CellSummary, RepliesSummary};
-pub use self::outcome::{CellError, ErrorCells, HaltSummary, Outcome, TickBefore, cells_in_error};
-pub(crate) use self::verdict::many;
+pub use self::outcome::{CellError, ErrorCells, HaltSummary, Outcome, TickSummary, cells_in_error};
+pub(crate) use self::verdict::count_noun;
 pub use self::verdict::{CELL_ERROR_NM, Verdict};
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, Contributions, Event, Status, SumCounts, Table};
+use model::table::{Accuracy, CellStatus, Contributions, Event, SumCounts, Table};
 pub use trace::recording::account::{RecordingAccount, WrittenFile};
 
 mod cells;
@@ -45,7 +45,7 @@ pub struct Summary {
     /// Number of ended halts beyond the first 100.
     pub further_halts: u64,
     /// Ticks up to the last halt, oldest first.
-    pub before_halt: Vec<TickBefore>,
+    pub before_halt: Vec<TickSummary>,
     /// Reason why the external controller counts as absent, if it does. It is `None` if the robot was halted.
     pub no_controller: Option<String>,
     /// Errors that ended processes of cells.
@@ -112,7 +112,7 @@ impl Summary {
     /// of the exit code. Reasons of cells' errors are repeated only if `quiet`, because they have been printed
     /// otherwise.
     #[must_use]
-    pub fn complaints(&self, quiet: bool) -> Vec<String> {
+    pub fn end_messages(&self, quiet: bool) -> Vec<String> {
         // The error of a failed run names the lost bus.
         let came_to_its_end = self.failure.is_none() || self.failure == self.lost_frames();
         let lost = self.lost_buses().filter(|_| came_to_its_end);
@@ -406,7 +406,7 @@ impl BusSummary {
         let mut silent_cells = Vec::new();
         for (cell, status) in table.statuses(now) {
             *cells.entry(status.name()).or_default() += 1;
-            if matches!(status, Status::Dead | Status::Unknown) {
+            if matches!(status, CellStatus::Dead | CellStatus::Unknown) {
                 silent_cells.push(cell.node.get());
             }
         }
@@ -438,9 +438,9 @@ impl BusSummary {
             sent: kinds(&|kind| counters.sent(kind)),
             events: events.filter(|(_, count)| *count > 0).collect(),
             dropped_by_bus: dropped,
-            last_reply_us: Quantiles::from_histogram(table.delays().of_last_replies(), 1.0),
-            reply_us: Quantiles::from_histogram(table.delays().of_replies(), 1.0),
-            joints_not_taken_us: Quantiles::from_histogram(table.delays().of_joints_not_taken(), 1.0),
+            last_reply_us: Quantiles::from_histogram(table.delays().last_replies(), 1.0),
+            reply_us: Quantiles::from_histogram(table.delays().replies(), 1.0),
+            joints_not_taken_us: Quantiles::from_histogram(table.delays().pending_joints(), 1.0),
         }
     }
 }

@@ -5,15 +5,15 @@ use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 
 use model::network::check::ObservedCell;
-use model::table::{CellState, Responded, SWITCHES, Status, Switch};
+use model::table::{CellState, CellStatus, Responded, SWITCHES, Switch};
 
 /// State of a bus's cells, updated every 20 ms.
 #[derive(Clone, Debug, Default)]
-pub struct View {
+pub struct BusView {
     /// Cells in the order of the bus.
     pub cells: Vec<CellView>,
     /// True if some cell has not confirmed a switch.
-    pub lacking: bool,
+    pub has_unconfirmed: bool,
     /// True if some cell may hold stimuli that this gateway did not receive.
     pub unclear: bool,
     /// Number of the gateway's commands that were read back from the bus, or were lost when the bus failed.
@@ -41,7 +41,7 @@ pub struct CellView {
     /// True if the cell measures, so that stimuli do not touch it.
     pub measures: bool,
     /// True if the cell's configuration differs from the skin's.
-    pub other: bool,
+    pub other_configuration: bool,
     /// Epoch of the last joints that the cell received.
     pub last_joints: Epoch,
     /// Reports that the cell has sent since the last request for them.
@@ -49,51 +49,53 @@ pub struct CellView {
     /// Reply mode of the cell by its last report, as the words of the parameter.
     pub reply: Option<[i16; WORDS]>,
     /// Ports whose links the cell holds down, by its last report; one bit per port.
-    pub deaf: u8,
+    pub ports_down: u8,
     /// Switches that the cell has not confirmed.
-    pub lacks: [Option<Switch>; SWITCHES],
+    pub unconfirmed_switches: [Option<Switch>; SWITCHES],
     /// True if the cell computes with stimuli that this gateway may not have received.
     pub unclear: bool,
 }
 
-impl View {
+impl BusView {
     /// Creates the view of a bus.
     #[must_use]
     pub fn new(cells: Vec<CellView>, commands: u64, network: Vec<ObservedCell>) -> Self {
-        let lacking = cells.iter().any(CellView::is_lacking);
+        let lacking = cells.iter().any(CellView::has_unconfirmed_switch);
         let unclear = cells.iter().any(|cell| cell.unclear);
-        Self { cells, lacking, unclear, commands, network }
+        Self { cells, has_unconfirmed: lacking, unclear, commands, network }
     }
 }
 
 impl CellView {
     /// Returns true if the cell can receive and has not confirmed a switch.
     #[must_use]
-    pub fn is_lacking(&self) -> bool {
-        (self.ready || self.unconfigured) && self.lacks.iter().any(Option::is_some)
+    pub fn has_unconfirmed_switch(&self) -> bool {
+        (self.ready || self.unconfigured) && self.unconfirmed_switches.iter().any(Option::is_some)
     }
 
     /// Creates the view of a cell from its table entry.
     #[must_use]
-    pub fn new(cell: &CellState, status: Status) -> Self {
+    pub fn new(cell: &CellState, status: CellStatus) -> Self {
         let state = cell.heartbeat().map(|heartbeat| heartbeat.state);
-        let alive = !matches!(status, Status::Dead | Status::Unknown);
+        let alive = !matches!(status, CellStatus::Dead | CellStatus::Unknown);
         let settled = state.filter(|state| alive && !state.has(State::CLAIMING));
         let ready = settled.is_some_and(|state| state.has(State::CONFIGURED));
         Self {
             node: cell.node,
             seen: state.is_some(),
-            dead: status == Status::Dead,
+            dead: status == CellStatus::Dead,
             ready,
             halted: ready && !cell.is_ready(),
             unconfigured: settled.is_some() && !ready,
             measures: ready && cell.measures() == Some(true),
-            other: cell.heartbeat().is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
+            other_configuration: cell
+                .heartbeat()
+                .is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
             last_joints: cell.last_joints,
             responded: cell.responded(),
             reply: cell.reply,
-            deaf: cell.ports_down,
-            lacks: cell.unconfirmed_switches(),
+            ports_down: cell.ports_down,
+            unconfirmed_switches: cell.unconfirmed_switches(),
             unclear: ready && cell.has_unseen_stimuli(),
         }
     }

@@ -5,39 +5,39 @@ use nalgebra::Vector3;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 
-use crate::each::each;
+use crate::each::parallel_map;
 use crate::estimate::{Ages, Estimate, Guess, estimate};
-use crate::help::{Help, helpful};
+use crate::help::{MotionAdvice, suggest_motion};
 use crate::lag::Lags;
-use crate::neighbors::{Known, improve};
+use crate::neighbors::{LocatedCell, improve};
 use crate::observe::{Observations, Reading};
 use crate::refusal::{Disturbance, Refusal};
-use crate::result::{Calibration, CellResult, Pose, SensorResult, Summary, Trouble};
+use crate::result::{Calibration, CellResult, Diagnosis, Pose, SensorResult, Summary};
 use crate::rounded::rounded;
-use crate::table::Table;
+use crate::table::MotionTable;
 use crate::zero::zero_offsets;
 use model::accelerometer::sensor::{DataSheet, rotation};
 
 pub use crate::settings::Settings;
 
 /// The fraction of the expected readings below which a cell is reported as silent.
-const SILENT: f64 = 0.5;
+const MIN_READING_SHARE: f64 = 0.5;
 /// The minimum number of readings for an estimate.
-const FEWEST: usize = 200;
+const MIN_READINGS: usize = 200;
 /// The factor by which the residuals of a loose or damaged cell exceed those of most cells and those of the data sheet.
-const ROUGH: f64 = 1.5;
+const LOOSE_CELL_FACTOR: f64 = 1.5;
 /// The factor by which the residuals of most cells may exceed the data sheet; above it, the recording is refused.
-const SCATTER: f64 = 1.3;
+const MAX_SCATTER_FACTOR: f64 = 1.3;
 /// The relative difference above which the recorded broadcast rate does not match that of the skin.
-const OTHER_RATE: f64 = 0.02;
+const RATE_TOLERANCE: f64 = 0.02;
 /// The maximum difference between the lags of two stretches on a bus, as a fraction of the recording's duration.
-const MUCH_SHIFTED: f64 = 0.005;
+const MAX_SHIFTED_SHARE: f64 = 0.005;
 /// The number of rounds of estimates, each of which improves the shifts of stretches.
-const SHIFTS: usize = 5;
+const SHIFT_ROUNDS: usize = 5;
 /// The logarithm of the likelihood ratio above which the best joint is certain, against the next best one.
-const SURE: f64 = 10.0;
+const MIN_LOG_LIKELIHOOD_RATIO: f64 = 10.0;
 /// The factor by which a cell must be nearer to the described place of another cell than to its own, to be marked.
-const NEARER: f64 = 2.0;
+const NEARER_PLACE_FACTOR: f64 = 2.0;
 
 /// Estimates the pose and the sensor errors of every cell of a skin from a recording.
 ///
@@ -46,7 +46,7 @@ const NEARER: f64 = 2.0;
 /// estimated then.
 pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<Calibration, Refusal> {
     let (seen_by, disturbance) = estimated(skin, seen, settings)?;
-    let Seen { tables, lags, estimates } = seen_by;
+    let CellEstimates { tables, lags, estimates } = seen_by;
     let mut cells: Vec<_> = skin
         .cells
         .iter()
@@ -55,38 +55,42 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Resul
         .map(|((cell, estimate), readings)| {
             let table = tables.get(cell.bus).and_then(Option::as_ref);
             let usable = table.map_or(0, |table| readings.iter().filter(|it| table.is_known(it)).count());
-            let share = real(usable) / real(table.map_or(0, Table::known)).max(1.0);
+            let share = as_f64(usable) / as_f64(table.map_or(0, MotionTable::known_count)).max(1.0);
             result(skin, cell, estimate.as_ref(), readings, share)
         })
         .collect();
-    rough(&mut cells, &estimates);
+    mark_scattering_cells(&mut cells, &estimates);
     let wires = with_neighbors(skin, &mut cells, settings);
-    confused(skin, &mut cells);
+    find_swaps(skin, &mut cells);
     advise(skin, &estimates, &mut cells, settings);
     for (result, cell) in cells.iter_mut().zip(&skin.cells) {
-        result.settle(skin, cell, tables.get(cell.bus).and_then(Option::as_ref).map(|table| &table.arm));
+        result.store_pose(skin, cell, tables.get(cell.bus).and_then(Option::as_ref).map(|table| &table.arm));
     }
-    let summary = Summary::of(&cells, wires, disturbance);
+    let summary = Summary::from_cells(&cells, wires, disturbance);
     let zero_offsets =
         settings.zero_offsets.then(|| zero_offsets(skin, seen, settings, (&tables, &lags), &estimates));
     Ok(Calibration { summary, cells, zero_offsets })
 }
 
 /// The estimates of all cells, each from its own readings only.
-struct Seen {
+struct CellEstimates {
     /// The motions of the links, by bus; `None` for a bus without a chain.
-    tables: Vec<Option<Table>>,
+    tables: Vec<Option<MotionTable>>,
     lags: Vec<Lags>,
     /// The estimate of each cell.
     estimates: Vec<Option<Estimate>>,
 }
 
 /// Estimates each cell from its own readings, and the shifts of stretches between gaps from the cells of a bus.
-fn estimated(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<(Seen, Disturbance), Refusal> {
-    checked(skin, seen)?;
+fn estimated(
+    skin: &Skin,
+    seen: &Observations,
+    settings: &Settings,
+) -> Result<(CellEstimates, Disturbance), Refusal> {
+    check_joints(skin, seen)?;
     let mut lags: Vec<_> = seen.buses.iter().map(Lags::none).collect();
     let period = settings.sheet.period_s();
-    for round in 0..=SHIFTS {
+    for round in 0..=SHIFT_ROUNDS {
         let now = each_alone(skin, seen, settings, lags);
         let disturbance = disturbed(skin, seen, &now.tables)?;
         let more: Vec<_> = now
@@ -99,17 +103,17 @@ fn estimated(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<(S
                 let cells = cells.filter(|((cell, _), _)| cell.bus == bus);
                 let cells =
                     cells.filter_map(|((_, estimate), readings)| Some((estimate.as_ref()?, &readings[..])));
-                lags.more(table.as_ref()?, cells, period)
+                lags.refined(table.as_ref()?, cells, period)
             })
             .collect();
         let Some((bus, most)) =
-            more.iter().enumerate().find_map(|(bus, more)| Some((bus, more.as_ref()?.most())))
+            more.iter().enumerate().find_map(|(bus, more)| Some((bus, more.as_ref()?.largest())))
         else {
-            fitting(&now.estimates, &settings.sheet, disturbance)?;
-            much_shifted(skin, seen, &now.lags, disturbance)?;
+            check_scatter(&now.estimates, &settings.sheet, disturbance)?;
+            check_shifts(skin, seen, &now.lags, disturbance)?;
             return Ok((now, disturbance));
         };
-        if round == SHIFTS {
+        if round == SHIFT_ROUNDS {
             return Err(shifted(skin, seen, (bus, most), disturbance));
         }
         lags = now.lags.into_iter().zip(more).map(|(before, more)| more.unwrap_or(before)).collect();
@@ -125,23 +129,23 @@ fn shifted(
 ) -> Refusal {
     let gap = seen.buses.get(bus).and_then(|bus| bus.gaps.iter().rev().find(|gap| gap.place <= place));
     let (from, from_s) = gap.map_or((0, 0.0), |gap| (gap.place, gap.at_s));
-    let at_s = from_s + real(place - from) / skin.timing.broadcast_hz();
+    let at_s = from_s + as_f64(place - from) / skin.timing.broadcast_hz();
     let (at_s, ms) = (rounded(at_s, 3), rounded(lag * 1e3, 1));
     Refusal::Shifted { bus: name(skin, bus), at_s, ms, disturbance }
 }
 
 /// Checks that the lags of a bus' stretches differ by at most [`MUCH_SHIFTED`] of the duration, because many large
 /// shifts cannot be estimated accurately.
-fn much_shifted(
+fn check_shifts(
     skin: &Skin,
     seen: &Observations,
     lags: &[Lags],
     disturbance: Disturbance,
 ) -> Result<(), Refusal> {
     for (bus, (lags, observed)) in lags.iter().zip(&seen.buses).enumerate() {
-        let length_s = real(observed.joints.len()) / skin.timing.broadcast_hz();
-        if lags.range() > MUCH_SHIFTED * length_s {
-            return Err(shifted(skin, seen, (bus, lags.most()), disturbance));
+        let length_s = as_f64(observed.joints.len()) / skin.timing.broadcast_hz();
+        if lags.range() > MAX_SHIFTED_SHARE * length_s {
+            return Err(shifted(skin, seen, (bus, lags.largest()), disturbance));
         }
     }
     Ok(())
@@ -152,7 +156,7 @@ fn name(skin: &Skin, bus: usize) -> String {
 }
 
 /// Checks that the number of joints in a recording and their broadcast rate match the skin.
-fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
+fn check_joints(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
     for (bus, observed) in
         seen.buses.iter().enumerate().filter(|(bus, _)| skin.cells_on_bus(*bus).next().is_some())
     {
@@ -162,7 +166,7 @@ fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
         }
         let hz = skin.timing.broadcast_hz();
         if let Some(got) =
-            observed.period_s().map(f64::recip).filter(|got| (got / hz - 1.0).abs() > OTHER_RATE)
+            observed.period_s().map(f64::recip).filter(|got| (got / hz - 1.0).abs() > RATE_TOLERANCE)
         {
             return Err(Refusal::Rate { bus: name(skin, bus), got: rounded(got, 2), hz: rounded(hz, 2) });
         }
@@ -171,21 +175,25 @@ fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
 }
 
 /// Returns the gaps of a recording, or an error if the motion is known for too few of its broadcasts.
-fn disturbed(skin: &Skin, seen: &Observations, tables: &[Option<Table>]) -> Result<Disturbance, Refusal> {
+fn disturbed(
+    skin: &Skin,
+    seen: &Observations,
+    tables: &[Option<MotionTable>],
+) -> Result<Disturbance, Refusal> {
     let mut all = Disturbance::default();
     for (bus, (observed, table)) in seen.buses.iter().zip(tables).enumerate() {
         let Some(table) = table else { continue };
-        let disturbance = Disturbance::of(observed, table.known());
-        if table.known() < FEWEST {
+        let disturbance = Disturbance::from_bus(observed, table.known_count());
+        if table.known_count() < MIN_READINGS {
             return Err(Refusal::Disturbed { bus: name(skin, bus), disturbance });
         }
-        all = all.and(disturbance);
+        all = all.merged_with(disturbance);
     }
     Ok(all)
 }
 
 /// Checks that readings do not scatter much more than the data sheet allows.
-fn fitting(
+fn check_scatter(
     estimates: &[Option<Estimate>],
     sheet: &DataSheet,
     disturbance: Disturbance,
@@ -196,35 +204,37 @@ fn fitting(
         all.get(all.len() / 2).copied().unwrap_or_default()
     };
     let times = middle(|estimate| estimate.noise_times).max(middle(|estimate| estimate.rough_times));
-    if times <= SCATTER {
+    if times <= MAX_SCATTER_FACTOR {
         return Ok(());
     }
     Err(Refusal::Scatter {
         times: rounded(times, 1),
         noise_mg: rounded(middle(|estimate| estimate.noise_g) * 1e3, 1),
-        sheet_mg: rounded(sheet.deviation() * 1e3, 1),
+        sheet_mg: rounded(sheet.reading_deviation() * 1e3, 1),
         disturbance,
     })
 }
 
-fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<Lags>) -> Seen {
+fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<Lags>) -> CellEstimates {
     let buses: Vec<_> = (0..skin.buses.len()).collect();
-    let tables: Vec<_> = each(buses.len(), settings.threads, |bus| {
+    let tables: Vec<_> = parallel_map(buses.len(), settings.threads, |bus| {
         let is_used = skin.cells_on_bus(bus).next().is_some();
         let (sheet, gravity) = (&settings.sheet, settings.gravity);
         lags.get(bus)
             .filter(|_| is_used)
-            .map(|lags| Table::new(skin, bus, seen, sheet, gravity, &[0.0; MAX_JOINTS], lags))
+            .map(|lags| MotionTable::new(skin, bus, seen, sheet, gravity, &[0.0; MAX_JOINTS], lags))
     });
-    let ages = Ages::of(&settings.sheet, 1.0 / skin.timing.broadcast_hz());
-    let estimates = each(skin.cells.len(), settings.threads, |index| {
+    let ages = Ages::for_sheet(&settings.sheet, 1.0 / skin.timing.broadcast_hz());
+    let estimates = parallel_map(skin.cells.len(), settings.threads, |index| {
         let cell = skin.cells.get(index)?;
         let table = tables.get(cell.bus)?.as_ref()?;
         let readings = seen.cells.get(index)?;
-        if readings.len() < FEWEST || is_stuck(readings) {
+        if readings.len() < MIN_READINGS || is_stuck(readings) {
             return None;
         }
-        let own = table.arm.between(cell.row, skin.chain(cell.bus).row_of(cell.joint).unwrap_or_default());
+        let own = table
+            .arm
+            .transform_between(cell.row, skin.chain(cell.bus).row_of(cell.joint).unwrap_or_default());
         let guess = Guess {
             joint: cell.joint,
             rotation: own.rotation * rotation(cell.orientation, cell.normal),
@@ -232,7 +242,7 @@ fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<L
         };
         estimate(table, readings, &guess, &settings.sheet, &ages)
     });
-    Seen { tables, lags, estimates }
+    CellEstimates { tables, lags, estimates }
 }
 
 /// Returns true if all readings are equal.
@@ -252,15 +262,15 @@ fn result(
 ) -> CellResult {
     let mut result = CellResult::unknown(skin, cell, readings.len());
     if readings.is_empty() {
-        result.troubles.push(Trouble::Dead);
+        result.troubles.push(Diagnosis::Dead);
     } else if is_stuck(readings) {
-        result.troubles.push(Trouble::Stuck);
-    } else if share < SILENT || readings.len() < FEWEST {
-        result.troubles.push(Trouble::Silent { share: rounded(share, 3) });
+        result.troubles.push(Diagnosis::Stuck);
+    } else if share < MIN_READING_SHARE || readings.len() < MIN_READINGS {
+        result.troubles.push(Diagnosis::Silent { share: rounded(share, 3) });
     }
     let Some(estimate) = estimate else {
         if result.troubles.is_empty() {
-            result.troubles.push(Trouble::Silent { share: rounded(share, 3) });
+            result.troubles.push(Diagnosis::Silent { share: rounded(share, 3) });
         }
         return result;
     };
@@ -272,11 +282,11 @@ fn result(
         rough_g: Some(estimate.rough_g),
     };
     if estimate.joint == 0 {
-        result.troubles.push(Trouble::Still);
+        result.troubles.push(Diagnosis::Still);
         return result;
     }
-    if estimate.margin < SURE {
-        result.troubles.push(Trouble::Joint { joint: estimate.joint });
+    if estimate.margin < MIN_LOG_LIKELIHOOD_RATIO {
+        result.troubles.push(Diagnosis::Joint { joint: estimate.joint });
     }
     result.pose = Some(Pose {
         joint: estimate.joint,
@@ -289,7 +299,7 @@ fn result(
 }
 
 /// Marks cells whose readings scatter much more than those of most cells and than the data sheet allows.
-fn rough(cells: &mut [CellResult], estimates: &[Option<Estimate>]) {
+fn mark_scattering_cells(cells: &mut [CellResult], estimates: &[Option<Estimate>]) {
     let times = |(cell, estimate): (&CellResult, &Option<Estimate>)| {
         cell.pose.as_ref().and(estimate.as_ref()).map(|estimate| estimate.rough_times)
     };
@@ -298,8 +308,8 @@ fn rough(cells: &mut [CellResult], estimates: &[Option<Estimate>]) {
     let Some(&most) = all.get(all.len() / 2) else { return };
     for (cell, estimate) in cells.iter_mut().zip(estimates) {
         let Some(times) = times((cell, estimate)).map(|times| times / most.max(1.0)) else { continue };
-        if times > ROUGH {
-            cell.troubles.push(Trouble::Loose { times: rounded(times, 1) });
+        if times > LOOSE_CELL_FACTOR {
+            cell.troubles.push(Diagnosis::Loose { times: rounded(times, 1) });
         }
     }
 }
@@ -320,7 +330,7 @@ fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) ->
             let mut known: Vec<_> = members
                 .iter()
                 .filter_map(|&index| cells.get(index)?.pose.as_ref())
-                .map(|pose| Known {
+                .map(|pose| LocatedCell {
                     position: pose.position,
                     normal: pose.rotation * Vector3::z(),
                     covariance: pose.position_covariance,
@@ -346,20 +356,20 @@ fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) ->
 }
 
 /// Marks cells that were found at the described place of another cell.
-fn confused(skin: &Skin, cells: &mut [CellResult]) {
+fn find_swaps(skin: &Skin, cells: &mut [CellResult]) {
     let found: Vec<_> =
-        skin.cells.iter().zip(&*cells).map(|(cell, result)| place_of(skin, cell, result)).collect();
+        skin.cells.iter().zip(&*cells).map(|(cell, result)| other_cell_at(skin, cell, result)).collect();
     for (index, (result, place)) in cells.iter_mut().zip(&found).enumerate() {
         let Some(other) = place else { continue };
         let Some(there) = skin.cells.get(*other) else { continue };
         let both = found.get(*other).copied().flatten() == Some(index);
         let node = there.node.get();
-        result.troubles.push(if both { Trouble::Swapped { node } } else { Trouble::Elsewhere { node } });
+        result.troubles.push(if both { Diagnosis::Swapped { node } } else { Diagnosis::Elsewhere { node } });
     }
 }
 
 /// Returns the other cell of the same bus at whose described place a cell was found.
-fn place_of(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
+fn other_cell_at(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
     let pose = result.pose.as_ref().filter(|pose| pose.is_determined())?;
     // Half a turn counts as much as a metre: an offset by a cell's width equals 5 degrees.
     let far = |described: &Cell| {
@@ -378,12 +388,13 @@ fn place_of(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
     let (nearest, index) = *distances.first()?;
     let next = distances.get(1).map_or(f64::INFINITY, |(next, _)| *next);
     let certain = 2.0 * pose.position_95() + 0.002;
-    (nearest * NEARER < own && nearest * NEARER < next + 2e-3 && own > certain).then_some(index)
+    (nearest * NEARER_PLACE_FACTOR < own && nearest * NEARER_PLACE_FACTOR < next + 2e-3 && own > certain)
+        .then_some(index)
 }
 
 /// Adds to each cell without a determined pose the motion that would help to determine it.
 fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult], settings: &Settings) {
-    let mut known: Vec<((usize, u8), Help)> = Vec::new();
+    let mut known: Vec<((usize, u8), MotionAdvice)> = Vec::new();
     for ((cell, estimate), result) in skin.cells.iter().zip(estimates).zip(cells) {
         let (Some(estimate), Some(pose)) = (estimate, &result.pose) else { continue };
         if pose.is_determined() {
@@ -392,12 +403,12 @@ fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult],
         let key = (cell.bus, pose.joint);
         let help = known.iter().find(|(of, _)| *of == key).map(|(_, help)| help.clone());
         let help = help.unwrap_or_else(|| {
-            let help = helpful(skin, cell.bus, estimate, settings);
+            let help = suggest_motion(skin, cell.bus, estimate, settings);
             known.push((key, help.clone()));
             help
         });
         let [position_mm, orientation_deg] = [pose.position_95() * 1e3, pose.turn_95().to_degrees()];
-        result.troubles.push(Trouble::NotObservable {
+        result.troubles.push(Diagnosis::NotObservable {
             position_mm: rounded(position_mm, 1),
             orientation_deg: rounded(orientation_deg, 1),
             help,
@@ -406,6 +417,6 @@ fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult],
 }
 
 #[expect(clippy::cast_precision_loss, reason = "counts of readings")]
-const fn real(of: usize) -> f64 {
+const fn as_f64(of: usize) -> f64 {
     of as f64
 }

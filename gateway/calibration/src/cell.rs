@@ -61,7 +61,7 @@ pub(crate) struct CellModel {
 
 impl CellModel {
     /// Creates a model with a perfect sensor.
-    pub(crate) fn at(rotation: UnitQuaternion<f64>, position: Vector3<f64>) -> Self {
+    pub(crate) fn ideal(rotation: UnitQuaternion<f64>, position: Vector3<f64>) -> Self {
         Self { rotation, position, bias: Vector3::zeros(), matrix: Matrix3::identity(), age: 0.0 }
     }
 
@@ -258,7 +258,7 @@ mod tests {
             *to = from;
         }
         let shown = model.coefficients().transpose() * SVector::<f64, MOMENT>::from(moment);
-        let force = model.rotation.inverse() * motions[2].at(&model.position);
+        let force = model.rotation.inverse() * motions[2].force_at(&model.position);
         assert!((shown - (model.matrix * force + model.bias)).norm() < 1e-12);
     }
 }

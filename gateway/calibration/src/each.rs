@@ -5,7 +5,11 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
 /// Calls `work` for the numbers below `count` on several threads, and returns the results in order.
-pub(crate) fn each<T: Send>(count: usize, threads: usize, work: impl Fn(usize) -> T + Sync) -> Vec<T> {
+pub(crate) fn parallel_map<T: Send>(
+    count: usize,
+    threads: usize,
+    work: impl Fn(usize) -> T + Sync,
+) -> Vec<T> {
     let next = AtomicUsize::new(0);
     let done = Mutex::new(Vec::with_capacity(count));
     let run = || {
@@ -41,10 +45,10 @@ mod tests {
     fn results_are_in_order_whatever_the_number_of_threads() {
         for threads in [0, 1, 3, 100] {
             assert_eq!(
-                each(20, threads, |index| index * index),
+                parallel_map(20, threads, |index| index * index),
                 (0..20).map(|it| it * it).collect::<Vec<_>>()
             );
         }
-        assert!(each(0, 2, |index| index).is_empty());
+        assert!(parallel_map(0, 2, |index| index).is_empty());
     }
 }

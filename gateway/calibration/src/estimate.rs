@@ -7,30 +7,30 @@ use nalgebra::{Cholesky, Matrix3, UnitQuaternion, Vector3};
 use crate::cell::{AGE, CellModel, Coefficients, Information, Moment, POSITION, TURN, Unknowns, expected};
 use crate::lag::Lags;
 use crate::observe::Reading;
-use crate::sums::{Fit, Free, Sums, at_middle_age};
-use crate::table::Table;
+use crate::sums::{Fit, FreeCoefficients, ReadingSums, at_middle_age};
+use crate::table::MotionTable;
 use model::accelerometer::sensor::DataSheet;
 
 /// The number of readings that are used in the first search for the joint.
-const FIRST_LOOK: usize = 1_500;
+const SEARCH_READINGS: usize = 1_500;
 /// The number of joints that are fitted completely after the first search.
 const SHORTLIST: usize = 3;
 /// The number of times that the weights of readings are recomputed.
 const ROUNDS: usize = 2;
 /// Residuals beyond this many standard deviations get a lower weight; see [`weight`].
-const TOLERATED: f64 = 3.5;
+const HUBER_THRESHOLD: f64 = 3.5;
 /// The number of broadcasts in a batch, over which scores are summed before their correlation is computed.
 const BATCH: u32 = 4;
 /// The maximum distance of batches whose correlation is included, about 16 s.
-const BATCHES: u32 = 256;
+const CORRELATED_BATCHES: u32 = 256;
 /// The number of assumed sensor clock rates over which the correlation of ages is averaged.
 const CLOCKS: u32 = 101;
 /// The minimum number of readings for an estimate.
-const FEWEST: f64 = 100.0;
+const MIN_READINGS: f64 = 100.0;
 /// The median of the squared length of three standard normal numbers.
 const MEDIAN_SQUARE: f64 = 2.366;
 /// The 90 % quantile of the squared length of three standard normal numbers.
-const MOST_SQUARE: f64 = 6.251;
+const NINETY_PERCENT_SQUARE: f64 = 6.251;
 /// The error of predicted readings from the rounding and smoothing of joint positions, in g.
 const SMOOTHED_G: f64 = 1e-3;
 /// The standard deviation of a position along each axis from smoothed accelerations, in m.
@@ -81,7 +81,7 @@ pub(crate) struct Guess {
 
 /// Estimates a cell; returns `None` if too few of its readings can be used.
 pub(crate) fn estimate(
-    table: &Table,
+    table: &MotionTable,
     readings: &[Reading],
     guess: &Guess,
     sheet: &DataSheet,
@@ -92,21 +92,21 @@ pub(crate) fn estimate(
     let within = |reading: &&Reading| reading.g.iter().all(|axis| axis.abs() < 0.98 * sheet.range_g);
     let readings: &[Reading] = &readings.iter().filter(within).copied().collect::<Vec<_>>();
     // The age of readings varies from one to the next, which looks like noise while the robot moves.
-    let variance = (sheet.deviation().powi(2) + 0.002_f64.powi(2)).max(1e-8);
+    let variance = (sheet.reading_deviation().powi(2) + 0.002_f64.powi(2)).max(1e-8);
     let (joint, margin, start) = identify(table, readings, guess, &expected, variance)?;
     let link = table.link(joint);
     let mut spread = variance;
     let mut fit: Option<Fit> = None;
-    let mut sums = Sums::default();
+    let mut sums = ReadingSums::default();
     for _ in 0..=ROUNDS {
         let coefficients = fit.as_ref().map(|fit| fit.model.coefficients());
-        sums = Sums::default();
+        sums = ReadingSums::default();
         for (moment, reading) in paired(link, readings) {
             let weight =
                 coefficients.as_ref().map_or(1.0, |it| weight(&residual(it, moment, &reading.g), spread));
             sums.add(moment, &reading.g, weight);
         }
-        if sums.weight < FEWEST {
+        if sums.weight < MIN_READINGS {
             return None;
         }
         let from = fit.take().map_or_else(|| start.clone(), |fit| fit.model);
@@ -124,19 +124,19 @@ pub(crate) fn estimate(
 
 /// Finds the joint whose motion explains the readings best, with its margin over the next best one and a fitted model.
 fn identify(
-    table: &Table,
+    table: &MotionTable,
     readings: &[Reading],
     guess: &Guess,
     expected: &Unknowns,
     variance: f64,
 ) -> Option<(u8, f64, CellModel)> {
-    let stride = (readings.len() / FIRST_LOOK).max(1);
+    let stride = (readings.len() / SEARCH_READINGS).max(1);
     let few: Vec<_> = readings.iter().step_by(stride).copied().collect();
     // A joint that fits worst without constraints does not fit better with them: only the best ones are fitted
     // completely.
     let mut looks = Vec::new();
     for joint in 0..=table.joints() {
-        let mut sums = Sums::default();
+        let mut sums = ReadingSums::default();
         for (moment, reading) in paired(table.link(joint), &few) {
             sums.add(moment, &reading.g, 1.0);
         }
@@ -147,8 +147,8 @@ fn identify(
     looks.truncate(SHORTLIST);
     let mut fits = Vec::new();
     for (_, joint, sums, free) in looks {
-        let found = first(&free).map(|start| sums.fit(start, expected, variance));
-        let described = (guess.joint == joint).then(|| CellModel::at(guess.rotation, guess.position));
+        let found = initial_model(&free).map(|start| sums.fit(start, expected, variance));
+        let described = (guess.joint == joint).then(|| CellModel::ideal(guess.rotation, guess.position));
         let described = described.map(|start| sums.fit(start, expected, variance));
         // If both explain the readings equally well, the described joint is kept.
         let best = match (found, described) {
@@ -170,7 +170,7 @@ fn identify(
 }
 
 /// Returns the model that is nearest to an unconstrained fit.
-fn first(free: &Free) -> Option<CellModel> {
+fn initial_model(free: &FreeCoefficients) -> Option<CellModel> {
     let axes = Matrix3::from_fn(|axis, part| free[(part, axis)]);
     let parts = axes.svd(true, true);
     let (left, right) = (parts.u?, parts.v_t?);
@@ -191,7 +191,7 @@ fn first(free: &Free) -> Option<CellModel> {
         each.map(|(axis, part)| axes[(axis, part)] * free[(3 + 3 * at + part, axis)]).sum::<f64>() / scale
     });
     let position = if position.norm() < 3.0 { position } else { Vector3::zeros() };
-    Some(CellModel::at(UnitQuaternion::from_rotation_matrix(&rotation), position))
+    Some(CellModel::ideal(UnitQuaternion::from_rotation_matrix(&rotation), position))
 }
 
 /// Returns the readings at whose time the motion is known, each with that motion.
@@ -221,7 +221,7 @@ fn square(of: &[f64; 3]) -> f64 {
 /// Returns the weight of a reading by Huber: 1, or less if its residual exceeds [`TOLERATED`] standard deviations.
 pub(crate) fn weight(residual: &[f64; 3], variance: f64) -> f64 {
     let off = (square(residual) / variance).sqrt();
-    if off <= TOLERATED { 1.0 } else { TOLERATED / off }
+    if off <= HUBER_THRESHOLD { 1.0 } else { HUBER_THRESHOLD / off }
 }
 
 /// Returns the variance of the axes' residuals, once from the median of their squares and once from the 90 % quantile.
@@ -238,7 +238,7 @@ fn spreads(
         let own = square(&residual(&coefficients, moment, &reading.g));
         own / sheet.map_or(1.0, |sheet| {
             let aged = square(&change(&derivatives[AGE], moment)) * sheet.period_s().powi(2) / 12.0;
-            sheet.deviation().powi(2) + SMOOTHED_G * SMOOTHED_G + aged / 3.0
+            sheet.reading_deviation().powi(2) + SMOOTHED_G * SMOOTHED_G + aged / 3.0
         })
     });
     let mut squares: Vec<_> = squares.collect();
@@ -250,7 +250,7 @@ fn spreads(
         let (_, square, _) = squares.select_nth_unstable_by(place, f64::total_cmp);
         *square
     };
-    [below(1, 2) / MEDIAN_SQUARE, below(9, 10) / MOST_SQUARE]
+    [below(1, 2) / MEDIAN_SQUARE, below(9, 10) / NINETY_PERCENT_SQUARE]
 }
 
 /// Returns the covariance of the unknowns. It includes the noise, and the ages of readings, which change as a sensor's
@@ -260,7 +260,7 @@ fn covariance(
     link: &[Option<Moment>],
     readings: &[Reading],
     model: &CellModel,
-    sums: &Sums,
+    sums: &ReadingSums,
     expected: &Unknowns,
     (variance, ages, lags): (f64, &Ages, &Lags),
 ) -> Option<Information> {
@@ -294,7 +294,7 @@ fn covariance(
         // The sum over later batches first: one product of vectors instead of one for each pair.
         let mut beside = score * (ages.covariance(0) / 2.0);
         let later = scores.iter().skip(at + 1).map(|(other, score)| (other - batch, score));
-        for (distance, score) in later.take_while(|(distance, _)| *distance < BATCHES) {
+        for (distance, score) in later.take_while(|(distance, _)| *distance < CORRELATED_BATCHES) {
             beside.axpy(ages.covariance(distance), score, 1.0);
         }
         scatter.ger(1.0, score, &beside, 1.0);
@@ -331,12 +331,12 @@ pub(crate) struct Ages {
 
 impl Ages {
     /// Returns the covariance for sensors that are read with broadcasts at this interval.
-    pub(crate) fn of(sheet: &DataSheet, broadcast_s: f64) -> Self {
+    pub(crate) fn for_sheet(sheet: &DataSheet, broadcast_s: f64) -> Self {
         let period = sheet.period_s();
         if period <= 0.0 {
             return Self { covariance: Vec::new() };
         }
-        let covariance = (0..BATCHES).map(|distance| {
+        let covariance = (0..CORRELATED_BATCHES).map(|distance| {
             let mut sum = 0.0;
             for clock in 0..CLOCKS {
                 let off = sheet.rate_error * ((2.0 * f64::from(clock) + 1.0) / f64::from(CLOCKS) - 1.0);

@@ -6,15 +6,15 @@ use serde::Serialize;
 
 use crate::cell::{Information, POSITION, TURN};
 use crate::estimate::Estimate;
-use crate::motion::Step;
-use crate::plan::{AIM, SWING_S, Supposed, Swings, informed, poses};
+use crate::motion::MotionStep;
+use crate::plan::{AIM, ProbeCell, SWING_S, Swings, poses, step_information};
 use crate::settings::Settings;
 use model::accelerometer::kinematics::Arm;
 
 /// The motion that would help to determine a pose.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "help", rename_all = "kebab-case")]
-pub enum Help {
+pub enum MotionAdvice {
     /// A joint should swing more.
     Swing {
         /// The joint's name.
@@ -26,7 +26,7 @@ pub enum Help {
     Nothing,
 }
 
-impl core::fmt::Display for Help {
+impl core::fmt::Display for MotionAdvice {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::Swing { joint } => write!(f, "a larger swing of {joint} would help most"),
@@ -37,40 +37,45 @@ impl core::fmt::Display for Help {
 }
 
 /// The fraction of the uncertainty that may remain after a motion that counts as a help.
-const HELP: f64 = 0.7;
+const HELPFUL_RATIO: f64 = 0.7;
 
 /// Finds the motion that would reduce the uncertainty of a cell's pose most.
-pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &Settings) -> Help {
+pub(crate) fn suggest_motion(
+    skin: &Skin,
+    bus: usize,
+    estimate: &Estimate,
+    settings: &Settings,
+) -> MotionAdvice {
     let swings = Swings::new(skin, &settings.bounds);
     let arms = [(bus, Arm::new(skin, bus, settings.gravity))];
     let row = usize::from(skin.chain(bus).row_of(estimate.joint).unwrap_or_default());
-    let supposed = [Supposed { bus, row, model: estimate.model.clone() }];
-    let Some(known) = estimate.covariance.try_inverse() else { return Help::Nothing };
-    let before = uncertain(&known);
-    let mut best = (HELP, Help::Nothing);
+    let supposed = [ProbeCell { bus, row, model: estimate.model.clone() }];
+    let Some(known) = estimate.covariance.try_inverse() else { return MotionAdvice::Nothing };
+    let before = worst_uncertainty(&known);
+    let mut best = (HELPFUL_RATIO, MotionAdvice::Nothing);
     for pose in poses(skin, &settings.bounds, &swings).iter().step_by(3) {
-        let steps = core::iter::once(Step::Hold { at: pose.clone() }).chain(swings.about(pose));
+        let steps = core::iter::once(MotionStep::Hold { at: pose.clone() }).chain(swings.about(pose));
         for step in steps {
-            let informed = informed(skin, &arms, &supposed, &step, SWING_S, &settings.sheet);
+            let informed = step_information(skin, &arms, &supposed, &step, SWING_S, &settings.sheet);
             // As many repetitions as fit into a plan.
             let more = informed.first().copied().unwrap_or_else(Information::zeros)
                 * (settings.bounds.length_s / SWING_S);
-            let left = uncertain(&(known + more)) / before;
+            let left = worst_uncertainty(&(known + more)) / before;
             if left >= best.0 {
                 continue;
             }
             best = match &step {
-                Step::Swing { amplitude, .. } => {
+                MotionStep::Swing { amplitude, .. } => {
                     let joints = skin.robot.joints.iter().zip(amplitude);
                     let swung = joints.max_by(|(_, one), (_, other)| one.total_cmp(other));
                     (
                         left,
-                        Help::Swing {
+                        MotionAdvice::Swing {
                             joint: swung.map_or_else(String::new, |(joint, _)| joint.name.clone()),
                         },
                     )
                 }
-                Step::Hold { .. } | Step::Move { .. } => (left, Help::Poses),
+                MotionStep::Hold { .. } | MotionStep::Move { .. } => (left, MotionAdvice::Poses),
             };
         }
     }
@@ -78,7 +83,7 @@ pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &S
 }
 
 /// Returns the standard deviation of a pose in its least certain direction, relative to [`AIM`](crate::plan::AIM).
-fn uncertain(information: &Information) -> f64 {
+fn worst_uncertainty(information: &Information) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return f64::INFINITY };
     let part = |start: usize, aim: f64| {
         let part: Matrix3<f64> = covariance.fixed_view::<3, 3>(start, start).into_owned();

@@ -9,7 +9,7 @@
 use crate::observe::BusObservations;
 
 /// The maximum number of broadcasts in a stretch, about 4 s.
-const LONGEST: usize = 256;
+const MAX_STRETCH: usize = 256;
 
 /// The lags of a bus: the additional age of the readings of each stretch, in s.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -27,7 +27,7 @@ impl Lags {
         let mut starts = Vec::new();
         let mut begin = 0;
         for end in bus.gaps.iter().map(|gap| gap.place).chain([bus.joints.len()]) {
-            let parts = end.saturating_sub(begin).div_ceil(LONGEST).max(1);
+            let parts = end.saturating_sub(begin).div_ceil(MAX_STRETCH).max(1);
             starts.extend((1..parts).map(|part| begin + (end - begin) * part / parts));
             starts.push(end);
             begin = end;
@@ -43,7 +43,7 @@ impl Lags {
     }
 
     /// Returns the lag of the stretch that contains a broadcast, in s.
-    pub(crate) fn at(&self, index: usize) -> f64 {
+    pub(crate) fn lag_at(&self, index: usize) -> f64 {
         self.by_stretch.get(self.stretch(index)).copied().unwrap_or_default()
     }
 
@@ -59,7 +59,7 @@ impl Lags {
     }
 
     /// Returns the first broadcast and the lag in s of the stretch with the largest absolute lag.
-    pub(crate) fn most(&self) -> (usize, f64) {
+    pub(crate) fn largest(&self) -> (usize, f64) {
         let all = core::iter::once(0).chain(self.starts.iter().copied()).zip(self.by_stretch.iter().copied());
         all.max_by(|(_, one), (_, other)| one.abs().total_cmp(&other.abs())).unwrap_or_default()
     }

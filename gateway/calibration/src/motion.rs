@@ -11,7 +11,7 @@ const RAMP_S: f64 = 0.6;
 /// A step of a motion.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "do", rename_all = "lowercase")]
-pub enum Step {
+pub enum MotionStep {
     /// The robot stands still.
     Hold {
         /// The pose: the position of each joint, in rad or m.
@@ -37,27 +37,27 @@ pub enum Step {
 
 /// A step of a motion with its start time and its duration.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Timed {
+pub struct TimedStep {
     /// The start time in s.
     pub at_s: f64,
     /// The duration in s.
     pub for_s: f64,
     /// The step.
     #[serde(flatten)]
-    pub step: Step,
+    pub step: MotionStep,
 }
 
 /// A sequence of steps.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Motion {
+pub struct MotionPlan {
     /// The steps, in order.
-    pub steps: Vec<Timed>,
+    pub steps: Vec<TimedStep>,
 }
 
-impl Motion {
+impl MotionPlan {
     /// Appends a step that lasts `for_s` seconds.
-    pub fn then(&mut self, for_s: f64, step: Step) {
-        self.steps.push(Timed { at_s: self.length_s(), for_s, step });
+    pub fn push_step(&mut self, for_s: f64, step: MotionStep) {
+        self.steps.push(TimedStep { at_s: self.length_s(), for_s, step });
     }
 
     /// Returns the total duration in s.
@@ -69,16 +69,18 @@ impl Motion {
     /// Returns the positions, speeds and accelerations of the joints at a time in s; before the first step and after
     /// the last one the robot stands still.
     #[must_use]
-    pub fn at(&self, time: f64) -> RobotState {
+    pub fn state_at(&self, time: f64) -> RobotState {
         let index = self.steps.partition_point(|step| step.at_s <= time).saturating_sub(1);
-        let Some(Timed { at_s, for_s, step }) = self.steps.get(index) else { return RobotState::default() };
+        let Some(TimedStep { at_s, for_s, step }) = self.steps.get(index) else {
+            return RobotState::default();
+        };
         let time = (time - at_s).clamp(0.0, *for_s);
         let mut state = RobotState::default();
         let joints = state.position.iter_mut().zip(&mut state.speed).zip(&mut state.acceleration);
         let joints = joints.map(|((position, speed), acceleration)| [position, speed, acceleration]);
         match step {
-            Step::Hold { at } => joints.zip(at).for_each(|([position, ..], at)| *position = *at),
-            Step::Move { from, to } => {
+            MotionStep::Hold { at } => joints.zip(at).for_each(|([position, ..], at)| *position = *at),
+            MotionStep::Move { from, to } => {
                 let [share, rate, change] = rise(time, *for_s);
                 for ([position, speed, acceleration], (from, to)) in joints.zip(from.iter().zip(to)) {
                     *position = (to - from).mul_add(share, *from);
@@ -86,7 +88,7 @@ impl Motion {
                     *acceleration = (to - from) * change;
                 }
             }
-            Step::Swing { about, amplitude, rate_hz } => {
+            MotionStep::Swing { about, amplitude, rate_hz } => {
                 let envelope = envelope(time, *for_s);
                 let each = about.iter().zip(amplitude).zip(rate_hz);
                 for ([position, speed, acceleration], ((about, amplitude), rate)) in joints.zip(each) {
@@ -147,15 +149,16 @@ mod tests {
 
     #[test]
     fn speeds_and_accelerations_are_the_differences_of_positions() {
-        let mut motion = Motion::default();
-        motion.then(0.5, Step::Hold { at: vec![0.1, -0.2] });
-        motion.then(1.0, Step::Move { from: vec![0.1, -0.2], to: vec![0.7, 0.4] });
-        let swing = Step::Swing { about: vec![0.7, 0.4], amplitude: vec![0.2, 0.1], rate_hz: vec![1.0, 1.3] };
-        motion.then(3.0, swing);
+        let mut motion = MotionPlan::default();
+        motion.push_step(0.5, MotionStep::Hold { at: vec![0.1, -0.2] });
+        motion.push_step(1.0, MotionStep::Move { from: vec![0.1, -0.2], to: vec![0.7, 0.4] });
+        let swing =
+            MotionStep::Swing { about: vec![0.7, 0.4], amplitude: vec![0.2, 0.1], rate_hz: vec![1.0, 1.3] };
+        motion.push_step(3.0, swing);
         let step = 1e-4;
         for at in 1..4_499 {
             let time = f64::from(at) * 1e-3;
-            let [before, now, after] = [time - step, time, time + step].map(|time| motion.at(time));
+            let [before, now, after] = [time - step, time, time + step].map(|time| motion.state_at(time));
             for joint in 0..2 {
                 let position = |state: &RobotState| state.position[joint];
                 let speed = (position(&after) - position(&before)) / (2.0 * step);

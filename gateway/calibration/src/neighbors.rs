@@ -15,14 +15,14 @@ pub struct Spacing {
 impl Spacing {
     /// Returns the spacing for a distance in m, with a deviation of 1 %.
     #[must_use]
-    pub const fn of(distance: f64) -> Self {
+    pub const fn with_distance(distance: f64) -> Self {
         Self { distance, deviation: distance * 0.01 }
     }
 }
 
 /// The estimated place of a cell, with its uncertainty.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Known {
+pub(crate) struct LocatedCell {
     pub(crate) position: Vector3<f64>,
     pub(crate) normal: Vector3<f64>,
     pub(crate) covariance: Matrix3<f64>,
@@ -30,20 +30,21 @@ pub(crate) struct Known {
 
 /// The number of standard deviations by which the length of a wire may be off; longer ones are ignored, as they are
 /// cables or lead to mistaken cells.
-const OFF: f64 = 4.0;
+const MAX_LENGTH_DEVIATIONS: f64 = 4.0;
 /// The number of times that the positions are recomputed.
 const ROUNDS: usize = 3;
 
 /// Improves the positions of the cells on one link; `wires` has pairs of indices. Returns the number of wires used.
-pub(crate) fn improve(cells: &mut [Known], wires: &[(usize, usize)], spacing: &Spacing) -> usize {
-    let pair = |cells: &[Known], &(one, other): &(usize, usize)| Some((*cells.get(one)?, *cells.get(other)?));
+pub(crate) fn improve(cells: &mut [LocatedCell], wires: &[(usize, usize)], spacing: &Spacing) -> usize {
+    let pair =
+        |cells: &[LocatedCell], &(one, other): &(usize, usize)| Some((*cells.get(one)?, *cells.get(other)?));
     let fits = |wire: &&(usize, usize)| {
         pair(cells, wire).is_some_and(|(one, other)| {
             let way = other.position - one.position;
             let along = way.try_normalize(1e-9).unwrap_or_else(Vector3::x);
             let variance = (along.transpose() * (one.covariance + other.covariance) * along).x;
             let deviation = (variance + spacing.deviation.powi(2)).sqrt();
-            (way.norm() - spacing.distance).abs() < OFF * deviation
+            (way.norm() - spacing.distance).abs() < MAX_LENGTH_DEVIATIONS * deviation
         })
     };
     let wires: Vec<_> = wires.iter().filter(fits).copied().collect();
@@ -106,7 +107,7 @@ mod tests {
 
     #[test]
     fn neighbours_pull_cells_to_their_distance_and_a_wrong_wire_does_not() {
-        let cell = |x: f64, z: f64| Known {
+        let cell = |x: f64, z: f64| LocatedCell {
             position: Vector3::new(x, 0.0, z),
             normal: Vector3::z(),
             covariance: Matrix3::identity() * 1e-6,

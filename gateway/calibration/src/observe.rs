@@ -14,13 +14,13 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 
 /// The word from which on a reading counts as saturated.
-const FULL: i16 = i16::MAX - 8;
+const SATURATED_WORD: i16 = i16::MAX - 8;
 /// The allowed jitter of the receive time of a broadcast, in periods.
-const JITTER: f64 = 0.25;
+const MAX_JITTER_PERIODS: f64 = 0.25;
 /// The number of consecutive broadcasts over which the period is measured.
-const SPAN: usize = 8;
+const PERIOD_SPAN: usize = 8;
 /// The maximum number of later broadcasts before a reading arrives.
-const LATEST: u32 = 100;
+const MAX_READING_DELAY: u32 = 100;
 
 /// The observations on all buses of a skin.
 #[derive(Clone, Debug)]
@@ -109,7 +109,7 @@ impl Observations {
 
     /// Records the next message of a bus, given as an index into [`Skin::buses`], with the time at which it was on the
     /// bus.
-    pub fn take(&mut self, bus: usize, at: Micros, message: &Message) {
+    pub fn record(&mut self, bus: usize, at: Micros, message: &Message) {
         let Some(bus) = self.buses.get_mut(bus) else { return };
         if let Message::Joints { epoch, joints } = message {
             if usize::from(joints.in_use) != bus.revolute.len() {
@@ -119,7 +119,8 @@ impl Observations {
         } else if let Message::Sensors { from, epoch, page: SensorPage::Acceleration(words) } = message {
             let cell = bus.nodes.get(usize::from(from.get())).copied().flatten();
             let cell = cell.and_then(|cell| self.cells.get_mut(cell));
-            let full = words.iter().any(|word| word.to_bits() > FULL || word.to_bits() < -FULL);
+            let full =
+                words.iter().any(|word| word.to_bits() > SATURATED_WORD || word.to_bits() < -SATURATED_WORD);
             if let (Some(cell), Some(epoch), false) = (cell, bus.index_of(*epoch), full) {
                 // A page that repeats the reading for the same joints adds no information.
                 if cell.last().is_none_or(|last| last.epoch < epoch) {
@@ -136,11 +137,11 @@ impl BusObservations {
             let periods = real(at.0.saturating_sub(before.0)) / self.period_us;
             let steps = epoch.epochs_since(last);
             // Epoch numbers repeat after 256 broadcasts.
-            if steps < 1 && periods < f64::from(LATEST) {
+            if steps < 1 && periods < f64::from(MAX_READING_DELAY) {
                 // A repeated or an old broadcast.
                 return;
             }
-            let is_regular = steps >= 1 && (periods - f64::from(steps)).abs() <= JITTER;
+            let is_regular = steps >= 1 && (periods - f64::from(steps)).abs() <= MAX_JITTER_PERIODS;
             if is_regular {
                 self.joints.extend((1..steps).map(|_| None));
                 self.follow(at, steps == 1);
@@ -177,7 +178,7 @@ impl BusObservations {
             self.times.clear();
         }
         self.times.push(at);
-        let before = self.times.len().checked_sub(SPAN + 1).and_then(|index| self.times.get(index));
+        let before = self.times.len().checked_sub(PERIOD_SPAN + 1).and_then(|index| self.times.get(index));
         self.spans.extend(before.map(|before| at.0.saturating_sub(before.0)));
     }
 
@@ -186,7 +187,7 @@ impl BusObservations {
         let mut spans = self.spans.clone();
         spans.sort_unstable();
         let middle = spans.get(spans.len() / 2)?;
-        Some(real(*middle) * 1e-6 / f64::from(u8::try_from(SPAN).unwrap_or(1)))
+        Some(real(*middle) * 1e-6 / f64::from(u8::try_from(PERIOD_SPAN).unwrap_or(1)))
     }
 
     /// Returns the time since the first broadcast, in s.
@@ -198,7 +199,7 @@ impl BusObservations {
     fn index_of(&self, epoch: Epoch) -> Option<u32> {
         let index = self.epochs.get(usize::from(epoch.0)).copied().flatten()?;
         let last = u32::try_from(self.joints.len()).ok()?;
-        (last - index <= LATEST).then_some(index)
+        (last - index <= MAX_READING_DELAY).then_some(index)
     }
 }
 

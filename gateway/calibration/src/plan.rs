@@ -14,9 +14,9 @@ use rand_pcg::Pcg64Mcg;
 use thiserror::Error;
 
 use crate::cell::{AGE_STEP, CellModel, Information, MOMENT, POSITION, TURN, expected, numbers};
-use crate::motion::{Motion, RISE_PEAKS, Step};
-use crate::sums::Sums;
-use model::accelerometer::kinematics::{Arm, G};
+use crate::motion::{MotionPlan, MotionStep, RISE_PEAKS};
+use crate::sums::ReadingSums;
+use model::accelerometer::kinematics::{Arm, STANDARD_GRAVITY};
 use model::accelerometer::sensor::DataSheet;
 
 /// The limits of a plan.
@@ -82,14 +82,14 @@ const RATE_HZ: f64 = 1.1;
 /// The frequencies of joints that swing together; they differ, so that the joints can be separated.
 const RATES_HZ: [f64; 7] = [0.8, 1.3, 1.0, 1.5, 0.9, 1.2, 1.4];
 /// The interval between the moments at which a candidate's information is computed, in s.
-const LOOK_S: f64 = 1.0 / 15.0;
+const SAMPLE_INTERVAL_S: f64 = 1.0 / 15.0;
 /// The standard deviations at which an estimate counts as good: of the position in m, and of the orientation in rad.
 pub(crate) const AIM: [f64; 2] = [0.5e-3, 0.2 * TAU / 360.0];
 
 impl Bounds {
     /// Returns limits about the middle of each joint's range, or about 0 if it turns by more than half a turn each way.
     #[must_use]
-    pub fn of(skin: &Skin) -> Self {
+    pub fn from_skin(skin: &Skin) -> Self {
         let middle = |[min, max]: [f64; 2], kind: JointKind| {
             let wide = kind == JointKind::Revolute && max - min > 0.99 * TAU;
             if wide { 0.0_f64.clamp(min, max) } else { f64::midpoint(min, max) }
@@ -128,14 +128,14 @@ impl Bounds {
 /// A candidate step: a hold at a pose, or a swing about it.
 struct Candidate {
     pose: usize,
-    step: Step,
+    step: MotionStep,
     seconds: f64,
     /// The information that the step adds on each assumed cell.
     information: Vec<Information>,
 }
 
 /// A cell that the planner assumes at some place of a link, to rate candidates by it.
-pub(crate) struct Supposed {
+pub(crate) struct ProbeCell {
     pub(crate) bus: usize,
     pub(crate) row: usize,
     pub(crate) model: CellModel,
@@ -145,18 +145,23 @@ pub(crate) struct Supposed {
 ///
 /// # Errors
 /// Returns [`PlanError`] if the bounds do not fit the robot.
-pub fn plan(skin: &Skin, bounds: &Bounds, sheet: &DataSheet, gravity: [f64; 3]) -> Result<Motion, PlanError> {
+pub fn plan(
+    skin: &Skin,
+    bounds: &Bounds,
+    sheet: &DataSheet,
+    gravity: [f64; 3],
+) -> Result<MotionPlan, PlanError> {
     bounds.check(skin)?;
     let swings = Swings::new(skin, bounds);
     let poses = poses(skin, bounds, &swings);
     let buses = (0..skin.buses.len()).filter(|&bus| skin.cells_on_bus(bus).next().is_some());
     let arms: Vec<_> = buses.map(|bus| (bus, Arm::new(skin, bus, gravity))).collect();
-    let supposed = supposed(skin, &arms);
+    let supposed = probe_cells(skin, &arms);
     let mut candidates = Vec::new();
     for (pose, at) in poses.iter().enumerate() {
-        let hold = (HOLD_S, Step::Hold { at: at.clone() });
+        let hold = (HOLD_S, MotionStep::Hold { at: at.clone() });
         for (seconds, step) in core::iter::once(hold).chain(swings.about(at).map(|step| (SWING_S, step))) {
-            let information = informed(skin, &arms, &supposed, &step, seconds, sheet);
+            let information = step_information(skin, &arms, &supposed, &step, seconds, sheet);
             candidates.push(Candidate { pose, step, seconds, information });
         }
     }
@@ -176,7 +181,8 @@ impl Swings {
         let amplitudes = joints.map(|(index, (joint, max_speed))| {
             let reach = reach(skin, index);
             let [min, max] = joint.limits;
-            let force = bounds.force_g * G / if joint.kind == JointKind::Revolute { reach } else { 1.0 };
+            let force = bounds.force_g * STANDARD_GRAVITY
+                / if joint.kind == JointKind::Revolute { reach } else { 1.0 };
             let speed = bounds.speed * max_speed / rate;
             let acceleration = bounds.acceleration.min(force) / (rate * rate);
             speed.min(acceleration).min(bounds.within / 2.0).min((max - min) / 4.0)
@@ -185,10 +191,13 @@ impl Swings {
     }
 
     /// Returns swings about a pose: of each joint alone, and of all joints together.
-    pub(crate) fn about<'a>(&'a self, pose: &'a [f64]) -> impl Iterator<Item = Step> + 'a {
+    pub(crate) fn about<'a>(&'a self, pose: &'a [f64]) -> impl Iterator<Item = MotionStep> + 'a {
         let joints = self.amplitudes.len();
-        let swing =
-            |amplitude: Vec<f64>, rate_hz: Vec<f64>| Step::Swing { about: pose.to_vec(), amplitude, rate_hz };
+        let swing = |amplitude: Vec<f64>, rate_hz: Vec<f64>| MotionStep::Swing {
+            about: pose.to_vec(),
+            amplitude,
+            rate_hz,
+        };
         let alone = (0..joints).map(move |joint| {
             let own = |(at, amplitude): (usize, &f64)| if at == joint { *amplitude } else { 0.0 };
             swing(self.amplitudes.iter().enumerate().map(own).collect(), vec![RATE_HZ; joints])
@@ -234,7 +243,7 @@ pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &Swings) -> Vec<Vec<f6
 }
 
 /// Returns assumed cells on each link: near its joint, in its middle, and at its end.
-fn supposed(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<Supposed> {
+fn probe_cells(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<ProbeCell> {
     let mut all = Vec::new();
     for &(bus, _) in arms {
         let chain = skin.chain(bus);
@@ -245,7 +254,7 @@ fn supposed(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<Supposed> {
             for (share, turn) in [(0.2, 0.5), (0.8, 2.1)] {
                 let position = Vector3::new(-length * share, 0.06, 0.04 * share);
                 let rotation = UnitQuaternion::from_euler_angles(turn, 0.3 * turn, 0.7 - turn);
-                all.push(Supposed { bus, row, model: CellModel::at(rotation, position) });
+                all.push(ProbeCell { bus, row, model: CellModel::ideal(rotation, position) });
             }
         }
     }
@@ -253,23 +262,24 @@ fn supposed(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<Supposed> {
 }
 
 /// Returns the information that a step adds on each assumed cell.
-pub(crate) fn informed(
+pub(crate) fn step_information(
     skin: &Skin,
     arms: &[(usize, Arm)],
-    supposed: &[Supposed],
-    step: &Step,
+    supposed: &[ProbeCell],
+    step: &MotionStep,
     seconds: f64,
     sheet: &DataSheet,
 ) -> Vec<Information> {
-    let mut motion = Motion::default();
-    motion.then(seconds, step.clone());
-    let mut sums: Vec<Option<Sums>> = vec![None; supposed.len()];
-    let (mut time, look) = (LOOK_S / 2.0, skin.timing.broadcast_hz() * LOOK_S);
+    let mut motion = MotionPlan::default();
+    motion.push_step(seconds, step.clone());
+    let mut sums: Vec<Option<ReadingSums>> = vec![None; supposed.len()];
+    let (mut time, look) = (SAMPLE_INTERVAL_S / 2.0, skin.timing.broadcast_hz() * SAMPLE_INTERVAL_S);
     while time < seconds {
         for (bus, arm) in arms {
             let joints = &skin.chain(*bus).joints;
             let ages = [-AGE_STEP, 0.0, AGE_STEP];
-            let motions = ages.map(|age| arm.rows(&motion.at((time - age).max(0.0)).of_chain(joints)));
+            let motions =
+                ages.map(|age| arm.rows(&motion.state_at((time - age).max(0.0)).chain_state(joints)));
             // The cells of one link see the same motion: they share the sums of the first one.
             let mut seen = usize::MAX;
             for (one, sum) in supposed.iter().zip(&mut sums) {
@@ -280,12 +290,12 @@ pub(crate) fn informed(
                 let mut moment = [1.0; MOMENT];
                 let all = motions.iter().flat_map(|rows| rows.get(one.row).map(numbers).unwrap_or_default());
                 moment.iter_mut().zip(all).for_each(|(to, from)| *to = from);
-                sum.get_or_insert_with(Sums::default).add(&moment, &[0.0; 3], look);
+                sum.get_or_insert_with(ReadingSums::default).add(&moment, &[0.0; 3], look);
             }
         }
-        time += LOOK_S;
+        time += SAMPLE_INTERVAL_S;
     }
-    let variance = sheet.deviation().powi(2) + 0.003_f64.powi(2);
+    let variance = sheet.reading_deviation().powi(2) + 0.003_f64.powi(2);
     let mut last = None;
     let each = supposed.iter().zip(&sums).map(|(one, sum)| {
         last = sum.as_ref().or(last);
@@ -295,7 +305,12 @@ pub(crate) fn informed(
 }
 
 /// Returns the chosen candidates, in the order in which they were chosen.
-fn choose(candidates: &[Candidate], supposed: &[Supposed], bounds: &Bounds, sheet: &DataSheet) -> Vec<usize> {
+fn choose(
+    candidates: &[Candidate],
+    supposed: &[ProbeCell],
+    bounds: &Bounds,
+    sheet: &DataSheet,
+) -> Vec<usize> {
     let prior = Information::from_diagonal(&expected(sheet));
     let mut known = vec![prior; supposed.len()];
     let mut scores: Vec<_> = known.iter().map(score).collect();
@@ -346,12 +361,12 @@ fn ordered(
     poses: &[Vec<f64>],
     candidates: &[Candidate],
     chosen: &[usize],
-) -> Motion {
+) -> MotionPlan {
     let mut left: Vec<_> = (0..poses.len()).collect();
     left.retain(|pose| chosen.iter().any(|&it| candidates.get(it).is_some_and(|it| it.pose == *pose)));
-    let mut motion = Motion::default();
+    let mut motion = MotionPlan::default();
     let mut at = bounds.center.clone();
-    motion.then(HOLD_S, Step::Hold { at: at.clone() });
+    motion.push_step(HOLD_S, MotionStep::Hold { at: at.clone() });
     let distance = |from: &[f64], pose: usize| {
         poses.get(pose).map_or(f64::INFINITY, |to| travel(skin, bounds, from, to))
     };
@@ -362,24 +377,24 @@ fn ordered(
     {
         left.remove(place);
         let Some(to) = poses.get(pose) else { continue };
-        go(skin, bounds, &mut motion, &mut at, to);
-        motion.then(HOLD_S, Step::Hold { at: to.clone() });
+        push_move(skin, bounds, &mut motion, &mut at, to);
+        motion.push_step(HOLD_S, MotionStep::Hold { at: to.clone() });
         let swings = chosen.iter().filter_map(|&it| candidates.get(it)).filter(|it| it.pose == pose);
         for Candidate { step, seconds, .. } in swings {
-            if matches!(step, Step::Swing { .. }) {
-                motion.then(*seconds, step.clone());
+            if matches!(step, MotionStep::Swing { .. }) {
+                motion.push_step(*seconds, step.clone());
             }
         }
     }
-    go(skin, bounds, &mut motion, &mut at, &bounds.center);
-    motion.then(HOLD_S, Step::Hold { at });
+    push_move(skin, bounds, &mut motion, &mut at, &bounds.center);
+    motion.push_step(HOLD_S, MotionStep::Hold { at });
     motion
 }
 
-fn go(skin: &Skin, bounds: &Bounds, motion: &mut Motion, at: &mut Vec<f64>, to: &[f64]) {
+fn push_move(skin: &Skin, bounds: &Bounds, motion: &mut MotionPlan, at: &mut Vec<f64>, to: &[f64]) {
     let seconds = travel(skin, bounds, at, to);
     if seconds > 0.0 {
-        motion.then(seconds, Step::Move { from: at.clone(), to: to.to_vec() });
+        motion.push_step(seconds, MotionStep::Move { from: at.clone(), to: to.to_vec() });
         *at = to.to_vec();
     }
 }
@@ -404,12 +419,12 @@ mod tests {
     #[test]
     fn a_plan_stays_within_limits_speeds_and_its_time() {
         for skin in [testing::ur5(), testing::panda()] {
-            let bounds = Bounds::of(&skin);
-            let motion = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -G]).unwrap();
+            let bounds = Bounds::from_skin(&skin);
+            let motion = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap();
             assert!(motion.length_s() < 180.0 && motion.length_s() > 100.0, "{}", motion.length_s());
             let mut time = 0.0;
             while time < motion.length_s() {
-                let state = motion.at(time);
+                let state = motion.state_at(time);
                 for (index, joint) in skin.robot.joints.iter().enumerate() {
                     let (position, speed) = (state.position[index], state.speed[index]);
                     assert!(position >= joint.limits[0] && position <= joint.limits[1], "{time}: {position}");
@@ -424,15 +439,15 @@ mod tests {
     #[test]
     fn a_pose_outside_of_limits_is_refused() {
         let skin = testing::panda();
-        let mut bounds = Bounds::of(&skin);
+        let mut bounds = Bounds::from_skin(&skin);
         bounds.center[3] = 0.5;
-        let error = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -G]).unwrap_err();
+        let error = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap_err();
         assert_eq!(
             error.to_string(),
             "joint joint4 at 0.5: its limits are -3.0718 to -0.0698; choose a position between them"
         );
         bounds.center.pop();
-        let error = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -G]).unwrap_err();
+        let error = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap_err();
         assert_eq!(error.to_string(), "the pose has 6 positions; the robot has 7 joints: give one for each");
     }
 }

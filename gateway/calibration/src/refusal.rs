@@ -24,7 +24,7 @@ pub struct Disturbance {
 
 impl Disturbance {
     /// Returns the gaps of one bus; `known` is the number of broadcasts whose motion is known.
-    pub(crate) fn of(bus: &BusObservations, known: usize) -> Self {
+    pub(crate) fn from_bus(bus: &BusObservations, known: usize) -> Self {
         let broadcasts = bus.joints.iter().flatten().count();
         let longest = bus.gaps.iter().max_by(|one, other| one.took_ms.total_cmp(&other.took_ms));
         Self {
@@ -37,7 +37,7 @@ impl Disturbance {
     }
 
     /// Returns the sum of the gaps of this bus and of another one.
-    pub(crate) fn and(self, other: Self) -> Self {
+    pub(crate) fn merged_with(self, other: Self) -> Self {
         let is_longer = other.longest_ms > self.longest_ms;
         let (longest_ms, longest_at_s) = if is_longer {
             (other.longest_ms, other.longest_at_s)

@@ -4,14 +4,14 @@ use nalgebra::{Matrix3, SymmetricEigen, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Skin};
 use serde::Serialize;
 
-use crate::help::Help;
+use crate::help::MotionAdvice;
 use crate::refusal::Disturbance;
 use crate::rounded::rounded;
 use crate::zero::ZeroOffset;
 use model::accelerometer::kinematics::Arm;
 
 /// The limits of the 95 % uncertainty of a determined pose: of the position in m, and of the orientation in rad.
-const ENOUGH: [f64; 2] = [0.02, 0.09];
+const MAX_UNCERTAINTY: [f64; 2] = [0.02, 0.09];
 
 /// The results of the calibration of a skin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -58,10 +58,10 @@ pub struct CellResult {
     /// The number of readings of the cell.
     pub readings: usize,
     /// The problems with the cell; empty for most cells.
-    pub troubles: Vec<Trouble>,
+    pub troubles: Vec<Diagnosis>,
     /// The place of the cell, as it is written to a skin file.
     #[serde(flatten)]
-    pub found: Option<Found>,
+    pub found: Option<FoundPlace>,
     /// The errors of the cell's accelerometer.
     #[serde(flatten)]
     pub sensor: SensorResult,
@@ -85,7 +85,7 @@ pub struct SensorResult {
 
 /// The place of a cell, in the terms of a skin file.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Found {
+pub struct FoundPlace {
     /// The joint that moves the cell.
     pub joint: u8,
     /// The row in whose frame position and orientation are given.
@@ -122,7 +122,7 @@ pub struct Pose {
 /// The reason to distrust a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "trouble", rename_all = "kebab-case")]
-pub enum Trouble {
+pub enum Diagnosis {
     /// The cell sent nothing.
     Dead,
     /// All readings of the cell have the same value.
@@ -161,11 +161,11 @@ pub enum Trouble {
         /// The 95 % angle of the orientation, in degrees.
         orientation_deg: f64,
         /// The motion that would help to determine the pose.
-        help: Help,
+        help: MotionAdvice,
     },
 }
 
-impl core::fmt::Display for Trouble {
+impl core::fmt::Display for Diagnosis {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::Dead => f.write_str("dead: it sent no acceleration; its description is kept"),
@@ -215,15 +215,15 @@ impl CellResult {
     /// Returns true if the cell's new pose is written to a skin file.
     #[must_use]
     pub fn is_written(&self) -> bool {
-        let kept = |trouble: &Trouble| {
+        let kept = |trouble: &Diagnosis| {
             matches!(
                 trouble,
-                Trouble::Dead
-                    | Trouble::Stuck
-                    | Trouble::Still
-                    | Trouble::Joint { .. }
-                    | Trouble::Loose { .. }
-                    | Trouble::NotObservable { .. }
+                Diagnosis::Dead
+                    | Diagnosis::Stuck
+                    | Diagnosis::Still
+                    | Diagnosis::Joint { .. }
+                    | Diagnosis::Loose { .. }
+                    | Diagnosis::NotObservable { .. }
             )
         };
         self.found.is_some() && !self.troubles.iter().any(kept)
@@ -231,27 +231,27 @@ impl CellResult {
 
     /// Stores the pose in the terms of a skin file: in the frame of the row that carries the cell in the skin, if that
     /// row belongs to the same joint.
-    pub(crate) fn settle(&mut self, skin: &Skin, cell: &Cell, arm: Option<&Arm>) {
+    pub(crate) fn store_pose(&mut self, skin: &Skin, cell: &Cell, arm: Option<&Arm>) {
         let sensor = &mut self.sensor;
         sensor.bias_g = sensor.bias_g.map(|bias| bias.map(|it| rounded(it, 5)));
         sensor.gain = sensor.gain.map(|gain| gain.map(|it| rounded(it, 5)));
         (sensor.noise_g, sensor.rough_g) =
             (sensor.noise_g.map(|it| rounded(it, 5)), sensor.rough_g.map(|it| rounded(it, 5)));
         let (Some(pose), Some(arm)) = (&self.pose, arm) else { return };
-        if self.troubles.iter().any(|trouble| matches!(trouble, Trouble::Loose { .. })) {
+        if self.troubles.iter().any(|trouble| matches!(trouble, Diagnosis::Loose { .. })) {
             // The uncertainty of its pose follows from noise, which these residuals are not.
             return;
         }
         let own = skin.chain(cell.bus).row_of(pose.joint).unwrap_or_default();
         let row = if cell.joint == pose.joint { cell.row } else { own };
-        let change = arm.between(own, row);
+        let change = arm.transform_between(own, row);
         let placed = pose.seen_from((&change.rotation, &change.translation.vector));
         let quaternion = placed.rotation.quaternion();
         let sign = if quaternion.w < 0.0 { -1.0 } else { 1.0 };
         let same_link = cell.joint == pose.joint;
         let way = (placed.position - Vector3::from(cell.position)).norm();
         let turn = (placed.rotation * Vector3::z()).angle(&Vector3::from(cell.normal));
-        self.found = Some(Found {
+        self.found = Some(FoundPlace {
             joint: pose.joint,
             row,
             position: placed.position.map(|part| rounded(part, 5)).into(),
@@ -281,7 +281,7 @@ impl Pose {
     /// Returns true if the pose is certain enough to be used.
     #[must_use]
     pub fn is_determined(&self) -> bool {
-        let [position, turn] = ENOUGH;
+        let [position, turn] = MAX_UNCERTAINTY;
         self.position_95() < position && self.turn_95() < turn
     }
 
@@ -311,7 +311,7 @@ fn radius_95(covariance: &Matrix3<f64>) -> f64 {
 }
 
 impl Summary {
-    pub(crate) fn of(cells: &[CellResult], wires: usize, joints: Disturbance) -> Self {
+    pub(crate) fn from_cells(cells: &[CellResult], wires: usize, joints: Disturbance) -> Self {
         let median = |pick: &dyn Fn(&CellResult) -> Option<f64>| {
             let mut all: Vec<_> = cells.iter().filter(|cell| cell.is_written()).filter_map(pick).collect();
             all.sort_by(f64::total_cmp);

@@ -4,7 +4,7 @@ use protocol::skin::Skin;
 
 use crate::neighbors::Spacing;
 use crate::plan::Bounds;
-use model::accelerometer::kinematics::G;
+use model::accelerometer::kinematics::STANDARD_GRAVITY;
 use model::accelerometer::sensor::DataSheet;
 
 /// The prior knowledge and the options of a calibration.
@@ -27,14 +27,14 @@ pub struct Settings {
 impl Settings {
     /// Returns settings for sensors with the default data sheet, on a robot that stands upright.
     #[must_use]
-    pub fn of(skin: &Skin) -> Self {
+    pub fn from_skin(skin: &Skin) -> Self {
         Self {
             sheet: DataSheet::default(),
-            gravity: [0.0, 0.0, -G],
+            gravity: [0.0, 0.0, -STANDARD_GRAVITY],
             spacing: None,
             zero_offsets: false,
             threads: 1,
-            bounds: Bounds::of(skin),
+            bounds: Bounds::from_skin(skin),
         }
     }
 }

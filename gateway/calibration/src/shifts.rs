@@ -4,40 +4,40 @@ use crate::cell::AGE;
 use crate::estimate::{Estimate, change, paired, residual, weight};
 use crate::lag::Lags;
 use crate::observe::Reading;
-use crate::table::Table;
+use crate::table::MotionTable;
 
 /// The lag from which on a stretch counts as shifted, in s.
-const SHIFTED: f64 = 1e-3;
+const MIN_SHIFT_S: f64 = 1e-3;
 /// The number of standard deviations from which on a shift counts as certain.
-const CERTAIN: f64 = 5.0;
+const MIN_SIGNIFICANCE: f64 = 5.0;
 /// The residual beyond which a reading gets a lower weight, in g.
-const CHANGING: f64 = 0.05;
+const RESIDUAL_LIMIT: f64 = 0.05;
 
 impl Lags {
     /// Returns these lags plus the shifts that remain in the residuals, or `None` if no shift is certain; `period` is
     /// the interval of the sensors' samples, in s.
-    pub(crate) fn more<'a>(
+    pub(crate) fn refined<'a>(
         &self,
-        table: &Table,
+        table: &MotionTable,
         cells: impl Iterator<Item = (&'a Estimate, &'a [Reading])>,
         period: f64,
     ) -> Option<Self> {
         if self.starts.is_empty() {
             return None;
         }
-        let mut all = vec![Sum::default(); self.by_stretch.len()];
+        let mut all = vec![StretchSums::default(); self.by_stretch.len()];
         let (mut ages, mut count) = (0.0, 0.0);
         for (estimate, readings) in cells {
             (ages, count) = (ages + estimate.model.age, count + 1.0);
             let (coefficients, derivatives) = (estimate.model.coefficients(), estimate.model.derivatives());
-            let mut own = vec![Sum::default(); all.len()];
+            let mut own = vec![StretchSums::default(); all.len()];
             for (moment, reading) in paired(table.link(estimate.joint), readings) {
                 let index = usize::try_from(reading.epoch).unwrap_or_default();
                 let Some(sum) = own.get_mut(self.stretch(index)) else { continue };
                 let change = change(&derivatives[AGE], moment);
                 let off = residual(&coefficients, moment, &reading.g);
                 // Large shifts cause large residuals.
-                let weight = weight(&off, CHANGING * CHANGING);
+                let weight = weight(&off, RESIDUAL_LIMIT * RESIDUAL_LIMIT);
                 sum.weight += weight * change.iter().map(|it| it * it).sum::<f64>();
                 sum.product += weight * change.iter().zip(off).map(|(one, other)| one * other).sum::<f64>();
             }
@@ -63,7 +63,7 @@ impl Lags {
             // Each cell's own age varies over a whole period.
             let deviation = (period * period / 12.0 * sum.squares + sum.noise).sqrt() / sum.weight;
             *own = deviation;
-            is_certain |= off.abs() > SHIFTED.max(CERTAIN * deviation);
+            is_certain |= off.abs() > MIN_SHIFT_S.max(MIN_SIGNIFICANCE * deviation);
             before + off
         });
         let by_stretch = by_stretch.collect();
@@ -72,7 +72,7 @@ impl Lags {
 }
 
 #[derive(Clone, Copy, Debug, Default)]
-struct Sum {
+struct StretchSums {
     weight: f64,
     product: f64,
     squares: f64,

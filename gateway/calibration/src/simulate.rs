@@ -9,7 +9,7 @@ use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use crate::motion::Motion;
+use crate::motion::MotionPlan;
 use crate::observe::Observations;
 
 /// The deviation of a cell from the skin's description.
@@ -31,7 +31,12 @@ pub enum Defect {
 /// Moves a simulated skin through a motion, and returns the observations of its bus; values are rounded to words as in
 /// frames.
 #[must_use]
-pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: &[Defect]) -> Observations {
+pub fn observe(
+    skin: &Skin,
+    motion: &MotionPlan,
+    sensors: &Accelerometers,
+    defects: &[Defect],
+) -> Observations {
     let mut seen = Observations::new(skin);
     let period = 1.0 / skin.timing.broadcast_hz();
     let epochs = (motion.length_s() / period).floor();
@@ -40,10 +45,10 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
     while index < epochs {
         let now = index * period;
         let at = micros(now);
-        let state = motion.at(now);
+        let state = motion.state_at(now);
         for bus in 0..skin.buses.len() {
             let chain = skin.chain(bus);
-            let joints = state.of_chain(&chain.joints);
+            let joints = state.chain_state(&chain.joints);
             let mut positions = [Q1_14::ZERO; MAX_JOINTS];
             let kinds = chain.rows.iter().map(|row| row.kind).filter(|kind| *kind != RowKind::Fixed);
             for ((word, position), kind) in positions.iter_mut().zip(joints.position).zip(kinds) {
@@ -53,7 +58,7 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
                 };
             }
             let in_use = u8::try_from(chain.joints.len()).unwrap_or_default();
-            seen.take(bus, at, &Message::Joints { epoch, joints: Joints { positions, in_use } });
+            seen.record(bus, at, &Message::Joints { epoch, joints: Joints { positions, in_use } });
         }
         let tilt = |cell: usize, force: &Vector3<f64>| match defects.get(cell) {
             // The cell rests on one side or the other, as gravity pulls it.
@@ -63,7 +68,7 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
             }
             _ => *force,
         };
-        let shown: Vec<_> = sensors.readings(skin, |time| motion.at(time), now, tilt).collect();
+        let shown: Vec<_> = sensors.readings(skin, |time| motion.state_at(time), now, tilt).collect();
         for ((number, cell), shown) in skin.cells.iter().enumerate().zip(shown) {
             let shown = match defects.get(number) {
                 Some(Defect::Dead) => continue,
@@ -73,7 +78,7 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
             };
             let words: [f64; 3] = shown.into();
             let page = SensorPage::Acceleration(words.map(Q::nearest));
-            seen.take(cell.bus, at, &Message::Sensors { from: cell.node, epoch, page });
+            seen.record(cell.bus, at, &Message::Sensors { from: cell.node, epoch, page });
         }
         epoch = epoch.next();
         index += 1.0;

@@ -10,8 +10,8 @@ use protocol::parameters::MAX_JOINTS;
 use model::accelerometer::kinematics::JointState;
 
 /// The number of broadcasts in a window on each side of the middle one.
-pub(crate) const HALF: usize = 10;
-const WINDOW: usize = 2 * HALF + 1;
+pub(crate) const HALF_WINDOW: usize = 10;
+const WINDOW: usize = 2 * HALF_WINDOW + 1;
 /// The number of coefficients of the polynomial.
 const TERMS: usize = 7;
 
@@ -40,21 +40,21 @@ impl Smoother {
     #[must_use]
     pub(crate) fn new(period_s: f64) -> Self {
         let powers = SMatrix::<f64, WINDOW, TERMS>::from_fn(|at, power| {
-            let x = (real(at) - real(HALF)) / real(HALF);
+            let x = (real(at) - real(HALF_WINDOW)) / real(HALF_WINDOW);
             x.powi(i32::try_from(power).unwrap_or_default())
         });
         let normal = powers.tr_mul(&powers);
         // The inverse exists: the times differ, and there are fewer terms than times.
         let fit = normal.try_inverse().map_or_else(SMatrix::zeros, |inverse| inverse * powers.transpose());
         let left = SMatrix::identity() - powers * fit;
-        Self { fit, left, half_s: period_s * real(HALF) }
+        Self { fit, left, half_s: period_s * real(HALF_WINDOW) }
     }
 
     /// Returns the root mean square distance of each of the first `joints` in a window from a smooth motion, or `None`
     /// if the window is incomplete.
     #[must_use]
     pub(crate) fn roughness(&self, window: &[Option<Positions>], joints: usize) -> Option<Positions> {
-        let middle = window.get(HALF)?.as_ref().filter(|_| window.len() == WINDOW)?;
+        let middle = window.get(HALF_WINDOW)?.as_ref().filter(|_| window.len() == WINDOW)?;
         let mut roughness = [0.0; MAX_JOINTS];
         for (joint, (rough, middle)) in roughness.iter_mut().zip(middle).take(joints).enumerate() {
             let mut series = SVector::<f64, WINDOW>::zeros();
@@ -132,8 +132,9 @@ mod tests {
             })
             .collect();
         let mut worst = [0.0_f64; 3];
-        for middle in HALF..words.len() - HALF {
-            let state = smoother.state(&words[middle - HALF..=middle + HALF], 1, earlier).unwrap();
+        for middle in HALF_WINDOW..words.len() - HALF_WINDOW {
+            let state =
+                smoother.state(&words[middle - HALF_WINDOW..=middle + HALF_WINDOW], 1, earlier).unwrap();
             let at = middle as f64 * period - earlier;
             let speed = amplitude * rate * (rate * at).cos();
             let acceleration = -rate * rate * position(at);

@@ -7,11 +7,11 @@ use nalgebra::{Cholesky, SMatrix};
 use crate::cell::{CellModel, Coefficients, Information, MOMENT, Moment, ROW, UNKNOWNS, Unknowns};
 
 /// The maximum number of least-squares steps.
-const STEPS: usize = 60;
+const MAX_STEPS: usize = 60;
 
 /// Weighted sums over the readings of a cell, from which least squares compute residuals and derivatives.
 #[derive(Clone, Debug)]
-pub(crate) struct Sums {
+pub(crate) struct ReadingSums {
     /// The sums of products of two numbers of a moment.
     moments: SMatrix<f64, MOMENT, MOMENT>,
     /// The sums of products of a number of a moment and the reading of each axis.
@@ -23,7 +23,7 @@ pub(crate) struct Sums {
 }
 
 /// The coefficients of the 12 numbers of a motion at the middle age, and of 1, without the constraints of a model.
-pub(crate) type Free = SMatrix<f64, 13, 3>;
+pub(crate) type FreeCoefficients = SMatrix<f64, 13, 3>;
 
 /// Converts an index into [`Free`] to the index among all numbers of a moment.
 const fn place(number: usize) -> usize {
@@ -31,7 +31,7 @@ const fn place(number: usize) -> usize {
 }
 
 /// Converts coefficients for the middle age to coefficients for all ages, with zeros for the others.
-pub(crate) fn at_middle_age(free: &Free) -> Coefficients {
+pub(crate) fn at_middle_age(free: &FreeCoefficients) -> Coefficients {
     let mut all = Coefficients::zeros();
     for number in 0..=ROW {
         all.row_mut(place(number)).copy_from(&free.row(number));
@@ -47,13 +47,13 @@ pub(crate) struct Fit {
     pub(crate) cost: f64,
 }
 
-impl Default for Sums {
+impl Default for ReadingSums {
     fn default() -> Self {
         Self { moments: SMatrix::zeros(), shown: Coefficients::zeros(), squares: 0.0, weight: 0.0 }
     }
 }
 
-impl Sums {
+impl ReadingSums {
     /// Adds a reading at a moment, with a weight.
     pub(crate) fn add(&mut self, moment: &Moment, shown: &[f64; 3], weight: f64) {
         // Columns of static matrices are contiguous: both loops become vector instructions.
@@ -109,7 +109,7 @@ impl Sums {
         };
         let mut best = Fit { cost: cost(&start), model: start };
         let mut damping = 1e-3;
-        for _ in 0..STEPS {
+        for _ in 0..MAX_STEPS {
             let (mut information, mut gradient) = self.information(&best.model);
             information /= variance;
             gradient /= variance;
@@ -140,7 +140,7 @@ impl Sums {
 
     /// Returns the coefficients at the middle age that fit the readings best without constraints, as a start for least
     /// squares. `ridge` regularises the coefficients on which the readings have no information.
-    pub(crate) fn unconstrained(&self, ridge: f64) -> Option<Free> {
+    pub(crate) fn unconstrained(&self, ridge: f64) -> Option<FreeCoefficients> {
         let mut moments =
             SMatrix::<f64, 13, 13>::from_fn(|row, column| self.moments[(place(row), place(column))]);
         let shown = SMatrix::<f64, 13, 3>::from_fn(|row, axis| self.shown[(place(row), axis)]);

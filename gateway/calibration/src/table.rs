@@ -6,13 +6,13 @@ use protocol::skin::{Chain, Skin};
 use crate::cell::{AGE_STEP, AGES, MOMENT, Moment, numbers};
 use crate::lag::Lags;
 use crate::observe::{BusObservations, Observations, Reading};
-use crate::smooth::{HALF, Positions, STEP_M, STEP_RAD, Smoother};
+use crate::smooth::{HALF_WINDOW, Positions, STEP_M, STEP_RAD, Smoother};
 use model::accelerometer::kinematics::Arm;
 use model::accelerometer::sensor::DataSheet;
 
 /// The motion of the links of one bus' chain.
 #[derive(Debug)]
-pub(crate) struct Table {
+pub(crate) struct MotionTable {
     pub(crate) arm: Arm,
     /// The ages of readings relative to their joints.
     pub(crate) lags: Lags,
@@ -21,13 +21,13 @@ pub(crate) struct Table {
 }
 
 /// The factor by which the roughness of a joint in a window may exceed that of rounding; rougher windows are left out.
-const ROUGH: f64 = 1.1;
+const MAX_ROUGHNESS_FACTOR: f64 = 1.1;
 /// The factor by which the roughness may exceed that of the median window, because the positions of real joints
 /// scatter.
-const ROUGHER: f64 = 4.0;
+const MAX_MEDIAN_ROUGHNESS_FACTOR: f64 = 4.0;
 
 /// Periods with a smaller relative difference than this count as equal.
-const EQUAL: f64 = 5e-4;
+const PERIOD_TOLERANCE: f64 = 5e-4;
 
 /// Returns the roughness up to which a window counts as a smooth motion, by joint in rad or m.
 fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
@@ -39,12 +39,12 @@ fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
         let mut all: Vec<_> = of_joint.collect();
         all.sort_by(f64::total_cmp);
         let most = all.get(all.len() / 2).copied().unwrap_or_default();
-        *limit = (ROUGH * step / 2.0).max(ROUGHER * most);
+        *limit = (MAX_ROUGHNESS_FACTOR * step / 2.0).max(MAX_MEDIAN_ROUGHNESS_FACTOR * most);
     }
     limits
 }
 
-impl Table {
+impl MotionTable {
     /// Computes the motions. `offsets` are added to the positions of joints; `lags` is the additional age of readings.
     pub(crate) fn new(
         skin: &Skin,
@@ -61,7 +61,7 @@ impl Table {
         let nominal = 1.0 / skin.timing.broadcast_hz();
         let period = observed.and_then(BusObservations::period_s).unwrap_or(nominal);
         // Time stamps are not more accurate than the clock of the loop.
-        let period = if (period / nominal - 1.0).abs() < EQUAL { nominal } else { period };
+        let period = if (period / nominal - 1.0).abs() < PERIOD_TOLERANCE { nominal } else { period };
         let smoother = Smoother::new(period);
         let (middle, _) = sheet.age();
         let joints = chain.joints.len();
@@ -71,21 +71,21 @@ impl Table {
         let series = observed.map_or(&[][..], |bus| &bus.joints);
         let mut links = vec![vec![None; series.len()]; rows.len()];
         let roughness: Vec<_> =
-            series.windows(2 * HALF + 1).map(|window| smoother.roughness(window, joints)).collect();
+            series.windows(2 * HALF_WINDOW + 1).map(|window| smoother.roughness(window, joints)).collect();
         let limits = limits(chain, &roughness);
         let is_smooth =
             |roughness: &Positions| !roughness.iter().zip(&limits).any(|(rough, limit)| rough > limit);
         for index in 0..series.len() {
             // The window around the time of the reading, which may lie at other joints than the preceding ones.
-            let lag = lags.at(index);
+            let lag = lags.lag_at(index);
             let periods = (lag / period).round();
-            let Some(first) =
-                (0..roughness.len()).nth(index.wrapping_sub(HALF).wrapping_add_signed(-whole(periods)))
+            let Some(first) = (0..roughness.len())
+                .nth(index.wrapping_sub(HALF_WINDOW).wrapping_add_signed(-whole(periods)))
             else {
                 continue;
             };
             let known = roughness.get(first).copied().flatten().is_some_and(|it| is_smooth(&it));
-            let (Some(window), true) = (series.get(first..=first + 2 * HALF), known) else { continue };
+            let (Some(window), true) = (series.get(first..=first + 2 * HALF_WINDOW), known) else { continue };
             let middle = middle + lag - periods * period;
             let mut moments = vec![[1.0; MOMENT]; rows.len()];
             let mut complete = true;
@@ -131,7 +131,7 @@ impl Table {
     }
 
     /// Returns the number of broadcasts with a known motion.
-    pub(crate) fn known(&self) -> usize {
+    pub(crate) fn known_count(&self) -> usize {
         self.link(0).iter().flatten().count()
     }
 }

@@ -4,7 +4,7 @@ use protocol::skin::Skin;
 use protocol::skin::file::{Edit, Value};
 use thiserror::Error;
 
-use crate::result::{Calibration, Found};
+use crate::result::{Calibration, FoundPlace};
 
 /// The error for a skin whose text cannot be changed.
 #[derive(Debug, Error)]
@@ -19,13 +19,13 @@ pub enum WriteError {
 ///
 /// # Errors
 /// Returns [`WriteError`] if the text does not belong to the skin.
-pub fn calibrated(skin: &Skin, text: &str, calibration: &Calibration) -> Result<String, WriteError> {
+pub fn calibrated_text(skin: &Skin, text: &str, calibration: &Calibration) -> Result<String, WriteError> {
     let mut edit = Edit::new(skin, text).map_err(|error| WriteError::Text(error.to_string()))?;
     for (index, (cell, result)) in skin.cells.iter().zip(&calibration.cells).enumerate() {
         let Some(found) = result.found.filter(|_| result.is_written()) else { continue };
-        let Found { joint, row, position, orientation, .. } = found;
+        let FoundPlace { joint, row, position, orientation, .. } = found;
         if joint != cell.joint {
-            put(&mut edit, index, "joint", Value::Integer(i64::from(joint)), "node");
+            set_or_insert(&mut edit, index, "joint", Value::Integer(i64::from(joint)), "node");
         }
         edit.set(index, "row", Value::Integer(i64::from(row)));
         edit.set(index, "position", Value::Numbers(&position));
@@ -34,14 +34,14 @@ pub fn calibrated(skin: &Skin, text: &str, calibration: &Calibration) -> Result<
         if edit.has(index, "normal") {
             edit.replace(index, "normal", "orientation", orientation);
         } else {
-            put(&mut edit, index, "orientation", orientation, "position");
+            set_or_insert(&mut edit, index, "orientation", orientation, "position");
         }
     }
     Ok(edit.text())
 }
 
 /// Sets the value of a cell's key. Inserts the key after another one if the cell does not have it.
-fn put(edit: &mut Edit<'_>, cell: usize, key: &str, value: Value<'_>, after: &str) {
+fn set_or_insert(edit: &mut Edit<'_>, cell: usize, key: &str, value: Value<'_>, after: &str) {
     if edit.has(cell, key) {
         edit.set(cell, key, value);
     } else {
@@ -75,7 +75,7 @@ orientation = [0.0, 0.0, 0.0, 1.0]
     #[test]
     fn poses_change_and_nothing_else() {
         let skin = Skin::parse("skin.toml", SKIN).unwrap();
-        let found = Found {
+        let found = FoundPlace {
             joint: 2,
             row: 2,
             position: [0.01, -0.02, 0.3],
@@ -93,13 +93,13 @@ orientation = [0.0, 0.0, 0.0, 1.0]
             cells: cells.to_vec(),
             zero_offsets: None,
         };
-        let text = calibrated(&skin, SKIN, &calibration(&cells)).unwrap();
+        let text = calibrated_text(&skin, SKIN, &calibration(&cells)).unwrap();
         let expected = SKIN
             .replace("[-0.2, 0.0, 0.06]", "[0.01, -0.02, 0.3]")
             .replace("normal = [0.0, 1.0, 0.0]", "orientation = [0.0, 0.0, 0.6, 0.8]");
         assert_eq!(text, expected);
         cells[1].found = Some(found);
-        let text = calibrated(&skin, SKIN, &calibration(&cells)).unwrap();
+        let text = calibrated_text(&skin, SKIN, &calibration(&cells)).unwrap();
         let new = Skin::parse("new.toml", &text).unwrap();
         assert_eq!((new.cells[1].joint, new.cells[1].orientation), (2, Some([0.0, 0.0, 0.6, 0.8])));
     }
@@ -109,7 +109,7 @@ orientation = [0.0, 0.0, 0.0, 1.0]
         let skin = Skin::parse("skin.toml", SKIN).unwrap();
         let calibration = Calibration { summary: Default::default(), cells: Vec::new(), zero_offsets: None };
         let (one, _) = SKIN.rsplit_once("[[cell]]").unwrap();
-        let error = calibrated(&skin, one, &calibration).unwrap_err();
+        let error = calibrated_text(&skin, one, &calibration).unwrap_err();
         assert_eq!(
             error.to_string(),
             "the skin's text is not that of the skin that was read: 1 cells, not 2; calibrate again"

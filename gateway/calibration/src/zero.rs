@@ -12,25 +12,25 @@ use protocol::skin::{JointKind, Skin};
 use serde::Serialize;
 
 use crate::cell::{Information, MOMENT, UNKNOWNS, Unknowns, expected};
-use crate::each::each;
+use crate::each::parallel_map;
 use crate::estimate::{Estimate, paired, residual};
 use crate::lag::Lags;
 use crate::observe::{Observations, Reading};
 use crate::rounded::rounded;
 use crate::settings::Settings;
-use crate::table::Table;
+use crate::table::MotionTable;
 
 /// The prior standard deviation of offsets, in rad or m.
-const SUPPOSED: f64 = 0.1;
+const PRIOR_DEVIATION: f64 = 0.1;
 /// An offset with a larger standard deviation than this is not observable: 1 degree, or 2 cm.
-const OBSERVED: f64 = 0.0175;
+const MAX_DEVIATION: f64 = 0.0175;
 /// The step of numerical derivatives.
 const STEP: f64 = 1e-5;
 /// The interval of the readings that are used: one of this many.
 const STRIDE: usize = 4;
 /// The fraction of an independent reading that each reading counts as, because errors of readings close in time are
 /// correlated.
-const SHARE: f64 = 0.5;
+const READING_WEIGHT: f64 = 0.5;
 
 /// The zero offset of a joint.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -70,27 +70,27 @@ pub(crate) fn zero_offsets(
     skin: &Skin,
     seen: &Observations,
     settings: &Settings,
-    (tables, lags): (&[Option<Table>], &[Lags]),
+    (tables, lags): (&[Option<MotionTable>], &[Lags]),
     estimates: &[Option<Estimate>],
 ) -> Vec<ZeroOffset> {
     let size = skin.robot.joints.len();
-    let mut information = DMatrix::<f64>::identity(size, size) / (SUPPOSED * SUPPOSED);
+    let mut information = DMatrix::<f64>::identity(size, size) / (PRIOR_DEVIATION * PRIOR_DEVIATION);
     let mut gradient = DVector::<f64>::zeros(size);
     for (bus, table) in tables.iter().enumerate() {
         let (Some(table), Some(lags)) = (table, lags.get(bus)) else { continue };
         let joints = &skin.chain(bus).joints;
-        let moved: Vec<_> = each(joints.len(), settings.threads, |joint| {
+        let moved: Vec<_> = parallel_map(joints.len(), settings.threads, |joint| {
             let mut offsets = [0.0; MAX_JOINTS];
             if let Some(offset) = offsets.get_mut(joint) {
                 *offset = STEP;
             }
-            Table::new(skin, bus, seen, &settings.sheet, settings.gravity, &offsets, lags)
+            MotionTable::new(skin, bus, seen, &settings.sheet, settings.gravity, &offsets, lags)
         });
-        let left = each(skin.cells.len(), settings.threads, |index| {
+        let left = parallel_map(skin.cells.len(), settings.threads, |index| {
             let (cell, estimate) = (skin.cells.get(index)?, estimates.get(index)?.as_ref()?);
             let readings = seen.cells.get(index)?;
             (cell.bus == bus && estimate.joint > 0)
-                .then(|| left(table, &moved, estimate, readings, settings))?
+                .then(|| cell_remainder(table, &moved, estimate, readings, settings))?
         });
         for left in left.into_iter().flatten() {
             for (row, &to) in joints.iter().enumerate() {
@@ -109,7 +109,7 @@ pub(crate) fn zero_offsets(
         ZeroOffset {
             joint: joint.name.clone(),
             unit: if joint.kind == JointKind::Revolute { "rad" } else { "m" },
-            offset: (deviation < OBSERVED).then(|| rounded(offsets[index], 5)),
+            offset: (deviation < MAX_DEVIATION).then(|| rounded(offsets[index], 5)),
             deviation: rounded(deviation, 5),
         }
     });
@@ -117,9 +117,9 @@ pub(crate) fn zero_offsets(
 }
 
 /// Returns the information of a cell's readings on the offsets that the cell's own unknowns cannot explain.
-fn left(
-    table: &Table,
-    moved: &[Table],
+fn cell_remainder(
+    table: &MotionTable,
+    moved: &[MotionTable],
     estimate: &Estimate,
     readings: &[Reading],
     settings: &Settings,
@@ -132,7 +132,8 @@ fn left(
     let mut shared = DMatrix::<f64>::zeros(UNKNOWNS, size);
     let mut information = DMatrix::<f64>::zeros(size, size);
     let (mut of_own, mut gradient) = (Unknowns::zeros(), DVector::<f64>::zeros(size));
-    let weight = SHARE * f64::from(u8::try_from(STRIDE).unwrap_or(1)) / estimate.noise_g.powi(2).max(1e-10);
+    let weight =
+        READING_WEIGHT * f64::from(u8::try_from(STRIDE).unwrap_or(1)) / estimate.noise_g.powi(2).max(1e-10);
     let links: Vec<_> = moved.iter().map(|table| table.link(estimate.joint)).collect();
     for (moment, reading) in paired(table.link(estimate.joint), &few) {
         let at = usize::try_from(reading.epoch).ok()?;

@@ -190,10 +190,10 @@ pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Par
     }
     let plain = rows.iter().take(shape.rows).all(|row| row.kind == RowKind::Revolute);
     // The cell is on the last row, or on one after the first joint.
-    let first = rows.iter().position(Row::moves).unwrap_or(0);
+    let first = rows.iter().position(Row::has_joint).unwrap_or(0);
     let span = u32::try_from(shape.rows - first).unwrap_or(1);
     let place = if dice.below(2) == 0 { shape.rows } else { first + 1 + dice.below(span) as usize };
-    let joint = rows.iter().take(place).filter(|row| row.moves()).count();
+    let joint = rows.iter().take(place).filter(|row| row.has_joint()).count();
     let byte = |number: usize| u8::try_from(number).unwrap_or_default();
     let (row, table_rows) = if plain { (0, 0) } else { (byte(place), byte(shape.rows)) };
     let position = [0; 3].map(|_| Q1_14::nearest(dice.unit() * share));
@@ -223,8 +223,9 @@ fn normal(dice: &mut TestRandom) -> [Q1_14; 3] {
 
 /// Returns joint positions for a chain; prismatic joints stay near 0.
 pub(crate) fn positions(dice: &mut TestRandom, parameters: &Parameters) -> [i16; MAX_JOINTS] {
-    let moving: Vec<_> = parameters.table().iter().filter(|row| row.moves()).map(|row| row.kind).collect();
-    let share = 16_384 / i16::try_from(parameters.table().len().max(1) * 3).unwrap_or(i16::MAX);
+    let moving: Vec<_> =
+        parameters.all_rows().iter().filter(|row| row.has_joint()).map(|row| row.kind).collect();
+    let share = 16_384 / i16::try_from(parameters.all_rows().len().max(1) * 3).unwrap_or(i16::MAX);
     core::array::from_fn(|index| match moving.get(index) {
         None => 0,
         Some(RowKind::Prismatic) => dice.word() % share,

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use bench::bus::follow::fill;
+use bench::bus::follow::receive_batch;
 use bench::bus::listen;
 use protocol::bus::{Bus as Socket, BusError, BusOptions, GATEWAY_RECEIVE_BUFFER, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
@@ -95,7 +95,7 @@ impl TestBus for SocketBus {
             let before = self.now();
             let wait = until.elapsed_since(before).min(SIGNAL_POLL_INTERVAL);
             let wait_time = Duration::from_micros(wait.0);
-            let count = fill(&self.socket, &mut self.inbox, wait_time).map_err(lost)?;
+            let count = receive_batch(&self.socket, &mut self.inbox, wait_time).map_err(lost)?;
             let now = self.now();
             if self.inbox.dropped() > 0 {
                 let name = self.socket.name();

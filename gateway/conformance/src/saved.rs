@@ -65,7 +65,7 @@ impl Session<'_> {
             match self.read(number)? {
                 Reply::Value(words) => _ = parameters.insert(number, words),
                 // A cell that implements the protocol without baselines.
-                Reply::Refused(Answer::UNKNOWN) if parameter == Parameter::Baseline => {}
+                Reply::Refused(Answer::UNKNOWN_PARAMETER) if parameter == Parameter::Baseline => {}
                 Reply::Refused(_) | Reply::Nothing => {
                     return Ok(Err(format!("it does not answer a read of parameter {number}")));
                 }

@@ -406,7 +406,7 @@ impl<'a> Session<'a> {
     /// Records the time from a request to its answer, with the lateness of the bench meanwhile.
     pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
         let late = self.lateness();
-        self.timings.note(what, answered.elapsed_since(asked), late);
+        self.timings.record(what, answered.elapsed_since(asked), late);
     }
 
     /// Returns a joints message for the chain in use.

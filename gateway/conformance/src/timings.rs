@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use protocol::time::Span;
 
 /// The lateness of the bench above which late answers do not count against the cell.
-const LATE: Span = Span::from_millis(1);
+const MAX_BENCH_LATENESS: Span = Span::from_millis(1);
 
 /// The kinds of answers that TIME-2 limits, each with its limit in ms.
 pub(crate) const LIMITS: [(&str, u64); 6] = [
@@ -33,16 +33,16 @@ pub(crate) struct Timings(pub(crate) BTreeMap<&'static str, Times>);
 
 impl Timings {
     /// Records the time of an answer, with the lateness of the bench meanwhile.
-    pub(crate) fn note(&mut self, what: &'static str, took: Span, bench: Span) {
+    pub(crate) fn record(&mut self, what: &'static str, took: Span, bench: Span) {
         let times = self.0.entry(what).or_default();
         let limit = LIMITS.iter().find(|(name, _)| *name == what);
         let is_late = limit.is_some_and(|(_, limit)| took > Span::from_millis(*limit));
-        match (is_late, bench > LATE) {
+        match (is_late, bench > MAX_BENCH_LATENESS) {
             (false, _) => times.in_time += 1,
             (true, true) => times.blameless += 1,
             (true, false) => times.late += 1,
         }
-        if bench <= LATE {
+        if bench <= MAX_BENCH_LATENESS {
             times.longest = times.longest.max(took);
         }
     }

@@ -105,7 +105,7 @@ struct Admittance {
     /// Mobility 1/D in rad/s per Nm.
     mobility: f64,
     /// Fraction of the velocity that remains after one tick without torque: `e^(-D/M T)`.
-    keep: f64,
+    remaining: f64,
     max_speed: f64,
 }
 
@@ -114,18 +114,23 @@ impl Kinesthetic {
     #[must_use]
     pub fn new(skin: &Skin) -> Option<Self> {
         match &skin.controller.kind {
-            ControllerKind::Kinesthetic { inertia, damping } => Some(Self::with(skin, inertia, damping)),
+            ControllerKind::Kinesthetic { inertia, damping } => {
+                Some(Self::from_parameters(skin, inertia, damping))
+            }
             ControllerKind::External { .. } => None,
         }
     }
 
-    pub(crate) fn with(skin: &Skin, inertia: &[f64], damping: &[f64]) -> Self {
+    pub(crate) fn from_parameters(skin: &Skin, inertia: &[f64], damping: &[f64]) -> Self {
         let tick = 1.0 / skin.timing.control_hz;
         let mut joints = [Admittance::default(); MAX_ROBOT_JOINTS];
         let given = inertia.iter().zip(damping).zip(&skin.controller.max_speed);
         for (joint, ((inertia, damping), &max_speed)) in joints.iter_mut().zip(given) {
-            *joint =
-                Admittance { mobility: damping.recip(), keep: (-damping / inertia * tick).exp(), max_speed };
+            *joint = Admittance {
+                mobility: damping.recip(),
+                remaining: (-damping / inertia * tick).exp(),
+                max_speed,
+            };
         }
         Self { joints }
     }
@@ -143,7 +148,7 @@ impl Controller for Kinesthetic {
         for ((velocity, torque), joint) in velocity.iter_mut().zip(input.torque).zip(&self.joints) {
             // Keep the value finite: the difference of two infinities below is not a number.
             let settled = (torque * joint.mobility).clamp(f64::MIN, f64::MAX);
-            let next = settled + (*velocity - settled) * joint.keep;
+            let next = settled + (*velocity - settled) * joint.remaining;
             *velocity = next.clamp(-joint.max_speed, joint.max_speed);
         }
         ControllerOutput::Move(velocity)

@@ -27,7 +27,7 @@ use protocol::time::Micros;
 use crate::controller::{BadCycle, Controller, ControllerOutput, Input};
 use crate::external::Absence;
 use crate::robot::{Robot, StepResult};
-use carried::{BusInput, Carried, bit};
+use carried::{BusInput, CarriedBroadcasts, bit};
 use chain::Chain;
 use model::central::Central;
 use model::table::Snapshot;
@@ -124,14 +124,14 @@ pub struct Cycle {
     ticks_per_broadcast: u64,
     safety: Safety,
     /// The broadcasts that each bus has carried.
-    carried: Vec<Carried>,
+    carried: Vec<CarriedBroadcasts>,
     epoch: Epoch,
     broadcasts: u64,
     /// Index of the last broadcast in the schedule of broadcasts.
     slot: Option<u64>,
     bad_in_a_row: u32,
     /// Deadline for the start of the external controller; `None` once it has started.
-    starts: Option<Micros>,
+    start_deadline: Option<Micros>,
     good_in_a_row: u32,
     halted: Option<Halt>,
     halts: u32,
@@ -168,12 +168,12 @@ impl Cycle {
             tick_seconds: 1.0 / skin.timing.control_hz,
             ticks_per_broadcast: u64::from(skin.timing.ticks_per_broadcast),
             safety: skin.safety,
-            carried: vec![Carried::default(); skin.buses.len()],
+            carried: vec![CarriedBroadcasts::default(); skin.buses.len()],
             epoch: Epoch(255),
             broadcasts: 0,
             slot: None,
             bad_in_a_row: 0,
-            starts: match &skin.controller.kind {
+            start_deadline: match &skin.controller.kind {
                 ControllerKind::External { start, .. } => Some(Micros(0) + *start),
                 ControllerKind::Kinesthetic { .. } => None,
             },
@@ -247,7 +247,7 @@ impl Cycle {
             } else {
                 input.missing |= bit(index);
             }
-            let part = carried::part(unanswered, &self.safety);
+            let part = carried::remaining_fraction(unanswered, &self.safety);
             if part > 0.0 {
                 chain.add(part, &bus.torque, &mut input.torque);
                 input.contributing += bus.contributing;
@@ -264,7 +264,7 @@ impl Cycle {
             LostBus::Continue => some_bus_works,
             LostBus::Halt => input.missing == 0,
         };
-        let heard = self.obey(halts, resumes);
+        let heard = self.handle_commands(halts, resumes);
         input.halted = self.halted.is_some();
 
         let step = self.controller.step(&input);
@@ -272,7 +272,7 @@ impl Cycle {
             ControllerOutput::Move(_) => None,
             ControllerOutput::Bad(why) => Some(why),
         };
-        let command = if self.count(bad, tick.time) { Some(Command::Halt) } else { heard };
+        let command = if self.count_cycle(bad, tick.time) { Some(Command::Halt) } else { heard };
         let velocity = match step {
             ControllerOutput::Move(velocity) if self.halted.is_none() => velocity,
             // Without an answer, the robot first keeps its velocity for some cycles; then it stands, halted or not.
@@ -336,13 +336,13 @@ impl Cycle {
 
     /// Returns the joint positions of a chain at the last broadcast, in rad or m, before they were rounded to words.
     #[must_use]
-    pub fn positions_of(&self, chain: usize) -> [f64; MAX_JOINTS] {
+    pub fn chain_positions(&self, chain: usize) -> [f64; MAX_JOINTS] {
         self.chains.get(chain).map_or([0.0; MAX_JOINTS], |chain| chain.positions(&self.robot.positions()))
     }
 
     /// Handles halts and resumes that other senders sent on a bus. A halt takes precedence over a resume. Returns the
     /// command to send on the other buses.
-    fn obey(&mut self, halts: u32, resumes: u32) -> Option<Command> {
+    fn handle_commands(&mut self, halts: u32, resumes: u32) -> Option<Command> {
         let mut heard = None;
         if resumes != self.resumes {
             self.resumes = resumes;
@@ -359,18 +359,18 @@ impl Cycle {
     }
 
     /// Counts consecutive bad cycles. Returns true if this cycle halts the robot.
-    fn count(&mut self, bad: Option<BadCycle>, now: Micros) -> bool {
+    fn count_cycle(&mut self, bad: Option<BadCycle>, now: Micros) -> bool {
         let Some(why) = bad else {
             self.bad_in_a_row = 0;
             self.good_in_a_row = self.good_in_a_row.saturating_add(1);
             // The controller has started once it has answered as often in a row as it may later fail.
-            self.starts = self.starts.filter(|_| self.good_in_a_row < self.safety.bad_cycles);
+            self.start_deadline = self.start_deadline.filter(|_| self.good_in_a_row < self.safety.bad_cycles);
             return false;
         };
         self.good_in_a_row = 0;
         self.bad_in_a_row = self.bad_in_a_row.saturating_add(1);
         let begins = matches!(why, BadCycle::NoPeer | BadCycle::NoAnswer)
-            && self.starts.is_some_and(|until| now < until);
+            && self.start_deadline.is_some_and(|until| now < until);
         let halt = self.bad_in_a_row >= self.safety.bad_cycles && !begins && self.halted.is_none();
         if halt {
             self.halted = Some(Halt::BadCycles(why));

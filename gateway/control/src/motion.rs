@@ -19,7 +19,7 @@ pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>
             motion.state_at(seconds).map_or(motion.start, |state| state.position)
         })),
         (MotionKind::Kinesthetic, ControllerKind::Kinesthetic { inertia, damping }) => {
-            Box::new(Kinesthetic::with(skin, inertia, damping))
+            Box::new(Kinesthetic::from_parameters(skin, inertia, damping))
         }
         (MotionKind::Kinesthetic, ControllerKind::External { socket, .. }) => {
             Box::new(External::listen(Path::new(socket), skin)?)

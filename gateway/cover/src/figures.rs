@@ -14,7 +14,7 @@ pub(crate) fn figures(
 ) -> LinkFigures {
     let grid = Grid::with_points(pitch, spots.iter().map(|spot| &spot.point));
     let covered = |sample: &&Sample| {
-        let mut near = grid.around(grid.cube(&sample.point)).filter_map(|index| spots.get(index));
+        let mut near = grid.points_around(grid.cube(&sample.point)).filter_map(|index| spots.get(index));
         near.any(|spot| {
             // A cell covers only samples whose faces point to the same side, so not the other side of a thin wall.
             spot.normal.dot(&sample.face) > -0.5 && (spot.point - sample.point).norm() <= pitch

@@ -43,7 +43,7 @@ impl Grid {
 
     /// Returns the indices of the points in a cube and in the 26 cubes around it. They include all points that are
     /// within an edge length of any point in the cube.
-    pub(crate) fn around(&self, [x, y, z]: [i64; 3]) -> impl Iterator<Item = usize> {
+    pub(crate) fn points_around(&self, [x, y, z]: [i64; 3]) -> impl Iterator<Item = usize> {
         let near = |middle: i64| middle.saturating_sub(1)..=middle.saturating_add(1);
         near(x).flat_map(move |x| near(y).map(move |y| [x, y])).flat_map(move |[x, y]| {
             let row = [x, y, z.saturating_sub(1)]..=[x, y, z.saturating_add(1)];
@@ -67,7 +67,7 @@ mod tests {
             let grid = Grid::with_points(0.7, &points);
             prop_assert_eq!(grid.cubes().map(|(_, points)| points.len()).sum::<usize>(), points.len());
             for point in &points {
-                let found: Vec<_> = grid.around(grid.cube(point)).collect();
+                let found: Vec<_> = grid.points_around(grid.cube(point)).collect();
                 for (index, other) in points.iter().enumerate() {
                     prop_assert!((point - other).norm() > 0.7 || found.contains(&index));
                 }

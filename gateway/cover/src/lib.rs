@@ -245,11 +245,11 @@ pub fn cover(links: &[RobotLink], others: &[RobotLink], options: &CoverOptions) 
     let mut figures = Vec::with_capacity(links.len());
     for (index, link) in links.iter().enumerate() {
         let surface = Surface::new(index, links, others, options)?;
-        let spots = place::place(&surface, options, index);
+        let spots = place::place_cells(&surface, options, index);
         figures.push(figures::figures(link, &surface, &spots, options.pitch));
         placed.push(spots);
     }
-    let (cells, buses) = wire::wire(&placed, options);
+    let (cells, buses) = wire::wire_cells(&placed, options);
     Ok(Cover { cells, buses, links: figures })
 }
 

@@ -47,7 +47,7 @@ pub(crate) struct CellPosition {
 }
 
 /// Returns the places of the cells on a link.
-pub(crate) fn place(surface: &Surface<'_>, options: &CoverOptions, link: usize) -> Vec<CellPosition> {
+pub(crate) fn place_cells(surface: &Surface<'_>, options: &CoverOptions, link: usize) -> Vec<CellPosition> {
     let pitch = options.pitch;
     let field = Field::new(surface.samples.iter().filter(|sample| sample.free).collect(), 1.2 * pitch);
     if real(field.samples.len()) * surface.share < cell_area(pitch) / 4.0 {
@@ -87,7 +87,8 @@ fn thinned(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition> {
         let near = |other: &CellPosition| {
             other.normal.dot(&spot.normal) > SAME_SIDE && (other.point - spot.point).norm() < apart
         };
-        let is_crowded = grid.around(grid.cube(&spot.point)).filter_map(|index| kept.get(index)).any(near);
+        let is_crowded =
+            grid.points_around(grid.cube(&spot.point)).filter_map(|index| kept.get(index)).any(near);
         if !is_crowded {
             grid.insert(&spot.point, kept.len());
             kept.push(spot);
@@ -120,7 +121,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
 /// Returns the places of cells on the mesh, one for each site that relaxation has found.
 fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -> Vec<CellPosition> {
     let mut best: Vec<Option<(f64, &Sample)>> = vec![None; sites.len()];
-    for (owner, sample) in field.owners(sites).into_iter().zip(&field.samples) {
+    for (owner, sample) in field.nearest_sites(sites).into_iter().zip(&field.samples) {
         let Some((site, best)) = owner.and_then(|owner| Some((sites.get(owner)?, best.get_mut(owner)?)))
         else {
             continue;

@@ -21,7 +21,7 @@ const MIN_GROWTH_DISTANCE: f64 = 0.75;
 const ROUNDS: usize = 60;
 
 /// The number of rounds after which new sites are added at samples that are far from every site.
-const ADDING: usize = 15;
+const ROUNDS_PER_ADDITION: usize = 15;
 
 /// A point that is the center of the samples nearest to it. A cell is placed there at the end.
 #[derive(Clone, Copy, Debug)]
@@ -53,10 +53,10 @@ impl<'a> Field<'a> {
     }
 
     /// Adds a site at each sample, in the given order, that is farther than `apart` (in m) from all sites.
-    pub(crate) fn apart(&self, order: &[usize], apart: f64, sites: &mut Vec<Site>) {
+    pub(crate) fn add_sites(&self, order: &[usize], apart: f64, sites: &mut Vec<Site>) {
         let mut grid = Grid::with_points(apart, sites.iter().map(|site| &site.point));
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
-            let near = grid.around(grid.cube(&sample.point)).filter_map(|index| sites.get(index));
+            let near = grid.points_around(grid.cube(&sample.point)).filter_map(|index| sites.get(index));
             let free =
                 !near.filter_map(|site| site.distance(sample)).any(|distance| distance < apart * apart);
             if free {
@@ -72,7 +72,7 @@ impl<'a> Field<'a> {
         let mut sites: Vec<Site> = Vec::new();
         let mut grid = Grid::new(step);
         let free = |site: &Site, apart: f64, sites: &[Site], grid: &Grid| {
-            let mut near = grid.around(grid.cube(&site.point)).filter_map(|index| sites.get(index));
+            let mut near = grid.points_around(grid.cube(&site.point)).filter_map(|index| sites.get(index));
             near.all(|other| {
                 other.normal.dot(&site.normal) <= MIN_NORMAL_COSINE
                     || (other.point - site.point).norm() >= apart
@@ -109,7 +109,8 @@ impl<'a> Field<'a> {
 
     /// Moves a site onto the surface at the nearest sample; `None` if no sample is within `within`, in m.
     fn snapped(&self, site: &Site, within: f64) -> Option<Site> {
-        let near = self.grid.around(self.grid.cube(&site.point)).filter_map(|index| self.samples.get(index));
+        let near =
+            self.grid.points_around(self.grid.cube(&site.point)).filter_map(|index| self.samples.get(index));
         let near = near.filter_map(|sample| Some((site.distance(sample)?, sample)));
         let (distance, sample) = near.min_by(|a, b| a.0.total_cmp(&b.0))?;
         let height = (site.point - sample.point).dot(&sample.smooth);
@@ -118,12 +119,12 @@ impl<'a> Field<'a> {
     }
 
     /// Returns the index of the nearest site for each sample; `None` if no site is near enough.
-    pub(crate) fn owners(&self, sites: &[Site]) -> Vec<Option<usize>> {
+    pub(crate) fn nearest_sites(&self, sites: &[Site]) -> Vec<Option<usize>> {
         let mut owners = vec![None; self.samples.len()];
         let grid = Grid::with_points(self.reach, sites.iter().map(|site| &site.point));
         for (cube, members) in self.grid.cubes() {
             let near: Vec<_> =
-                grid.around(cube).filter_map(|index| Some((index, sites.get(index)?))).collect();
+                grid.points_around(cube).filter_map(|index| Some((index, sites.get(index)?))).collect();
             for &member in members {
                 let Some(sample) = self.samples.get(member) else { continue };
                 let mut best = None;
@@ -146,7 +147,7 @@ impl<'a> Field<'a> {
     /// `apart` (in m) from others.
     pub(crate) fn relax(&self, sites: &mut Vec<Site>, apart: f64) {
         for round in 1..=ROUNDS {
-            let owners = self.owners(sites);
+            let owners = self.nearest_sites(sites);
             let mut sums = vec![(0.0, Vector3::zeros(), Vector3::zeros()); sites.len()];
             let mut alone = Vec::new();
             for (index, (owner, sample)) in owners.iter().zip(&self.samples).enumerate() {
@@ -167,8 +168,8 @@ impl<'a> Field<'a> {
                     Some(Site { point: Point3::from(points / count), normal })
                 })
                 .collect();
-            if round % ADDING == 0 && round < ROUNDS {
-                self.apart(&alone, apart, sites);
+            if round % ROUNDS_PER_ADDITION == 0 && round < ROUNDS {
+                self.add_sites(&alone, apart, sites);
             }
         }
     }

@@ -10,7 +10,7 @@ use crate::tree::{Ray, TriangleTree};
 use crate::{CoverError, CoverOptions, KeepOut, RobotLink};
 
 /// The number of samples on the area of a cell.
-const PER_CELL: f64 = 64.0;
+const SAMPLES_PER_CELL: f64 = 64.0;
 
 /// The maximum number of cells whose area the triangles of a link may have.
 const MAX_CELLS: usize = 6000;
@@ -37,7 +37,7 @@ const MIN_REACHED_SHARE: f64 = 0.05;
 const REACH_RAYS: u32 = 128;
 
 /// The height above the surface from which rays start, in pitches.
-const ABOVE: f64 = 1e-3;
+const RAY_START_HEIGHT: f64 = 1e-3;
 
 /// The distance up to which other links hide a surface from rays, in pitches.
 const HIDING_DISTANCE: f64 = 2.0;
@@ -94,7 +94,7 @@ impl<'a> Surface<'a> {
                 collect(link, &(frame * link.pose), &mut obstacles)?;
             }
         }
-        once(&mut own);
+        remove_duplicates(&mut own);
         let pitch = options.pitch;
         let area: f64 = own.iter().map(area).sum();
         let cells = area / cell_area(pitch);
@@ -112,7 +112,7 @@ impl<'a> Surface<'a> {
             share: 0.0,
         };
         if area > 0.0 {
-            surface.sample(area, (cells * PER_CELL).max(MIN_SAMPLES));
+            surface.sample(area, (cells * SAMPLES_PER_CELL).max(MIN_SAMPLES));
             surface.smooth();
         }
         Ok(surface)
@@ -154,7 +154,7 @@ impl<'a> Surface<'a> {
         let back = if front < 0.95 { self.escaping(point, &-face) } else { 0.0 };
         let (side, share) = if back > front { (-face, back) } else { (*face, front) };
         let is_outer = share >= MIN_ESCAPING_SHARE
-            && !self.inside_another(&(point + side * (ABOVE * self.pitch)))
+            && !self.inside_another(&(point + side * (RAY_START_HEIGHT * self.pitch)))
             && self.is_reached(point, &side);
         is_outer.then_some(side)
     }
@@ -185,7 +185,7 @@ impl<'a> Surface<'a> {
     /// Returns a function that creates a ray from its number. The rays start just above a point; their density is
     /// proportional to the cosine of the angle to the normal.
     fn rays(&self, point: &Point3<f64>, side: &Vector3<f64>) -> impl Fn(u32) -> Ray {
-        let origin = point + side * (ABOVE * self.pitch);
+        let origin = point + side * (RAY_START_HEIGHT * self.pitch);
         let ((s, t), side) = (tangents(side), *side);
         move |ray| {
             let (u, v) = scattered(ray);
@@ -237,7 +237,7 @@ impl<'a> Surface<'a> {
         let min = MIN_SUPPORT * PI * radius * radius / self.share;
         let mut smoothed = Vec::new();
         for (cube, members) in grid.cubes() {
-            let near: Vec<_> = grid.around(cube).filter_map(|index| self.samples.get(index)).collect();
+            let near: Vec<_> = grid.points_around(cube).filter_map(|index| self.samples.get(index)).collect();
             for &member in members {
                 let Some(sample) = self.samples.get(member) else { continue };
                 let mut sum = Vector3::zeros();
@@ -342,7 +342,7 @@ fn collect(link: &RobotLink, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle
 }
 
 /// Removes repeated triangles, also those whose corners are in another order.
-fn once(triangles: &mut Vec<Triangle>) {
+fn remove_duplicates(triangles: &mut Vec<Triangle>) {
     let mut seen = std::collections::HashSet::with_capacity(triangles.len());
     triangles.retain(|triangle| {
         // Adding zero turns -0 into 0, so that both compare as equal.

@@ -8,7 +8,7 @@ use nalgebra::{Point3, Vector3};
 use crate::mesh::Triangle;
 
 /// The maximum number of triangles in a leaf.
-const LEAF: usize = 4;
+const MAX_LEAF_TRIANGLES: usize = 4;
 
 /// A bounding box.
 #[derive(Clone, Copy, Debug)]
@@ -108,7 +108,7 @@ impl TriangleTree {
             {
                 *second = node;
             }
-            if to - from <= LEAF {
+            if to - from <= MAX_LEAF_TRIANGLES {
                 continue;
             }
             let axis = (bounds.max - bounds.min).imax();

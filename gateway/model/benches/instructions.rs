@@ -13,7 +13,7 @@
 use std::hint::black_box;
 
 use gungraun::{library_benchmark, library_benchmark_group};
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use model::latched::{LatchedPackets, ReceivedFrame};
 use model::table::Table;
 use protocol::can::Format;
@@ -40,7 +40,7 @@ const EPOCH_NANOS: u64 = 16_000_000;
 type Frames = fn(u8, Format) -> Vec<ReceivedFrame>;
 
 fn skin(format: Format) -> Skin {
-    let text = generate(&Target { cells: CELLS, ..Target::default() }).expect("a UR5 has room");
+    let text = generate(&SkinRequest { cells: CELLS, ..SkinRequest::default() }).expect("a UR5 has room");
     let mut skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
     skin.buses.iter_mut().for_each(|bus| bus.format = format);
     skin

@@ -76,13 +76,13 @@ impl Central {
         let cells = skin.cells.iter().map(|cell| {
             let parameters = skin.parameters(cell);
             if links.is_empty() {
-                links.extend(parameters.table().iter().map(ChainLink::of_words));
+                links.extend(parameters.all_rows().iter().map(ChainLink::from_row));
             }
             let pose = parameters.pose;
             CellGeometry::new(cell, pose.position.map(Q::to_f64), pose.normal.map(Q::to_f64))
         });
         let cells = cells.collect();
-        Self { base: base(skin), links, cells }
+        Self { base: base_pose(skin), links, cells }
     }
 
     /// Builds the reference from the unrounded numbers of the skin's file. All cells must sit on one chain, as in
@@ -99,24 +99,24 @@ impl Central {
         };
         let cells = skin.cells.iter().map(|cell| CellGeometry::new(cell, cell.position, cell.normal));
         let links = skin.cells.first().map_or_else(Vec::new, |cell| rows(skin.chain(cell.bus)));
-        Self { base: base(skin), links, cells: cells.collect() }
+        Self { base: base_pose(skin), links, cells: cells.collect() }
     }
 
     /// Builds the reference for a single cell (index 0) with these parameters, in frame 0 of its chain.
     #[must_use]
-    pub fn of_cell(parameters: &Parameters) -> Self {
+    pub fn for_single_cell(parameters: &Parameters) -> Self {
         let Parameters { pose, contact, .. } = *parameters;
         let position = pose.position.map(Q::to_f64).into();
         let normal = pose.normal.map(Q::to_f64).into();
         let place = CellGeometry { row: parameters.chain().len(), position, normal, contact };
-        let links = parameters.table().iter().map(ChainLink::of_words).collect();
+        let links = parameters.all_rows().iter().map(ChainLink::from_row).collect();
         Self { base: IsometryMatrix3::identity(), links, cells: vec![place] }
     }
 
     /// Returns the poses of all links for these joint words. Bounded work, no allocation.
     #[must_use]
     pub fn frames(&self, joints: &[Q1_14]) -> Frames {
-        self.chain(joints, |link, word| match (link.kind, word) {
+        self.chain_frames(joints, |link, word| match (link.kind, word) {
             (RowKind::Revolute, Some(word)) => (word.wrapping_add(link.offset_word).to_radians(), 0.0),
             (RowKind::Prismatic, Some(word)) => (link.offset_word.to_radians(), word.to_f64()),
             (RowKind::Fixed, _) | (_, None) => (link.offset_word.to_radians(), 0.0),
@@ -125,8 +125,8 @@ impl Central {
 
     /// Returns the poses of all links for these joint positions, in rad or m. Bounded work, no allocation.
     #[must_use]
-    pub fn frames_at(&self, q: &[f64]) -> Frames {
-        self.chain(q, |link, q| match (link.kind, q) {
+    pub fn frames_at_positions(&self, q: &[f64]) -> Frames {
+        self.chain_frames(q, |link, q| match (link.kind, q) {
             (RowKind::Revolute, Some(angle)) => (angle + link.offset, 0.0),
             (RowKind::Prismatic, Some(slide)) => (link.offset, *slide),
             (RowKind::Fixed, _) | (_, None) => (link.offset, 0.0),
@@ -146,7 +146,7 @@ impl Central {
 
     /// Multiplies the transforms of the rows, base to tip. `place` returns the joint angle in rad and the displacement
     /// in m of a row.
-    fn chain<T>(&self, joints: &[T], place: impl Fn(&ChainLink, Option<&T>) -> (f64, f64)) -> Frames {
+    fn chain_frames<T>(&self, joints: &[T], place: impl Fn(&ChainLink, Option<&T>) -> (f64, f64)) -> Frames {
         let mut tip = self.base;
         let mut frames = Frames { frames: [tip; MAX_ROWS + 1], kinds: [RowKind::Fixed; MAX_ROWS] };
         let mut joints = joints.iter();
@@ -207,7 +207,7 @@ impl Central {
 }
 
 /// Returns the pose of frame 0 of the cells' chain in the robot's base frame.
-fn base(skin: &Skin) -> IsometryMatrix3<f64> {
+fn base_pose(skin: &Skin) -> IsometryMatrix3<f64> {
     let base = skin.cells.first().map_or_else(ChainBase::default, |cell| skin.chain(cell.bus).base);
     let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();
     Translation3::from(base.position) * Rotation3::from_matrix_unchecked(turn)
@@ -240,7 +240,7 @@ impl Frames {
 }
 
 impl ChainLink {
-    fn of_words(row: &Row) -> Self {
+    fn from_row(row: &Row) -> Self {
         let (a, d, alpha) = (row.a.to_f64(), row.d.to_f64(), row.alpha.to_radians());
         Self::new(row.kind, a, d, alpha, row.theta_offset, row.theta_offset.to_radians())
     }

@@ -27,17 +27,17 @@ pub struct ListedCell {
     /// Its last other pages.
     pub pages: NetworkPages,
     /// The serial number of another cell that claims this node id, or held it before.
-    pub other: Option<u32>,
+    pub other_serial: Option<u32>,
     claim: AddressClaim,
     /// Arrival time of the last packet of the cell.
-    last: Micros,
+    last_packet: Micros,
 }
 
 impl ListedCell {
     /// Returns the time since the last packet of the cell.
     #[must_use]
     pub const fn age(&self, now: Micros) -> Span {
-        now.elapsed_since(self.last)
+        now.elapsed_since(self.last_packet)
     }
 
     fn record_page(&mut self, now: Micros, page: &NetworkPage) {
@@ -46,10 +46,15 @@ impl ListedCell {
             let before = self.claim.serial();
             if matches!(self.claim.receive(now, heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider)
             {
-                self.other = Some(heartbeat.serial);
+                self.other_serial = Some(heartbeat.serial);
             } else if before.is_some_and(|before| before != heartbeat.serial) {
                 // The reports so far belong to the previous cell: start again.
-                *self = Self { other: before, claim: self.claim, last: self.last, ..Self::default() };
+                *self = Self {
+                    other_serial: before,
+                    claim: self.claim,
+                    last_packet: self.last_packet,
+                    ..Self::default()
+                };
             }
             self.heartbeat = self.claim.heartbeat();
         }
@@ -79,7 +84,7 @@ impl Listing {
         };
         self.format.get_or_insert(format);
         let cell = self.cells.entry(from.get()).or_default();
-        cell.last = now;
+        cell.last_packet = now;
         if let Message::Network { page, .. } = message {
             cell.record_page(now, page);
         }
@@ -104,7 +109,7 @@ impl Listing {
 
     /// Returns the node id of the cell with this serial number, if it is on the bus.
     #[must_use]
-    pub fn number_of(&self, serial: u32) -> Option<u8> {
+    pub fn node_id(&self, serial: u32) -> Option<u8> {
         let is = |cell: &ListedCell| cell.claim.serial() == Some(serial);
         self.cells.iter().find(|(_, cell)| is(cell)).map(|(&number, _)| number)
     }
@@ -142,7 +147,7 @@ mod tests {
         assert_eq!((third.heartbeat, third.pages.rejected, third.pages.tree), (Some(heartbeat), None, None));
         assert_eq!((fourth.heartbeat, fourth.pages.rejected), (None, Some(RejectedCounts::default())));
         assert_eq!(
-            (third.age(Micros(110)), listing.number_of(7), listing.number_of(8)),
+            (third.age(Micros(110)), listing.node_id(7), listing.node_id(8)),
             (Span(100), Some(3), None)
         );
         assert_eq!((listing.format(), listing.has_gateway()), (Some(Format::Classic), false));
@@ -156,7 +161,7 @@ mod tests {
             listing.receive(Micros(0), Format::Fd, &says(3, page));
         }
         let (_, cell) = listing.cells().next().unwrap();
-        assert_eq!((cell.other, cell.pages.received), (Some(7), None));
+        assert_eq!((cell.other_serial, cell.pages.received), (Some(7), None));
     }
 
     #[test]
@@ -166,6 +171,6 @@ mod tests {
         listing.receive(Micros(10), Format::Fd, &says(3, beat(7)));
         listing.receive(Micros(900_000), Format::Fd, &says(3, beat(8)));
         let (_, cell) = listing.cells().next().unwrap();
-        assert_eq!((cell.age(Micros(900_400)), cell.other), (Span(400), Some(7)));
+        assert_eq!((cell.age(Micros(900_400)), cell.other_serial), (Span(400), Some(7)));
     }
 }

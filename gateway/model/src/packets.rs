@@ -120,7 +120,7 @@ impl PacketReader {
     /// Creates a reader for a bus of a skin: packets have the format of the bus, and torques, joints and sums have the
     /// length of its chain.
     #[must_use]
-    pub fn of_skin(skin: &Skin, bus: usize) -> Self {
+    pub fn for_bus(skin: &Skin, bus: usize) -> Self {
         Self {
             format: Some(skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format)),
             length: ChainLength::Described(skin.packet_length(bus)),
@@ -142,7 +142,7 @@ impl PacketReader {
     pub(crate) fn packet(&mut self, at: Micros, frame: &Frame) -> (Result<Packet, NoPacket>, Pending) {
         let Ok(id) = data_id(frame) else { return (Err(NoPacket::NotData), Pending::default()) };
         let packet = match self.format.unwrap_or_else(|| frame.format()) {
-            Format::Fd => Packet::from_fd(frame).and_then(|packet| self.of_described_length(packet)),
+            Format::Fd => Packet::from_fd(frame).and_then(|packet| self.check_length(packet)),
             Format::Classic if frame.format() == Format::Fd => {
                 Err(PacketError::Length { expected: 8, got: frame.data().len() })
             }
@@ -164,7 +164,7 @@ impl PacketReader {
     }
 
     /// Checks that the length of a packet fits the described chain.
-    fn of_described_length(&self, packet: Packet) -> Result<Packet, PacketError> {
+    fn check_length(&self, packet: Packet) -> Result<Packet, PacketError> {
         match self.length {
             ChainLength::Described(length)
                 if packet.words.length() != length && Lengths::for_id(packet.id) == Lengths::ALL =>

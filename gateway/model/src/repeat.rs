@@ -8,20 +8,20 @@ use protocol::time::{Micros, Span};
 
 /// The retry limit and the timeouts of a request.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Limits {
+pub struct RetryLimits {
     /// Timeout after the first transmission.
-    pub first: Span,
+    pub first_timeout: Span,
     /// The longest timeout. The timeout doubles after each transmission.
-    pub longest: Span,
+    pub max_timeout: Span,
     /// Number of transmissions before the request fails.
-    pub tries: u8,
+    pub max_transmissions: u8,
 }
 
 /// The retry state of one request that has not been answered yet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Attempt {
-    limits: Limits,
-    tries: u8,
+    limits: RetryLimits,
+    transmissions: u8,
     due: Micros,
 }
 
@@ -31,7 +31,7 @@ pub enum RetryAction {
     /// Wait: the timeout has not expired.
     Wait,
     /// Send the request again.
-    Again,
+    Resend,
     /// Fail the request: the retry limit is reached.
     GiveUp,
 }
@@ -39,63 +39,63 @@ pub enum RetryAction {
 impl Attempt {
     /// Starts the timeout of a request whose first transmission is at `now`.
     #[must_use]
-    pub fn new(now: Micros, limits: Limits) -> Self {
-        Self { limits, tries: 1, due: now + limits.first }
+    pub fn new(now: Micros, limits: RetryLimits) -> Self {
+        Self { limits, transmissions: 1, due: now + limits.first_timeout }
     }
 
     /// Returns the number of transmissions so far.
     #[must_use]
-    pub const fn tries(&self) -> u8 {
-        self.tries
+    pub const fn transmissions(&self) -> u8 {
+        self.transmissions
     }
 
-    /// Returns the time at which the timeout expires and [`Attempt::turn`] must be called.
+    /// Returns the time at which the timeout expires and [`Attempt::handle_timeout`] must be called.
     #[must_use]
     pub const fn due(&self) -> Micros {
         self.due
     }
 
-    /// Handles the timeout and returns the next action; [`RetryAction::Again`] counts as a transmission. A call before the
+    /// Handles the timeout and returns the next action; [`RetryAction::Resend`] counts as a transmission. A call before the
     /// timeout has no effect.
-    pub fn turn(&mut self, now: Micros) -> RetryAction {
+    pub fn handle_timeout(&mut self, now: Micros) -> RetryAction {
         if now < self.due {
             return RetryAction::Wait;
         }
-        if self.tries >= self.limits.tries {
+        if self.transmissions >= self.limits.max_transmissions {
             return RetryAction::GiveUp;
         }
-        self.tries += 1;
+        self.transmissions += 1;
         self.extend(now);
-        RetryAction::Again
+        RetryAction::Resend
     }
 
     /// Restarts the timeout, because one cell has answered and others may still answer.
     pub fn extend(&mut self, now: Micros) {
-        let doubled = self.limits.first.0.saturating_mul(1 << (self.tries - 1).min(32));
-        self.due = now + Span(doubled.min(self.limits.longest.0));
+        let doubled = self.limits.first_timeout.0.saturating_mul(1 << (self.transmissions - 1).min(32));
+        self.due = now + Span(doubled.min(self.limits.max_timeout.0));
     }
 }
 
 /// Requests to many cells that are repeated without a limit. Each is sent at most once per interval.
 #[derive(Clone, Debug)]
 pub struct Repeats<K> {
-    every: Span,
+    interval: Span,
     /// Time of the last transmission of each request, and of the last message to all cells.
     sent: BTreeMap<K, Micros>,
-    all: Option<Micros>,
+    all_sent: Option<Micros>,
 }
 
 impl<K: Copy + Ord> Repeats<K> {
     /// Creates an empty set of requests with this repeat interval.
     #[must_use]
     pub const fn new(every: Span) -> Self {
-        Self { every, sent: BTreeMap::new(), all: None }
+        Self { interval: every, sent: BTreeMap::new(), all_sent: None }
     }
 
     /// Returns the requests among `open` whose interval has passed, and records them as sent.
     pub fn due(&mut self, now: Micros, open: impl IntoIterator<Item = K>) -> Vec<K> {
-        let last = |key: &K| self.sent.get(key).copied().max(self.all);
-        let is_due = |key: &K| last(key).is_none_or(|at| now.elapsed_since(at) >= self.every);
+        let last = |key: &K| self.sent.get(key).copied().max(self.all_sent);
+        let is_due = |key: &K| last(key).is_none_or(|at| now.elapsed_since(at) >= self.interval);
         let due: Vec<_> = open.into_iter().filter(is_due).collect();
         self.sent.extend(due.iter().map(|key| (*key, now)));
         due
@@ -103,11 +103,11 @@ impl<K: Copy + Ord> Repeats<K> {
 
     /// Records that one message to all cells contained all requests.
     pub const fn mark_all_sent(&mut self, now: Micros) {
-        self.all = Some(now);
+        self.all_sent = Some(now);
     }
 
     /// Lets a changed request be sent without waiting for its interval.
-    pub fn renew(&mut self, key: K) {
+    pub fn make_due(&mut self, key: K) {
         self.sent.remove(&key);
     }
 }
@@ -116,19 +116,23 @@ impl<K: Copy + Ord> Repeats<K> {
 mod tests {
     use super::*;
 
-    const LIMITS: Limits = Limits { first: Span(100), longest: Span(300), tries: 4 };
+    const LIMITS: RetryLimits =
+        RetryLimits { first_timeout: Span(100), max_timeout: Span(300), max_transmissions: 4 };
 
     #[test]
     fn an_attempt_waits_twice_as_long_each_time_up_to_a_limit_and_then_gives_up() {
         let mut attempt = Attempt::new(Micros(0), LIMITS);
         for due in [100, 300, 600] {
-            assert_eq!((attempt.due(), attempt.turn(Micros(due - 1))), (Micros(due), RetryAction::Wait));
-            assert_eq!(attempt.turn(Micros(due)), RetryAction::Again);
+            assert_eq!(
+                (attempt.due(), attempt.handle_timeout(Micros(due - 1))),
+                (Micros(due), RetryAction::Wait)
+            );
+            assert_eq!(attempt.handle_timeout(Micros(due)), RetryAction::Resend);
         }
-        assert_eq!((attempt.tries(), attempt.due()), (4, Micros(900)));
+        assert_eq!((attempt.transmissions(), attempt.due()), (4, Micros(900)));
         attempt.extend(Micros(800));
         assert_eq!(
-            (attempt.turn(Micros(1_099)), attempt.turn(Micros(1_100))),
+            (attempt.handle_timeout(Micros(1_099)), attempt.handle_timeout(Micros(1_100))),
             (RetryAction::Wait, RetryAction::GiveUp)
         );
     }
@@ -142,7 +146,7 @@ mod tests {
         repeats.mark_all_sent(Micros(200));
         assert!(repeats.due(Micros(299), [1, 2, 3, 4]).is_empty());
         assert_eq!(repeats.due(Micros(300), [1, 4]), [1, 4]);
-        repeats.renew(4);
+        repeats.make_due(4);
         assert_eq!(repeats.due(Micros(301), [1, 4]), [4], "it has changed");
     }
 }

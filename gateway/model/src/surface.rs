@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 /// The smallest number of cells on a link to which a cylinder is fitted.
-const CYLINDER_CELLS: usize = 6;
+const MIN_CYLINDER_CELLS: usize = 6;
 
 /// A cell on a link: its centre in m and its unit normal, in the link's frame.
 pub type SurfaceCell = ([f64; 3], [f64; 3]);
@@ -28,7 +28,7 @@ impl Cylinder {
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a number of cells")]
     pub fn fit(cells: &[SurfaceCell]) -> Option<Self> {
-        if cells.len() < CYLINDER_CELLS {
+        if cells.len() < MIN_CYLINDER_CELLS {
             return None;
         }
         let count = cells.len() as f64;
@@ -66,14 +66,14 @@ impl Cylinder {
 
     /// Returns the point on the axis at the distance `along` in m from `middle`.
     #[must_use]
-    pub fn at(&self, along: f64) -> [f64; 3] {
+    pub fn axis_point(&self, along: f64) -> [f64; 3] {
         (Vector3::from(self.middle) + Vector3::from(self.axis) * along).into()
     }
 }
 
 /// The cells of a link, laid flat and seen from outside.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Flat {
+pub struct FlatMap {
     /// Position of each cell, to the right and down, in m. On a cylinder, 0 to the right is where the link's x axis
     /// passes through the surface (or its y axis, if the cylinder lies along x).
     pub places: Vec<[f64; 2]>,
@@ -86,12 +86,12 @@ pub struct Flat {
 /// points down.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "a number of cells")]
-pub fn lay_flat(cells: &[SurfaceCell], tip: [f64; 3]) -> Flat {
+pub fn lay_flat(cells: &[SurfaceCell], tip: [f64; 3]) -> FlatMap {
     let tip = Vector3::from(tip);
     if let Some(cylinder) = Cylinder::fit(cells) {
         let axis = Vector3::from(cylinder.axis);
         let axis = if axis.dot(&tip) < 0.0 { -axis } else { axis };
-        let front = beside(&axis);
+        let front = perpendicular(&axis);
         let right = front.cross(&axis);
         let places = cells.iter().map(|cell| {
             let position = vectors(cell).0;
@@ -99,22 +99,23 @@ pub fn lay_flat(cells: &[SurfaceCell], tip: [f64; 3]) -> Flat {
             let angle = out.dot(&right).atan2(out.dot(&front));
             [angle * cylinder.radius, axis.dot(&position)]
         });
-        return Flat { places: places.collect(), radius: Some(cylinder.radius) };
+        return FlatMap { places: places.collect(), radius: Some(cylinder.radius) };
     }
     let mean = cells.iter().fold(Vector3::zeros(), |sum, cell| sum + vectors(cell).1);
     let normal = (mean / cells.len().max(1) as f64).try_normalize(1e-6).unwrap_or_else(Vector3::z);
-    let down = (tip - normal * normal.dot(&tip)).try_normalize(1e-6).unwrap_or_else(|| beside(&normal));
+    let down =
+        (tip - normal * normal.dot(&tip)).try_normalize(1e-6).unwrap_or_else(|| perpendicular(&normal));
     let right = normal.cross(&down);
     let places = cells.iter().map(|cell| {
         let position = vectors(cell).0;
         [right.dot(&position), down.dot(&position)]
     });
-    Flat { places: places.collect(), radius: None }
+    FlatMap { places: places.collect(), radius: None }
 }
 
 /// Returns the unit vector perpendicular to `axis` that is nearest to the x axis, or to the y axis if `axis` is close
 /// to x.
-fn beside(axis: &Vector3<f64>) -> Vector3<f64> {
+fn perpendicular(axis: &Vector3<f64>) -> Vector3<f64> {
     let chosen = if axis.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
     (chosen - axis * axis.dot(&chosen)).normalize()
 }
@@ -144,7 +145,7 @@ mod tests {
         assert!((cylinder.radius - 0.05).abs() < 1e-9, "{cylinder:?}");
         let [x, y, _] = cylinder.middle;
         assert!((x - 0.1).abs() < 1e-9 && (y - 0.2).abs() < 1e-9, "{cylinder:?}");
-        let [from, to] = cylinder.along.map(|along| cylinder.at(along)[2]);
+        let [from, to] = cylinder.along.map(|along| cylinder.axis_point(along)[2]);
         assert!((from.min(to)).abs() < 1e-9 && (from.max(to) - 0.15).abs() < 1e-9, "{from} {to}");
         assert_eq!(Cylinder::fit(&ring()[..5]), None, "too few");
     }

@@ -15,9 +15,9 @@ use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table};
 
 /// The number of angles between two that are drawn.
-const DRAWN: usize = 16;
+const DRAWN_INTERVAL: usize = 16;
 /// The number of angles in each part of the circle for which a maximum error is drawn.
-const PART: usize = 256;
+const ANGLES_PER_PART: usize = 256;
 
 /// The error of a fixed-point sine function over the whole circle.
 #[derive(Clone, Debug)]
@@ -37,17 +37,17 @@ impl SineError {
     #[must_use]
     pub fn of_function(function: impl Fn(Q1_14) -> Q1_14) -> Self {
         let (mut sum, mut max) = (0.0, 0.0_f64);
-        let (mut points, mut parts) = (Vec::new(), vec![(0.0, 0.0_f64); 65_536 / PART]);
+        let (mut points, mut parts) = (Vec::new(), vec![(0.0, 0.0_f64); 65_536 / ANGLES_PER_PART]);
         for (place, bits) in (i16::MIN..=i16::MAX).enumerate() {
             let angle = Q1_14::from_bits(bits);
             let error = function(angle).to_f64() - angle.to_radians().sin();
             sum += error.abs();
             max = max.max(error.abs());
-            if place % DRAWN == 0 {
+            if place % DRAWN_INTERVAL == 0 {
                 points.push((angle.to_f64(), error));
             }
-            if let Some((middle, max)) = parts.get_mut(place / PART) {
-                *middle += angle.to_f64() / count(PART);
+            if let Some((middle, max)) = parts.get_mut(place / ANGLES_PER_PART) {
+                *middle += angle.to_f64() / count(ANGLES_PER_PART);
                 *max = max.max(error.abs());
             }
         }
@@ -64,11 +64,11 @@ pub fn sine_section() -> Section {
         SineError::of_function(|angle| Q1_14::nearest(angle.to_radians().sin())),
     ];
     let figure = |name: &str, title: &str, error: &str| {
-        let angle = Axis::new("angle", "quarter turns").between(-2.0, 2.0);
+        let angle = Axis::new("angle", "quarter turns").with_ends(-2.0, 2.0);
         Figure::new(name, title, angle, Axis::new(error, ""))
     };
     let mean = |what: &str, error: &SineError, bar: f64| {
-        Finding::less_is_better(what, paper::SINE, error.mean).at_most(bar)
+        Finding::less_is_better(what, paper::SINE_MEAN_ERROR, error.mean).at_most(bar)
     };
     let max = |what: &str, error: &SineError, bar: f64| Finding::stated(what, error.max).at_most(bar);
     Section::new("sine", "The sine in 16 bits")
@@ -140,7 +140,7 @@ fn named(done: &Operations) -> [(&'static str, u32); 4] {
 }
 
 /// The maximum number of operations of each kind that the wrench kernel may need, in the order of the paper.
-const WRENCH: [u32; 4] = [40, 24, 5, 5];
+const MAX_WRENCH_OPERATIONS: [u32; 4] = [40, 24, 5, 5];
 
 /// Writes the section that compares the operations of both kernels.
 #[must_use]
@@ -156,12 +156,12 @@ pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
         let what = format!("{name} of {kernel}, cell on the last link");
         Finding::less_is_better(what, f64::from(paper), f64::from(ours))
     };
-    let wrench = last(&costs.wrench).into_iter().zip(paper::OPERATIONS).zip(WRENCH);
+    let wrench = last(&costs.wrench).into_iter().zip(paper::OPERATIONS).zip(MAX_WRENCH_OPERATIONS);
     let projection = last(&costs.projection).into_iter().zip(paper::OPERATIONS);
     let figure = Figure::new(
         "kernels",
         "Multiplications and additions over the link that the cell is on",
-        Axis::new("link", "").between(0.0, 7.0),
+        Axis::new("link", "").with_ends(0.0, 7.0),
         Axis::new("multiplications and additions", ""),
     );
     let rows = [("wrench", &costs.wrench), ("projections", &costs.projection)];
@@ -188,15 +188,18 @@ pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
 mod tests {
     use super::*;
     use crate::ticks;
-    use analysis::report::figure::Verdict;
+    use analysis::report::figure::FindingVerdict;
 
     #[test]
     fn the_sines_errors_are_within_their_bars_and_over_the_whole_circle() {
         let section = sine_section();
-        assert!(section.findings.iter().all(|finding| finding.verdict != Verdict::Worse), "{section:?}");
+        assert!(
+            section.findings.iter().all(|finding| finding.verdict != FindingVerdict::Worse),
+            "{section:?}"
+        );
         let drawn =
             section.figures.iter().flat_map(|figure| &figure.series).map(|series| series.points.len());
-        assert_eq!(drawn.collect::<Vec<_>>(), [65_536 / DRAWN, 256, 256, 256]);
+        assert_eq!(drawn.collect::<Vec<_>>(), [65_536 / DRAWN_INTERVAL, 256, 256, 256]);
         let error = SineError::of_function(sine);
         let max = error.parts.iter().map(|(_, error)| *error).fold(0.0, f64::max);
         assert!((max - error.max).abs() < 1e-15 && (error.parts[128].0 - 0.0078).abs() < 1e-4);
@@ -210,10 +213,8 @@ mod tests {
         let costs = JacobianCosts::for_skin(&ticks::skin(1, 1).unwrap());
         let section = kernels_section("UR5", &costs);
         assert!(
-            section
-                .findings
-                .iter()
-                .all(|finding| finding.verdict == Verdict::Better || finding.verdict == Verdict::Same)
+            section.findings.iter().all(|finding| finding.verdict == FindingVerdict::Better
+                || finding.verdict == FindingVerdict::Same)
         );
         let ours: Vec<_> = section.findings.iter().map(|finding| finding.ours.to_string()).collect();
         assert_eq!(ours, ["40", "24", "5", "5", "103", "56", "6", "6"]);

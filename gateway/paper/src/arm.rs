@@ -3,13 +3,13 @@
 use protocol::skin::Skin;
 
 use super::Effort;
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 
 pub use model::generate::Reply;
 
 /// Returns the name, without extension, of the files of a run in which cells reply in this way.
 #[must_use]
-pub const fn name(reply: Reply) -> &'static str {
+pub const fn run_name(reply: Reply) -> &'static str {
     match reply {
         Reply::Torque => "single",
         Reply::Sum => "sum",
@@ -58,7 +58,7 @@ pub fn skin(reply: Reply, effort: Effort) -> String {
         Effort::Quick => QUICK_CELLS,
         Effort::Full => CELLS,
     };
-    generate(&Target { cells, reply, ..Target::default() }).expect("so many cells fit on the arm")
+    generate(&SkinRequest { cells, reply, ..SkinRequest::default() }).expect("so many cells fit on the arm")
 }
 
 /// Returns the skin of the paper's arm with 253 cells that reply with torques.
@@ -82,7 +82,7 @@ pub const fn scenario(effort: Effort) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use model::scenario::{Mode, Scenario};
+    use model::scenario::{Scenario, TorqueSource};
     use protocol::time::Micros;
 
     #[test]
@@ -98,8 +98,8 @@ mod tests {
             let skin = Skin::parse("skin.toml", &skin(reply, effort)).unwrap();
             let scenario = Scenario::parse("scenario.toml", scenario(effort), &skin).unwrap();
             let switched = if effort == Effort::Full { 5_700_000 } else { 1_200_000 };
-            assert_eq!(scenario.mode_at(Micros(switched - 1)), Mode::Compare);
-            assert_eq!(scenario.mode_at(Micros(switched)), Mode::Distributed);
+            assert_eq!(scenario.mode_at(Micros(switched - 1)), TorqueSource::Compare);
+            assert_eq!(scenario.mode_at(Micros(switched)), TorqueSource::Distributed);
         }
     }
 }

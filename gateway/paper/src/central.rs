@@ -22,7 +22,7 @@ use model::central::Central;
 /// The number of computations between two readings of the clock.
 const IN_A_ROW: u32 = 16;
 /// The number of measurements of each touch. The shortest time is used.
-const LOOKS: usize = 5;
+const MEASUREMENTS_PER_TOUCH: usize = 5;
 
 /// The number of measurements for Fig. 9 and 10.
 #[derive(Clone, Copy, Debug)]
@@ -83,7 +83,7 @@ pub fn over_cells(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> 
         [count(cells), at(0.5), at(0.25), at(0.75)]
     });
     let points: Vec<_> = points.collect();
-    let line = LinearFit::through_equals(&points.iter().map(|[x, y, ..]| (*x, *y)).collect::<Vec<_>>())?;
+    let line = LinearFit::fit_unweighted(&points.iter().map(|[x, y, ..]| (*x, *y)).collect::<Vec<_>>())?;
     Some(OverCells { points, line })
 }
 
@@ -100,7 +100,9 @@ pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) ->
         let mut sensors = vec![SkinSensors::default(); cells];
         sensors.iter_mut().take(active).for_each(|reference_torque| *reference_torque = touch());
         sensors.rotate_right(first);
-        let min = (0..LOOKS).map(|_| timed(&central, &sensors, &now)).fold(f64::INFINITY, f64::min);
+        let min = (0..MEASUREMENTS_PER_TOUCH)
+            .map(|_| timed(&central, &sensors, &now))
+            .fold(f64::INFINITY, f64::min);
         if let Some(values) = by_active.get_mut(active) {
             values.push(min);
         }
@@ -108,15 +110,15 @@ pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) ->
     let points = by_active.iter_mut().enumerate().filter(|(_, values)| !values.is_empty());
     let points: Vec<_> =
         points.map(|(active, values)| WeightedPoint::median(count(active), values)).collect();
-    Some(OverActive { cells, line: LinearFit::through(&points)?, points })
+    Some(OverActive { cells, line: LinearFit::fit(&points)?, points })
 }
 
 /// The minimum R² at which a fitted line counts as a good description.
-const QUALITY: f64 = 0.99;
+const MIN_QUALITY: f64 = 0.99;
 
 fn quality(line: &LinearFit, paper: f64) -> Finding {
     let finding = Finding::more_is_better("quality of the fit, R²", paper, line.quality);
-    finding.must(format!("at least {QUALITY}"), line.quality >= QUALITY)
+    finding.with_requirement(format!("at least {MIN_QUALITY}"), line.quality >= MIN_QUALITY)
 }
 
 /// Compares a slope or an intercept in ns with that of the paper in s: both values, and their ratio.
@@ -151,7 +153,7 @@ fn beside(
 ) -> Figure {
     let law = (0..=100).map(|step| most * f64::from(step) / 100.0).map(|x| (x, law(x) * 1e6));
     let title = format!("The same beside the paper's law ({equation})");
-    let y = Axis::new("T_skin", "µs").log().between(0.1, 10_000.0);
+    let y = Axis::new("T_skin", "µs").log().with_ends(0.1, 10_000.0);
     Figure::new(format!("{}-paper", figure.name), title, figure.x.clone(), y)
         .draw("measured", Shape::Points, measured)
         .draw("the paper's law", Shape::Dashed, law.collect())
@@ -176,8 +178,10 @@ pub fn fig9(over: &OverCells) -> Section {
         .draw("middle half", Shape::Band, band.collect())
         .draw("median", Shape::Points, median.clone())
         .draw("linear fit", Shape::Line, law(line, most));
-    let papers = beside(&fig9, "Eq. 29", median, most, |cells| paper::CELL_S * cells + paper::FIXED_S);
-    let cells = paper::most_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
+    let papers = beside(&fig9, "Eq. 29", median, most, |cells| {
+        paper::CENTRAL_PER_CELL_S * cells + paper::CENTRAL_FIXED_S
+    });
+    let cells = paper::max_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
     Section::new("fig9", "Fig. 9: central computation over the number of cells")
         .text(
             "A loop that computes the skin's torques has to look at every cell in every cycle, also when none is \
@@ -197,9 +201,9 @@ pub fn fig9(over: &OverCells) -> Section {
              leads to 2163, which the paper rounds to 2160.",
         ))
         .figures([fig9, papers])
-        .findings(cost("T_skin for each cell (slope of Eq. 29)", line.slope_in("ns"), paper::CELL_S))
-        .findings(cost("T_skin without a cell", (line.intercept, "ns"), paper::FIXED_S))
-        .findings([quality(line, paper::CELLS_QUALITY), limit("none", paper::LIMIT, cells)])
+        .findings(cost("T_skin for each cell (slope of Eq. 29)", line.slope_in("ns"), paper::CENTRAL_PER_CELL_S))
+        .findings(cost("T_skin without a cell", (line.intercept, "ns"), paper::CENTRAL_FIXED_S))
+        .findings([quality(line, paper::CELLS_QUALITY), limit("none", paper::MAX_CELLS, cells)])
 }
 
 /// Writes the section on Fig. 10, with the lines of Eq. 30 and 31, and the number of cells at which each line reaches
@@ -209,24 +213,31 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
     let OverActive { points, line, cells: of } = over;
     let most = count(*of);
     let of_cells = cells.line;
-    let limits = [(0.0, paper::LIMIT), (paper::LIMIT_AT, paper::LIMIT_ACTIVE)].map(|(active, paper)| {
-        let [cell, fixed, each] = [of_cells.slope, of_cells.intercept, line.slope].map(|ns| ns * 1e-9);
-        limit(&active.to_string(), paper, paper::most_cells(cell, fixed, each, active))
-    });
+    let limits = [(0.0, paper::MAX_CELLS), (paper::LIMIT_ACTIVE_CELLS, paper::MAX_CELLS_WITH_ACTIVE)].map(
+        |(active, paper)| {
+            let [cell, fixed, each] = [of_cells.slope, of_cells.intercept, line.slope].map(|ns| ns * 1e-9);
+            limit(&active.to_string(), paper, paper::max_cells(cell, fixed, each, active))
+        },
+    );
     let micros: Vec<_> = points.iter().map(|point| (point.x, point.y * 1e-3)).collect();
     let fig10 = figure("fig10", format!("T_skin over active cells, of {of}"), "active cells")
         .draw("median of touches", Shape::Points, micros.clone())
         .draw("linear fit", Shape::Line, law(line, most));
-    let papers =
-        beside(&fig10, "Eq. 30", micros, most, |active| paper::ACTIVE_S * active + paper::NONE_ACTIVE_S);
+    let papers = beside(&fig10, "Eq. 30", micros, most, |active| {
+        paper::CENTRAL_PER_ACTIVE_CELL_S * active + paper::NONE_ACTIVE_S
+    });
     let all = Finding::stated(
         format!("T_skin of {of} cells, all active (Eq. 31)"),
         ((of_cells.value_at(most) + line.slope * most) * 1e-3, "µs"),
     );
-    let all_papers = (paper::CELL_S * most + paper::FIXED_S + paper::ACTIVE_S * most) * 1e6;
+    let all_papers =
+        (paper::CENTRAL_PER_CELL_S * most + paper::CENTRAL_FIXED_S + paper::CENTRAL_PER_ACTIVE_CELL_S * most)
+            * 1e6;
     let touches: f64 = points.iter().map(|point| point.weight).sum();
-    let laws =
-        [("cells (Eq. 29)", of_cells, paper::CELL_S), ("active cells (Eq. 30)", *line, paper::ACTIVE_S)];
+    let laws = [
+        ("cells (Eq. 29)", of_cells, paper::CENTRAL_PER_CELL_S),
+        ("active cells (Eq. 30)", *line, paper::CENTRAL_PER_ACTIVE_CELL_S),
+    ];
     let laws = laws.map(|(name, line, paper)| {
         let quality = format!("{:.4}", line.quality);
         let [slope, start, papers] = [line.slope, line.intercept, paper * 1e9].map(number);
@@ -244,13 +255,13 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
             number(of_cells.intercept)
         ))
         .figures([fig10, papers])
-        .findings(cost("T_skin for each active cell (slope of Eq. 30)", line.slope_in("ns"), paper::ACTIVE_S))
+        .findings(cost("T_skin for each active cell (slope of Eq. 30)", line.slope_in("ns"), paper::CENTRAL_PER_ACTIVE_CELL_S))
         .findings(cost(
             &format!("T_skin of {of} cells, none active"),
             (line.intercept, "ns"),
             paper::NONE_ACTIVE_S,
         ))
-        .findings([quality(line, paper::ACTIVE_QUALITY), all.beside(all_papers)])
+        .findings([quality(line, paper::ACTIVE_QUALITY), all.with_paper_value(all_papers)])
         .findings(limits)
         .tables([Table::new("Laws", ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"], laws)])
 }
@@ -259,7 +270,7 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
 mod tests {
     use super::*;
     use crate::ticks;
-    use analysis::report::figure::Verdict;
+    use analysis::report::figure::FindingVerdict;
 
     fn line(slope: f64, intercept: f64) -> LinearFit {
         LinearFit { slope, intercept, quality: 0.999, slope_half: 0.1 }
@@ -268,11 +279,11 @@ mod tests {
     /// The findings that result from the lines of the paper, converted to ns.
     #[test]
     fn the_papers_own_laws_lead_to_its_limits_and_to_no_verdict_but_the_same() {
-        let law = line(paper::CELL_S * 1e9, paper::FIXED_S * 1e9);
+        let law = line(paper::CENTRAL_PER_CELL_S * 1e9, paper::CENTRAL_FIXED_S * 1e9);
         let points = [0.0, 1500.0, 3000.0]
             .map(|cells| [cells, law.value_at(cells), law.value_at(cells), law.value_at(cells)]);
         let cells = OverCells { points: points.to_vec(), line: law };
-        let over = line(paper::ACTIVE_S * 1e9, paper::NONE_ACTIVE_S * 1e9);
+        let over = line(paper::CENTRAL_PER_ACTIVE_CELL_S * 1e9, paper::NONE_ACTIVE_S * 1e9);
         let points = [0.0, 100.0, 253.0].map(|x| WeightedPoint { x, y: over.value_at(x), weight: 3.0 });
         let active = OverActive { cells: 253, points: points.to_vec(), line: over };
         let (nine, ten) = (fig9(&cells), fig10(&active, &cells));
@@ -285,12 +296,13 @@ mod tests {
             limits.iter().map(|limit| limit.ours.value.to_string()).collect::<Vec<_>>(),
             ["2163", "2163", "2067"]
         );
-        assert!(limits.iter().all(|limit| limit.verdict == Verdict::Same));
+        assert!(limits.iter().all(|limit| limit.verdict == FindingVerdict::Same));
         let of = |what: &str| all().find(|finding| finding.what.starts_with(what)).unwrap();
-        assert_eq!(of("T_skin for each cell").verdict, Verdict::Same);
-        assert_eq!(of("quality").verdict, Verdict::Better, "above the bar");
+        assert_eq!(of("T_skin for each cell").verdict, FindingVerdict::Same);
+        assert_eq!(of("quality").verdict, FindingVerdict::Better, "above the bar");
         let steep = OverCells { line: LinearFit { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
-        let worse = fig9(&steep).findings.iter().filter(|finding| finding.verdict == Verdict::Worse).count();
+        let worse =
+            fig9(&steep).findings.iter().filter(|finding| finding.verdict == FindingVerdict::Worse).count();
         assert_eq!(worse, 3, "slope, quality and limit");
     }
 

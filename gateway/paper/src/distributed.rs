@@ -18,7 +18,7 @@ use super::line::{LinearFit, count};
 use super::samples;
 use super::ticks::{BUSES, Ticks, nanos, spread};
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, number};
-use model::scenario::Mode;
+use model::scenario::TorqueSource;
 use model::table::Table;
 
 /// The number of measurements.
@@ -78,8 +78,10 @@ pub fn measure(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + C
     let parts: Vec<Skin> = cells.iter().map(|&cells| spread(skin, cells)).collect();
     let of_part = |place: usize, mode| Ticks::new(parts.get(place).unwrap_or(skin), 0, mode);
     let of_touch = |place: usize, mode| Ticks::new(skin, active.get(place).copied().unwrap_or(0), mode);
-    let (cells, active) =
-        (over(&cells, extent.rounds, 11, of_part, now)?, over(&active, extent.rounds, 12, of_touch, now)?);
+    let (cells, active) = (
+        tick_times(&cells, extent.rounds, 11, of_part, now)?,
+        tick_times(&active, extent.rounds, 12, of_touch, now)?,
+    );
     Some(Distributed {
         cells,
         active,
@@ -91,14 +93,14 @@ pub fn measure(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + C
 
 /// Measures ticks with and without the central computation for each of some numbers. `ticks` creates the loop for the
 /// number with this index and for a mode.
-pub(super) fn over(
+pub(super) fn tick_times(
     numbers: &[usize],
     rounds: usize,
     seed: u64,
-    ticks: impl Fn(usize, Mode) -> Ticks,
+    ticks: impl Fn(usize, TorqueSource) -> Ticks,
     now: impl Fn() -> u64 + Copy,
 ) -> Option<TickTimes> {
-    let (distributed, central) = (Mode::Distributed, Mode::Compare);
+    let (distributed, central) = (TorqueSource::Distributed, TorqueSource::Compare);
     let things = (0..numbers.len()).flat_map(|place| [(place, distributed), (place, central)]);
     let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
     let measured = samples::interleaved(loops.len(), rounds, seed, |thing| {
@@ -112,7 +114,7 @@ pub(super) fn over(
     let pairs = numbers.iter().zip(medians.as_chunks().0);
     let points: Vec<_> = pairs.map(|(&number, &[tick, central])| [count(number), tick, central]).collect();
     let line = |place: fn(&[f64; 3]) -> f64| {
-        LinearFit::through_equals(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
+        LinearFit::fit_unweighted(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
     };
     Some(TickTimes { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
 }
@@ -126,14 +128,14 @@ fn over_buses(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Co
     };
     let numbers: Vec<usize> = (1..=skin.buses.len()).collect();
     let mut loops: Vec<_> =
-        numbers.iter().map(|&buses| Ticks::new(&bare(buses), 0, Mode::Distributed)).collect();
+        numbers.iter().map(|&buses| Ticks::new(&bare(buses), 0, TorqueSource::Distributed)).collect();
     let measured = samples::interleaved(loops.len(), extent.rounds, 13, |thing| {
         let Some(ticks) = loops.get_mut(thing) else { return f64::NAN };
         ticks.epoch(now);
         ticks.epoch(now).tick
     });
     let medians = samples::medians(&measured);
-    LinearFit::through_equals(&numbers.iter().map(|&buses| count(buses)).zip(medians).collect::<Vec<_>>())
+    LinearFit::fit_unweighted(&numbers.iter().map(|&buses| count(buses)).zip(medians).collect::<Vec<_>>())
 }
 
 /// Measures the time for handling a torque, in ns: its packet is checked and decoded, and the torque replaces the
@@ -175,12 +177,13 @@ pub(super) fn of_share(what: &str, over: &TickTimes) -> [Finding; 3] {
     let TickTimes { distributed, central, .. } = over;
     [
         Finding::stated(format!("central T_skin for each {what}"), central.slope_in("ns")),
-        Finding::stated(format!("distributed tick for each {what}"), distributed.slope_in("ns")).beside(0.0),
+        Finding::stated(format!("distributed tick for each {what}"), distributed.slope_in("ns"))
+            .with_paper_value(0.0),
         Finding::stated(
             format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
             (over.share() * 100.0, "%"),
         )
-        .must(format!("at most {} %", MAX_SLOPE_RATIO * 100.0), over.share() <= MAX_SLOPE_RATIO),
+        .with_requirement(format!("at most {} %", MAX_SLOPE_RATIO * 100.0), over.share() <= MAX_SLOPE_RATIO),
     ]
 }
 

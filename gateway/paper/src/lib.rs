@@ -83,7 +83,7 @@ impl Experiment {
 
     /// Returns the name and the description of the experiment, and its approximate duration in s for a quick and for a
     /// full measurement.
-    const fn about_it(self) -> (&'static str, &'static str, [u64; 2]) {
+    const fn metadata(self) -> (&'static str, &'static str, [u64; 2]) {
         match self {
             Self::Fig6 => (
                 "fig6",
@@ -124,20 +124,20 @@ impl Experiment {
     /// Returns the name of the experiment, as used on the command line and in file names.
     #[must_use]
     pub const fn name(self) -> &'static str {
-        self.about_it().0
+        self.metadata().0
     }
 
     /// Returns a description of the experiment, in one line.
     #[must_use]
-    pub const fn about(self) -> &'static str {
-        self.about_it().1
+    pub const fn description(self) -> &'static str {
+        self.metadata().1
     }
 
     /// Returns the approximate duration in s, without the time for measurements that it shares with earlier
     /// experiments.
     #[must_use]
     pub const fn seconds(self, effort: Effort) -> u64 {
-        let [quick, full] = self.about_it().2;
+        let [quick, full] = self.metadata().2;
         match effort {
             Effort::Quick => quick,
             Effort::Full => full,
@@ -196,7 +196,7 @@ pub trait Lab {
     ///
     /// # Errors
     /// Returns an error if the experiments are to end, for example because the user stopped them.
-    fn go_on(&mut self) -> Result<(), Self::Error>;
+    fn check_stopped(&mut self) -> Result<(), Self::Error>;
 }
 
 /// A sequence of experiments. Measurements that several experiments need are made only once.
@@ -223,11 +223,11 @@ impl Session {
     /// # Panics
     /// Never panics in practice: generated skins are valid, and all lines are fitted to enough points.
     pub fn perform<L: Lab>(&mut self, experiment: Experiment, lab: &mut L) -> Result<Section, L::Error> {
-        lab.go_on()?;
+        lab.check_stopped()?;
         Ok(match experiment {
             Experiment::Fig6 => {
                 let single = self.single(lab)?.clone();
-                lab.go_on()?;
+                lab.check_stopped()?;
                 moving::fig6(&single, &lab.bench(Reply::Sum, self.effort)?)
             }
             Experiment::Fig7 => moving::fig7(self.single(lab)?),
@@ -235,7 +235,7 @@ impl Session {
             Experiment::Fig9 => central::fig9(self.over_cells(lab)),
             Experiment::Fig10 => {
                 let cells = self.over_cells(lab).clone();
-                lab.go_on()?;
+                lab.check_stopped()?;
                 let (cells_of_arm, extent) = (self.arm(), self.extent());
                 let active = central::over_active(&cells_of_arm, extent, || lab.now());
                 central::fig10(&active.expect("more than two numbers of active cells"), &cells)
@@ -252,7 +252,7 @@ impl Session {
                 let arm = self.arm();
                 let mut errors = Vec::new();
                 for active in sums::numbers(&arm) {
-                    lab.go_on()?;
+                    lab.check_stopped()?;
                     errors.push(sums::errors(&arm, active, sums::SumsExtent { touches, epochs }));
                 }
                 sums::section(&arm, &errors)

@@ -45,7 +45,7 @@ impl LinearFit {
     ///   interval of the slope: slope ± t(0.975, n - 2) · sqrt(s² / Sxx)
     /// ```
     #[must_use]
-    pub fn through(points: &[WeightedPoint]) -> Option<Self> {
+    pub fn fit(points: &[WeightedPoint]) -> Option<Self> {
         if points.len() < 3 {
             return None;
         }
@@ -71,15 +71,15 @@ impl LinearFit {
         // If all y are equal, there is no variance that the line could explain, so the quality is 0.
         let quality = if syy > 0.0 { (1.0 - residual / syy).max(0.0) } else { 0.0 };
         let freedom = count(points.len() - 2);
-        let slope_half = student(freedom) * (residual / freedom / sxx).sqrt();
+        let slope_half = student_t(freedom) * (residual / freedom / sxx).sqrt();
         Some(Self { slope, intercept, quality, slope_half })
     }
 
     /// Returns the line that fits points of equal weight best.
     #[must_use]
-    pub fn through_equals(points: &[(f64, f64)]) -> Option<Self> {
+    pub fn fit_unweighted(points: &[(f64, f64)]) -> Option<Self> {
         let points: Vec<_> = points.iter().map(|&(x, y)| WeightedPoint { x, y, weight: 1.0 }).collect();
-        Self::through(&points)
+        Self::fit(&points)
     }
 
     /// Returns the value of the line at `x`.
@@ -117,7 +117,7 @@ pub fn count(count: usize) -> f64 {
 /// Returns the 97.5 % quantile of Student's t distribution for `freedom` degrees of freedom. It is computed by an
 /// expansion about the normal distribution (Abramowitz and Stegun 26.7.5), which is up to 5 % too small below 10
 /// degrees of freedom.
-fn student(freedom: f64) -> f64 {
+fn student_t(freedom: f64) -> f64 {
     const Z: f64 = 1.959_963_984_540_054;
     let z = |power: i32| Z.powi(power);
     let terms = [
@@ -147,7 +147,7 @@ mod tests {
     #[test]
     fn a_line_is_found_and_explains_everything() {
         let points: Vec<_> = (0..10).map(|x| (f64::from(x), 3.0 * f64::from(x) - 2.0)).collect();
-        let line = LinearFit::through_equals(&points).unwrap();
+        let line = LinearFit::fit_unweighted(&points).unwrap();
         assert!((line.slope - 3.0).abs() < 1e-12 && (line.intercept + 2.0).abs() < 1e-12);
         assert!((line.quality - 1.0).abs() < 1e-12 && line.slope_half < 1e-6);
         assert!((line.reaches(25.0) - 9.0).abs() < 1e-12 && (line.value_at(9.0) - 25.0).abs() < 1e-12);
@@ -158,7 +158,7 @@ mod tests {
     #[test]
     fn quality_and_interval_are_those_of_a_textbook() {
         let points = [(1.0, 2.0), (2.0, 4.0), (3.0, 5.0), (4.0, 4.0), (5.0, 5.0)];
-        let line = LinearFit::through_equals(&points).unwrap();
+        let line = LinearFit::fit_unweighted(&points).unwrap();
         assert!((line.slope - 0.6).abs() < 1e-12 && (line.intercept - 2.2).abs() < 1e-12);
         assert!((line.quality - 0.6).abs() < 1e-12);
         assert!((line.slope_half / 0.282_843 - 3.182).abs() < 0.02 * 3.182, "{}", line.slope_half);
@@ -170,7 +170,7 @@ mod tests {
         for (freedom, target, within) in
             [(3.0, 3.182, 0.02), (10.0, 2.228, 1e-3), (29.0, 2.045, 1e-3), (100.0, 1.984, 1e-3)]
         {
-            let t = student(freedom);
+            let t = student_t(freedom);
             assert!((t / target - 1.0).abs() < within, "{freedom}: {t}");
         }
     }
@@ -180,8 +180,7 @@ mod tests {
         let once = [(0.0, 1.0), (1.0, 2.0), (1.0, 2.0), (1.0, 2.0), (2.0, 5.0)];
         let thrice = [(0.0, 1.0, 1.0), (1.0, 2.0, 3.0), (2.0, 5.0, 1.0)];
         let thrice = thrice.map(|(x, y, weight)| WeightedPoint { x, y, weight });
-        let (once, thrice) =
-            (LinearFit::through_equals(&once).unwrap(), LinearFit::through(&thrice).unwrap());
+        let (once, thrice) = (LinearFit::fit_unweighted(&once).unwrap(), LinearFit::fit(&thrice).unwrap());
         assert!((once.slope - thrice.slope).abs() < 1e-12);
         assert!((once.intercept - thrice.intercept).abs() < 1e-12);
         assert!((once.quality - thrice.quality).abs() < 1e-12);
@@ -189,9 +188,9 @@ mod tests {
 
     #[test]
     fn where_there_is_no_line_there_is_none() {
-        assert_eq!(LinearFit::through_equals(&[(0.0, 1.0), (1.0, 2.0)]), None);
-        assert_eq!(LinearFit::through_equals(&[(1.0, 1.0), (1.0, 2.0), (1.0, 3.0)]), None);
-        let level = LinearFit::through_equals(&[(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]).unwrap();
+        assert_eq!(LinearFit::fit_unweighted(&[(0.0, 1.0), (1.0, 2.0)]), None);
+        assert_eq!(LinearFit::fit_unweighted(&[(1.0, 1.0), (1.0, 2.0), (1.0, 3.0)]), None);
+        let level = LinearFit::fit_unweighted(&[(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]).unwrap();
         assert!(level.reaches(5.0).is_nan(), "a line that does not rise has no limit");
     }
 

@@ -4,8 +4,8 @@
 use super::arm;
 use super::line::count;
 use analysis::fit::limits::MAX_NODES;
-use analysis::fit::verdict::Answer;
-use analysis::fit::{self, COMPUTATION_NS, Row};
+use analysis::fit::verdict::FitSummary;
+use analysis::fit::{self, COMPUTATION_NS, RatesRow};
 use analysis::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table};
 
 /// The maximum number of cells in the figure.
@@ -17,23 +17,23 @@ pub fn section() -> Section {
     let skin = arm::paper();
     let rows = fit::table(&skin, None, COMPUTATION_NS);
     let cells = skin.cells.len();
-    let series = |row: &Row| {
+    let series = |row: &RatesRow| {
         let rated = &row.fullest.rated;
         let load = |cells| (f64::from(cells), 100.0 * rated.case.with_cells(cells).load().total());
         let points = (0..=MAX_CELLS).step_by(10).map(load).collect();
-        Series::new(Answer::worst_case(rated).rates, Shape::Line, points)
+        Series::new(FitSummary::worst_case(rated).rates, Shape::Line, points)
     };
     // The bit rates are defaults that no user has chosen, so the findings get no verdict.
-    let finding = |row: &Row| {
-        let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.rated);
+    let finding = |row: &RatesRow| {
+        let FitSummary { load, rates, cells, verdict } = FitSummary::worst_case(&row.fullest.rated);
         let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");
         Finding::stated(what, (100.0 * load, "%"))
     };
     let figure = Figure::new(
         "load",
         "Load of one bus, every cell in contact, worst case",
-        Axis::new("cells", "").between(0.0, f64::from(MAX_CELLS)),
-        Axis::new("load", "%").between(0.0, 200.0),
+        Axis::new("cells", "").with_ends(0.0, f64::from(MAX_CELLS)),
+        Axis::new("load", "%").with_ends(0.0, 200.0),
     );
     let marks = [
         Mark::y(100.0, "full"),
@@ -56,10 +56,10 @@ pub fn section() -> Section {
         .tables([table(&rows, cells)])
 }
 
-fn table(rows: &[Row], cells: usize) -> Table {
-    let row = |row: &Row| {
+fn table(rows: &[RatesRow], cells: usize) -> Table {
+    let row = |row: &RatesRow| {
         let rated = &row.fullest.rated;
-        let Answer { load, rates, .. } = Answer::worst_case(rated);
+        let FitSummary { load, rates, .. } = FitSummary::worst_case(rated);
         [
             rates,
             format!("{:.1}", rated.case.packet_ns() as f64 / 1e3),

@@ -117,7 +117,7 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
         .text(bare(single))
         .figures((0..single.joints).map(joint))
         .findings([
-            cell.must("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
+            cell.with_requirement("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
             sum,
             single.replies(),
             Finding::stated(format!("cells' torques that were in sums in time, of {summed_due}"), summed_in),
@@ -199,7 +199,7 @@ pub fn fig8(run: &Run) -> Section {
     let over = run.rows.iter().filter(|row| row.took_us > paper::CYCLE_S * 1e6).count();
     let us = |value| (value, "µs");
     let figure = |name: &str, title: &str, top| {
-        run.drawn(name, title, Axis::new("time in a cycle", "µs").between(0.0, top))
+        run.drawn(name, title, Axis::new("time in a cycle", "µs").with_ends(0.0, top))
     };
     let medians = |time: &dyn Fn(&TickRow) -> f64| {
         let pieces = run.rows.chunks(CYCLES_PER_MEDIAN).filter_map(|rows| Some((rows.first()?.time_s, rows)));
@@ -211,11 +211,11 @@ pub fn fig8(run: &Run) -> Section {
     };
     let none = Finding::less_is_better(
         format!("mean T_skin while none of {cells} cells is active"),
-        (paper::CELL_S * cells + paper::FIXED_S) * 1e6,
+        (paper::CENTRAL_PER_CELL_S * cells + paper::CENTRAL_FIXED_S) * 1e6,
         us(none_active),
     );
     let after_switch =
-        Finding::less_is_better("T_total after the switch, median", paper::REST_S * 1e6, us(total[1]));
+        Finding::less_is_better("T_total after the switch, median", paper::OTHER_WORK_S * 1e6, us(total[1]));
     let of_active = slope.map(|line| {
         let slope = Quantity::new(line.slope * 1e3, "ns").plus_minus(line.slope_half * 1e3);
         Finding::stated("T_total after the switch for each active cell", slope)
@@ -242,9 +242,9 @@ pub fn fig8(run: &Run) -> Section {
         ])
         .findings([
             none,
-            Finding::stated("T_skin after the switch, maximum", us(off)).beside(0.0).must("0", off <= 0.0),
+            Finding::stated("T_skin after the switch, maximum", us(off)).with_paper_value(0.0).with_requirement("0", off <= 0.0),
             Finding::stated("T_total before the switch, median", us(total[0])),
-            after_switch.must("less than before", total[1] < total[0]),
+            after_switch.with_requirement("less than before", total[1] < total[0]),
         ])
         .findings(of_active)
         .findings([
@@ -263,13 +263,13 @@ fn over_active<'a>(rows: impl Iterator<Item = &'a TickRow>) -> Option<LinearFit>
         by_active.entry(row.contributing).or_default().push(row.took_us);
     }
     let points = by_active.iter_mut().map(|(&active, times)| WeightedPoint::median(f64::from(active), times));
-    LinearFit::through(&points.collect::<Vec<_>>())
+    LinearFit::fit(&points.collect::<Vec<_>>())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use analysis::report::figure::Verdict;
+    use analysis::report::figure::FindingVerdict;
     use protocol::packet::padded;
     use serde_json::json;
 
@@ -308,11 +308,11 @@ mod tests {
         assert!((of("mean T_skin").ours.value - 3.0).abs() < 1e-9);
         assert!((of("T_total before").ours.value - 4.0).abs() < 1e-9);
         assert!((of("T_total after the switch, median").ours.value - 1.0).abs() < 1e-9);
-        assert!(section.findings.iter().all(|finding| finding.verdict != Verdict::Worse));
+        assert!(section.findings.iter().all(|finding| finding.verdict != FindingVerdict::Worse));
         assert!((of("all of the gateway's").ours.value - 10.0).abs() < 1e-9);
         let mut never_off = run;
         never_off.rows.iter_mut().for_each(|row| row.central_us = 3.0);
-        assert!(fig8(&never_off).findings.iter().any(|finding| finding.verdict == Verdict::Worse));
+        assert!(fig8(&never_off).findings.iter().any(|finding| finding.verdict == FindingVerdict::Worse));
     }
 
     #[test]

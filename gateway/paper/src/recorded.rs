@@ -37,7 +37,7 @@ pub struct TickRow {
 /// # Errors
 /// Returns [`CaptureError`] if the recording cannot be read or is damaged.
 pub fn read(path: &Path) -> Result<Vec<TickRow>, CaptureError> {
-    let mut items = Reader::open_with_others(&[path.to_path_buf()])?;
+    let mut items = Reader::open_with_all_topics(&[path.to_path_buf()])?;
     let mut rows: BTreeMap<u64, TickRow> = BTreeMap::new();
     while let Some(item) = items.next_item()? {
         if let Item::Other(other) = item {

@@ -12,12 +12,12 @@ use std::fmt::Write;
 use protocol::id::CellId;
 use serde_json::Value;
 
-use super::distributed::{TickTimes, over};
+use super::distributed::{TickTimes, tick_times};
 use super::line::count;
 use super::ticks::{self, Ticks, spread};
 use super::{Effort, Lab};
-use model::generate::{Target, generate};
-use model::scenario::Mode;
+use model::generate::{SkinRequest, generate};
+use model::scenario::TorqueSource;
 
 pub use section::section;
 
@@ -28,7 +28,7 @@ pub const MIN_IN_TIME_SHARE: f64 = 0.99;
 /// The force on a touched cell, in N.
 const TOUCH_N: f64 = 0.5;
 /// The number of cells of the smallest bench in a full measurement: that of the paper's arm.
-const PAPER: usize = 253;
+const PAPER_CELLS: usize = 253;
 
 /// The size and the load of a bench.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,7 +60,7 @@ impl ScaleBench {
     #[must_use]
     pub fn skin(&self) -> String {
         let Self { cells, buses, hz, .. } = *self;
-        let target = Target { cells, buses, broadcast_hz: hz, ..Target::default() };
+        let target = SkinRequest { cells, buses, broadcast_hz: hz, ..SkinRequest::default() };
         generate(&target).expect("so many cells fit on the arm")
     }
 
@@ -72,7 +72,7 @@ impl ScaleBench {
             "duration_s = {:?}\n\n[motion]\nkind = \"kinesthetic\"\n\n[[mode]]\nat_s = 0.0\nkind = \"distributed\"\n",
             self.seconds
         );
-        let touched = if self.active { share(self.cells) } else { 0 };
+        let touched = if self.active { touched_cells(self.cells) } else { 0 };
         for bus in 0..self.buses {
             let here = touched / self.buses + usize::from(bus < touched % self.buses);
             if here > 0 {
@@ -89,7 +89,7 @@ impl ScaleBench {
 }
 
 /// Returns the number of touched cells of a bench with this many cells.
-const fn share(cells: usize) -> usize {
+const fn touched_cells(cells: usize) -> usize {
     cells.div_ceil(20)
 }
 
@@ -205,7 +205,7 @@ struct ScaleExtent {
 }
 
 const FULL: ScaleExtent = ScaleExtent {
-    cells: &[PAPER, 2 * PAPER, 4 * PAPER, 10 * PAPER, 20 * PAPER, 10_000],
+    cells: &[PAPER_CELLS, 2 * PAPER_CELLS, 4 * PAPER_CELLS, 10 * PAPER_CELLS, 20 * PAPER_CELLS, 10_000],
     rates: &[62.5, 31.25, 15.625],
     seconds: 5.0,
     steps: 10,
@@ -231,7 +231,7 @@ pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<Scale, L::Error> {
     for &cells in extent.cells {
         sizes.push(size(lab, cells, extent)?);
     }
-    lab.go_on()?;
+    lab.check_stopped()?;
     let (fewest, most) = (extent.cells.first().copied(), extent.cells.last().copied());
     let (ticks, beside) = loops(fewest.unwrap_or(1), most.unwrap_or(1), extent, || lab.now());
     Ok(Scale { sizes, ticks, beside })
@@ -243,14 +243,14 @@ fn size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Result<SizeFi
     let of = |hz, active| ScaleBench { cells, buses, hz, active, seconds: extent.seconds };
     let (mut hz, mut active) = (f64::NAN, BenchFigures::default());
     for &rate in extent.rates {
-        lab.go_on()?;
+        lab.check_stopped()?;
         hz = rate;
         active = BenchFigures::from_summary(&lab.scaled(&of(hz, true))?);
         if active.holds() {
             break;
         }
     }
-    lab.go_on()?;
+    lab.check_stopped()?;
     let quiet = BenchFigures::from_summary(&lab.scaled(&of(hz, false))?);
     Ok(SizeFigures { cells, buses, hz, holds: active.holds(), quiet, active })
 }
@@ -273,10 +273,11 @@ fn loops(
         let part = parts.get(place).unwrap_or(&large);
         Ticks::new(part, part.cells.len(), mode)
     };
-    let over = over(&numbers, extent.rounds, 14, all_active, now).expect("more than two numbers of cells");
+    let over =
+        tick_times(&numbers, extent.rounds, 14, all_active, now).expect("more than two numbers of cells");
     let few = skin(fewest, fewest.div_ceil(CellId::COUNT));
     let skins = [&few, &spread(&large, fewest.max(buses)), &large];
-    let mut loops = skins.map(|skin| Ticks::new(skin, skin.cells.len(), Mode::Distributed));
+    let mut loops = skins.map(|skin| Ticks::new(skin, skin.cells.len(), TorqueSource::Distributed));
     let measured = super::samples::interleaved(loops.len(), extent.rounds, 15, |thing| {
         let Some(ticks) = loops.get_mut(thing) else { return f64::NAN };
         ticks.epoch(now);

@@ -18,11 +18,11 @@ use analysis::report::figure::{Axis, Figure, Finding, Section, Series, Shape, Ta
 /// The numbers of active cells that are measured. About twenty were active on the arm in the paper.
 const ACTIVE: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
 /// The number of active cells at which the findings are stated.
-const FOUND_AT: usize = 20;
+const FINDINGS_AT: usize = 20;
 /// The number of epochs over which the sum of a constant touch is averaged.
-const AVERAGED: u32 = 32;
+const AVERAGED_EPOCHS: u32 = 32;
 /// The maximum torque in Nm. Touches that cause a larger torque are left out, because Q7.8 cannot hold it.
-const MOST_NM: f64 = 127.0;
+const MAX_TORQUE_NM: f64 = 127.0;
 
 /// The number of measurements.
 #[derive(Clone, Copy, Debug)]
@@ -71,7 +71,8 @@ struct Mean {
 impl Mean {
     /// Adds the absolute errors of the first `loaded` joints.
     fn add(&mut self, loaded: usize, got: &[f64; MAX_JOINTS], target: &[f64; MAX_JOINTS]) {
-        for (got, target) in got.iter().zip(target).take(loaded).filter(|(_, target)| target.abs() < MOST_NM)
+        for (got, target) in
+            got.iter().zip(target).take(loaded).filter(|(_, target)| target.abs() < MAX_TORQUE_NM)
         {
             self.sum += (got - target).abs();
             self.count += 1;
@@ -101,7 +102,7 @@ pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
         let phase: [f64; MAX_JOINTS] = core::array::from_fn(|_| dice.random_range(0.0..6.0));
         for epoch in 0..extent.epochs {
             let q = phase.map(|phase| (phase + f64::from(epoch) * 0.016).sin());
-            let (round, carry) = (rounding.turn(&q, &touch), carrying.turn(&q, &touch));
+            let (round, carry) = (rounding.run_epoch(&q, &touch), carrying.run_epoch(&q, &touch));
             truncated.add(round.loaded, &round.truncated, &round.central);
             rounded.add(round.loaded, &round.sum, &round.central);
             carried.add(carry.loaded, &carry.sum, &carry.central);
@@ -131,10 +132,10 @@ fn averaged(
     touch: &[(usize, SkinSensors)],
 ) -> ([f64; MAX_JOINTS], EpochResult) {
     let (mut mean, mut last) = ([0.0; MAX_JOINTS], EpochResult::default());
-    for _ in 0..AVERAGED {
-        last = tree.turn(q, touch);
+    for _ in 0..AVERAGED_EPOCHS {
+        last = tree.run_epoch(q, touch);
         for (mean, sum) in mean.iter_mut().zip(last.sum) {
-            *mean += sum / f64::from(AVERAGED);
+            *mean += sum / f64::from(AVERAGED_EPOCHS);
         }
     }
     (mean, last)
@@ -159,17 +160,17 @@ pub fn section(skin: &Skin, errors: &[SumErrors]) -> Section {
     let figure = Figure::new(
         "sums",
         format!("Mean error of the summed torque over active cells of {of}, Q7.8, loaded joints"),
-        Axis::new("active cells", "").log().between(0.9, 300.0),
-        Axis::new("mean absolute error", "Nm").log().between(1e-5, 1.0),
+        Axis::new("active cells", "").log().with_ends(0.9, 300.0),
+        Axis::new("mean absolute error", "Nm").log().with_ends(1e-5, 1.0),
     );
     let series = WAYS.map(|(caption, _, error)| {
         let points = errors.iter().map(|errors| (count(errors.active), error(errors))).collect();
         Series::new(caption, Shape::Line, points)
     });
-    let at = errors.iter().filter(|errors| errors.active == FOUND_AT).take(1);
+    let at = errors.iter().filter(|errors| errors.active == FINDINGS_AT).take(1);
     let findings = at.flat_map(|at| {
         WAYS.map(|(caption, what, error)| {
-            let what = format!("sum of {FOUND_AT} active cells of {of}, {what}");
+            let what = format!("sum of {FINDINGS_AT} active cells of {of}, {what}");
             let found = Finding::less_is_better(what, paper::SUMMED_NM, (error(at), "Nm"));
             if caption == "rounded" { found.at_most(0.005) } else { found }
         })

@@ -1,7 +1,7 @@
 //! Tests that perform every experiment that needs no bench, with few measurements.
 
 use super::*;
-use analysis::report::figure::{Figure, Shape, Verdict};
+use analysis::report::figure::{Figure, FindingVerdict, Shape};
 use std::sync::LazyLock;
 use std::time::Instant;
 
@@ -25,7 +25,7 @@ impl Lab for Bare {
         Err("there is no bench here")
     }
 
-    fn go_on(&mut self) -> Result<(), &'static str> {
+    fn check_stopped(&mut self) -> Result<(), &'static str> {
         Ok(())
     }
 }
@@ -65,7 +65,7 @@ fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
         for finding in &section.findings {
             assert!(finding.ours.value.is_finite(), "{finding:?}");
             assert_eq!(
-                finding.verdict == Verdict::Stated,
+                finding.verdict == FindingVerdict::Stated,
                 finding.bar.is_none() && is_stated(finding),
                 "{finding:?}"
             );
@@ -85,7 +85,7 @@ fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
 /// Returns true if a finding has no value of the paper to be compared with, or if the comparison is for information
 /// only.
 fn is_stated(finding: &analysis::report::figure::Finding) -> bool {
-    finding.paper.is_none() || finding.verdict == Verdict::Stated
+    finding.paper.is_none() || finding.verdict == FindingVerdict::Stated
 }
 
 #[test]
@@ -101,7 +101,7 @@ fn a_bench_that_fails_fails_its_experiments_and_no_others() {
 fn names_lead_to_experiments_and_others_to_the_list() {
     for experiment in Experiment::ALL {
         assert_eq!(experiment.name().parse(), Ok(experiment));
-        assert!(!experiment.about().contains('\n'));
+        assert!(!experiment.description().contains('\n'));
     }
     let error = "fig11".parse::<Experiment>().unwrap_err();
     assert!(error.contains("fig6, fig7, fig8") && error.ends_with("scale"), "{error}");

@@ -14,8 +14,8 @@ use control::controller::{Controller, ControllerOutput, Input, Kinesthetic};
 use control::cycle::turn::{BusPort, Shared, TickDriver, TimedRecord};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
-use model::generate::{GenerateError, Target, generate};
-use model::scenario::{Mode, ModeChange, Scenario, contact_words};
+use model::generate::{GenerateError, SkinRequest, generate};
+use model::scenario::{ModeChange, Scenario, TorqueSource, contact_words};
 use model::table::{Snapshot, Table};
 
 /// The maximum number of cells in Fig. 9 of the paper.
@@ -27,7 +27,7 @@ pub const POSE: [f64; WORDS] = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
 /// The force on an active cell, in N.
 const TOUCH_N: f64 = 1.5;
 /// The number of ticks in an epoch, with 500 ticks and 62.5 epochs per second.
-const TICKS: u64 = 8;
+const TICKS_PER_EPOCH: u64 = 8;
 /// The capacity of the queues for records and broadcasts between two epochs. It is much larger than needed.
 const QUEUE: usize = 64;
 
@@ -36,7 +36,7 @@ const QUEUE: usize = 64;
 /// # Errors
 /// Returns [`GenerateError`] if the cells do not fit on the buses.
 pub fn skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
-    let text = generate(&Target { cells, buses, ..Target::default() })?;
+    let text = generate(&SkinRequest { cells, buses, ..SkinRequest::default() })?;
     Ok(Skin::parse("generated skin", &text)?)
 }
 
@@ -101,7 +101,7 @@ pub struct Ticks {
     turn: TickDriver,
     buses: Vec<ReceiverEnds>,
     records: rtrb::Consumer<TimedRecord>,
-    mode: Mode,
+    mode: TorqueSource,
     number: u64,
 }
 
@@ -128,7 +128,7 @@ impl Ticks {
     /// # Panics
     /// Panics if the skin has an external controller, which a generated skin does not have.
     #[must_use]
-    pub fn new(skin: &Skin, active: usize, mode: Mode) -> Self {
+    pub fn new(skin: &Skin, active: usize, mode: TorqueSource) -> Self {
         let buses = skin.buses.len();
         let share = |bus: usize| active / buses + usize::from(bus < active % buses);
         let (records_in, records) = rtrb::RingBuffer::new(QUEUE);
@@ -156,18 +156,18 @@ impl Ticks {
 
     /// Runs the ticks of one epoch, each with a new snapshot. Returns their mean times.
     pub fn epoch(&mut self, now: impl Fn() -> u64 + Copy) -> TickCost {
-        for _ in 0..TICKS {
+        for _ in 0..TICKS_PER_EPOCH {
             for ReceiverEnds { snapshot, to_loop, positions } in &mut self.buses {
                 // The epoch that was read back is that of the previous broadcast, as on a bus that works.
-                let sent = self.number.checked_sub(1).map(|number| number / TICKS);
+                let sent = self.number.checked_sub(1).map(|number| number / TICKS_PER_EPOCH);
                 snapshot.sums.read_back = sent.map(|sent| Epoch(sent.to_le_bytes()[0]));
-                to_loop.input_buffer_mut().copy_from(snapshot, self.mode == Mode::Compare);
+                to_loop.input_buffer_mut().copy_from(snapshot, self.mode == TorqueSource::Compare);
                 to_loop.publish();
                 while positions.pop().is_ok() {}
             }
             let tick = Tick { number: self.number, time: Micros(self.number * 2_000) };
             let take = |_, frames: &[Frame]| std::hint::black_box(!frames.is_empty());
-            self.turn.turn(tick, 0, 0, now, take);
+            self.turn.run_tick(tick, 0, 0, now, take);
             self.number += 1;
         }
         let mut took = TickCost::default();
@@ -181,10 +181,10 @@ impl Ticks {
 
     /// Runs one more epoch and returns the state after it: the number of cells in the torque, the number of active
     /// cells in the central computation (`None` if there is none), and true if the robot is halted.
-    pub fn known(&mut self, now: impl Fn() -> u64 + Copy) -> (u32, Option<u32>, bool) {
+    pub fn state_after_epoch(&mut self, now: impl Fn() -> u64 + Copy) -> (u32, Option<u32>, bool) {
         self.epoch(now);
         let tick = Tick { number: self.number, time: Micros(self.number * 2_000) };
-        self.turn.turn(tick, 0, 0, now, |_, _| true);
+        self.turn.run_tick(tick, 0, 0, now, |_, _| true);
         self.number += 1;
         let timed = self.records.pop().ok();
         timed.map_or((0, None, true), |TimedRecord { record, central, .. }| {
@@ -211,15 +211,15 @@ mod tests {
             let counts: Vec<_> = (0..BUSES).map(|bus| part.cells_on_bus(bus).count()).collect();
             assert!(counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 1, "{counts:?}");
             let target = u32::try_from(active).unwrap();
-            let mut compared = Ticks::new(&part, active, Mode::Compare);
+            let mut compared = Ticks::new(&part, active, TorqueSource::Compare);
             // The loop runs for more than a hundred ticks. If the broadcasts were not read back, the robot would be
             // halted.
             for _ in 0..20 {
                 compared.epoch(|| 0);
             }
-            assert_eq!(compared.known(|| 0), (target, Some(target), false));
-            let mut distributed = Ticks::new(&part, active, Mode::Distributed);
-            assert_eq!(distributed.known(|| 0), (target, None, false));
+            assert_eq!(compared.state_after_epoch(|| 0), (target, Some(target), false));
+            let mut distributed = Ticks::new(&part, active, TorqueSource::Distributed);
+            assert_eq!(distributed.state_after_epoch(|| 0), (target, None, false));
         }
     }
 
@@ -234,7 +234,7 @@ mod tests {
             clock.get()
         };
         let took = |mode| Ticks::new(&part, 0, mode).epoch(now);
-        assert_eq!(took(Mode::Compare), TickCost { tick: 2.0, central: 1.0 });
-        assert_eq!(took(Mode::Distributed), TickCost { tick: 1.0, central: 0.0 });
+        assert_eq!(took(TorqueSource::Compare), TickCost { tick: 2.0, central: 1.0 });
+        assert_eq!(took(TorqueSource::Distributed), TickCost { tick: 1.0, central: 0.0 });
     }
 }

@@ -18,7 +18,7 @@ use protocol::time::{Micros, Span};
 use model::central::Central;
 
 /// The number of fraction bits of a cell's exact torque that Q7.8 does not have.
-const SHORTENED: u32 = 30 - 8;
+const DROPPED_BITS: u32 = 30 - 8;
 /// The interval between joint broadcasts, in µs.
 const PERIOD: u64 = 16_000;
 
@@ -102,7 +102,7 @@ impl SumTree {
 
     /// Runs one epoch with the joint positions `q` in rad. `touch` are the cells in contact, by index, with their
     /// sensor values.
-    pub fn turn(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochResult {
+    pub fn run_epoch(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochResult {
         let words = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
         let frames = self.central.frames(&words);
         let mut came = EpochResult::default();
@@ -164,5 +164,5 @@ fn add(sum: &mut [f64; MAX_JOINTS], more: [f64; MAX_JOINTS]) {
 /// Returns the torque in Nm after the bits below those of Q7.8 were dropped.
 #[expect(clippy::cast_precision_loss, reason = "a torque has far fewer than 2^53 steps")]
 fn truncated(exact: Acc<30>) -> f64 {
-    (exact.steps() >> SHORTENED) as f64 / 256.0
+    (exact.steps() >> DROPPED_BITS) as f64 / 256.0
 }

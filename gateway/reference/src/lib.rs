@@ -49,7 +49,7 @@ impl ReferenceCell {
     /// Returns the words of the torques of a force on the cell in N, whatever its sensors measure. The force is rounded
     /// to 2^-16 N.
     #[must_use]
-    pub fn torque_of(&self, joints: &[Q1_14; MAX_JOINTS], newtons: f64) -> [i16; MAX_JOINTS] {
+    pub fn torque_for_force(&self, joints: &[Q1_14; MAX_JOINTS], newtons: f64) -> [i16; MAX_JOINTS] {
         #[expect(clippy::cast_possible_truncation, reason = "held within what a force can be")]
         let steps = (newtons * 65_536.0).round() as i64;
         self.under(joints, Force::from_steps(steps))

@@ -12,7 +12,7 @@ use protocol::can::Format;
 use protocol::document::DocumentError;
 use protocol::parameters::RowKind;
 use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
-use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, REACH, Skin, reach};
+use protocol::skin::{JointKind, MAX_REACH, MAX_ROBOT_JOINTS, Skin, reach};
 use thiserror::Error;
 
 use crate::chain::{ChainJoint, UrdfChain};
@@ -22,7 +22,7 @@ use crate::error::RobotError;
 pub const DEFAULT_CELLS_PER_BUS: usize = 250;
 
 /// Maximum speed of a joint for which the URDF gives none, in rad/s or m/s.
-const MAX_SPEED: f64 = 2.0;
+const DEFAULT_MAX_SPEED: f64 = 2.0;
 
 /// A cell that is placed on a link of the robot.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -137,7 +137,7 @@ pub enum ImportError {
     /// A cell is too far from the joints that move it.
     #[error(
         "{}position px,py,pz = {x},{y},{z} of link {link:?} can come {reach:.3} m from a frame of the rows below \
-         it, if all joints turn freely; less than {REACH} m is possible: correct it, or choose a root nearer to the link",
+         it, if all joints turn freely; less than {MAX_REACH} m is possible: correct it, or choose a root nearer to the link",
         line_prefix(*line)
     )]
     Reach {
@@ -179,7 +179,7 @@ impl ImportError {
 
     /// Converts an error of the check of the written skin. The result refers to the lines of the file of cells, because
     /// the user does not see the text of the skin.
-    fn of_check(error: DocumentError, cells: &[CellOnLink], buses: &[BusAssignment]) -> Self {
+    fn from_check(error: DocumentError, cells: &[CellOnLink], buses: &[BusAssignment]) -> Self {
         let DocumentError::InvalidValue { what, .. } = error else {
             return Self::Robot { what: error.to_string() };
         };
@@ -249,7 +249,7 @@ impl SkinImport<'_> {
         let text = self.text(&buses, &placed);
         match Skin::parse("imported skin", &text) {
             Ok(_) => Ok(text),
-            Err(error) => Err(ImportError::of_check(error, cells, &buses)),
+            Err(error) => Err(ImportError::from_check(error, cells, &buses)),
         }
     }
 
@@ -285,7 +285,7 @@ impl SkinImport<'_> {
         let position = frame.frame * Point3::from(cell.position);
         let rows = self.chains.get(owner).map(UrdfChain::chain_rows).unwrap_or_default();
         let reach = reach(rows.get(..frame.row).unwrap_or_default(), position.into());
-        if reach.is_nan() || reach >= REACH {
+        if reach.is_nan() || reach >= MAX_REACH {
             let ([x, y, z], link) = (cell.position, cell.link.clone());
             return Err(ImportError::Reach { line, link, x, y, z, reach });
         }
@@ -417,7 +417,7 @@ impl SkinImport<'_> {
             5,
             "Nm s/rad, or N s/m",
         );
-        let speed = each(&|joint| joint.max_speed.unwrap_or(MAX_SPEED));
+        let speed = each(&|joint| joint.max_speed.unwrap_or(DEFAULT_MAX_SPEED));
         draft.set_with_comment("max_speed", Value::Numbers(&speed), 3, "rad/s, or m/s");
         for cell in cells {
             let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);

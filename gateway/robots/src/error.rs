@@ -3,7 +3,7 @@
 use thiserror::Error;
 
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS};
-use protocol::skin::REACH;
+use protocol::skin::MAX_REACH;
 
 use crate::rows::{MAX_LENGTH_M, MAX_RESIDUAL};
 
@@ -249,7 +249,7 @@ pub enum RobotProblem {
     },
     /// A cell on the chain can be farther from a joint than a cell can compute.
     #[error(
-        "link {link:?} can come {reach:.3} m from a frame of the rows below it, if all joints turn freely; less than {REACH} m is possible: choose a tip or a root nearer to the other"
+        "link {link:?} can come {reach:.3} m from a frame of the rows below it, if all joints turn freely; less than {MAX_REACH} m is possible: choose a tip or a root nearer to the other"
     )]
     Reach {
         /// Name of the link.

@@ -48,9 +48,9 @@ pub use nalgebra::Isometry3;
 pub use protocol::parameters::RowKind;
 pub use protocol::skin::JointKind;
 pub use rows::{DhRow, MAX_LENGTH_M, MAX_RESIDUAL, frames, pose_of};
-pub use taken::{UniqueNames, chain_words, word};
+pub use taken::{UniqueNames, chain_prefixes, sanitized};
 pub use urdf::{Geometry, Shape, Urdf, text};
-pub use written::{WrittenUrdf, written};
+pub use written::{WrittenUrdf, write_urdf};
 
 #[cfg(test)]
 mod tests;

@@ -7,7 +7,7 @@ const MAX_SUGGESTIONS: usize = 3;
 pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>) -> String {
     let target = target.to_lowercase();
     let mut found: Vec<_> =
-        names.into_iter().map(|name| (edits(&target, &name.to_lowercase()), name)).collect();
+        names.into_iter().map(|name| (edit_distance(&target, &name.to_lowercase()), name)).collect();
     found.sort();
     let found: Vec<_> =
         found.into_iter().take(MAX_SUGGESTIONS).map(|(_, name)| format!("{name:?}")).collect();
@@ -19,7 +19,7 @@ pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>
 }
 
 /// Returns the edit distance of two words: the minimum number of characters to insert, delete or replace.
-fn edits(from: &str, to: &str) -> usize {
+fn edit_distance(from: &str, to: &str) -> usize {
     let to: Vec<_> = to.chars().collect();
     let mut row: Vec<_> = (0..=to.len()).collect();
     for (above, letter) in from.chars().enumerate() {
@@ -38,14 +38,14 @@ fn edits(from: &str, to: &str) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::{edits, nearest};
+    use super::{edit_distance, nearest};
 
     #[test]
     fn edits_are_counted() {
-        assert_eq!(edits("kitten", "sitting"), 3);
-        assert_eq!(edits("", "abc"), 3);
-        assert_eq!(edits("abc", ""), 3);
-        assert_eq!(edits("same", "same"), 0);
+        assert_eq!(edit_distance("kitten", "sitting"), 3);
+        assert_eq!(edit_distance("", "abc"), 3);
+        assert_eq!(edit_distance("abc", ""), 3);
+        assert_eq!(edit_distance("same", "same"), 0);
     }
 
     #[test]

@@ -5,7 +5,7 @@ use core::f64::consts::TAU;
 use nalgebra::Isometry3;
 
 use crate::chain::UrdfChain;
-use crate::chain::{CarriedLink, behind};
+use crate::chain::{CarriedLink, frames_after_joints};
 use crate::urdf::UrdfJoint;
 use protocol::skin::JointKind;
 
@@ -26,7 +26,7 @@ pub(crate) fn residual(chain: &UrdfChain, path: &[&UrdfJoint], hanging: &[Carrie
     let mut worst = Residual::default();
     for positions in positions(chain) {
         let frames = chain.frames(&positions);
-        let behind = behind(path, &positions);
+        let behind = frames_after_joints(path, &positions);
         for (CarriedLink { link, joint, fixed }, (_, found)) in hanging.iter().zip(chain.links()) {
             let urdf = joint.checked_sub(1).and_then(|index| behind.get(index)).map(|pose| pose * fixed);
             let rows = frames.get(found.row).map(|frame| frame * found.frame);

@@ -28,14 +28,14 @@ const WELL_KNOWN_SINE: f64 = 1e-3;
 
 /// Maximum distance in m of frame 0 from the origin of the first joint, and of the last frame from the origin of the
 /// last joint, both along the joint's axis.
-const LONG_M: f64 = 1.0;
+const MAX_SHIFT_M: f64 = 1.0;
 
 /// Lengths in m that a fixed row must save. A row has a cost because it adds a rounding error to a cell's computation.
 /// The second value is for chains whose rows are too long with the first.
 pub(crate) const ROW_COSTS_M: [f64; 2] = [0.2, 0.0];
 
 /// Cost in m of a length that exceeds the range of a row.
-const IMPOSSIBLE_M: f64 = 1e3;
+const OUT_OF_RANGE_COST_M: f64 = 1e3;
 
 /// One row in standard Denavit-Hartenberg form, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`. It leads from frame l - 1, whose z
 /// axis is the axis of the row's joint, to frame l.
@@ -85,7 +85,7 @@ impl DhRow {
 
     /// Returns |a| + |d| of the row in m. A value that is out of range counts as 1000 m.
     fn length(&self) -> f64 {
-        let length = |value: f64| if value.abs() < MAX_LENGTH_M { value.abs() } else { IMPOSSIBLE_M };
+        let length = |value: f64| if value.abs() < MAX_LENGTH_M { value.abs() } else { OUT_OF_RANGE_COST_M };
         length(self.a) + length(self.d)
     }
 
@@ -94,7 +94,7 @@ impl DhRow {
     fn tidy(self) -> Self {
         let length = |value: f64| if value.abs() < LENGTH_TOLERANCE_M { 0.0 } else { value };
         // Adding zero removes the sign of a negative zero.
-        let angle = |value| quarter(value) + 0.0;
+        let angle = |value| round_to_quarter_turn(value) + 0.0;
         Self {
             a: length(self.a),
             alpha: angle(self.alpha),
@@ -143,7 +143,7 @@ struct RowPath {
 
 impl RowPath {
     /// Returns the path extended by these rows.
-    fn and(&self, rows: &[DhRow], row_cost: f64) -> Self {
+    fn extended(&self, rows: &[DhRow], row_cost: f64) -> Self {
         let frame = rows.iter().fold(self.frame, |frame, row| frame * row.transform(0.0));
         let cost = |row: &DhRow| row.length() + if row.kind == RowKind::Fixed { row_cost } else { 0.0 };
         let cost = self.cost + rows.iter().map(cost).sum::<f64>();
@@ -176,9 +176,12 @@ pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometr
         for way in &ways {
             let local = |point: &Point3<f64>| way.frame.inverse_transform_point(point).coords;
             let Some(next) = next else {
-                let d = local(tip).z.clamp(-LONG_M, LONG_M);
+                let d = local(tip).z.clamp(-MAX_SHIFT_M, MAX_SHIFT_M);
                 longer.push(
-                    way.and(&[DhRow { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.tidy()], row_cost),
+                    way.extended(
+                        &[DhRow { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.tidy()],
+                        row_cost,
+                    ),
                 );
                 continue;
             };
@@ -186,7 +189,7 @@ pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometr
             let mut places = vec![local(&next.point)];
             places.extend(axes.get(index + 2).and_then(|beyond| next.foot(beyond)).map(|foot| local(&foot)));
             for rows in between(kind, &places, &direction) {
-                let way = way.and(&rows, row_cost);
+                let way = way.extended(&rows, row_cost);
                 // Paths that end in the same frame have the same continuations.
                 let same = |other: &&mut RowPath| {
                     let apart = other.frame.translation.vector - way.frame.translation.vector;
@@ -220,7 +223,7 @@ fn base(first: &Axis) -> Isometry3<f64> {
     let y = z.cross(&x);
     let turn = Rotation3::from_basis_unchecked(&[x, y, z]);
     let along = -z.dot(&first.point.coords);
-    let origin = if along.abs() <= LONG_M / 2.0 { first.point + z * along } else { first.point };
+    let origin = if along.abs() <= MAX_SHIFT_M / 2.0 { first.point + z * along } else { first.point };
     Isometry3::from_parts(origin.into(), UnitQuaternion::from_rotation_matrix(&turn))
 }
 
@@ -243,7 +246,7 @@ fn between(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> 
 /// next joint's origin is used.
 fn parallel(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let meets = point.xy().norm() < LENGTH_TOLERANCE_M;
-    let theta_offset = if meets { 0.0 } else { upright(point.y.atan2(point.x)) };
+    let theta_offset = if meets { 0.0 } else { within_quarter_turn(point.y.atan2(point.x)) };
     let alpha = if direction.z > 0.0 { 0.0 } else { PI };
     DhRow { kind, a: along_x(point, theta_offset), alpha, d: point.z, theta_offset }.tidy()
 }
@@ -251,7 +254,7 @@ fn parallel(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> Dh
 /// Returns the row that leads along the common normal to an axis through `point`.
 fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let along = -point.xy().dot(&direction.xy()) / direction.xy().norm_squared();
-    let theta_offset = upright(direction.x.atan2(-direction.y));
+    let theta_offset = within_quarter_turn(direction.x.atan2(-direction.y));
     // The component of the direction that is perpendicular to the new x axis.
     let (sine, cosine) = theta_offset.sin_cos();
     let alpha = (sine * direction.x - cosine * direction.y).atan2(direction.z);
@@ -280,13 +283,13 @@ fn helper(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [DhRow;
 }
 
 /// Returns an angle within [-pi/2, pi/2] in rad that describes the same or the opposite direction.
-fn upright(angle: f64) -> f64 {
-    let angle = quarter(angle);
+fn within_quarter_turn(angle: f64) -> f64 {
+    let angle = round_to_quarter_turn(angle);
     if angle.abs() <= FRAC_PI_2 { angle } else { angle - PI.copysign(angle) }
 }
 
 /// Rounds an angle in rad to a multiple of a quarter turn if it is nearly one.
-fn quarter(angle: f64) -> f64 {
+fn round_to_quarter_turn(angle: f64) -> f64 {
     let whole = (angle / FRAC_PI_2).round() * FRAC_PI_2;
     if (angle - whole).abs() < ANGLE_TOLERANCE { whole } else { angle }
 }

@@ -11,14 +11,14 @@ pub struct UniqueNames(BTreeSet<String>);
 impl UniqueNames {
     /// Returns a unique name for each requested one, in order. A name that is already in use, possibly by an earlier
     /// name of the list, gets a number: `name_2`.
-    pub fn give(&mut self, requested: Vec<String>) -> Vec<String> {
+    pub fn assign_all(&mut self, requested: Vec<String>) -> Vec<String> {
         let is_free: Vec<_> = requested.iter().map(|name| self.0.insert(name.clone())).collect();
         let numbered = requested.into_iter().zip(is_free);
         numbered.map(|(name, is_free)| if is_free { name } else { self.numbered(&name) }).collect()
     }
 
     /// Returns a unique name for the requested name, and records it as used.
-    pub fn give_one(&mut self, name: String) -> String {
+    pub fn assign(&mut self, name: String) -> String {
         if self.0.insert(name.clone()) { name } else { self.numbered(&name) }
     }
 
@@ -36,19 +36,19 @@ impl UniqueNames {
 
 /// Replaces the characters of a name that are not allowed in names of frames and topics.
 #[must_use]
-pub fn word(name: &str) -> String {
+pub fn sanitized(name: &str) -> String {
     name.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '_' }).collect()
 }
 
 /// Returns a unique word for each chain of a skin, to be used in names of links. The words are empty if there is only
 /// one chain.
 #[must_use]
-pub fn chain_words(skin: &Skin) -> Vec<String> {
+pub fn chain_prefixes(skin: &Skin) -> Vec<String> {
     let chains = &skin.robot.chains;
     if chains.len() < 2 {
         return vec![String::new(); chains.len()];
     }
-    UniqueNames::default().give(chains.iter().map(|chain| word(&chain.name)).collect())
+    UniqueNames::default().assign_all(chains.iter().map(|chain| sanitized(&chain.name)).collect())
 }
 
 #[cfg(test)]
@@ -58,8 +58,8 @@ mod tests {
     #[test]
     fn a_taken_name_gets_a_number_that_is_free() {
         let mut taken = UniqueNames::default();
-        let given = taken.give(["a", "b", "a", "a_2", "a"].map(str::to_owned).to_vec());
+        let given = taken.assign_all(["a", "b", "a", "a_2", "a"].map(str::to_owned).to_vec());
         assert_eq!(given, ["a", "b", "a_3", "a_2", "a_4"]);
-        assert_eq!([taken.give_one("b".to_owned()), taken.give_one("c".to_owned())], ["b_2", "c"]);
+        assert_eq!([taken.assign("b".to_owned()), taken.assign("c".to_owned())], ["b_2", "c"]);
     }
 }

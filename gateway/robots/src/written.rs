@@ -13,16 +13,16 @@ use protocol::skin::{JointKind, Skin};
 use protocol::xml::escaped;
 
 use crate::rows::{DhRow, pose_of};
-use crate::taken::chain_words;
+use crate::taken::chain_prefixes;
 
 /// Name of the link that is the base of all chains.
-const BASE: &str = "base";
+const BASE_LINK: &str = "base";
 /// Radius of the cylinders that stand for segments, in m.
 const RADIUS_M: f64 = 0.04;
 /// Minimum length of a segment that is drawn, in m.
-const SHORTEST_M: f64 = 1e-3;
+const MIN_DRAWN_M: f64 = 1e-3;
 /// The effort limit in Nm or N. URDF requires one, and a skin has none.
-const EFFORT: f64 = 1000.0;
+const EFFORT_LIMIT: f64 = 1000.0;
 
 /// A written URDF, and the names of its links.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,7 +42,7 @@ struct Origin {
 
 impl Origin {
     /// Returns the origin for the constant part of a row.
-    fn of_row(row: &DhRow) -> Self {
+    fn from_row(row: &DhRow) -> Self {
         let (sine, cosine) = row.theta_offset.sin_cos();
         Self { xyz: [row.a * cosine, row.a * sine, row.d], rpy: [row.alpha, 0.0, row.theta_offset] }
     }
@@ -77,13 +77,13 @@ struct WrittenJoint {
 
 /// Writes a URDF for the chains of a skin.
 #[must_use]
-pub fn written(skin: &Skin) -> WrittenUrdf {
+pub fn write_urdf(skin: &Skin) -> WrittenUrdf {
     let robot = &skin.robot;
     let mut joints: Vec<WrittenJoint> = Vec::new();
     let mut links = Vec::new();
-    for (chain, word) in robot.chains.iter().zip(chain_words(skin)) {
+    for (chain, word) in robot.chains.iter().zip(chain_prefixes(skin)) {
         let prefix = if word.is_empty() { word } else { word + "_" };
-        let (mut parent, mut origin) = (BASE.to_owned(), Origin::of_base(&chain.base));
+        let (mut parent, mut origin) = (BASE_LINK.to_owned(), Origin::of_base(&chain.base));
         let (mut of_chain, mut moving) = (Vec::new(), chain.joints.iter());
         for (index, row) in chain.rows.iter().enumerate() {
             let moved = if row.kind == RowKind::Fixed { None } else { moving.next().copied() };
@@ -102,7 +102,7 @@ pub fn written(skin: &Skin) -> WrittenUrdf {
             if moved.is_some() {
                 of_chain.push(link.clone());
             }
-            (parent, origin) = (link, Origin::of_row(&DhRow::from(row)));
+            (parent, origin) = (link, Origin::from_row(&DhRow::from(row)));
         }
         joints.push(joint(skin, &joints, (parent, origin, None), format!("{prefix}tip")));
         links.push(of_chain);
@@ -130,7 +130,7 @@ fn joint(
     let [lower, upper] = joint.limits;
     let speed = skin.controller.max_speed.get(index).copied().unwrap_or(1.0);
     let mut inner = format!(
-        "    <axis xyz=\"0 0 1\"/>\n    <limit lower=\"{lower}\" upper=\"{upper}\" velocity=\"{speed}\" effort=\"{EFFORT}\"/>\n"
+        "    <axis xyz=\"0 0 1\"/>\n    <limit lower=\"{lower}\" upper=\"{upper}\" velocity=\"{speed}\" effort=\"{EFFORT_LIMIT}\"/>\n"
     );
     let mut name = joint.name.clone();
     if before.iter().any(|it| it.moved == moved) {
@@ -152,7 +152,7 @@ fn xml(name: &str, joints: &[WrittenJoint]) -> String {
     let mut out = format!(
         "<?xml version=\"1.0\"?>\n<robot name=\"{name}\">\n  <material name=\"grey\"><color rgba=\"0.6 0.6 0.6 1\"/></material>\n"
     );
-    for link in core::iter::once(BASE).chain(joints.iter().map(|joint| joint.link.as_str())) {
+    for link in core::iter::once(BASE_LINK).chain(joints.iter().map(|joint| joint.link.as_str())) {
         let _ = writeln!(out, "  <link name=\"{link}\">");
         shape(&mut out, [0.0; 3], [0.0; 3], &format!("<sphere radius=\"{RADIUS_M}\"/>"));
         for joint in joints.iter().filter(|joint| joint.parent == link) {
@@ -177,7 +177,7 @@ fn xml(name: &str, joints: &[WrittenJoint]) -> String {
 fn segment(out: &mut String, to: [f64; 3]) {
     let way = Vector3::from(to);
     let length = way.norm();
-    if length < SHORTEST_M {
+    if length < MIN_DRAWN_M {
         return;
     }
     let turn = UnitQuaternion::rotation_between(&Vector3::z(), &way)

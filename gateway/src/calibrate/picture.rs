@@ -6,7 +6,7 @@ use calibration::Calibration;
 use protocol::skin::Skin;
 use view::{MovedCell, Scene};
 
-use crate::skin::still;
+use crate::skin::still_view;
 use crate::visuals::Packages;
 
 /// Returns the HTML page, which shows the cells at the positions found, each with a line from the position that the
@@ -20,7 +20,7 @@ pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> Strin
         cell.orientation = Some(pose.orientation);
         cell.normal = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)];
     }
-    let mut still = still(file, &found, &Packages::beside());
+    let mut still = still_view(file, &found, &Packages::beside_urdf());
     let described = Scene::from_skin(skin, false);
     for (index, (old, result)) in described.cells.into_iter().zip(&calibration.cells).enumerate() {
         let chain = described.buses.get(old.bus).map_or(0, |bus| bus.chain);

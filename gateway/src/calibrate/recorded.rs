@@ -5,7 +5,7 @@ use protocol::usage::Failure;
 
 /// Checks that a recording belongs to this skin: the cells, buses, robot and rate are the same. Poses of cells and zero
 /// offsets of joints may differ, because a calibration finds them.
-pub(super) fn check(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Failure> {
+pub(super) fn check_same_skin(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Failure> {
     let Some((what, is, was)) = difference(skin, recorded) else { return Ok(()) };
     Err(Failure::usage(format!(
         "{name} was recorded with another skin: {what} {is}, recorded {was}; calibrate with the skin that was recorded"
@@ -25,13 +25,13 @@ fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, Str
     ];
     let differing = |(what, pick): &(&'static str, Pick)| {
         let (is, was) = (pick(skin), pick(recorded));
-        (is != was).then(|| first(what, &is, &was))
+        (is != was).then(|| first_item(what, &is, &was))
     };
-    all.iter().find_map(differing).or_else(|| rows(skin, recorded))
+    all.iter().find_map(differing).or_else(|| row_difference(skin, recorded))
 }
 
 /// Returns the first items in which two lists differ, under the name `what`.
-fn first(what: &'static str, is: &str, was: &str) -> (&'static str, String, String) {
+fn first_item(what: &'static str, is: &str, was: &str) -> (&'static str, String, String) {
     let [mut left, mut right] = [is.split(", "), was.split(", ")];
     loop {
         match (left.next(), right.next()) {
@@ -45,7 +45,7 @@ fn first(what: &'static str, is: &str, was: &str) -> (&'static str, String, Stri
 }
 
 /// Returns the first row of the robot's table that differs, apart from the zero offsets of joints.
-fn rows(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
+fn row_difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
     let all = |skin: &Skin| -> Vec<_> {
         let chains = skin.robot.chains.iter();
         chains
@@ -94,7 +94,7 @@ mod tests {
         assert_eq!(what, "serial numbers");
         let mut other = skin.clone();
         other.robot.chains[0].rows[1].table.a = -0.612;
-        let said = check("run.mcap", &other, &skin).unwrap_err().to_string();
+        let said = check_same_skin("run.mcap", &other, &skin).unwrap_err().to_string();
         assert!(
             said.contains("run.mcap was recorded with another skin: a row of the robot's table a = -0.612"),
             "{said}"

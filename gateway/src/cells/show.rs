@@ -34,7 +34,9 @@ const COLUMNS: [Column; 10] = [
     ("joint", |it| text(it.joint)),
     ("up", |it| it.tree.as_ref().map(TreeShown::up)),
     ("depth", |it| text(it.tree.as_ref()?.depth)),
-    ("ports", |it| it.ports.as_ref().map(|ports| space_separated(ports.iter().map(PortShown::leads_to)))),
+    ("ports", |it| {
+        it.ports.as_ref().map(|ports| space_separated(ports.iter().map(PortShown::neighbour_text)))
+    }),
     ("hash", |it| it.hash.clone()),
     ("skin", |it| it.skin.clone()),
     ("age", |it| Some(format!("{:.2}", it.age_s))),
@@ -54,7 +56,7 @@ const COUNTERS: [Column; 9] = [
 ];
 
 /// Columns with text instead of numbers.
-const OF_WORDS: [&str; 3] = ["state", "ports", "skin"];
+const TEXT_COLUMNS: [&str; 3] = ["state", "ports", "skin"];
 
 fn text(value: Option<impl Display>) -> Option<String> {
     value.map(|value| value.to_string())
@@ -79,7 +81,7 @@ impl<'a> CellList<'a> {
     pub(super) fn of(watch: &'a CellWatch, known: Option<&'a DescribedBus>) -> Self {
         let (bus, listing, now) = (watch.bus(), watch.listing(), watch.now());
         let missing = |known: &DescribedBus| {
-            let silent = known.cells.iter().filter(|(serial, _)| listing.number_of(**serial).is_none());
+            let silent = known.cells.iter().filter(|(serial, _)| listing.node_id(**serial).is_none());
             silent.map(|(_, (cell, _))| cell.get()).collect()
         };
         Self {
@@ -100,7 +102,7 @@ impl<'a> CellList<'a> {
             Some(wide) if width(&whole) > usize::from(wide) => self.lines(COLUMNS),
             _ => whole,
         };
-        text + &self.end()
+        text + &self.totals()
     }
 
     /// Formats one line per cell, without empty columns.
@@ -111,7 +113,7 @@ impl<'a> CellList<'a> {
         table.set_header(&heads).add_rows(lines);
         for (column, head) in table.column_iter_mut().zip(&heads) {
             column.set_padding((0, 1));
-            if !OF_WORDS.contains(head) {
+            if !TEXT_COLUMNS.contains(head) {
                 column.set_cell_alignment(CellAlignment::Right);
             }
         }
@@ -119,7 +121,7 @@ impl<'a> CellList<'a> {
     }
 
     /// Formats the counts and anomalies below the table.
-    fn end(&self) -> String {
+    fn totals(&self) -> String {
         let mut text = format!("{} cells on {} ({})", self.cells.len(), self.bus, self.kind);
         let active = self.cells.iter().filter(|cell| cell.is("active")).count();
         let bare = self.cells.iter().filter(|cell| cell.configured == Some(false)).count();
@@ -155,7 +157,7 @@ impl DescribedBus {
     }
 
     /// Returns how a cell differs from its description, or agrees with it, as text.
-    fn compared(&self, node: u8, heartbeat: &Heartbeat) -> Option<String> {
+    fn compare(&self, node: u8, heartbeat: &Heartbeat) -> Option<String> {
         let Some((described, hash)) = self.cells.get(&heartbeat.serial) else {
             return Some("unknown".to_owned());
         };
@@ -174,7 +176,7 @@ fn width(text: &str) -> usize {
 }
 
 /// Returns the text that redraws the terminal from the top. Lines that do not fit are dropped.
-pub(super) fn screen(text: &str) -> String {
+pub(super) fn redraw(text: &str) -> String {
     let rows = tcgetwinsize(std::io::stdout()).map_or(0, |size| usize::from(size.ws_row));
     let all = text.lines().count();
     let shown = if rows > 2 && all >= rows { rows - 2 } else { all };
@@ -223,7 +225,7 @@ impl CellShown {
             joint: configured.map(|it| it.state.joint()),
             version: beat.map(|it| it.state.version()),
             hash: configured.map(|it| format!("{:04X}", it.configuration)),
-            skin: known.and_then(|known| known.compared(node, beat?)),
+            skin: known.and_then(|known| known.compare(node, beat?)),
             sent: beat.map(|it| it.sent),
             refused: beat.map(|it| it.rejected),
             heard: cell.pages.received,
@@ -231,7 +233,7 @@ impl CellShown {
             tree: cell.pages.tree.as_ref().map(TreeShown::of),
             ports: cell.pages.ports.map(|it| it.ports.iter().map(PortShown::of).collect()),
             parent_changes: cell.pages.ports.map(|it| it.changes),
-            other_serial: cell.other,
+            other_serial: cell.other_serial,
         }
     }
 
@@ -292,7 +294,7 @@ impl PortShown {
     }
 
     /// Formats the neighbour: `?` follows one that receives nothing, `!` one with another protocol version.
-    fn leads_to(&self) -> String {
+    fn neighbour_text(&self) -> String {
         match (self.node, self.works, self.other_version) {
             (None, _, _) => ".".to_owned(),
             (Some(node), _, true) => format!("{node}!"),
@@ -314,6 +316,6 @@ mod tests {
         let works = PortState { works: true, ..heard };
         let other = PortState { other_version: true, ..works };
         let all = [PortState::default(), heard, works, other];
-        assert_eq!(space_separated(all.map(|port| PortShown::of(&port).leads_to())), ". 12? 12 12!");
+        assert_eq!(space_separated(all.map(|port| PortShown::of(&port).neighbour_text())), ". 12? 12 12!");
     }
 }

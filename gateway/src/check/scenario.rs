@@ -5,7 +5,7 @@ use std::path::Path;
 use bench::processes::groups;
 use bench::run::RunError;
 use model::scenario::{
-    BusFault, FaultKind, ForceErrors, MotionKind, Profile, Scenario as Description, SensorFault,
+    BusFault, FaultKind, ForceErrors, ForceProfile, MotionKind, Scenario as Description, SensorFault,
 };
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -16,7 +16,7 @@ use serde_json::{Map, Value, json};
 use crate::print::{comma_separated, count, decimals, json as pretty, or_else_text, space_separated, table};
 
 /// Maximum number of values listed one by one.
-const LISTED: usize = 8;
+const MAX_LISTED: usize = 8;
 
 /// Checks the text of a scenario file against a skin, and describes the scenario.
 ///
@@ -29,14 +29,14 @@ pub(super) fn plan(
 ) -> Result<(String, Option<Failure>), Failure> {
     let scenario = Description::parse(&file.display().to_string(), text, skin).map_err(Failure::usage)?;
     let refused = RunError::bus_fault(&scenario, skin).map(Failure::usage);
-    let plan = Plan::of(&scenario, skin);
+    let plan = ScenarioPlan::of(&scenario, skin);
     let text = if as_json { pretty(&plan)? } else { plan.text(&file.display().to_string()) };
     Ok((text, refused))
 }
 
 /// Content of a scenario, as printed.
 #[derive(Serialize)]
-struct Plan {
+struct ScenarioPlan {
     skin: String,
     duration_s: f64,
     /// Period after which the touches repeat.
@@ -44,7 +44,7 @@ struct Plan {
     touches_repeat_s: Option<f64>,
     seed: u64,
     motion: PlannedMotion,
-    events: Vec<Event>,
+    events: Vec<PlannedEvent>,
     /// Simulated errors of the sensors, by the file's keys.
     #[serde(skip_serializing_if = "Map::is_empty")]
     sensors: Map<String, Value>,
@@ -64,7 +64,7 @@ struct PlannedMotion {
 }
 
 #[derive(Serialize)]
-struct Event {
+struct PlannedEvent {
     at_s: f64,
     /// Duration of the event in s; null for instantaneous and permanent events.
     for_s: Option<f64>,
@@ -76,19 +76,19 @@ struct Event {
     how: Map<String, Value>,
 }
 
-impl Plan {
+impl ScenarioPlan {
     fn of(scenario: &Description, skin: &Skin) -> Self {
         let joints = skin.robot.joints.len();
         let each = |values: &[f64]| values.iter().take(joints).copied().collect::<Vec<_>>();
         let how = match scenario.motion.kind {
             MotionKind::Hold | MotionKind::Kinesthetic => Map::new(),
             MotionKind::Sine { amplitude, period_s } => {
-                map([("amplitude", json!(each(&amplitude))), ("period_s", json!(period_s))])
+                to_map([("amplitude", json!(each(&amplitude))), ("period_s", json!(period_s))])
             }
         };
         let mut events = Vec::new();
         for change in &scenario.modes {
-            events.push(Event {
+            events.push(PlannedEvent {
                 at_s: seconds(change.at),
                 for_s: None,
                 what: change.mode.name(),
@@ -99,17 +99,26 @@ impl Plan {
         }
         for touch in &scenario.touches {
             let profile = match &touch.profile {
-                Profile::Points(points) => {
+                ForceProfile::Points(points) => {
                     json!(points.iter().map(|(at, force_n)| (at.seconds(), force_n)).collect::<Vec<_>>())
                 }
-                named @ (Profile::HalfSine | Profile::Step | Profile::Ramp) => json!(named.name()),
+                named @ (ForceProfile::HalfSine | ForceProfile::Step | ForceProfile::Ramp) => {
+                    json!(named.name())
+                }
             };
-            let mut how = map([("force_n", json!(touch.force_n)), ("profile", profile)]);
+            let mut how = to_map([("force_n", json!(touch.force_n)), ("profile", profile)]);
             how.extend(touch.values.listed().map(|(key, value)| (key.to_owned(), value)));
-            events.extend(on_cells(skin, touch.at, length(touch.length), "touch", &touch.cells, &how));
+            events.extend(on_cells(
+                skin,
+                touch.at,
+                finite_seconds(touch.length),
+                "touch",
+                &touch.cells,
+                &how,
+            ));
         }
         for fault in &scenario.faults {
-            events.extend(broken(skin, fault.at, &fault.kind));
+            events.extend(fault_events(skin, fault.at, &fault.kind));
         }
         events.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
         let units = skin.robot.joints.iter().map(|joint| joint.kind.unit()).collect();
@@ -120,7 +129,7 @@ impl Plan {
             how,
         };
         let (duration_s, seed) = (scenario.duration.seconds(), scenario.seed);
-        let remarks = scenario.remarks(skin);
+        let remarks = scenario.warnings(skin);
         let errors = errors(&scenario.sensors.force).into_iter().filter(|(_, error)| *error > 0.0);
         let mut sensors: Map<_, _> = errors.map(|(key, error)| (key.to_owned(), json!(error))).collect();
         let temperature = scenario.sensors.temperature.iter().map(|(at, degrees)| [seconds(*at), *degrees]);
@@ -143,8 +152,11 @@ impl Plan {
             "sine" => "every joint swings about",
             _ => "the skin's controller moves the robot from",
         };
-        let how =
-            if motion.how.is_empty() { String::new() } else { format!(" ({})", described(&motion.how)) };
+        let how = if motion.how.is_empty() {
+            String::new()
+        } else {
+            format!(" ({})", parameters_text(&motion.how))
+        };
         let is_mixed = motion.units.iter().any(|unit| *unit != "rad");
         let start = if is_mixed {
             let each = motion.start.iter().zip(&motion.units).map(|(start, unit)| format!("{start} {unit}"));
@@ -157,14 +169,18 @@ impl Plan {
             "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n{}{}",
             count(events.len(), "event"),
             or_else_text(touches_repeat_s.map(|period| format!("the touches repeat every {period} s\n")), ""),
-            if sensors.is_empty() { String::new() } else { format!("sensors: {}\n", described(sensors)) }
+            if sensors.is_empty() {
+                String::new()
+            } else {
+                format!("sensors: {}\n", parameters_text(sensors))
+            }
         );
         let remarks: String =
             remarks.iter().map(|remark| format!("remark: {}\n", printable(remark))).collect();
         if events.is_empty() {
             return head + "no touches and no faults\n" + &remarks;
         }
-        let rows = events.iter().map(Event::row);
+        let rows = events.iter().map(PlannedEvent::row);
         head + &format!(
             "{}\n{remarks}",
             table(["at s", "for s", "what", "bus", "cells", "how"], rows, |column| column < 2)
@@ -172,7 +188,7 @@ impl Plan {
     }
 }
 
-impl Event {
+impl PlannedEvent {
     fn row(&self) -> Vec<String> {
         let mut nodes = self.cells.clone();
         nodes.sort_unstable();
@@ -186,7 +202,7 @@ impl Event {
             self.what.to_owned(),
             or_else_text(self.bus.as_ref(), ""),
             space_separated(runs),
-            described(&self.how),
+            parameters_text(&self.how),
         ]
     }
 }
@@ -199,12 +215,19 @@ fn on_cells(
     what: &'static str,
     cells: &[usize],
     how: &Map<String, Value>,
-) -> Vec<Event> {
+) -> Vec<PlannedEvent> {
     let of_bus = |(index, bus): (usize, &protocol::skin::SkinBus)| {
         let cells = cells.iter().filter_map(|&cell| skin.cells.get(cell)).filter(|cell| cell.bus == index);
         let cells: Vec<u8> = cells.map(|cell| cell.node.get()).collect();
         let bus = Some(bus.name.clone());
-        (!cells.is_empty()).then(|| Event { at_s: seconds(at), for_s, what, bus, cells, how: how.clone() })
+        (!cells.is_empty()).then(|| PlannedEvent {
+            at_s: seconds(at),
+            for_s,
+            what,
+            bus,
+            cells,
+            how: how.clone(),
+        })
     };
     skin.buses.iter().enumerate().filter_map(of_bus).collect()
 }
@@ -225,25 +248,32 @@ const fn errors(errors: &ForceErrors) -> [(&'static str, f64); 9] {
 }
 
 /// Creates the events of a fault.
-fn broken(skin: &Skin, at: Micros, kind: &FaultKind) -> Vec<Event> {
+fn fault_events(skin: &Skin, at: Micros, kind: &FaultKind) -> Vec<PlannedEvent> {
     let what = kind.name();
     match kind {
         FaultKind::Process { cells, .. } => on_cells(skin, at, None, what, cells, &Map::new()),
         FaultKind::Sensor { fault, length: span, cells } => {
             let how = match fault {
                 SensorFault::Stuck => Map::new(),
-                SensorFault::Drift { n_per_s } => map([("n_per_s", json!(n_per_s))]),
+                SensorFault::Drift { n_per_s } => to_map([("n_per_s", json!(n_per_s))]),
             };
-            on_cells(skin, at, length(*span), what, cells, &how)
+            on_cells(skin, at, finite_seconds(*span), what, cells, &how)
         }
         FaultKind::Wire { from, to, both_ways, .. } => {
-            on_cells(skin, at, None, what, &[*from, *to], &map([("one_way", json!(!both_ways))]))
+            on_cells(skin, at, None, what, &[*from, *to], &to_map([("one_way", json!(!both_ways))]))
         }
         FaultKind::Bus { fault, length: span, bus, cells } => {
             let nodes = cells.iter().filter_map(|&cell| skin.cells.get(cell));
             let cells = nodes.map(|cell| cell.node.get()).collect();
             let bus = skin.buses.get(*bus).map(|bus| bus.name.clone());
-            vec![Event { at_s: seconds(at), for_s: length(*span), what, bus, cells, how: parameters(fault) }]
+            vec![PlannedEvent {
+                at_s: seconds(at),
+                for_s: finite_seconds(*span),
+                what,
+                bus,
+                cells,
+                how: parameters(fault),
+            }]
         }
     }
 }
@@ -254,38 +284,38 @@ fn parameters(fault: &BusFault) -> Map<String, Value> {
         BusFault::Drop { probability }
         | BusFault::Duplicate { probability }
         | BusFault::Corrupt { probability }
-        | BusFault::Reorder { probability } => map([("probability", json!(probability))]),
+        | BusFault::Reorder { probability } => to_map([("probability", json!(probability))]),
         BusFault::Delay { probability, delay } => {
-            map([("probability", json!(probability)), ("delay_us", json!(delay.0))])
+            to_map([("probability", json!(probability)), ("delay_us", json!(delay.0))])
         }
         BusFault::Babble { frames_per_s, id } => {
-            map([("frames_per_s", json!(frames_per_s)), ("id", json!(id))])
+            to_map([("frames_per_s", json!(frames_per_s)), ("id", json!(id))])
         }
     }
 }
 
 /// Formats keys of the file with their values.
-fn described(how: &Map<String, Value>) -> String {
+fn parameters_text(how: &Map<String, Value>) -> String {
     let words_of = |value: &Value| match value {
         Value::String(text) => text.clone(),
         Value::Array(values) => match values.as_slice() {
-            [first, second, .., last] if values.len() > LISTED => {
+            [first, second, .., last] if values.len() > MAX_LISTED => {
                 format!("{first} {second} ... {last} ({} in all)", values.len())
             }
             few => space_separated(few),
         },
-        Value::Object(values) => format!("({})", described(values)),
+        Value::Object(values) => format!("({})", parameters_text(values)),
         Value::Null | Value::Bool(_) | Value::Number(_) => value.to_string(),
     };
     comma_separated(how.iter().map(|(key, it)| format!("{key} {}", words_of(it))))
 }
 
-fn map<const N: usize>(pairs: [(&str, Value); N]) -> Map<String, Value> {
+fn to_map<const N: usize>(pairs: [(&str, Value); N]) -> Map<String, Value> {
     pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
 /// Returns a duration in s, or `None` if it has no end.
-fn length(span: Span) -> Option<f64> {
+fn finite_seconds(span: Span) -> Option<f64> {
     (span != Span(u64::MAX)).then(|| span.seconds())
 }
 

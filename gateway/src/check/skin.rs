@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 
 use crate::arguments::bus_names;
 use crate::print::{comma_separated, count, or_else_text, space_separated};
-use crate::robot_file::{RobotOfSkin, urdf_of};
+use crate::robot_file::{SkinRobot, urdf_path};
 
 /// Selection of the cells that are listed with or without the summary.
 #[derive(Clone, Copy, Debug)]
@@ -31,7 +31,7 @@ pub(super) fn summary(
     as_json: bool,
 ) -> Result<String, Failure> {
     if let Some(urdf) = &skin.robot.urdf {
-        RobotOfSkin::read(skin, Some(&urdf_of(file, urdf)))?;
+        SkinRobot::read(skin, Some(&urdf_path(file, urdf)))?;
     }
     let is_listed = |cell: &&Cell| match listed {
         Listed::None => false,
@@ -48,9 +48,9 @@ pub(super) fn summary(
         )));
     }
     if as_json {
-        return crate::print::json(&values(file, skin, &cells));
+        return crate::print::json(&skin_json(file, skin, &cells));
     }
-    let lines: String = cells.iter().map(|cell| line(skin, cell)).collect();
+    let lines: String = cells.iter().map(|cell| cell_line(skin, cell)).collect();
     Ok(if let Listed::Only(_) = listed { lines } else { describe(skin) + &lines })
 }
 
@@ -120,7 +120,7 @@ fn describe(skin: &Skin) -> String {
             bus.name
         );
     }
-    for [first, second] in at_one_place(skin) {
+    for [first, second] in coincident_cells(skin) {
         let name = |cell: &Cell| format!("{} on {}", cell.node, bus_name(skin, cell));
         text += &format!("remark: cells {} and {} sit at the same place\n", name(first), name(second));
     }
@@ -128,7 +128,7 @@ fn describe(skin: &Skin) -> String {
 }
 
 /// Returns pairs of cells that have the same position.
-fn at_one_place(skin: &Skin) -> Vec<[&Cell; 2]> {
+fn coincident_cells(skin: &Skin) -> Vec<[&Cell; 2]> {
     let mut known = HashMap::new();
     let place = |cell: &Cell| {
         (
@@ -152,12 +152,12 @@ fn bus_name<'a>(skin: &'a Skin, cell: &Cell) -> &'a str {
 }
 
 /// Describes a cell in one line.
-fn line(skin: &Skin, cell: &Cell) -> String {
+fn cell_line(skin: &Skin, cell: &Cell) -> String {
     let on_bus = bus_name(skin, cell);
     let Cell { node, serial, joint, row, position, normal, neighbors, root, .. } = cell;
     let (position, ports) =
         (space_separated(position), space_separated(neighbors.map(|port| or_else_text(port, "-"))));
-    let normal = space_separated(rounded(normal));
+    let normal = space_separated(rounded_normal(normal));
     let root = if *root { " root" } else { "" };
     let row = Some(*row).filter(|row| skin.chain(cell.bus).row_of(*joint) != Some(*row));
     let row = or_else_text(row.map(|row| format!(" row {row}")), "");
@@ -169,7 +169,7 @@ fn line(skin: &Skin, cell: &Cell) -> String {
 
 /// Rounds a unit vector to four decimals, which is as precise as can be measured. A vector computed from a quaternion
 /// has more.
-fn rounded(normal: &[f64; 3]) -> [f64; 3] {
+fn rounded_normal(normal: &[f64; 3]) -> [f64; 3] {
     normal.map(|part| (part * 1e4).round() / 1e4 + 0.0)
 }
 
@@ -180,7 +180,7 @@ fn hash(skin: &Skin) -> u16 {
 }
 
 /// Returns the skin and these cells as JSON.
-fn values(file: &Path, skin: &Skin, cells: &[&Cell]) -> Value {
+fn skin_json(file: &Path, skin: &Skin, cells: &[&Cell]) -> Value {
     let buses = skin.buses.iter().enumerate().map(|(index, bus)| {
         let roots = skin.cells_on_bus(index).filter(|cell| cell.root).map(|cell| cell.node.get());
         json!({
@@ -199,7 +199,7 @@ fn values(file: &Path, skin: &Skin, cells: &[&Cell]) -> Value {
             "node": cell.node.get(),
             "joint": cell.joint,
             "position_m": cell.position,
-            "normal": rounded(&cell.normal),
+            "normal": rounded_normal(&cell.normal),
             "neighbors": cell.neighbors.map(|port| port.map(protocol::id::CellId::get)),
             "root": cell.root,
             "serial": cell.serial,

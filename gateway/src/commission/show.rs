@@ -11,7 +11,7 @@ use serde::Serialize;
 use crate::print::{KeyValueTable, abbreviated, count};
 
 /// Maximum number of cells with other node ids that get a line each.
-const LINES: usize = 8;
+const MAX_CELL_LINES: usize = 8;
 
 /// Result of a commissioning over all buses, as printed.
 #[derive(Debug, Serialize)]
@@ -66,7 +66,7 @@ impl<'a> BusShown<'a> {
     }
 
     /// Returns the cells whose node id differs from the description, with their present ids.
-    fn moved(&self) -> impl Iterator<Item = (CellId, &CellReport)> {
+    fn renumbered_cells(&self) -> impl Iterator<Item = (CellId, &CellReport)> {
         self.cells.iter().filter_map(|it| Some((it.number.filter(|&node| node != it.described)?, it)))
     }
 
@@ -79,11 +79,11 @@ impl<'a> BusShown<'a> {
         };
         rows.section(format!("{} ({})", self.name, self.kind), cells, others);
         let compared = "read back, and compared word by word";
-        rows.any("written", self.written, compared);
-        rows.any("already so", self.already_so, "by their hash; --verify reads them back");
-        rows.any("already so, verified", self.verified, compared);
-        rows.any("would be written", self.would_write, "");
-        rows.any("failed", self.failed, "");
+        rows.row_unless_zero("written", self.written, compared);
+        rows.row_unless_zero("already so", self.already_so, "by their hash; --verify reads them back");
+        rows.row_unless_zero("already so, verified", self.verified, compared);
+        rows.row_unless_zero("would be written", self.would_write, "");
+        rows.row_unless_zero("failed", self.failed, "");
         // One row for each reason, whatever the number of cells.
         let mut reasons = BTreeMap::<String, Vec<String>>::new();
         for cell in self.cells {
@@ -97,10 +97,14 @@ impl<'a> BusShown<'a> {
         if let Some(failure) = &self.failure {
             rows.row("ended", failure, "");
         }
-        let moved = self.moved().count();
-        rows.any("with another node id", moved, "than in the description; --node-ids writes a copy");
-        rows.any("requests", self.requests, format!("{} retries", self.repeated));
-        rows.any("frames lost", self.frames_dropped, "they came faster than they were read");
+        let moved = self.renumbered_cells().count();
+        rows.row_unless_zero(
+            "with another node id",
+            moved,
+            "than in the description; --node-ids writes a copy",
+        );
+        rows.row_unless_zero("requests", self.requests, format!("{} retries", self.repeated));
+        rows.row_unless_zero("frames lost", self.frames_dropped, "they came faster than they were read");
     }
 }
 
@@ -125,12 +129,12 @@ impl CommissionResult<'_> {
                 notes.push(format!("cells on {name} that {file} does not have, left alone: {unknown_nodes}"));
             }
             notes.extend(elsewhere);
-            let moved = bus.moved().count();
-            if moved > LINES {
+            let moved = bus.renumbered_cells().count();
+            if moved > MAX_CELL_LINES {
                 let copy = if has_copy { "" } else { "; --node-ids FILE writes a copy with theirs" };
                 notes.push(format!("{moved} cells have other node ids on {name} than in {file}{copy}"));
             } else {
-                notes.extend(bus.moved().map(|(node, CellReport { serial, described, .. })| {
+                notes.extend(bus.renumbered_cells().map(|(node, CellReport { serial, described, .. })| {
                     format!("the cell with serial number {serial} is {node} on {name}, {described} in {file}")
                 }));
             }

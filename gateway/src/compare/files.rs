@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use analysis::compare::{self, Both, Trace};
+use analysis::compare::{self, Both, JointTrace};
 use model::decode::Decoder;
 use protocol::input::can_be_read_again;
 use protocol::skin::Skin;
@@ -11,7 +11,7 @@ use protocol::usage::Failure;
 use trace::capture::{Entry, Reader};
 
 /// Finds the parts of a recording after the first file: `run-1.mcap`, `run-2.mcap` after `run.mcap`.
-pub(super) fn parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
+pub(super) fn recording_parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
     if first.is_dir() {
         return Err(Failure::usage(format!(
             "{} is a directory: name a candump log or an MCAP recording",
@@ -40,33 +40,33 @@ pub(super) fn parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
 /// Returns the start of a recording, by its metadata, and the number of the part that a file holds.
 fn part(file: &Path) -> Option<(String, u32)> {
     let reader = can_be_read_again(file).then(|| Reader::open(file).ok()).flatten()?;
-    let fact = |record, key| reader.extras().fact(record, key).map(str::to_owned);
+    let fact = |record, key| reader.extras().metadata_value(record, key).map(str::to_owned);
     Some((fact("program", "began_ns")?, fact("part", "number")?.parse().ok()?))
 }
 
 /// Returns for each capture the number of its first joints within the run. Reads a capture that starts in the middle of
 /// a run once more for that, if it can be read twice.
-pub(super) fn starts(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<Both<Option<u64>>, Failure> {
+pub(super) fn first_numbers(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<Both<Option<u64>>, Failure> {
     let unknown = Both { a: None, b: None };
     if ![&files.a, &files.b].iter().all(|files| files.iter().all(|file| can_be_read_again(file))) {
         return Ok(unknown);
     }
     let begins = |files: &[PathBuf]| {
         let is_later = files.first().and_then(|first| part(first)).is_some_and(|(_, number)| number > 0);
-        !is_later && trace(files, skin, true).is_none_or(|trace| trace.first() == Some(0))
+        !is_later && read_joints(files, skin, true).is_none_or(|trace| trace.first() == Some(0))
     };
     if begins(&files.a) && begins(&files.b) {
         return Ok(unknown);
     }
-    let both = trace(&files.a, skin, false).zip(trace(&files.b, skin, false));
-    Ok(both.map_or(unknown, |(a, b)| compare::starts(&a, &b)))
+    let both = read_joints(&files.a, skin, false).zip(read_joints(&files.b, skin, false));
+    Ok(both.map_or(unknown, |(a, b)| compare::start_numbers(&a, &b)))
 }
 
 /// Reads the joints of a capture, or only the first. Errors are reported later, when it is compared.
-fn trace(files: &[PathBuf], skin: &Skin, is_first_enough: bool) -> Option<Trace> {
+fn read_joints(files: &[PathBuf], skin: &Skin, is_first_enough: bool) -> Option<JointTrace> {
     let mut reader = super::captures(files, |file| Box::new(file)).ok()?;
     let mut decoder = Decoder::new(None);
-    let mut trace = Trace::new(skin);
+    let mut trace = JointTrace::new(skin);
     while let Ok(Some(entry)) = reader.next() {
         let Entry::Frame(record) = entry else { continue };
         let nanos = record.time.nanos;

@@ -4,7 +4,9 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use analysis::compare::{ASPECTS, Both, CaptureSide, CellRow, FirstDifference, Replies, Report, Source};
+use analysis::compare::{
+    ASPECTS, Both, CaptureFigures, CaptureSide, CellRow, CompareReport, FirstDifference, ReplyCounts,
+};
 use model::quantiles::Quantiles;
 use protocol::usage::printable;
 
@@ -12,9 +14,9 @@ use crate::junit::{Case, Outcome, Suite};
 use crate::print::{abbreviated, comma_separated, count, decimals, or_else_text, table};
 
 /// Width of the tables in columns.
-const WIDTH: u16 = 80;
+const TABLE_WIDTH: u16 = 80;
 /// Maximum number of cells in the table.
-const CELLS: usize = 8;
+const MAX_CELLS: usize = 8;
 
 /// Description of one of the compared captures: its name, its format and its files.
 #[derive(Debug)]
@@ -30,7 +32,7 @@ pub(super) struct ComparisonText<'a> {
     pub(super) inputs: Both<CaptureNames<'a>>,
     /// Path given by the option `--skin`.
     pub(super) skin: Option<&'a Path>,
-    pub(super) report: &'a Report,
+    pub(super) report: &'a CompareReport,
 }
 
 impl ComparisonText<'_> {
@@ -49,7 +51,7 @@ impl ComparisonText<'_> {
     }
 
     fn verdict(&self) -> String {
-        let Report { epochs, torques, sums, first, .. } = self.report;
+        let CompareReport { epochs, torques, sums, first, .. } = self.report;
         if self.report.equal {
             let tolerated = torques.tolerated + sums.tolerated + self.report.joints.tolerated;
             let within = if tolerated > 0 { " within the tolerance" } else { "" };
@@ -76,7 +78,7 @@ impl ComparisonText<'_> {
     }
 
     fn table(&self) -> String {
-        let Report { captures: Both { a, b }, epochs, joints, halts, contacts, torques, sums, .. } =
+        let CompareReport { captures: Both { a, b }, epochs, joints, halts, contacts, torques, sums, .. } =
             self.report;
         let mut rows = Vec::new();
         let mut row = |name: &str, a: String, b: String, both: String| {
@@ -95,12 +97,12 @@ impl ComparisonText<'_> {
             }
         }
         row("last epoch, s", decimals(a.last_s, 3, "-"), decimals(b.last_s, 3, "-"), none());
-        let only_joints = Replies {
+        let only_joints = ReplyCounts {
             equal: joints.equal,
             tolerated: joints.tolerated,
             different: joints.different,
             max_steps: joints.max_steps,
-            ..Replies::default()
+            ..ReplyCounts::default()
         };
         row("joints", none(), none(), replies_text(&only_joints));
         let touched = [contacts.only.only_a, contacts.only.only_b].map(|only| contacts.both + only);
@@ -118,13 +120,14 @@ impl ComparisonText<'_> {
                 row("  missing", a, b, "the other has them".to_owned());
             }
         }
-        let at =
-            |of: fn(&Quantiles) -> f64, source: &Source| decimals(source.reply_us.as_ref().map(of), 0, "-");
+        let at = |of: fn(&Quantiles) -> f64, source: &CaptureFigures| {
+            decimals(source.reply_us.as_ref().map(of), 0, "-")
+        };
         let information = || "information only".to_owned();
         row("reply, 50 %, µs", at(|it| it.p50, a), at(|it| it.p50, b), information());
         row("reply, 99 %, µs", at(|it| it.p99, a), at(|it| it.p99, b), information());
         for (name, of) in [
-            ("late replies", (|it| it.late) as fn(&Source) -> u64),
+            ("late replies", (|it| it.late) as fn(&CaptureFigures) -> u64),
             ("lost packets", |it| it.lost),
             ("restarts of cells", |it| it.restarts),
             ("lost by the recorder", |it| it.dropped),
@@ -136,8 +139,8 @@ impl ComparisonText<'_> {
             }
         }
         let mut table = table(["", "A", "B", "compared"], rows, |column| column == 1 || column == 2);
-        if table.width().is_none_or(|width| width > WIDTH) {
-            table.set_width(WIDTH);
+        if table.width().is_none_or(|width| width > TABLE_WIDTH) {
+            table.set_width(TABLE_WIDTH);
         }
         format!("{table}\n")
     }
@@ -150,20 +153,20 @@ impl ComparisonText<'_> {
         cells.sort_by_key(|row| std::cmp::Reverse(row.replies.different + row.replies.missing()));
         let mut text = String::new();
         if total > 0 {
-            let rows = cells.iter().take(CELLS).map(|row| {
-                let Replies { different, missing_in_a, missing_in_b, max_steps, .. } = row.replies;
+            let rows = cells.iter().take(MAX_CELLS).map(|row| {
+                let ReplyCounts { different, missing_in_a, missing_in_b, max_steps, .. } = row.replies;
                 let numbers = [different, u64::from(max_steps), missing_in_a, missing_in_b];
                 let name = format!("{}:{}", row.bus, row.node);
                 [name].into_iter().chain(numbers.map(|number| number.to_string())).collect::<Vec<_>>()
             });
             let head = ["cell", "different", "max steps", "missing in A", "missing in B"];
             let mut table = table(head, rows, |column| column > 0);
-            if table.width().is_none_or(|width| width > WIDTH) {
-                table.set_width(WIDTH);
+            if table.width().is_none_or(|width| width > TABLE_WIDTH) {
+                table.set_width(TABLE_WIDTH);
             }
             let _ = writeln!(text, "{table}");
-            if total > CELLS {
-                let _ = writeln!(text, "and {}; --json has all", count(total - CELLS, "further cell"));
+            if total > MAX_CELLS {
+                let _ = writeln!(text, "and {}; --json has all", count(total - MAX_CELLS, "further cell"));
             }
         }
         for (letter, only_in) in [("A", "a"), ("B", "b")] {
@@ -221,11 +224,11 @@ impl ComparisonText<'_> {
             };
             let _ = writeln!(text, "  {inputs}");
         }
-        if let Some(hint) = self.tolerance(first) {
+        if let Some(hint) = self.tolerance_hint(first) {
             let _ = writeln!(text, "  {hint}");
         }
         for which in [CaptureSide::A, CaptureSide::B] {
-            if let Some(line) = self.explain(first, which) {
+            if let Some(line) = self.explain_command(first, which) {
                 let _ = writeln!(text, "  {line}");
             }
         }
@@ -233,7 +236,7 @@ impl ComparisonText<'_> {
     }
 
     /// Returns the options that would accept a difference like the first one, if any.
-    fn tolerance(&self, first: &FirstDifference) -> Option<&'static str> {
+    fn tolerance_hint(&self, first: &FirstDifference) -> Option<&'static str> {
         match (first.what, first.steps) {
             ("joints", Some(_)) => Some(
                 "a motion depends on when ticks ran: kind = \"hold\" has none, --joints-tolerance and --tolerance allow steps",
@@ -246,7 +249,7 @@ impl ComparisonText<'_> {
     }
 
     /// Returns the command that shows more about the joints of the first difference.
-    fn explain(&self, first: &FirstDifference, which: CaptureSide) -> Option<String> {
+    fn explain_command(&self, first: &FirstDifference, which: CaptureSide) -> Option<String> {
         let occurrence = (*first.occurrence.get(which))?;
         let about = self.inputs.get(which);
         let names = about.files.iter().map(|file| printable(&file.display().to_string()).into_owned());
@@ -285,7 +288,7 @@ impl ComparisonText<'_> {
 
     /// Describes the differences of one aspect in one line.
     fn failed(&self, aspect: &str) -> String {
-        let Report { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = self.report;
+        let CompareReport { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = self.report;
         let missing = |a, b| format!("{a} missing in A, {b} in B");
         match aspect {
             "epochs" if epochs.compared == 0 => "no epoch is in both".to_owned(),
@@ -303,8 +306,8 @@ impl ComparisonText<'_> {
 }
 
 /// Formats the numbers of equal and different replies.
-fn replies_text(replies: &Replies) -> String {
-    let Replies { equal, tolerated, different, open, max_steps, .. } = *replies;
+fn replies_text(replies: &ReplyCounts) -> String {
+    let ReplyCounts { equal, tolerated, different, open, max_steps, .. } = *replies;
     let mut all = vec![format!("{equal} equal")];
     for (count, what) in [(tolerated, "tolerated"), (different, "different"), (open, "open")] {
         if count > 0 {

@@ -26,15 +26,15 @@ const KEEP_INTERVAL: Duration = Duration::from_millis(50);
 /// Number of bytes written to a recording at once.
 const WRITE_BYTES: usize = 64 << 10;
 /// Stack size in bytes of the writing thread, which calls no deep functions.
-const STACK: usize = 256 << 10;
+const STACK_BYTES: usize = 256 << 10;
 
 /// A file that readers can read while it grows.
-enum Grown {
+enum GrowingFile {
     Log(LogFile),
     Part(BufWriter<File>),
 }
 
-impl Write for Grown {
+impl Write for GrowingFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         match self {
             // Write all bytes or none, because they are whole lines.
@@ -53,7 +53,7 @@ impl Write for Grown {
 
 /// An output, and what has happened since its last flush.
 struct State {
-    output: CaptureWriter<Grown>,
+    output: CaptureWriter<GrowingFile>,
     /// Set by each write, cleared when everything is in the file.
     is_dirty: bool,
     /// Error of the writing thread, kept for the next call.
@@ -62,13 +62,13 @@ struct State {
 }
 
 #[derive(Default)]
-struct Meeting {
+struct SharedOutput {
     state: Mutex<Option<State>>,
     /// Condition that wakes the writing thread at the end.
     over: Condvar,
 }
 
-impl Meeting {
+impl SharedOutput {
     fn with<T>(&self, act: impl FnOnce(&mut State) -> io::Result<T>) -> io::Result<T> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let state = state.as_mut().ok_or_else(|| io::Error::other("it has ended"))?;
@@ -79,7 +79,7 @@ impl Meeting {
     }
 
     /// Flushes written entries at intervals, until the output is finished or closed.
-    fn keep(&self) {
+    fn flush_periodically(&self) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         while let Some(State { output, is_dirty, failed, is_over: false }) = state.as_mut() {
             if std::mem::take(is_dirty) && failed.is_none() {
@@ -93,7 +93,7 @@ impl Meeting {
 
 /// An output file that grows while a capture is converted from a pipe.
 pub(super) struct GrowingCapture {
-    meeting: Arc<Meeting>,
+    meeting: Arc<SharedOutput>,
     keeper: Option<JoinHandle<()>>,
     path: PathBuf,
     force: bool,
@@ -110,27 +110,29 @@ impl GrowingCapture {
         stopped: &AtomicBool,
     ) -> io::Result<Self> {
         let (output, part) = match format {
-            CaptureFormat::Candump => {
-                (CaptureWriter::new(Grown::Log(LogFile::create(path, force, stopped)?), format, style)?, None)
-            }
+            CaptureFormat::Candump => (
+                CaptureWriter::new(GrowingFile::Log(LogFile::create(path, force, stopped)?), format, style)?,
+                None,
+            ),
             CaptureFormat::Mcap => {
                 let (part, mut file) = PartFile::create(path.to_owned())?;
                 let begun = file.rewind().and_then(|()| {
-                    let out = Grown::Part(BufWriter::with_capacity(WRITE_BYTES, file.try_clone()?));
-                    CaptureWriter::recording(out, Origin { of_log, file: Some(&file.metadata()?) })
+                    let out = GrowingFile::Part(BufWriter::with_capacity(WRITE_BYTES, file.try_clone()?));
+                    CaptureWriter::new_mcap(out, Origin { of_log, file: Some(&file.metadata()?) })
                 });
                 (begun.inspect_err(|_| part.remove())?, Some((part, file)))
             }
         };
         let state = State { output, is_dirty: false, failed: None, is_over: false };
-        let meeting = Arc::new(Meeting { state: Mutex::new(Some(state)), ..Meeting::default() });
+        let meeting = Arc::new(SharedOutput { state: Mutex::new(Some(state)), ..SharedOutput::default() });
         let keeping = Arc::clone(&meeting);
-        let keeper = thread::Builder::new().stack_size(STACK).spawn(move || keeping.keep())?;
+        let keeper =
+            thread::Builder::new().stack_size(STACK_BYTES).spawn(move || keeping.flush_periodically())?;
         Ok(Self { meeting, keeper: Some(keeper), path: path.to_owned(), force, part })
     }
 
     /// Returns text that names the file which holds the entries so far.
-    pub(super) fn left(&self) -> String {
+    pub(super) fn remaining_file(&self) -> String {
         match &self.part {
             Some(_) => {
                 let part = format!("{}.part", self.path.display());
@@ -203,12 +205,12 @@ impl EntrySink for GrowingCapture {
 }
 
 /// Checks that a growing recording can be created, before waiting for input.
-pub(super) fn check(path: &Path) -> io::Result<()> {
+pub(super) fn check_part_file(path: &Path) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
     let part = PathBuf::from(part);
     match File::open(&part) {
-        Ok(file) if names::is_held(&file) => Err(io::Error::other(format!(
+        Ok(file) if names::is_locked(&file) => Err(io::Error::other(format!(
             "{} is being written by another program: name another file",
             part.display()
         ))),

@@ -23,18 +23,18 @@ pub(super) fn write(
     out: impl Write,
 ) -> Result<(u64, LossCounts), SeriesError<csv::Error>> {
     let summed = (0..skin.robot.joints.len()).map(|joint| is_summed(skin, joint)).collect();
-    let mut rows = Rows { summed, out: WriterBuilder::new().from_writer(out) };
-    rows.out.write_record(header(skin)).map_err(SeriesError::Taken)?;
+    let mut rows = TorqueRows { summed, out: WriterBuilder::new().from_writer(out) };
+    rows.out.write_record(header(skin)).map_err(SeriesError::Consumer)?;
     let mut missing = LossCounts::default();
     let done = each_epoch(reader, skin, |note| missing.count(note), |first, epoch| rows.write(first, epoch));
     let epochs = done?.epochs;
-    rows.out.flush().map_err(|error| SeriesError::Taken(error.into()))?;
+    rows.out.flush().map_err(|error| SeriesError::Consumer(error.into()))?;
     Ok((epochs, missing))
 }
 
 /// Returns the names of the buses whose cells answer with sums, which do not contain the torques of single cells.
 /// Returns `None` if there are no such buses.
-pub(super) fn summed(skin: &Skin) -> Option<String> {
+pub(super) fn summed_buses(skin: &Skin) -> Option<String> {
     let summed = skin.buses.iter().filter(|bus| bus.reply != SkinReply::Torque).map(|bus| bus.name.clone());
     let summed: Vec<_> = summed.collect();
     (!summed.is_empty()).then(|| comma_separated(summed))
@@ -60,13 +60,13 @@ fn digits(value: f64) -> String {
     format!("{value:?}")
 }
 
-struct Rows<W: Write> {
+struct TorqueRows<W: Write> {
     /// True for each joint that a chain of a bus with sums moves.
     summed: Vec<bool>,
     out: Writer<W>,
 }
 
-impl<W: Write> Rows<W> {
+impl<W: Write> TorqueRows<W> {
     /// Writes a row with the torques that `skinbus explain` shows. Seconds count from `zero`, in ns since 1970.
     fn write(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
         let EpochTorque { at_ns, epoch, positions, explanation } = epoch;
@@ -82,7 +82,7 @@ impl<W: Write> Rows<W> {
                 of_words(total.difference_nm),
             ]);
         }
-        let most = |count: fn(&analysis::explain::Total) -> u32| {
+        let most = |count: fn(&analysis::explain::JointTotal) -> u32| {
             explanation.total.iter().map(count).max().unwrap_or_default().to_string()
         };
         row.extend([most(|total| total.open), most(|total| total.saturated)]);

@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::io::{self, Write};
 use std::sync::Arc;
 
-use analysis::explain::another_robot;
-use analysis::stats::{Report, Stats};
+use analysis::explain::other_robot_text;
+use analysis::stats::{Stats, StatsReport};
 use model::decode::pick::FrameFilter;
 use model::decode::settle::Settler;
 use model::decode::{Decoded, json};
@@ -20,7 +20,7 @@ use protocol::time::Micros;
 use protocol::usage::printable;
 
 use crate::output::note;
-use crate::print::{GREEN, PLAIN, RED, YELLOW, comma_separated, harmless};
+use crate::print::{GREEN, PLAIN, RED, YELLOW, comma_separated, escape_controls};
 
 /// Colours of a terminal.
 const DIM: &str = "\x1b[2m";
@@ -63,7 +63,7 @@ pub(super) struct FrameOutput<W> {
     contact: bool,
     how: OutputStyle,
     /// Number of frames that may still be shown before the dump ends.
-    left: u64,
+    remaining: u64,
     /// Buses named by the filters from which no frame has come.
     absent: Vec<String>,
     /// Time in ns since 1970 from which seconds count; `None` until it is known or the first frame comes.
@@ -91,7 +91,7 @@ impl<W: Write> FrameOutput<W> {
             pick,
             contact,
             how,
-            left: max,
+            remaining: max,
             zero: None,
             raw: String::new(),
         }
@@ -103,7 +103,7 @@ impl<W: Write> FrameOutput<W> {
     }
 
     /// Sets the units of the skin's buses; other buses keep the default. Call it before the first frame.
-    pub(super) fn describe(&mut self, skin: &Skin) {
+    pub(super) fn set_units(&mut self, skin: &Skin) {
         let buses = skin.buses.iter().enumerate();
         let described = buses.map(|(index, bus)| {
             (bus.name.clone(), Units::for_bus(skin, index), skin.joints_on_bus(index).len())
@@ -123,20 +123,20 @@ impl<W: Write> FrameOutput<W> {
         }
         let waiting = Waiting { time, bus: Arc::clone(&self.bus), units: self.units, frame, direction };
         self.settler.push(Micros(time.nanos / 1_000), interface, &frame, waiting);
-        self.settled()
+        self.show_settled()
     }
 
     /// Settles and shows frames whose packets have been incomplete for too long at `now`; call it when no frame
     /// arrives.
     pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<()> {
         self.settler.handle_time(now);
-        self.settled()
+        self.show_settled()
     }
 
     /// Settles and shows all waiting frames at the end of the input.
     pub(super) fn finish(&mut self) -> io::Result<()> {
         self.settler.finish();
-        self.settled()
+        self.show_settled()
     }
 
     /// Returns true if any frame waits for the rest of its packet.
@@ -145,8 +145,8 @@ impl<W: Write> FrameOutput<W> {
     }
 
     /// Shows the frames whose meaning is settled.
-    fn settled(&mut self) -> io::Result<()> {
-        while self.left > 0
+    fn show_settled(&mut self) -> io::Result<()> {
+        while self.remaining > 0
             && let Some((Waiting { time, bus, units, frame, direction }, decoded)) = self.settler.pop()
         {
             self.check_robot(&bus, &decoded);
@@ -159,12 +159,12 @@ impl<W: Write> FrameOutput<W> {
 
     /// Returns the names of the buses that the options name but from which no frame came.
     pub(super) fn absent_buses(&self) -> Option<String> {
-        (!self.absent.is_empty() && self.left > 0).then(|| comma_separated(&self.absent))
+        (!self.absent.is_empty() && self.remaining > 0).then(|| comma_separated(&self.absent))
     }
 
     /// Returns true if no further frames are to be shown.
     pub(super) const fn has_enough(&self) -> bool {
-        self.left == 0
+        self.remaining == 0
     }
 
     /// If a bus's joints differ in number from those of its chain in the skin, drops the bus's description, because the
@@ -175,7 +175,7 @@ impl<W: Write> FrameOutput<W> {
         let is_other = |it: &(String, Units, usize)| it.0 == bus && it.2 != came;
         if let Some(at) = self.described.iter().position(is_other) {
             let (name, _, chain) = self.described.remove(at);
-            let another = another_robot(&name, came, chain);
+            let another = other_robot_text(&name, came, chain);
             note(format_args!(
                 "{another}; its torques are read as Q3.12 and joints as revolute from here on"
             ));
@@ -187,7 +187,7 @@ impl<W: Write> FrameOutput<W> {
     fn show(&mut self, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
         let nanos = record.time.nanos;
         let zero = *self.zero.get_or_insert(nanos);
-        if !self.pick.takes(zero, nanos, record.interface, &record.frame, decoded)
+        if !self.pick.matches(zero, nanos, record.interface, &record.frame, decoded)
             || self.contact && !decoded.is_contact()
         {
             return Ok(());
@@ -203,14 +203,15 @@ impl<W: Write> FrameOutput<W> {
                 } else {
                     let mut line = Vec::new();
                     json::write(&mut line, record, decoded, units)?;
-                    self.out.write_all(harmless(String::from_utf8_lossy(&line).into_owned()).as_bytes())?;
+                    self.out
+                        .write_all(escape_controls(String::from_utf8_lossy(&line).into_owned()).as_bytes())?;
                 }
             }
             OutputStyle::Brief { colour } => {
                 // Times before the loop's start, or of a capture whose times run backwards, are negative.
                 let (sign, since) = if nanos < zero { ("-", zero - nanos) } else { ("", nanos - zero) };
                 let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
-                let (dim, of, plain) = if *colour { (DIM, of(decoded), PLAIN) } else { ("", "", "") };
+                let (dim, of, plain) = if *colour { (DIM, colour_of(decoded), PLAIN) } else { ("", "", "") };
                 writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {interface}{plain} {of}{said}{plain}")?;
             }
             OutputStyle::Lines { colour } => {
@@ -224,21 +225,21 @@ impl<W: Write> FrameOutput<W> {
                 let _ = write!(self.raw, "{}{way}", Record { interface, ..*record });
                 let raw = &self.raw;
                 if *colour {
-                    let colour = of(decoded);
+                    let colour = colour_of(decoded);
                     writeln!(self.out, "{DIM}{raw}{PLAIN}\t{colour}{said}{PLAIN}")?;
                 } else {
                     writeln!(self.out, "{raw}\t{said}")?;
                 }
             }
         }
-        self.left -= 1;
+        self.remaining -= 1;
         Ok(())
     }
 
     /// Counts frames that were lost before this point.
     pub(super) fn dropped(&mut self, bus: &str, frames: u64) {
         if let OutputStyle::Stats(stats) = &mut self.how {
-            stats.dropped(bus, frames);
+            stats.record_dropped(bus, frames);
         }
     }
 
@@ -254,7 +255,7 @@ impl<W: Write> FrameOutput<W> {
     }
 
     /// Returns the statistics, if they are collected.
-    pub(super) fn report(&self) -> Option<Report> {
+    pub(super) fn report(&self) -> Option<StatsReport> {
         match &self.how {
             OutputStyle::Stats(stats) => Some(stats.report()),
             OutputStyle::Lines { .. } | OutputStyle::Brief { .. } | OutputStyle::Json => None,
@@ -263,7 +264,7 @@ impl<W: Write> FrameOutput<W> {
 }
 
 /// Returns the colour in which a decoded frame is shown.
-fn of(decoded: &Decoded) -> &'static str {
+fn colour_of(decoded: &Decoded) -> &'static str {
     match decoded {
         Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Segment { .. } => DIM,
         Decoded::Damaged { .. } | Decoded::Meaningless { .. } => RED,

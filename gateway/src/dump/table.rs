@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, Report};
+use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, StatsReport};
 use comfy_table::Table;
 use model::decode::error_classes;
 use protocol::usage::printable;
@@ -13,17 +13,17 @@ use crate::print::{
 };
 
 /// Formats the whole report: the capture, each bus, and each bus's cells.
-pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&RecordingExtras>) -> String {
+pub(super) fn text(name: &str, what: &str, report: &StatsReport, extras: Option<&RecordingExtras>) -> String {
     let head = format!("{what}, {:.3} s", report.duration_s);
     let mut rows = KeyValueTable::new(name, head, print::count(report.frames, "frame"));
-    rows.any("frames before the one before them", report.times_backwards, "times run backwards");
-    rows.any("frames missing", report.dropped, "lost by the recorder");
-    rows.any("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
+    rows.row_unless_zero("frames before the one before them", report.times_backwards, "times run backwards");
+    rows.row_unless_zero("frames missing", report.dropped, "lost by the recorder");
+    rows.row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     for bus in &report.buses {
-        numbers(&mut rows, bus, report.duration_s);
+        bus_rows(&mut rows, bus, report.duration_s);
     }
     if let Some(extras) = extras {
-        beside(&mut rows, extras);
+        extra_rows(&mut rows, extras);
     }
     let mut text = rows.text();
     for bus in &report.buses {
@@ -39,15 +39,15 @@ pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Reco
 
 /// A rate with the time span that it covers.
 fn per_s(rate: Option<f64>, span_s: f64) -> String {
-    or_else_text(rate.map(|rate| format!("{rate:.1} a second in {} s", span(span_s))), "")
+    or_else_text(rate.map(|rate| format!("{rate:.1} a second in {} s", seconds_text(span_s))), "")
 }
 
 /// Formats seconds with enough digits to differ from zero.
-fn span(span_s: f64) -> String {
+fn seconds_text(span_s: f64) -> String {
     if span_s < 1e-3 { format!("{span_s:.9}") } else { format!("{span_s:.3}") }
 }
 
-fn numbers(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
+fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
     rows.section(&bus.bus, print::count(bus.frames, "frame"), per_s(bus.frames_per_s, duration_s));
     for kind in &bus.kinds {
         rows.row(kind.kind, kind.packets, per_s(kind.packets_per_s, kind.span_s));
@@ -58,16 +58,20 @@ fn numbers(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
         let odd = comma_separated(odd.map(|(count, what)| format!("{count} {what}")));
         rows.row("epochs", format!("{first} to {last}"), odd);
     }
-    rows.any("wires", bus.wires, format!("{}, on no real bus", per_s(bus.wires_per_s, bus.wires_span_s)));
+    rows.row_unless_zero(
+        "wires",
+        bus.wires,
+        format!("{}, on no real bus", per_s(bus.wires_per_s, bus.wires_span_s)),
+    );
     let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
     let reasons = comma_separated(refused.iter().map(|(reason, count)| format!("{count} {reason}")));
     rows.row("damaged or refused", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
     let ForeignFrames { standard, extended, remote, error, packets_by_chance, .. } = bus.foreign;
     rows.row("foreign", bus.foreign.frames, "");
-    rows.any("  11-bit identifiers", standard, "");
-    rows.any("  29-bit identifiers", extended, "");
-    rows.any("  remote frames", remote, "");
-    rows.any("  error frames", error, comma_separated(reported(&bus.foreign)));
+    rows.row_unless_zero("  11-bit identifiers", standard, "");
+    rows.row_unless_zero("  29-bit identifiers", extended, "");
+    rows.row_unless_zero("  remote frames", remote, "");
+    rows.row_unless_zero("  error frames", error, comma_separated(error_counts(&bus.foreign)));
     if packets_by_chance >= 0.05 {
         let chance = format!("{packets_by_chance:.1}");
         rows.row("  packets by chance", chance, "expected");
@@ -77,7 +81,7 @@ fn numbers(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
 }
 
 /// Adds rows on the contents of an MCAP recording other than frames.
-fn beside(rows: &mut KeyValueTable, extras: &RecordingExtras) {
+fn extra_rows(rows: &mut KeyValueTable, extras: &RecordingExtras) {
     if !extras.topics.is_empty() {
         rows.section("other topics", "messages", "");
     }
@@ -93,7 +97,7 @@ fn beside(rows: &mut KeyValueTable, extras: &RecordingExtras) {
 }
 
 /// Counts error frames by class; one frame may report several classes.
-fn reported(foreign: &ForeignFrames) -> Vec<String> {
+fn error_counts(foreign: &ForeignFrames) -> Vec<String> {
     let mut counts = BTreeMap::<&str, u64>::new();
     for id in foreign.identifiers.iter().filter(|id| id.of == FrameType::Error) {
         for class in u32::from_str_radix(&id.id, 16).into_iter().flat_map(error_classes) {
@@ -104,7 +108,7 @@ fn reported(foreign: &ForeignFrames) -> Vec<String> {
 }
 
 /// Maximum number of foreign identifiers shown; --json has all.
-const FOREIGN: usize = 40;
+const MAX_FOREIGN: usize = 40;
 
 /// Formats a table with one line per foreign identifier, the most frequent ones first.
 fn foreign(bus: &BusReport) -> Table {
@@ -128,13 +132,13 @@ fn foreign(bus: &BusReport) -> Table {
             FrameType::Error => "error".to_owned(),
         };
         let first = format!("{:.3}", id.first_s);
-        let in_s = if id.frames > 1 { span(id.last_s - id.first_s) } else { String::new() };
+        let in_s = if id.frames > 1 { seconds_text(id.last_s - id.first_s) } else { String::new() };
         let per_s = decimals(id.frames_per_s, 1, "");
         vec![id.id.clone(), id.frames.to_string(), per_s, in_s, first, bytes, what]
     };
     let ForeignFrames { identifiers, frames_of_other_identifiers: unknown, .. } = &bus.foreign;
-    let mut lines: Vec<_> = identifiers.iter().take(FOREIGN).map(line).collect();
-    let further = identifiers.iter().skip(FOREIGN);
+    let mut lines: Vec<_> = identifiers.iter().take(MAX_FOREIGN).map(line).collect();
+    let further = identifiers.iter().skip(MAX_FOREIGN);
     let count = further.len();
     let frames = further.map(|id| id.frames).sum::<u64>() + unknown;
     if frames > 0 {
@@ -159,7 +163,7 @@ fn cells(bus: &BusReport) -> Table {
         (&name, |cell| Some(cell.node.to_string())),
         ("torques", |cell| Some(cell.torques.to_string())),
         ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
-        ("in s", |cell| cell.torques_per_s.map(|_| span(cell.torques_span_s))),
+        ("in s", |cell| cell.torques_per_s.map(|_| seconds_text(cell.torques_span_s))),
         ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),
         ("unanswered", |cell| some(cell.unanswered)),
         ("twice", |cell| some(cell.repeated)),

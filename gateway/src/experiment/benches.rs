@@ -35,7 +35,7 @@ pub(super) struct Benches {
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Paths of the files of one run.
-struct Files {
+struct RunFiles {
     skin: PathBuf,
     scenario: PathBuf,
     summary: PathBuf,
@@ -45,11 +45,11 @@ struct Files {
 impl Benches {
     /// Runs `skinbus run` on the arm and reads the recording.
     pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
-        let name = arm::name(reply);
+        let name = arm::run_name(reply);
         let what = format!("the bench of the moving arm ({name})");
         let file = |end: &str| self.folder.join(format!("arm-{name}{end}"));
         let recording = file(".mcap");
-        let files = Files {
+        let files = RunFiles {
             skin: file(".toml"),
             scenario: self.folder.join("arm-touches.toml"),
             summary: file(".json"),
@@ -57,16 +57,16 @@ impl Benches {
         };
         let text = arm::skin(reply, effort);
         let texts = [text.as_str(), arm::scenario(effort)];
-        let buses = buses::directory("experiment")?;
+        let buses = buses::private_directory("experiment")?;
         let ended = self.perform(&what, &files, texts, 1, buses.path())?;
         if !ended.status.success() {
-            return Err(failed(&what, &last_words(&ended)));
+            return Err(failed(&what, &last_message(&ended)));
         }
-        let rows = recorded::read(&recording).map_err(|error| at(&what, &recording, &error))?;
+        let rows = recorded::read(&recording).map_err(|error| file_error(&what, &recording, &error))?;
         let summary = read_summary(&what, &files.summary)?;
         let joints = Skin::parse("the arm's skin", &text).map_err(Failure::run)?.robot.joints.len();
         if rows.is_empty() {
-            return Err(at(&what, &recording, &"it has no ticks"));
+            return Err(file_error(&what, &recording, &"it has no ticks"));
         }
         Ok(Run { rows, summary, joints })
     }
@@ -76,9 +76,9 @@ impl Benches {
     /// failed.
     pub(super) fn scaled(&self, bench: &ScaleBench) -> Result<Value, Failure> {
         let what = format!("the bench of {} cells ({})", bench.cells, bench.name());
-        let buses = buses::directory("experiment")?;
+        let buses = buses::private_directory("experiment")?;
         // Files that can be generated again go into a temporary directory.
-        let files = Files {
+        let files = RunFiles {
             skin: buses.path().join("skin.toml"),
             scenario: buses.path().join("scenario.toml"),
             summary: self.folder.join(format!("{}.json", bench.name())),
@@ -92,7 +92,7 @@ impl Benches {
         if files.summary.exists() && !is_invalid {
             read_summary(&what, &files.summary)
         } else {
-            Err(failed(&what, &last_words(&ended)))
+            Err(failed(&what, &last_message(&ended)))
         }
     }
 
@@ -100,15 +100,15 @@ impl Benches {
     fn perform(
         &self,
         what: &str,
-        files: &Files,
+        files: &RunFiles,
         texts: [&str; 2],
         cells_per_process: u8,
         buses: &Path,
     ) -> Result<Output, Failure> {
         for (path, text) in [&files.skin, &files.scenario].into_iter().zip(texts) {
-            write_whole(path, text, true).map_err(|error| at(what, path, &error))?;
+            write_whole(path, text, true).map_err(|error| file_error(what, path, &error))?;
         }
-        let own = std::env::current_exe().map_err(|error| at(what, Path::new("skinbus"), &error))?;
+        let own = std::env::current_exe().map_err(|error| file_error(what, Path::new("skinbus"), &error))?;
         let mut command = Command::new(&own);
         command.arg("run").arg(&files.skin).arg("--scenario").arg(&files.scenario);
         command.arg("--summary").arg(&files.summary).args(["--bus-kind", "embedded", "--quiet"]);
@@ -117,7 +117,7 @@ impl Benches {
             command.arg("--record").arg(path);
         }
         command.env("SKINBUS_DIR", buses).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
-        self.wait(command).map_err(|error| at(what, &own, &error))
+        self.wait(command).map_err(|error| file_error(what, &own, &error))
     }
 
     /// Waits for the end of the bench; a signal ends it early.
@@ -140,18 +140,18 @@ fn failed(what: &str, error: &dyn std::fmt::Display) -> Failure {
     Failure::run(format!("{what}: {error}"))
 }
 
-fn at(what: &str, path: &Path, error: &dyn std::fmt::Display) -> Failure {
+fn file_error(what: &str, path: &Path, error: &dyn std::fmt::Display) -> Failure {
     failed(what, &format_args!("{}: {error}", path.display()))
 }
 
 /// Returns the last line that a run printed.
-fn last_words(ended: &Output) -> String {
+fn last_message(ended: &Output) -> String {
     let said = String::from_utf8_lossy(&ended.stderr);
     let last = said.trim_end().lines().last().unwrap_or("it printed nothing").to_owned();
     last.strip_prefix("skinbus: ").map(str::to_owned).unwrap_or(last)
 }
 
 fn read_summary(what: &str, path: &Path) -> Result<Value, Failure> {
-    let text = fs::read_to_string(path).map_err(|error| at(what, path, &error))?;
-    serde_json::from_str(&text).map_err(|error| at(what, path, &error))
+    let text = fs::read_to_string(path).map_err(|error| file_error(what, path, &error))?;
+    serde_json::from_str(&text).map_err(|error| file_error(what, path, &error))
 }

@@ -12,7 +12,7 @@ use crate::output::Overwrite;
 /// A directory for results of experiments. Files are written to a hidden directory in it until [`Folder::finish`];
 /// without that call they are removed.
 #[derive(Debug)]
-pub(super) struct Folder {
+pub(super) struct ResultFolder {
     path: PathBuf,
     inside: PathBuf,
     /// True if this program created the directory.
@@ -20,7 +20,7 @@ pub(super) struct Folder {
     overwrite: Overwrite,
 }
 
-impl Folder {
+impl ResultFolder {
     /// Creates the directory if it does not exist, and checks that it can be written. A directory that is not empty is
     /// accepted only with `overwrite`.
     pub(super) fn create(path: &Path, overwrite: Overwrite) -> Result<Self, Failure> {
@@ -46,7 +46,7 @@ impl Folder {
     }
 
     /// Returns the hidden directory that contains the files until they get their names.
-    pub(super) fn inside(&self) -> PathBuf {
+    pub(super) fn staging_directory(&self) -> PathBuf {
         self.inside.clone()
     }
 
@@ -83,7 +83,7 @@ impl Folder {
     }
 }
 
-impl Drop for Folder {
+impl Drop for ResultFolder {
     fn drop(&mut self) {
         // Errors cannot be handled here; a directory that is not empty stays.
         let _ = fs::remove_dir_all(&self.inside);
@@ -109,19 +109,19 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("deep/er");
         let [kept, forced] = [false, true].map(|overwrite| Overwrite { overwrite });
-        let folder = Folder::create(&path, kept).unwrap();
+        let folder = ResultFolder::create(&path, kept).unwrap();
         folder.write("report.html", "half").unwrap();
         drop(folder);
         assert!(!path.exists());
         for (overwrite, text) in [(kept, "first"), (forced, "second")] {
-            let folder = Folder::create(&path, overwrite).unwrap();
+            let folder = ResultFolder::create(&path, overwrite).unwrap();
             folder.write("report.html", text).unwrap();
             folder.finish().unwrap();
             assert_eq!(fs::read_to_string(path.join("report.html")).unwrap(), text);
         }
-        let refused = Folder::create(&path, kept).unwrap_err();
+        let refused = ResultFolder::create(&path, kept).unwrap_err();
         assert!(format!("{refused:?}").contains("there is something in it"), "{refused:?}");
-        let folder = Folder::create(&path, forced).unwrap();
+        let folder = ResultFolder::create(&path, forced).unwrap();
         folder.write("report.html", "third").unwrap();
         drop(folder);
         assert_eq!(fs::read_to_string(path.join("report.html")).unwrap(), "second");
@@ -133,7 +133,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("out");
         fs::create_dir_all(path.join("report.html")).unwrap();
-        let folder = Folder::create(&path, Overwrite { overwrite: true }).unwrap();
+        let folder = ResultFolder::create(&path, Overwrite { overwrite: true }).unwrap();
         folder.write("results.json", "{}").unwrap();
         folder.publish().unwrap();
         folder.write("report.html", "page").unwrap();
@@ -148,7 +148,7 @@ mod tests {
         let path = place.path().join("file");
         fs::write(&path, "mine").unwrap();
         for path in [path.clone(), path.join("below")] {
-            let error = Folder::create(&path, Overwrite { overwrite: true }).unwrap_err();
+            let error = ResultFolder::create(&path, Overwrite { overwrite: true }).unwrap_err();
             assert!(format!("{error:?}").contains("name a folder"), "{error:?}");
         }
         assert_eq!(fs::read_to_string(&path).unwrap(), "mine");

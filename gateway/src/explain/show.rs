@@ -3,7 +3,8 @@
 use std::collections::BTreeSet;
 
 use analysis::explain::{
-    BusExplained, CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict,
+    BusExplained, CellExplained, Explanation, ForceSteps, JointTotal, MAX_JACOBIAN_ERROR_STEPS, Origin,
+    TorqueRow, WordVerdict,
 };
 use protocol::fixed::TorqueFormat;
 use protocol::usage::printable;
@@ -67,13 +68,14 @@ pub(super) fn text(
 }
 
 /// Maximum number of joints side by side in a table.
-const BESIDE: usize = 6;
+const JOINTS_PER_TABLE: usize = 6;
 
 /// Formats the joint positions that the cells of a bus received.
 fn positions(bus: &BusExplained) -> String {
     let unit = if bus.units.contains(&"m") { "rad, m" } else { "rad" };
     // Put seven joints side by side, because the last would otherwise stand alone.
-    let beside = if bus.joints.len() == BESIDE + 1 { BESIDE + 1 } else { BESIDE };
+    let beside =
+        if bus.joints.len() == JOINTS_PER_TABLE + 1 { JOINTS_PER_TABLE + 1 } else { JOINTS_PER_TABLE };
     let words = bus.position_words.chunks(beside).zip(bus.position_rad.chunks(beside));
     let tables = bus.joints.chunks(beside).zip(words).map(|(joints, (words, positions))| {
         let line =
@@ -89,11 +91,11 @@ fn positions(bus: &BusExplained) -> String {
 /// Formats a table with right-aligned columns, except for the first column and, if it holds text, the last. The columns
 /// are close together, so that the table fits on 80 columns.
 fn table(head: Vec<String>, rows: impl IntoIterator<Item = Vec<String>>, words_at_the_end: bool) -> String {
-    spaced(head, rows, words_at_the_end, 1)
+    spaced_table(head, rows, words_at_the_end, 1)
 }
 
 /// Formats such a table with at least `spaces` spaces before each number.
-fn spaced(
+fn spaced_table(
     head: Vec<String>,
     rows: impl IntoIterator<Item = Vec<String>>,
     words_at_the_end: bool,
@@ -140,9 +142,9 @@ fn torques(cells: &[CellExplained]) -> String {
     };
     let used = cells.iter().map(says).max().unwrap_or_default();
     let joints = cells.first().map_or(&[][..], |cell| cell.rows.get(..used).unwrap_or_default());
-    let names = Names::of(cells);
-    let tables = joints.chunks(BESIDE).enumerate().map(|(part, joints)| {
-        let is_last = (part + 1) * BESIDE >= used;
+    let names = CellNames::of(cells);
+    let tables = joints.chunks(JOINTS_PER_TABLE).enumerate().map(|(part, joints)| {
+        let is_last = (part + 1) * JOINTS_PER_TABLE >= used;
         let mut head = vec![names.head()];
         head.extend((part == 0).then(|| "F_z N".to_owned()));
         head.extend(joints.iter().map(|row| format!("{} {}", row.unit, row.joint)));
@@ -150,12 +152,14 @@ fn torques(cells: &[CellExplained]) -> String {
         let lines = cells.iter().map(|cell| {
             let mut line = vec![names.of_cell(cell)];
             line.extend((part == 0).then(|| decimals(force_of(cell), 3, "?")));
-            let rows = cell.rows.iter().skip(part * BESIDE).take(joints.len());
+            let rows = cell.rows.iter().skip(part * JOINTS_PER_TABLE).take(joints.len());
             line.extend(rows.map(|row| decimals(row.word_nm, 4, "-")));
-            line.extend(is_last.then(|| [steps_off(&cell.rows), worst(&cell.rows)]).into_iter().flatten());
+            line.extend(
+                is_last.then(|| [steps_off(&cell.rows), worst_verdict(&cell.rows)]).into_iter().flatten(),
+            );
             line
         });
-        spaced(head, lines, is_last, u16::from(joints.len() < BESIDE))
+        spaced_table(head, lines, is_last, u16::from(joints.len() < JOINTS_PER_TABLE))
     });
     tables.collect()
 }
@@ -165,9 +169,9 @@ fn force_of(cell: &CellExplained) -> Option<f64> {
 }
 
 /// Names of cells in tables: the node id, with the bus's name if there are several buses.
-struct Names(Option<String>);
+struct CellNames(Option<String>);
 
-impl Names {
+impl CellNames {
     fn of(cells: &[CellExplained]) -> Self {
         let bus = cells.first().map(|cell| &cell.bus);
         Self(bus.filter(|bus| cells.iter().all(|cell| cell.bus == **bus)).cloned())
@@ -187,7 +191,7 @@ fn name(cell: &CellExplained) -> String {
 }
 
 /// Formats the largest difference between the words of a cell and the nearest steps.
-fn steps_off(rows: &[Row]) -> String {
+fn steps_off(rows: &[TorqueRow]) -> String {
     // Take the last one of equally large differences.
     let most = rows.iter().filter_map(|row| row.difference_steps).max_by_key(|steps| steps.abs());
     or_else_text(most.map(sign), "?")
@@ -198,21 +202,21 @@ fn sign(steps: i32) -> String {
 }
 
 /// Returns the rank of a verdict by importance, its name, and an explanation if it needs one.
-fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
+fn verdict_info(verdict: &WordVerdict) -> (u8, &'static str, Option<String>) {
     match verdict {
-        Verdict::Nearest => (0, "nearest", None),
-        Verdict::Rounded { .. } => {
+        WordVerdict::Nearest => (0, "nearest", None),
+        WordVerdict::Rounded { .. } => {
             let means = "a J so many steps of 2^-14 m from the exact one gives this word";
             (1, "16 bits", Some(means.to_owned()))
         }
-        Verdict::Saturated => {
+        WordVerdict::Saturated => {
             let means = "the product is beyond the range of the torque format: the word is saturated";
             (2, "saturated", Some(means.to_owned()))
         }
-        Verdict::Open => (3, "open", None),
-        Verdict::Unexplained => {
+        WordVerdict::Open => (3, "open", None),
+        WordVerdict::Unexplained => {
             let means = format!(
-                "no J within {JACOBIAN_STEPS} steps, and one for each row after the sixth, of the exact one gives this word"
+                "no J within {MAX_JACOBIAN_ERROR_STEPS} steps, and one for each row after the sixth, of the exact one gives this word"
             );
             (4, "NOT EXPLAINED", Some(means))
         }
@@ -220,22 +224,24 @@ fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
 }
 
 /// Returns the name of the most important verdict among these rows.
-fn worst(rows: &[Row]) -> String {
-    or_else_text(rows.iter().map(|row| about(&row.verdict)).max().map(|(_, short, _)| short), "")
+fn worst_verdict(rows: &[TorqueRow]) -> String {
+    or_else_text(rows.iter().map(|row| verdict_info(&row.verdict)).max().map(|(_, short, _)| short), "")
 }
 
 /// Returns the name of a verdict, with the Jacobian J that gives the word if the verdict is about rounding.
-fn long(verdict: &Verdict) -> String {
-    let (_, short, _) = about(verdict);
+fn verdict_with_jacobian(verdict: &WordVerdict) -> String {
+    let (_, short, _) = verdict_info(verdict);
     match verdict {
-        Verdict::Rounded { jacobian_steps, .. } => format!("{short}: J {jacobian_steps:+.2}"),
-        Verdict::Nearest | Verdict::Saturated | Verdict::Unexplained | Verdict::Open => short.to_owned(),
+        WordVerdict::Rounded { jacobian_steps, .. } => format!("{short}: J {jacobian_steps:+.2}"),
+        WordVerdict::Nearest | WordVerdict::Saturated | WordVerdict::Unexplained | WordVerdict::Open => {
+            short.to_owned()
+        }
     }
 }
 
 /// Explains the verdicts that occur in the last column.
 fn legend(cells: &[CellExplained]) -> String {
-    let said = cells.iter().flat_map(|cell| &cell.rows).map(|row| about(&row.verdict));
+    let said = cells.iter().flat_map(|cell| &cell.rows).map(|row| verdict_info(&row.verdict));
     let said: BTreeSet<_> = said.collect();
     said.iter().filter_map(|(_, short, means)| Some(format!("  {short}: {}\n", means.as_ref()?))).collect()
 }
@@ -253,10 +259,11 @@ fn every_step(cell: &CellExplained, zero: u64) -> String {
     text + &rows(std::slice::from_ref(cell), false)
 }
 
-fn force_steps(force: &Force, zero: u64) -> String {
-    let Force { contact_n: [a, b, c], proximity, touch_n, contact_threshold_n, proximity_threshold, .. } =
-        *force;
-    let Force { alpha_c, alpha_p_n, fused_n, force_threshold_n, force_steps, force_n, .. } = *force;
+fn force_steps(force: &ForceSteps, zero: u64) -> String {
+    let ForceSteps {
+        contact_n: [a, b, c], proximity, touch_n, contact_threshold_n, proximity_threshold, ..
+    } = *force;
+    let ForceSteps { alpha_c, alpha_p_n, fused_n, force_threshold_n, force_steps, force_n, .. } = *force;
     let counts = |counts: bool| if counts { "counts" } else { "none" };
     let against = |value: f64, threshold: f64| if value < threshold { "below" } else { "not below" };
     let touch = against(touch_n, contact_threshold_n);
@@ -300,12 +307,12 @@ fn joint(cells: &[CellExplained]) -> String {
 
 /// Formats a table with one line per joint of each cell.
 fn rows(cells: &[CellExplained], by_cell: bool) -> String {
-    let names = Names::of(cells);
+    let names = CellNames::of(cells);
     let first = if by_cell { names.head() } else { "joint".to_owned() };
     let mut head = vec![first];
     head.extend(by_cell.then(|| "F_z N".to_owned()));
     head.extend(["J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"].map(str::to_owned));
-    let line = |cell: &CellExplained, row: &Row| {
+    let line = |cell: &CellExplained, row: &TorqueRow| {
         let mut line = vec![if by_cell { names.of_cell(cell) } else { joint_name(row.joint, row.unit) }];
         line.extend(by_cell.then(|| decimals(force_of(cell), 2, "?")));
         line.extend([
@@ -315,7 +322,7 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
             or_else_text(row.word, "-"),
             decimals(row.word_nm, 6, "-"),
             or_else_text(row.difference_steps.map(sign), "?"),
-            long(&row.verdict),
+            verdict_with_jacobian(&row.verdict),
         ]);
         line
     };
@@ -329,7 +336,7 @@ fn joint_name(joint: u8, unit: &str) -> String {
     if unit == "Nm" { joint.to_string() } else { format!("{joint} ({unit})") }
 }
 
-fn totals(total: &[Total], is_finest: bool) -> String {
+fn totals(total: &[JointTotal], is_finest: bool) -> String {
     // Words of a coarser format are added in steps of the finest one.
     let words = if is_finest { "words" } else { "x 2^-12" };
     let head = ["joint", words, "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"];

@@ -15,13 +15,13 @@ use protocol::usage::{Failure, print_text};
 use reference::ReferenceCell;
 use serde::Serialize;
 
-use crate::arguments::cell_of;
+use crate::arguments::find_cell;
 use crate::columns::{Columns, Table};
 use crate::input::skin_in;
 use crate::print::{count, json_line, table};
 
 /// Maximum size in bytes of a file of rows.
-const BATCH: u64 = 256 << 20;
+const MAX_BATCH_BYTES: u64 = 256 << 20;
 
 /// Columns of a file of rows.
 const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: &[] };
@@ -98,10 +98,10 @@ impl<'a> Calculator<'a> {
 
     fn batch(&self, path: &Path) -> Result<Vec<Row>, Failure> {
         let file = path.display().to_string();
-        let text = document::read_text_within(path, BATCH).map_err(Failure::usage)?;
+        let text = document::read_text_within(path, MAX_BATCH_BYTES).map_err(Failure::usage)?;
         let mut table = Table::new(&file, &text, COLUMNS)?;
         let mut rows = Vec::new();
-        while let Some(line) = table.row()? {
+        while let Some(line) = table.next_row()? {
             let at = format!("{file}, row {}: cell", rows.len() + 1);
             let named = line
                 .text("cell")
@@ -119,12 +119,12 @@ impl<'a> Calculator<'a> {
     /// Computes the torques of one row both ways. Returns the reason if this is not possible; `option` names the option
     /// that gave the cell.
     fn row(&self, named: &CellName, option: &str, force: f64, positions: &str) -> Result<Row, String> {
-        let index = cell_of(self.skin, named, option).map_err(|failure| failure.to_string())?;
-        self.row_of(index, force, positions).map_err(|why| format!("{option} {named}: {why}"))
+        let index = find_cell(self.skin, named, option).map_err(|failure| failure.to_string())?;
+        self.compute_row(index, force, positions).map_err(|why| format!("{option} {named}: {why}"))
     }
 
     /// Computes the torques of one row for the cell with this index.
-    fn row_of(&self, index: usize, force: f64, positions: &str) -> Result<Row, String> {
+    fn compute_row(&self, index: usize, force: f64, positions: &str) -> Result<Row, String> {
         let skin = self.skin;
         let Some(cell) = skin.cells.get(index) else { return Err("no such cell".to_owned()) };
         let joints: Vec<_> = skin.joints_on_bus(cell.bus).map(|(_, joint)| joint).collect();
@@ -143,7 +143,8 @@ impl<'a> Calculator<'a> {
         let mut q = Vec::with_capacity(given.len());
         let mut words = [Q1_14::ZERO; MAX_JOINTS];
         for ((text, joint), word) in given.iter().zip(&joints).zip(&mut words) {
-            let position = text.parse().ok().and_then(|value: f64| Some((value, joint.kind.word(value)?)));
+            let position =
+                text.parse().ok().and_then(|value: f64| Some((value, joint.kind.position_to_word(value)?)));
             let Some((position, nearest)) = position else {
                 return Err(format!(
                     "position {text:?} of {}: a number in {} is needed",
@@ -169,16 +170,18 @@ impl<'a> Calculator<'a> {
         }
         let parameters = skin.parameters(cell);
         let reference = ReferenceCell::new(&parameters);
-        let words = reference.torque_of(&words, force);
+        let words = reference.torque_for_force(&words, force);
         // Position of the cell on its bus.
         let place = skin.cells_on_bus(cell.bus).position(|other| other.node == cell.node).unwrap_or_default();
-        let central =
-            self.central.get(cell.bus).map(|central| central.torque(place, &central.frames_at(&q), force));
+        let central = self
+            .central
+            .get(cell.bus)
+            .map(|central| central.torque(place, &central.frames_at_positions(&q), force));
         // Adding 0.0 turns -0.0 into 0.0.
         let central: Vec<f64> =
             central.into_iter().flatten().take(joints.len()).map(|value| value + 0.0).collect();
         let words = words.get(..joints.len()).unwrap_or_default();
-        let fixed: Vec<f64> = words.iter().map(|&word| reference.format().real(word)).collect();
+        let fixed: Vec<f64> = words.iter().map(|&word| reference.format().to_real(word)).collect();
         let bus = skin.buses.get(cell.bus).map_or("", |bus| &bus.name);
         Ok(Row {
             cell: format!("{bus}:{}", cell.node),

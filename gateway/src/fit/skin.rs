@@ -19,9 +19,10 @@ impl Fit {
             None => (Vec::new(), None, fit::table(skin, self.format, computation_ns)),
             Some(chosen) => {
                 let buses = chosen.into_iter().enumerate();
-                let fit = |(index, (format, rates))| fit::bus(skin, index, format, rates, computation_ns);
+                let fit =
+                    |(index, (format, rates))| fit::assess_bus(skin, index, format, rates, computation_ns);
                 let buses: Vec<BusFit> = buses.filter_map(fit).collect();
-                let whole = fit::whole(skin, &buses);
+                let whole = fit::spread_over_buses(skin, &buses);
                 (buses, whole, Vec::new())
             }
         };
@@ -67,7 +68,7 @@ impl Fit {
 
 /// Returns the bit rates that the skin gives for a bus, with the format.
 fn described(bus: &SkinBus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
-    let rates = rates::described(bus, format).transpose();
+    let rates = rates::described_rates(bus, format).transpose();
     let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;
     Ok(rates.map(|rates| (format, rates)))
 }

@@ -1,9 +1,9 @@
 //! Tables of `skinbus fit` for a skin.
 
-use analysis::fit::case::{Answers, Case};
+use analysis::fit::case::{AnswerPlan, BusCase};
 use analysis::fit::limits::{Limit, MAX_NODES, NeededBuses};
-use analysis::fit::verdict::{Answer, percent};
-use analysis::fit::{AssessedBus, BusFit, Row, SkinFit, Spread, name};
+use analysis::fit::verdict::{FitSummary, percent};
+use analysis::fit::{AssessedBus, BusFit, RatesRow, SkinFit, Spread, rates_name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
 use protocol::usage::printable;
@@ -11,7 +11,7 @@ use protocol::usage::printable;
 use crate::print::{self, KeyValueTable, comma_separated, count, decimals, or_else_text};
 
 /// Columns of the table over bit rates.
-const HEAD: [&str; 8] = [
+const HEADER: [&str; 8] = [
     "bit rates",
     "packet\nµs",
     "load\n%",
@@ -23,23 +23,23 @@ const HEAD: [&str; 8] = [
 ];
 
 /// Formats a table with one line for each pair of bit rates.
-pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
+pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
     let Some(first) = rows.first() else { return String::new() };
     let lines = rows.iter().map(|row| {
         let BusFit { rated, most, answers, .. } = &row.fullest;
         let roots = answers.iter().map(|it| &it.after).find(|it| is_of_roots(&it.case));
         vec![
-            name(rated.case.format, rated.case.rates),
+            rates_name(rated.case.format, rated.case.rates),
             micros(rated.case.packet_ns()),
             tenths(rated.load.total()),
-            ms(rated),
+            last_ms(rated),
             most.in_time().to_string(),
             row.need.in_short(),
             or_else_text(roots.map(|it| tenths(it.load.total())), ""),
-            or_else_text(roots.map(ms), ""),
+            or_else_text(roots.map(last_ms), ""),
         ]
     });
-    let table = print::table(HEAD, lines, |column| column > 0);
+    let table = print::table(HEADER, lines, |column| column > 0);
     let case = &first.fullest.rated.case;
     let cells = skin.cells.len();
     let bus = match skin.buses.len() {
@@ -56,7 +56,7 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
         printable(&skin.name),
         millis(case.period_ns),
         micros(case.computation_ns),
-        what(case),
+        reply_name(case),
         sensors(case),
         MAX_NODES - 1,
     )
@@ -88,11 +88,15 @@ fn section(rows: &mut KeyValueTable, bus: &BusFit) {
     let BusFit { name: bus_name, rated, most, need, answers, hints } = bus;
     let AssessedBus { case, load, times, .. } = rated;
     let cells = case.answers.cells();
-    let worst = Answer::worst_case(rated);
-    rows.section(format!("{bus_name} at {}", worst.rates), format!("{cells} cells, {}", what(case)), "");
-    rows.row(worst.case(), worst.value(), worst.cells);
+    let worst = FitSummary::worst_case(rated);
+    rows.section(
+        format!("{bus_name} at {}", worst.rates),
+        format!("{cells} cells, {}", reply_name(case)),
+        "",
+    );
+    rows.row(worst.case_name(), worst.table_value(), worst.cells);
     let parts = [
-        (format!("joints and {}", what(case)), load.joints + load.answers),
+        (format!("joints and {}", reply_name(case)), load.joints + load.answers),
         ("sensors".to_owned(), load.sensors),
         ("heartbeats".to_owned(), load.heartbeats),
     ];
@@ -123,18 +127,18 @@ fn section(rows: &mut KeyValueTable, bus: &BusFit) {
     }
 }
 
-fn is_of_roots(case: &Case) -> bool {
-    matches!(case.answers, Answers::Sums { shared: false, .. })
+fn is_of_roots(case: &BusCase) -> bool {
+    matches!(case.answers, AnswerPlan::Sums { shared: false, .. })
 }
 
-const fn what(case: &Case) -> &'static str {
+const fn reply_name(case: &BusCase) -> &'static str {
     match case.answers {
-        Answers::Torques { .. } => "torques",
-        Answers::Sums { .. } => "sums",
+        AnswerPlan::Torques { .. } => "torques",
+        AnswerPlan::Sums { .. } => "sums",
     }
 }
 
-const fn sensors(case: &Case) -> &'static str {
+const fn sensors(case: &BusCase) -> &'static str {
     match case.sensing {
         Sensing::Off => "",
         Sensing::Continuous { .. } => ", sensors",
@@ -158,7 +162,7 @@ fn last(rated: &AssessedBus) -> String {
 
 /// Formats the time of the last answer in ms for a column of numbers.
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
-fn ms(rated: &AssessedBus) -> String {
+fn last_ms(rated: &AssessedBus) -> String {
     decimals(rated.times.last_ns().map(|ns| ns as f64 / 1e6), 2, "-")
 }
 

@@ -17,8 +17,8 @@ use trace::capture::{Entry, NoteKind, Reader};
 use self::show::write_frames;
 use super::Fit;
 use crate::input::{
-    self, LossCounts, POLL_TIMEOUT, ReceiveEnd, captures, is_file, no_frame, place, remark_another,
-    skin_beside, stopped,
+    self, LossCounts, POLL_TIMEOUT, ReceiveEnd, captures, is_file, location, no_frame, note_other_skin,
+    skin_so_far, stop_flag,
 };
 use crate::output;
 use crate::print::comma_separated;
@@ -27,7 +27,7 @@ use crate::print::comma_separated;
 const RECEIVE_BUFFER: usize = 8 << 20;
 
 /// Result of reading the traffic from a capture or from buses.
-struct Taken {
+struct TrafficInput {
     /// Name of the kind of source.
     what: &'static str,
     /// Number of frames that the recorder lost.
@@ -41,7 +41,7 @@ impl Fit {
     pub(super) fn of_traffic(&self) -> Result<(), Failure> {
         let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         if let (Some(path), Some(skin)) = (&self.skin, &skin) {
-            remark_another(&self.sources, path, skin);
+            note_other_skin(&self.sources, path, skin);
         }
         let mut out = BufWriter::new(InterruptibleWriter::new(io::stdout()));
         let name = comma_separated(self.sources.iter().map(|source| source.display()));
@@ -50,15 +50,15 @@ impl Fit {
         let (mut shadow, taken) = if self.are_captures(&name)? {
             let reader = captures(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
-            let mut shadow = self.shadow(skin.or_else(|| skin_beside(&reader, "name one with --skin")))?;
+            let mut shadow = self.shadow(skin.or_else(|| skin_so_far(&reader, "name one with --skin")))?;
             for before in &reader.extras().latched {
-                shadow.latched(&before.bus, before.nanos, &before.frame);
+                shadow.receive_latched(&before.bus, before.nanos, &before.frame);
             }
             run_began = reader.extras().run_began();
-            let taken = captured(reader, &mut shadow, &mut out)?;
+            let taken = pass_capture(reader, &mut shadow, &mut out)?;
             (shadow, taken)
         } else {
-            let stopped = stopped()?;
+            let stopped = stop_flag()?;
             let mut shadow = self.shadow(skin)?;
             let taken = self.live(&mut shadow, &mut out, &stopped)?;
             (shadow, taken)
@@ -109,18 +109,18 @@ impl Fit {
         let requested = RequestedRates { nominal: self.nominal, data: self.data };
         let mut of_bus = self.rates.clone();
         for bus in skin.iter().flat_map(|skin| &skin.buses) {
-            let rates = requested.of_bus(bus);
+            let rates = requested.for_bus(bus);
             let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?.rates;
             of_bus.push((bus.name.clone(), rates));
         }
-        let options = shadow::Options {
-            of_bus,
+        let options = shadow::ShadowOptions {
+            rates_by_bus: of_bus,
             bit_errors: self.ber.unwrap_or_default(),
             seed: self.seed.unwrap_or(1),
             each_frame: self.json,
             bench_traffic: self.bench_traffic,
             skin,
-            ..shadow::Options::new(requested.rates().map_err(Failure::usage)?)
+            ..shadow::ShadowOptions::new(requested.rates().map_err(Failure::usage)?)
         };
         Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))
     }
@@ -131,8 +131,8 @@ impl Fit {
         shadow: &mut Shadow,
         out: &mut impl Write,
         stopped: &AtomicBool,
-    ) -> Result<Taken, Failure> {
-        let kinds = self.kinds.of_any()?;
+    ) -> Result<TrafficInput, Failure> {
+        let kinds = self.kinds.any_kinds()?;
         let options = BusOptions { receive_buffer: RECEIVE_BUFFER, ..BusOptions::default() };
         let mut receive_ends = input::receive_ends(&self.sources, &kinds, None, &options, None)?;
         let length = self.duration.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
@@ -142,7 +142,7 @@ impl Fit {
         {
             input::wait(&receive_ends, POLL_TIMEOUT)?;
             for receive_end in &mut receive_ends {
-                if let Err(error) = take(receive_end, shadow) {
+                if let Err(error) = pass_frames(receive_end, shadow) {
                     ended = Err(Failure::run(error));
                 }
             }
@@ -154,25 +154,29 @@ impl Fit {
         let mut missing = 0;
         for receive_end in &receive_ends {
             let lost = receive_end.missing("read");
-            shadow.missing(receive_end.bus().name(), lost);
+            shadow.record_missing(receive_end.bus().name(), lost);
             missing += lost;
         }
-        Ok(Taken { what: "live", missing, ended })
+        Ok(TrafficInput { what: "live", missing, ended })
     }
 }
 
 /// Passes waiting frames to the model.
-fn take(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusError> {
+fn pass_frames(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusError> {
     while receive_end.receive(Duration::ZERO)? {
         for received in receive_end.frames() {
-            shadow.frame(receive_end.bus().name(), received.at_nanos, &received.frame);
+            shadow.receive(receive_end.bus().name(), received.at_nanos, &received.frame);
         }
     }
     Ok(())
 }
 
 /// Passes the frames of a capture to the model, and reports unreadable and lost items.
-fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Result<Taken, Failure> {
+fn pass_capture(
+    mut reader: Reader,
+    shadow: &mut Shadow,
+    out: &mut impl Write,
+) -> Result<TrafficInput, Failure> {
     let name = reader.name().to_owned();
     let what = input::format(&reader);
     let (mut frames, mut missing) = (0_u64, LossCounts::default());
@@ -182,20 +186,20 @@ fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Re
             Err(error) => break Err(Failure::run(error)),
             Ok(Some(Entry::Frame(record))) => {
                 frames += 1;
-                shadow.frame(record.interface, record.time.nanos, &record.frame);
+                shadow.receive(record.interface, record.time.nanos, &record.frame);
                 if let Err(error) = write_frames(shadow, out) {
                     ignore_broken_pipe(Err(error))?;
-                    return Ok(Taken { what, missing: missing.frames, ended: Ok(()) });
+                    return Ok(TrafficInput { what, missing: missing.frames, ended: Ok(()) });
                 }
             }
             Ok(Some(Entry::Note(note))) => {
                 missing.count(&note);
                 match note.kind {
                     NoteKind::Dropped(lost) if !note.interface.is_empty() => {
-                        shadow.missing(note.interface, lost);
+                        shadow.record_missing(note.interface, lost);
                     }
                     NoteKind::Unreadable(why) if missing.unreadable() == 1 => {
-                        output::note(format_args!("{}: {why}", place(&name, note.line)));
+                        output::note(format_args!("{}: {why}", location(&name, note.line)));
                     }
                     NoteKind::Text | NoteKind::CanXl | NoteKind::Dropped(_) | NoteKind::Unreadable(_) => {}
                 }
@@ -211,5 +215,5 @@ fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Re
     } else if frames == 0 && ended.is_ok() {
         ended = Err(no_frame(&reader));
     }
-    Ok(Taken { what, missing: missing.frames, ended })
+    Ok(TrafficInput { what, missing: missing.frames, ended })
 }

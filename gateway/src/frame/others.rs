@@ -34,7 +34,7 @@ impl OtherPages {
         let mut words = [0; WORDS];
         for (_, field, texts) in &self.given {
             for (word, text) in words.iter_mut().skip(field.first_bit() / 16).zip(texts) {
-                let read = parameter::real(text).and_then(|_| parameter::read(field, text));
+                let read = parameter::parse_finite(text).and_then(|_| parameter::parse_value(field, text));
                 *word = read.map_err(|allowed| format!("--{} {text}: {allowed}", field.bare_name()))?;
             }
         }

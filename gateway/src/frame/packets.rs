@@ -151,7 +151,7 @@ impl PacketCommand {
     }
 
     /// Returns the addressee of the packet, or `None` if the packet is for all receivers.
-    pub(super) const fn to(&self) -> Option<&Party> {
+    pub(super) const fn addressee(&self) -> Option<&Party> {
         match self {
             Self::Halt | Self::Resume | Self::Sync | Self::Report | Self::Joints(_) => None,
             Self::Stimulus(Stimulus { cell, .. }) | Self::Configure(Configure { cell, .. }) => Some(cell),
@@ -164,8 +164,10 @@ impl Positions {
     fn message(&self) -> Result<Message, String> {
         let Angles { rad, words } = &self.positions;
         let (name, texts, read): (_, _, fn(&str) -> _) = match (rad, words) {
-            (Some(rad), _) => ("--rad", rad, parameter::angle),
-            (None, words) => ("--words", words.as_ref().ok_or("--rad or --words is needed")?, parameter::raw),
+            (Some(rad), _) => ("--rad", rad, parameter::parse_angle),
+            (None, words) => {
+                ("--words", words.as_ref().ok_or("--rad or --words is needed")?, parameter::parse_raw_word)
+            }
         };
         if texts.len() > MAX_JOINTS {
             let got = texts.len();
@@ -189,12 +191,12 @@ impl Stimulus {
             return Ok(Message::Stimulus { to, from, page });
         }
         let page = SensorPage::Skin(SkinSensors {
-            contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), contact)?,
+            contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), force_words)?,
             proximity: self
                 .proximity
                 .as_deref()
-                .map_or(Ok(Q1_14::ZERO), |text| contact_state("--proximity", "proximity", text))?,
-            temperature: several(
+                .map_or(Ok(Q1_14::ZERO), |text| sensor_value("--proximity", "proximity", text))?,
+            temperature: sensor_values(
                 "--temperature",
                 "temperature_c",
                 self.temperature.as_deref().unwrap_or_default(),
@@ -208,9 +210,9 @@ impl Configure {
     fn message(&self) -> Result<Message, String> {
         let wrong = |error: parameter::ParameterTextError| error.to_string();
         let request = match (&self.request.read, self.request.write.as_deref()) {
-            (Some(name), _) => Request::Read { number: parameter::number(name).map_err(wrong)? },
+            (Some(name), _) => Request::Read { number: parameter::parse_number(name).map_err(wrong)? },
             (None, Some([name, values @ ..])) => {
-                let (number, words) = parameter::write(name, values).map_err(wrong)?;
+                let (number, words) = parameter::parse_write(name, values).map_err(wrong)?;
                 Request::Write { number, words }
             }
             (None, None | Some([])) => return Err("--read or --write is needed".to_owned()),
@@ -225,29 +227,31 @@ fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) 
 }
 
 /// Parses a value of a sensor field.
-fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
+fn sensor_value<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
     let field = layouts().flat_map(|layout| &layout.fields).find(|field| field.name == name);
     let field = field.ok_or_else(|| format!("{option}: cells measure no {name}"))?;
-    let word = value(option, text, |text| parameter::real(text).and_then(|_| parameter::read(field, text)))?;
+    let word = value(option, text, |text| {
+        parameter::parse_finite(text).and_then(|_| parameter::parse_value(field, text))
+    })?;
     Ok(Q::from_bits(word))
 }
 
 /// Parses `N` numbers, or returns zeros if none are given.
-fn several<const F: u32, const N: usize>(
+fn sensor_values<const F: u32, const N: usize>(
     option: &str,
     name: &str,
     texts: &[String],
 ) -> Result<[Q<F>; N], String> {
     let mut all = [Q::ZERO; N];
     for (one, text) in all.iter_mut().zip(texts) {
-        *one = contact_state(option, name, text)?;
+        *one = sensor_value(option, name, text)?;
     }
     Ok(all)
 }
 
 /// Parses a force in N, and divides it among the three contact words.
-fn contact(text: &str) -> Result<[Q5_10; 3], String> {
-    let force = value("--force", text, parameter::real)?;
+fn force_words(text: &str) -> Result<[Q5_10; 3], String> {
+    let force = value("--force", text, parameter::parse_finite)?;
     let words = contact_words(force);
     let sum: f64 = words.into_iter().map(Q::to_f64).sum();
     if (sum - force).abs() > 1.0 / 1_024.0 {

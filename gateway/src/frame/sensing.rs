@@ -11,7 +11,7 @@ use protocol::skin::sensing::continuous_sensing;
 use protocol::usage::{Failure, print_text};
 
 use super::addressee::{addressee, only_cell};
-use crate::arguments::{OptionValue, one_of};
+use crate::arguments::{OptionValue, one_of_values};
 use model::decode::pick::Party;
 
 /// Set when cells send their sensor values: never, at a rate, or on changes
@@ -26,7 +26,7 @@ use model::decode::pick::Party;
   skinbus frame sensing off --skin skin.toml")]
 pub(super) struct SensingCommand {
     /// Times at which cells send their sensor values
-    #[arg(value_parser = one_of(MODES))]
+    #[arg(value_parser = one_of_values(MODES))]
     mode: SensingMode,
     /// Rate in continuous mode: frames per second of each cell
     #[arg(value_name = "HZ", allow_negative_numbers = true)]

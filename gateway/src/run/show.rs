@@ -11,18 +11,18 @@ use model::table::Errors;
 use protocol::usage::printable;
 
 use crate::print::{
-    GREEN, KeyValueTable, PLAIN, RED, YELLOW, comma_separated, count, hanging, or_else_text, quantiles,
-    space_separated,
+    GREEN, KeyValueTable, PLAIN, RED, YELLOW, comma_separated, count, hanging_indent, or_else_text,
+    quantiles, space_separated,
 };
 
 /// Maximum number of halts listed one by one.
-const HALTS: usize = 10;
+const MAX_HALTS: usize = 10;
 /// Maximum number of a bus's conspicuous cells that are listed one by one.
-const CELLS: usize = 5;
+const MAX_CELLS: usize = 5;
 /// Maximum number of lines of the verdict, except in verbose mode.
-const LINES: usize = 6;
+const MAX_VERDICT_LINES: usize = 6;
 /// Maximum width of a row's name in columns, except in verbose mode.
-const NAME: usize = 24;
+const MAX_NAME_WIDTH: usize = 24;
 
 /// Display options of a run.
 #[derive(Clone, Copy, Debug, Default)]
@@ -47,14 +47,14 @@ fn verdict(summary: &Summary, look: TableStyle, columns: usize) -> String {
     if summary.verdict.well {
         let is_interrupted = summary.outcome == Outcome::Interrupted;
         let begin = if is_interrupted { "all well until it was interrupted: " } else { "all well: " };
-        lines.push(hanging("", &format!("{begin}{}", printable(&summary.sums_of_all())), columns));
+        lines.push(hanging_indent("", &format!("{begin}{}", printable(&summary.totals_line())), columns));
     }
-    let many = if look.is_verbose { look_at.len() } else { LINES };
+    let many = if look.is_verbose { look_at.len() } else { MAX_VERDICT_LINES };
     let more = look_at.len().saturating_sub(many);
     let more = (more > 0).then(|| format!("and {more} more, with --verbose"));
     for (at, item) in look_at.iter().take(many).chain(&more).enumerate() {
         let begin = if at == 0 { "look at: " } else { "         " };
-        lines.push(hanging(begin, &printable(item), columns));
+        lines.push(hanging_indent(begin, &printable(item), columns));
     }
     let text = lines.join("\n");
     let is_unknown = summary.buses.iter().any(|bus| bus.replies.unknown + bus.uplink.unknown > 0);
@@ -76,7 +76,7 @@ fn rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
     let mut rows = if is_verbose {
         KeyValueTable::in_columns(look.columns, &summary.skin, cells, ended)
     } else {
-        KeyValueTable::in_columns(look.columns, &summary.skin, cells, ended).names_in(NAME)
+        KeyValueTable::in_columns(look.columns, &summary.skin, cells, ended).names_in(MAX_NAME_WIDTH)
     };
     rows = rows.coloured(look.is_coloured);
     halts(&mut rows, summary);
@@ -96,11 +96,11 @@ fn rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
 }
 
 fn halts(rows: &mut KeyValueTable, summary: &Summary) {
-    for HaltSummary { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(HALTS) {
+    for HaltSummary { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(MAX_HALTS) {
         let until = until_s.map_or_else(|| "to the end".to_owned(), |until| format!("to {until:.3} s"));
         rows.section("halted", format!("{at_s:.3} s {until}, epoch {epoch}"), reason);
     }
-    let more = summary.halts.len().saturating_sub(HALTS) as u64 + summary.further_halts;
+    let more = summary.halts.len().saturating_sub(MAX_HALTS) as u64 + summary.further_halts;
     if more > 0 {
         rows.section("halted", format!("{} more", count(more, "time")), "--summary has when and why");
     }
@@ -138,7 +138,11 @@ fn accuracy(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
             rows.row("  averaged over 32 epochs", error(errors), compared(errors));
         }
     }
-    rows.any("saturated words, left out", accuracy.saturated, "beyond the range of the torque format");
+    rows.row_unless_zero(
+        "saturated words, left out",
+        accuracy.saturated,
+        "beyond the range of the torque format",
+    );
 }
 
 fn error(errors: &Errors) -> String {
@@ -168,8 +172,8 @@ fn control(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
         rows.row(name, count, format!("{skipped} skipped"));
     }
     let why = "the bus refused them, or this machine was busy";
-    rows.any("frames not sent", control.unsent, why);
-    rows.any("records of ticks lost", control.records_lost, why);
+    rows.row_unless_zero("frames not sent", control.unsent, why);
+    rows.row_unless_zero("records of ticks lost", control.records_lost, why);
     for (name, count) in &control.controller {
         rows.row("external controller", count, name);
     }
@@ -185,7 +189,7 @@ fn control(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
 
 fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let replies = &bus.replies;
-    rows.section(&bus.name, each(&bus.cells), &bus.kind);
+    rows.section(&bus.name, counts_by_kind(&bus.cells), &bus.kind);
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         let ticks = format!("{} without it", count(bus.outages.ticks, "tick"));
@@ -214,14 +218,21 @@ fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
         let parts = sums.contributions;
         let unexpected = parts.unasked - parts.contact_unknown;
         let is_brief = !is_verbose && parts.in_time == parts.due;
-        due(rows, "cells due in sums", parts.due, is_brief, complete, [parts.contact_unknown, unexpected]);
+        due_rows(
+            rows,
+            "cells due in sums",
+            parts.due,
+            is_brief,
+            complete,
+            [parts.contact_unknown, unexpected],
+        );
         if !is_brief {
             rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
         }
         sums_on_the_bus(rows, bus, is_verbose);
     } else {
         let is_brief = !is_verbose && replies.in_time == replies.due;
-        due(
+        due_rows(
             rows,
             "replies due",
             replies.due,
@@ -238,7 +249,7 @@ fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
                     rows,
                     "  missing",
                     missing,
-                    explained(&reasons, replies.unknown),
+                    reasons_text(&reasons, replies.unknown),
                     replies.unknown,
                 );
             }
@@ -297,7 +308,7 @@ fn unexplained(rows: &mut KeyValueTable, name: &str, value: impl Display, reason
 }
 
 /// Adds rows on replies that were due, and on torques that were not due and so not compared, by reason.
-fn due(
+fn due_rows(
     rows: &mut KeyValueTable,
     name: &str,
     due: u64,
@@ -332,12 +343,12 @@ fn key_words(key: &str) -> String {
 }
 
 /// Formats the kinds with the count of each.
-fn each(kinds: impl IntoIterator<Item = (impl Display, impl Display)>) -> String {
+fn counts_by_kind(kinds: impl IntoIterator<Item = (impl Display, impl Display)>) -> String {
     comma_separated(kinds.into_iter().map(|(kind, count)| format!("{count} {kind}")))
 }
 
 /// Formats the counts of the reasons that occurred, and always the count of unknown ones.
-fn explained(reasons: &[(u64, impl Display)], unknown: u64) -> String {
+fn reasons_text(reasons: &[(u64, impl Display)], unknown: u64) -> String {
     let known = reasons.iter().filter(|(count, _)| *count > 0);
     let known = known.map(|(count, why)| format!("{count} {why}"));
     comma_separated(known.chain([format!("{unknown} unknown")]))
@@ -372,7 +383,7 @@ fn noteworthy(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
         |cell: &CellSummary| (is_off(cell), cell.missing.values().sum::<u64>(), cell.late, cell.restarts);
     let mut worst: Vec<_> = all().filter(|cell| rank(cell) > (false, 0, 0, 0)).collect();
     worst.sort_by_key(|cell| Reverse(rank(cell)));
-    for cell in worst.iter().take(CELLS) {
+    for cell in worst.iter().take(MAX_CELLS) {
         let CellSummary { due, in_time, late, restarts, .. } = **cell;
         let late = (late > 0).then(|| format!("{late} late"));
         let missing = cell.missing.iter().map(|(why, count)| format!("{count} {}", key_words(why)));
@@ -383,8 +394,8 @@ fn noteworthy(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
         let in_time = (due > 0).then(|| format!("{in_time} of {due} replies in time"));
         rows.row(format!("cell {}", cell.node), or_else_text(in_time, ""), comma_separated(why));
     }
-    let more = worst.len().saturating_sub(CELLS);
-    rows.any("further cells that stand out", more as u64, "--summary has each cell");
+    let more = worst.len().saturating_sub(MAX_CELLS);
+    rows.row_unless_zero("further cells that stand out", more as u64, "--summary has each cell");
 }
 
 fn frames(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
@@ -397,7 +408,7 @@ fn frames(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
         rows.row("packets of cells", up.sent, "none lost");
     }
     if is_verbose {
-        rows.row("received", each(&bus.received), "");
+        rows.row("received", counts_by_kind(&bus.received), "");
     }
     let sensors = &bus.sensors;
     if let (Some(min), Some(mean), Some(max)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
@@ -405,10 +416,10 @@ fn frames(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
         rows.row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
     }
     if is_verbose {
-        rows.row("sent", each(&bus.sent), "");
+        rows.row("sent", counts_by_kind(&bus.sent), "");
     }
     if !bus.events.is_empty() {
-        rows.row("anomalies", each(&bus.events), "");
+        rows.row("anomalies", counts_by_kind(&bus.events), "");
     }
 }
 
@@ -417,19 +428,19 @@ fn packets(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
-    rows.any("  for other cells", up.unheard, "sums that the gateway does not take");
+    rows.row_unless_zero("  for other cells", up.unheard, "sums that the gateway does not take");
     let reasons = [
         (up.dropped, "dropped by the bus"),
         (up.backlog, "by the kernel's backlog"),
         (up.outage, "with the bus"),
         (up.hosts, "between hosts"),
     ];
-    unexplained(rows, "  lost", lost, explained(&reasons, up.unknown), up.unknown);
-    rows.any("  surplus", up.surplus, "");
-    rows.any("  of other senders", up.outsiders, "");
-    rows.any("  in doubt", up.in_doubt, "");
-    rows.any("  after the last heartbeat", up.unsettled, "");
-    rows.any("  restarts of cells", up.restarts, "what they sent last is in doubt");
+    unexplained(rows, "  lost", lost, reasons_text(&reasons, up.unknown), up.unknown);
+    rows.row_unless_zero("  surplus", up.surplus, "");
+    rows.row_unless_zero("  of other senders", up.outsiders, "");
+    rows.row_unless_zero("  in doubt", up.in_doubt, "");
+    rows.row_unless_zero("  after the last heartbeat", up.unsettled, "");
+    rows.row_unless_zero("  restarts of cells", up.restarts, "what they sent last is in doubt");
 }
 
 fn costs(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {

@@ -25,7 +25,7 @@ pub(super) struct Covering {
     leave_out: Vec<String>,
     /// A box in the frame of a covered link that holds no cell, in m; may be given several times
     #[arg(long, value_name = "LINK:MINX,MINY,MINZ,MAXX,MAXY,MAXZ", requires = "cover", value_parser = keep_out)]
-    keep_out: Vec<KeptOut>,
+    keep_out: Vec<ExcludedBox>,
     /// Random seed: the same seed gives the same cells
     #[arg(long, value_name = "N", requires = "cover", default_value_t = 1)]
     seed: u64,
@@ -38,7 +38,7 @@ pub(super) struct Covering {
 
 /// A box in the frame of a link.
 #[derive(Clone, Debug)]
-struct KeptOut {
+struct ExcludedBox {
     link: String,
     min: [f64; 3],
     max: [f64; 3],
@@ -59,7 +59,7 @@ fn link(text: &str) -> Result<String, String> {
     Ok(text.trim().to_owned())
 }
 
-fn keep_out(text: &str) -> Result<KeptOut, String> {
+fn keep_out(text: &str) -> Result<ExcludedBox, String> {
     let parsed = || {
         let (link, numbers) = text.rsplit_once(':')?;
         let numbers =
@@ -68,7 +68,7 @@ fn keep_out(text: &str) -> Result<KeptOut, String> {
         let [min @ .., x, y, z] = numbers.as_slice() else { return None };
         let (min, max) = (<[f64; 3]>::try_from(min).ok()?, [*x, *y, *z]);
         let is_box = min.iter().zip(&max).all(|(min, max)| min <= max);
-        is_box.then(|| KeptOut { link: link.trim().to_owned(), min, max, text: text.to_owned() })
+        is_box.then(|| ExcludedBox { link: link.trim().to_owned(), min, max, text: text.to_owned() })
     };
     parsed().ok_or_else(|| {
         "a link, a colon, and six lengths in m: the min x, y, z of the box and the max".to_owned()
@@ -89,7 +89,7 @@ impl Covering {
         let there = urdf.links().filter(|name| !self.leave_out.iter().any(|out| out == name));
         let links = there.map(|name| {
             let pose = urdf.pose(name, &|joint| urdf.rest(joint)).map_err(|error| error.to_string())?;
-            let parts = visuals.parts(name).map_err(|error| {
+            let parts = visuals.link_parts(name).map_err(|error| {
                 let is_covered = self.cover.iter().any(|covered| covered == name);
                 let hint = if is_covered {
                     String::new()
@@ -246,7 +246,7 @@ fn without_cells(LinkFigures { name, outer_area, kept_out, .. }: &LinkFigures, i
 }
 
 /// Returns the figures of a covered link, in one line.
-pub(super) fn reported(figures: &LinkFigures) -> String {
+pub(super) fn figures_text(figures: &LinkFigures) -> String {
     let LinkFigures { name, cells, outer_area, kept_out: _, covered, spacing, tilt } = figures;
     let spacing =
         spacing.map_or_else(String::new, |metres| format!("; {:.1} mm from cell to cell", metres * 1e3));

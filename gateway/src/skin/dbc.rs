@@ -9,7 +9,7 @@ use protocol::usage::{Failure, print_text};
 
 use crate::arguments::bus_names;
 use crate::input::skin_in;
-use crate::output::{Overwrite, apart};
+use crate::output::{Overwrite, check_distinct};
 use crate::print::comma_separated;
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
@@ -43,7 +43,7 @@ pub(super) struct Dbc {
 impl Dbc {
     pub(super) fn run(self) -> Result<(), Failure> {
         let file = self.file.display();
-        apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
+        check_distinct([("-o", self.output.as_deref())], [self.file.as_path()])?;
         let skin = skin_in(&self.file)?;
         let names = || comma_separated(bus_names(&skin));
         let bus = match (&self.bus, skin.buses.as_slice()) {

@@ -9,9 +9,9 @@ use protocol::usage::{Failure, print_text};
 use robots::{CellOnLink, ImportError, JointKind, SkinImport as Described, UrdfChain};
 
 use super::super::columns::{Columns, Table};
-use super::super::output::{Overwrite, apart, is_standard_output, note};
+use super::super::output::{Overwrite, check_distinct, is_standard_output, note};
 use super::super::print::{comma_separated, count};
-use super::super::robot_file::{path_from, read_urdf};
+use super::super::robot_file::{read_urdf, relative_path};
 use super::covering::{self, Covered, Covering};
 
 /// Describe a skin on your own robot, from its URDF
@@ -62,7 +62,7 @@ const COLUMNS: Columns =
 impl Import {
     pub(super) fn run(self) -> Result<(), Failure> {
         let read = [Some(self.urdf.as_path()), self.places.as_deref()].into_iter().flatten();
-        apart([("-o", self.output.as_deref())], read)?;
+        check_distinct([("-o", self.output.as_deref())], read)?;
         let file = self.urdf.display().to_string();
         let (urdf, _) = read_urdf(&self.urdf).map_err(Failure::usage)?;
         let chain = |tip: &String| urdf.chain(self.root.as_deref(), tip).map_err(Failure::usage);
@@ -81,7 +81,7 @@ impl Import {
         // A skin cannot name a URDF that was read from a pipe.
         let is_named = |path: &&Path| !is_standard_output(path) && self.urdf.is_file();
         let output = self.output.as_deref().filter(is_named);
-        let path = output.and_then(|output| path_from(output, &self.urdf));
+        let path = output.and_then(|output| relative_path(output, &self.urdf));
         let import = Described {
             name: if urdf.name.is_empty() { "robot" } else { &urdf.name },
             command: &command,
@@ -99,13 +99,13 @@ impl Import {
             None => print_text(&skin)?,
         }
         for chain in &chains {
-            note(reported(chain));
-            for joint in wide(chain) {
+            note(chain_text(chain));
+            for joint in suspicious_limits(chain) {
                 note(joint);
             }
         }
         for figures in &figures {
-            note(covering::reported(figures));
+            note(covering::figures_text(figures));
         }
         Ok(())
     }
@@ -129,7 +129,7 @@ impl Import {
 }
 
 /// Describes a chain in one line.
-fn reported(chain: &UrdfChain) -> String {
+fn chain_text(chain: &UrdfChain) -> String {
     let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
     let names = comma_separated(chain.joints.iter().map(|joint| &joint.name));
     format!(
@@ -139,12 +139,12 @@ fn reported(chain: &UrdfChain) -> String {
 }
 
 /// Limit in rad, in both directions, above which an angle is probably in degrees.
-const WIDE_RAD: f64 = 8.0 * core::f64::consts::PI;
+const MAX_PLAUSIBLE_RAD: f64 = 8.0 * core::f64::consts::PI;
 
 /// Returns the joints whose limits are probably in degrees, one line each.
-fn wide(chain: &UrdfChain) -> impl Iterator<Item = String> {
+fn suspicious_limits(chain: &UrdfChain) -> impl Iterator<Item = String> {
     let turning = chain.joints.iter().filter(|joint| joint.kind == JointKind::Revolute);
-    let wide = turning.filter(|joint| joint.limits.iter().any(|limit| limit.abs() > WIDE_RAD));
+    let wide = turning.filter(|joint| joint.limits.iter().any(|limit| limit.abs() > MAX_PLAUSIBLE_RAD));
     wide.map(|joint| {
         let [lower, upper] = joint.limits;
         format!(
@@ -164,13 +164,14 @@ fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
     let text = text(path)?;
     let mut table = Table::new(&file, &text, COLUMNS)?;
     let mut cells = Vec::new();
-    while let Some(row) = table.row()? {
+    while let Some(row) = table.next_row()? {
         let vector =
             |[x, y, z]: [&str; 3]| Ok::<_, Failure>([row.number(x)?, row.number(y)?, row.number(z)?]);
         let node = match row.text("node") {
             "" => None,
             text => {
-                let wrong = |_| row.wrong("node", "1 to 254 are possible; an empty one gets a free node");
+                let wrong =
+                    |_| row.value_error("node", "1 to 254 are possible; an empty one gets a free node");
                 Some(text.parse::<CellId>().map_err(wrong)?.get())
             }
         };

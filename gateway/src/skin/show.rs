@@ -8,14 +8,14 @@ use protocol::skin::{Cell, Skin};
 use protocol::usage::{Failure, print_text};
 use view::{Scene, Still};
 
-use super::super::output::{Overwrite, apart};
+use super::super::output::{Overwrite, check_distinct};
 use super::super::print::space_separated;
-use super::super::robot_file::urdf_of;
+use super::super::robot_file::urdf_path;
 use super::super::surface::shells;
 use super::super::visuals::Packages;
 
 /// Maximum number of triangles of the robot in a page; larger meshes are simplified.
-const TRIANGLES: usize = 12_000;
+const MAX_TRIANGLES: usize = 12_000;
 
 /// Draw a skin in 3D, as one self-contained HTML page
 ///
@@ -40,13 +40,13 @@ pub(super) struct Show {
 impl Show {
     pub(super) fn run(self) -> Result<(), Failure> {
         let skin = Skin::read(&self.file).map_err(Failure::usage)?;
-        let urdf = skin.robot.urdf.as_deref().map(|urdf| urdf_of(&self.file, urdf));
+        let urdf = skin.robot.urdf.as_deref().map(|urdf| urdf_path(&self.file, urdf));
         let read = [Some(self.file.as_path()), urdf.as_deref()].into_iter().flatten();
-        apart([("-o", self.output.as_deref())], read)?;
+        check_distinct([("-o", self.output.as_deref())], read)?;
         if let Some(path) = &self.output {
             self.overwrite.check("-o", path)?;
         }
-        let page = still(&self.file, &skin, &self.packages).page();
+        let page = still_view(&self.file, &skin, &self.packages).page();
         match &self.output {
             Some(path) => self.overwrite.write("-o", path, &page),
             None => print_text(&page),
@@ -55,11 +55,11 @@ impl Show {
 }
 
 /// Reads the meshes of a skin's robot, and returns the skin as a page shows it.
-pub(crate) fn still(file: &Path, skin: &Skin, packages: &Packages) -> Still {
+pub(crate) fn still_view(file: &Path, skin: &Skin, packages: &Packages) -> Still {
     let position = |[min, max]: [f64; 2]| 0.0_f64.clamp(min, max);
     Still {
         scene: Scene::from_skin(skin, false),
-        surface: shells(file, skin, packages, TRIANGLES),
+        surface: shells(file, skin, packages, MAX_TRIANGLES),
         positions: skin.robot.joints.iter().map(|joint| position(joint.limits)).collect(),
         details: skin.cells.iter().map(|cell| details(skin, cell)).collect(),
         moved: Vec::new(),

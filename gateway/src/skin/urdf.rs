@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use clap::Args;
 use protocol::skin::Skin;
 use protocol::usage::{Failure, print_text};
-use robots::written;
+use robots::write_urdf;
 
-use super::super::output::{Overwrite, apart};
+use super::super::output::{Overwrite, check_distinct};
 
 /// Describe a skin's robot as a URDF: its chains, row by row
 ///
@@ -31,8 +31,8 @@ pub(super) struct Urdf {
 impl Urdf {
     pub(super) fn run(self) -> Result<(), Failure> {
         let skin = Skin::read(&self.file).map_err(Failure::usage)?;
-        apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
-        let text = written(&skin).xml;
+        check_distinct([("-o", self.output.as_deref())], [self.file.as_path()])?;
+        let text = write_urdf(&skin).xml;
         match &self.output {
             Some(path) => self.overwrite.write("-o", path, &text),
             None => print_text(&text),

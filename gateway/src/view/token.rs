@@ -15,10 +15,10 @@ use crate::output::note;
 /// read it there.
 pub(super) const VARIABLE: &str = "SKINBUS_TOKEN";
 /// Maximum number of bytes read from a token file.
-const LONGEST_FILE: u64 = 4096;
+const MAX_FILE_BYTES: u64 = 4096;
 
 /// Returns the token that the user has chosen: from a file, or else from the environment.
-pub(super) fn chosen(file: Option<&Path>) -> Result<Option<Token>, Failure> {
+pub(super) fn chosen_token(file: Option<&Path>) -> Result<Option<Token>, Failure> {
     match file {
         Some(path) => read(path).map(Some),
         None => of_environment(),
@@ -26,7 +26,7 @@ pub(super) fn chosen(file: Option<&Path>) -> Result<Option<Token>, Failure> {
 }
 
 /// Returns the token that a page must have. A page that can act, or that other machines can reach, always has one.
-pub(super) fn needed(
+pub(super) fn required_token(
     chosen: Option<Token>,
     acts: bool,
     listen: SocketAddr,
@@ -53,7 +53,7 @@ fn read(path: &Path) -> Result<Token, Failure> {
     let text = || -> io::Result<(String, File)> {
         let file = File::open(path)?;
         let mut text = String::new();
-        (&file).take(LONGEST_FILE).read_to_string(&mut text)?;
+        (&file).take(MAX_FILE_BYTES).read_to_string(&mut text)?;
         Ok((text, file))
     };
     let (text, file) = text().map_err(|error| Failure::usage(format!("--token-file {name}: {error}")))?;

@@ -17,8 +17,8 @@ use control::controller::Kinesthetic;
 use control::cycle::turn::{BusPort, BusState, Shared, TickDriver};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
-use model::generate::{Target, generate};
-use model::scenario::{Mode, ModeChange, Scenario};
+use model::generate::{SkinRequest, generate};
+use model::scenario::{ModeChange, Scenario, TorqueSource};
 use model::table::Table;
 use protocol::bus::{Bus, BusKind, BusOptions, KindChoice};
 use protocol::can::Frame;
@@ -29,7 +29,7 @@ use protocol::time::{Micros, Span};
 use vcan_setup::embedded::ServerThread;
 
 /// Counts the allocations of the current thread.
-struct Counting;
+struct CountingAllocator;
 
 thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
@@ -37,7 +37,7 @@ thread_local! {
 
 // SAFETY: everything is left to the system's allocator; counting touches a thread-local integer that needs
 // neither a constructor nor a destructor.
-unsafe impl GlobalAlloc for Counting {
+unsafe impl GlobalAlloc for CountingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.with(|count| count.set(count.get() + 1));
         // SAFETY: the caller keeps the contract of `alloc`.
@@ -51,15 +51,18 @@ unsafe impl GlobalAlloc for Counting {
 }
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 fn skin(cells: usize) -> Skin {
-    let text = generate(&Target { cells, ..Target::default() }).unwrap();
+    let text = generate(&SkinRequest { cells, ..SkinRequest::default() }).unwrap();
     Skin::parse("skin.toml", &text).unwrap()
 }
 
 /// Creates a loop over one bus in one mode; its records fit into a queue that is large enough.
-fn turn(skin: &Skin, mode: Mode) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, Table) {
+fn turn(
+    skin: &Skin,
+    mode: TorqueSource,
+) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, Table) {
     let (turn, input, table, _) = turn_of(skin, mode);
     (turn, input, table)
 }
@@ -67,7 +70,7 @@ fn turn(skin: &Skin, mode: Mode) -> (TickDriver, triple_buffer::Input<model::tab
 /// Creates such a loop, and the state of its bus.
 fn turn_of(
     skin: &Skin,
-    mode: Mode,
+    mode: TorqueSource,
 ) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, Table, Arc<BusState>) {
     let table = Table::new(skin, 0);
     let (input, snapshot) = triple_buffer::triple_buffer(table.snapshot());
@@ -90,11 +93,11 @@ fn a_tick_allocates_nothing_in_either_mode_also_on_a_bus_that_takes_nothing() {
     let served = ServerThread::start_in(&directory, "vcan0").unwrap();
     let options = BusOptions { directory: Some(directory), ..BusOptions::default() };
     let bus = Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap();
-    for mode in [Mode::Distributed, Mode::Compare] {
+    for mode in [TorqueSource::Distributed, TorqueSource::Compare] {
         assert_eq!(ticks(mode, &bus, true), Run { sent: 125, taken: 125, allocations: 0 }, "{mode:?}");
     }
     served.stop().unwrap();
-    let without = ticks(Mode::Distributed, &bus, false);
+    let without = ticks(TorqueSource::Distributed, &bus, false);
     assert_eq!(
         without,
         Run { sent: 240, taken: 0, allocations: 0 },
@@ -104,13 +107,13 @@ fn a_tick_allocates_nothing_in_either_mode_also_on_a_bus_that_takes_nothing() {
 
 #[test]
 fn a_halt_that_a_bus_refused_is_resent_before_its_next_joints_and_then_every_8() {
-    let (mut turn, mut snapshots, table) = turn(&skin(4), Mode::Distributed);
+    let (mut turn, mut snapshots, table) = turn(&skin(4), TorqueSource::Distributed);
     let mut taken = Vec::new();
     // No broadcast is read back, so the robot is halted within the first 100 ticks.
     for number in 0..200_u64 {
         snapshots.input_buffer_mut().copy_from(table.snapshot(), false);
         snapshots.publish();
-        turn.turn(
+        turn.run_tick(
             Tick { number, time: Micros(number * 2_000) },
             0,
             0,
@@ -130,7 +133,7 @@ fn a_halt_that_a_bus_refused_is_resent_before_its_next_joints_and_then_every_8()
 
 #[test]
 fn a_bus_that_is_back_gets_the_state_of_the_robot_before_its_next_joints() {
-    let (mut turn, mut snapshots, table, bus) = turn_of(&skin(4), Mode::Distributed);
+    let (mut turn, mut snapshots, table, bus) = turn_of(&skin(4), TorqueSource::Distributed);
     let mut said = Vec::new();
     for number in 0..64_u64 {
         bus.works.store(!(20..30).contains(&number), Ordering::Relaxed);
@@ -141,7 +144,7 @@ fn a_bus_that_is_back_gets_the_state_of_the_robot_before_its_next_joints() {
         snapshot.sums.halts = u32::from(number >= 44);
         snapshots.publish();
         let tick = Tick { number, time: Micros(number * 2_000) };
-        turn.turn(
+        turn.run_tick(
             tick,
             0,
             0,
@@ -175,7 +178,7 @@ fn a_bus_that_was_opened_again_is_found_by_the_tick_which_allocates_nothing_for_
     };
     assert_eq!(offer(), (true, 0));
     first.stop().unwrap();
-    assert!(monitor.lose(true) && !monitor.lose(true), "reported once");
+    assert!(monitor.mark_lost(true) && !monitor.mark_lost(true), "reported once");
     assert_eq!((offer(), link.is_gone(), link.state.is_there()), ((false, 0), true, false));
     assert!(monitor.reopen().is_err() && link.is_gone());
     let second = serve();
@@ -185,7 +188,7 @@ fn a_bus_that_was_opened_again_is_found_by_the_tick_which_allocates_nothing_for_
         (false, false),
         "open, and nothing was received on it yet"
     );
-    assert!(monitor.regain() && !monitor.regain() && link.state.is_there());
+    assert!(monitor.mark_working() && !monitor.mark_working() && link.state.is_there());
     assert_eq!(offer(), (true, 0));
     link.send(&frames).unwrap();
     assert_eq!(second.stop().unwrap().frames, 2);
@@ -199,7 +202,7 @@ struct Run {
 }
 
 /// Runs a thousand ticks that send on a bus, which accepts the frames or not.
-fn ticks(mode: Mode, bus: &Bus, carries: bool) -> Run {
+fn ticks(mode: TorqueSource, bus: &Bus, carries: bool) -> Run {
     let (mut turn, mut snapshots, table) = turn(&skin(253), mode);
     let mut run = Run { sent: 0, taken: 0, allocations: 0 };
     for number in 0..1_000_u64 {
@@ -209,7 +212,7 @@ fn ticks(mode: Mode, bus: &Bus, carries: bool) -> Run {
         snapshots.publish();
         let tick = Tick { number, time: Micros(number * 2_000) };
         let before = ALLOCATIONS.with(Cell::get);
-        turn.turn(tick, 0, realtime::now(), realtime::now, |_, frames| {
+        turn.run_tick(tick, 0, realtime::now(), realtime::now, |_, frames| {
             let taken = bus.try_send_all(frames);
             run.sent += frames.len();
             run.taken += if taken { frames.len() } else { 0 };

@@ -82,7 +82,7 @@ fn torque_off_by_one(folder: &Path, to: &str, place: usize) {
             torques += 1;
             if torques == place {
                 let mut packet = Packet::from_fd(&record.frame).unwrap();
-                packet.words = packet.words.with(1, packet.words.as_slice()[1] + 1);
+                packet.words = packet.words.with_word(1, packet.words.as_slice()[1] + 1);
                 record.frame = packet.frames(Format::Fd).next().unwrap();
             }
         }

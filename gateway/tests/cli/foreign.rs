@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use analysis::stats::{Report, Stats};
+use analysis::stats::{Stats, StatsReport};
 use model::decode::settle::Settler;
 use model::decode::{Decoded, Foreign};
 use protocol::can::{Format, Frame};
@@ -41,7 +41,7 @@ fn record(nanos: u64, frame: Frame) -> Record<'static> {
     Record { time, interface: "can0", frame, direction: None }
 }
 
-fn statistics(frames: &[(u64, Frame)]) -> Report {
+fn statistics(frames: &[(u64, Frame)]) -> StatsReport {
     let mut stats = Stats::default();
     for ((nanos, frame), decoded) in settled(frames) {
         stats.record(&record(nanos, frame), &decoded);

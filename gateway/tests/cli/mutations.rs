@@ -19,9 +19,9 @@ use rand_pcg::Pcg64Mcg;
 /// Number of files of the quick tests.
 const QUICK: u64 = 24;
 /// A time that only a hanging program needs.
-const HANGS: Duration = Duration::from_secs(120);
+const TIMEOUT: Duration = Duration::from_secs(120);
 /// Address space of a command in KiB. Reserved but unused memory counts here too.
-const ADDRESSES: &str = "400000";
+const ADDRESS_SPACE_KIB: &str = "400000";
 
 /// All commands that read a recording.
 const COMMANDS: &[&str] = &[
@@ -42,7 +42,7 @@ const COMMANDS: &[&str] = &[
 fn run(folder: &Path, line: &str) -> (ExitStatus, String) {
     let said = File::create(folder.join("said")).unwrap();
     let mut command = Command::new("sh");
-    command.args(["-c", "ulimit -v $1 && shift && exec \"$@\"", "sh", ADDRESSES]);
+    command.args(["-c", "ulimit -v $1 && shift && exec \"$@\"", "sh", ADDRESS_SPACE_KIB]);
     command.arg(env!("CARGO_BIN_EXE_skinbus")).args(line.split(' '));
     command.current_dir(folder).env("SKINBUS_DIR", folder.join("bus")).env("RUST_BACKTRACE", "0");
     let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(said).spawn().unwrap();
@@ -51,7 +51,7 @@ fn run(folder: &Path, line: &str) -> (ExitStatus, String) {
         if let Some(status) = child.try_wait().unwrap() {
             break status;
         }
-        if began.elapsed() > HANGS {
+        if began.elapsed() > TIMEOUT {
             child.kill().unwrap();
             break child.wait().unwrap();
         }

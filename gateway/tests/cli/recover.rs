@@ -116,7 +116,7 @@ fn a_damaged_chunk_is_omitted_and_said_and_the_others_are_kept() {
                 .unwrap();
         bytes[middle] ^= 0x10;
         let (said, copy) = recovered(&bytes).unwrap();
-        assert_eq!((said.damaged.0, said.messages, said.whole), (1, 80, true), "{said:?}");
+        assert_eq!((said.damaged.0, said.messages, said.has_end), (1, 80, true), "{said:?}");
         let lost = (number - 1) * 20;
         assert_eq!(messages(&copy), [&all[..lost], &all[lost + 20..]].concat());
         assert!(said.to_string().contains(" damaged bytes are lost"), "{said}");
@@ -158,7 +158,7 @@ fn types_and_topics_of_a_recording_by_others_are_known_from_its_summary() {
     // Without an end the other channels are unknown.
     let end = bytes.windows(9).position(|at| at == [15, 4, 0, 0, 0, 0, 0, 0, 0]).unwrap();
     let (said, _) = recovered(&damaged[..end]).unwrap();
-    assert!(said.messages == 0 && said.orphaned_messages >= 18 && said.is_little(), "{said:?}");
+    assert!(said.messages == 0 && said.orphaned_messages >= 18 && said.lost_more_than_kept(), "{said:?}");
 }
 
 #[test]
@@ -285,7 +285,7 @@ fn a_length_that_leads_over_others_or_beyond_the_end_hides_nothing() {
     // Blocks that were never written are zeros, as after a power loss.
     let zeros = [&bytes[..chunk], &[0; 300_000]].concat();
     let (said, _) = recovered(&zeros).unwrap();
-    assert_eq!((said.messages, said.unfinished, said.damaged.0), (20, 300_000, 0), "{said}");
+    assert_eq!((said.messages, said.unfinished_bytes, said.damaged.0), (20, 300_000, 0), "{said}");
 }
 
 #[test]

@@ -16,7 +16,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
 /// A time that only a hanging program needs.
-const HANGS: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 fn place() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
@@ -47,7 +47,7 @@ fn command(folder: &Path, line: &str) -> Command {
 fn until_it_waits(child: &mut Child, line: &str) {
     let (began, mut idle) = (Instant::now(), 0);
     while idle < 10 {
-        assert!(began.elapsed() < HANGS, "{line}: always busy");
+        assert!(began.elapsed() < TIMEOUT, "{line}: always busy");
         assert_eq!(child.try_wait().unwrap(), None, "{line}: it does not wait");
         let stat = fs::read_to_string(format!("/proc/{}/stat", child.id())).unwrap();
         let sleeps = stat.rsplit_once(')').unwrap().1.trim_start().starts_with('S');
@@ -63,7 +63,7 @@ fn end(child: &mut Child, line: &str, signal: Signal) -> ExitStatus {
         if let Some(status) = child.try_wait().unwrap() {
             return status;
         }
-        if began.elapsed() > HANGS {
+        if began.elapsed() > TIMEOUT {
             child.kill().unwrap();
             child.wait().unwrap();
             panic!("{line}: {signal:?} does not end it");

@@ -12,7 +12,7 @@ use tempfile::TempDir;
 use trace::capture::Reader;
 
 /// Number of rows from one compared row to the next.
-const EACH: usize = 9;
+const ROW_INTERVAL: usize = 9;
 
 fn recordings() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings")
@@ -62,7 +62,7 @@ fn same(one: f64, other: &Value) -> bool {
 /// Compares rows with `skinbus explain` for their epochs. Returns the number of torques other than 0.
 fn compared(folder: &TempDir, rows: &[Row], capture: &str) -> usize {
     let (mut loaded, mut next) = (0, 0.0);
-    for row in rows.iter().step_by(EACH).chain(rows.last()) {
+    for row in rows.iter().step_by(ROW_INTERVAL).chain(rows.last()) {
         let seconds: f64 = row["time_s"].parse().unwrap();
         assert!(seconds >= next, "in order of time");
         next = seconds;

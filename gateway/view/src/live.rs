@@ -4,7 +4,7 @@ mod bus;
 mod recent;
 mod said;
 
-use model::table::Status;
+use model::table::CellStatus;
 use protocol::can::Frame;
 use protocol::id::CellId;
 use protocol::skin::Skin;
@@ -106,11 +106,11 @@ impl Live {
     /// it, or if its torque does while the sensor values are unknown.
     pub fn touched(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
         self.buses.iter().enumerate().flat_map(move |(index, bus)| {
-            let cells = bus.table.cells().iter().zip(bus.table.sensors(now)).enumerate();
+            let cells = bus.table.cells().iter().zip(bus.table.presumed_sensors(now)).enumerate();
             cells.map(move |(place, (cell, (sensors, status)))| {
-                let is_active = matches!(status, Status::Active | Status::Stale);
+                let is_active = matches!(status, CellStatus::Active | CellStatus::Stale);
                 let touched = sensors.map_or(is_active, |sensors| bus.central.force(place, &sensors) > 0.0);
-                (index, cell.node, [touched, status == Status::Dead])
+                (index, cell.node, [touched, status == CellStatus::Dead])
             })
         })
     }

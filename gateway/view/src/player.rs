@@ -289,11 +289,11 @@ impl Player {
                 self.tape = Tape::new(self.skin.clone(), self.zero);
                 match self.is_exact {
                     true => SeekPoint::default(),
-                    false => self.places.before(at.saturating_sub(PREVIEW_NS)),
+                    false => self.places.point_before(at.saturating_sub(PREVIEW_NS)),
                 }
             }
         };
-        self.reader.go_to(&self.places, place)?;
+        self.reader.seek(&self.places, place)?;
         if place == SeekPoint::default() {
             self.tape.begin(self.reader.extras());
         }

@@ -200,7 +200,7 @@ fn tube(chain: usize, row: u8, cells: &[&SceneCell]) -> Option<Tube> {
     let placed: Vec<_> = cells.iter().map(|cell| (cell.position, cell.normal)).collect();
     let cylinder = Cylinder::fit(&placed)?;
     let ([from, to], radius) = (cylinder.along, cylinder.radius);
-    let ends = [from - radius * 0.2, to + radius * 0.2].map(|along| cylinder.at(along));
+    let ends = [from - radius * 0.2, to + radius * 0.2].map(|along| cylinder.axis_point(along));
     Some(Tube { chain, row, ends, radius: radius * 0.97 })
 }
 

@@ -181,7 +181,7 @@ fn receive(
         let read_to = last.map_or(UP_TO_DATE, |last| last.at_nanos / 1_000);
         shared.read_to.store(read_to, Ordering::Relaxed);
         let mut live = locked(live);
-        follower.parts(|part| {
+        follower.for_each_item(|part| {
             if let FollowedItem::Frame(received) = part {
                 live.apply_frame(index, Micros(received.at_nanos / 1_000), &received.frame);
             }
@@ -229,7 +229,7 @@ fn publish(
             if server.page_count() > 0 {
                 let snapshot = live.snapshot(now, &pressed);
                 let said = number.is_multiple_of(SNAPSHOTS_PER_STATUS).then(|| {
-                    let seen = |cell| state.as_ref().map(|state: &BenchState| state.seen_from(cell));
+                    let seen = |cell| state.as_ref().map(|state: &BenchState| state.for_cell(cell));
                     let mut said = StatusMessage { bench: seen(None), ..live.status_message(now) };
                     let all = to_json(&said);
                     let own = server.selected_cells().into_iter().map(|(page, chosen)| {

@@ -77,8 +77,8 @@ pub struct BusModel<T = u64> {
     free_at: u64,
     /// Time of the request that ended the last idle period of the bus, in ns.
     ready_at: u64,
-    on_wire: Option<(Waiting<T>, Attempt<T>)>,
-    contenders: BinaryHeap<Waiting<T>>,
+    on_wire: Option<(WaitingFrame<T>, Attempt<T>)>,
+    contenders: BinaryHeap<WaitingFrame<T>>,
     queues: Vec<Queue<T>>,
     ended: VecDeque<Attempt<T>>,
     requests: u64,
@@ -88,7 +88,7 @@ pub struct BusModel<T = u64> {
 
 /// A waiting frame.
 #[derive(Clone, Copy, Debug)]
-struct Waiting<T> {
+struct WaitingFrame<T> {
     request: Request<T>,
     /// Sequence number of the request. Of two frames with one identifier, the one requested first is sent first.
     number: u64,
@@ -99,29 +99,29 @@ struct Waiting<T> {
 struct Queue<T> {
     /// True if a frame of this queue takes part in arbitration or is on the wire.
     is_contending: bool,
-    waiting_frames: VecDeque<Waiting<T>>,
+    waiting_frames: VecDeque<WaitingFrame<T>>,
 }
 
-impl<T> Ord for Waiting<T> {
+impl<T> Ord for WaitingFrame<T> {
     /// Orders frames so that the maximum, which leaves the heap first, wins the arbitration.
     fn cmp(&self, other: &Self) -> Ordering {
         (other.request.priority, other.number).cmp(&(self.request.priority, self.number))
     }
 }
 
-impl<T> PartialOrd for Waiting<T> {
+impl<T> PartialOrd for WaitingFrame<T> {
     fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
         Some(self.cmp(other))
     }
 }
 
-impl<T> PartialEq for Waiting<T> {
+impl<T> PartialEq for WaitingFrame<T> {
     fn eq(&self, other: &Self) -> bool {
         self.cmp(other) == Ordering::Equal
     }
 }
 
-impl<T> Eq for Waiting<T> {}
+impl<T> Eq for WaitingFrame<T> {}
 
 impl<T: Copy> BusModel<T> {
     /// Creates an idle bus without errors.
@@ -163,7 +163,7 @@ impl<T: Copy> BusModel<T> {
     pub fn request(&mut self, mut request: Request<T>) {
         request.at = request.at.max(self.newest);
         self.run_until(request.at);
-        let waiting = Waiting { request, number: self.requests };
+        let waiting = WaitingFrame { request, number: self.requests };
         self.requests += 1;
         if self.waiting == 0 && self.on_wire.is_none() {
             self.ready_at = request.at;

@@ -45,7 +45,7 @@ impl BitErrors {
         }
         let mut errors =
             Self { dice: Pcg64Mcg::seed_from_u64(seed), log_undamaged: (-rate).ln_1p(), undamaged_bits: 0 };
-        errors.draw();
+        errors.draw_next();
         Ok(errors)
     }
 
@@ -55,7 +55,7 @@ impl BitErrors {
         clippy::cast_sign_loss,
         reason = "above 0; larger values saturate"
     )]
-    fn draw(&mut self) {
+    fn draw_next(&mut self) {
         let uniform: f64 = self.dice.random();
         // `1 - uniform` is in (0, 1]. Without errors the distance is unlimited.
         self.undamaged_bits = if self.log_undamaged < 0.0 {
@@ -74,7 +74,7 @@ impl BitErrors {
             return None;
         }
         let sent = u32::try_from(self.undamaged_bits).unwrap_or(exposed) + 1;
-        self.draw();
+        self.draw_next();
         let head = if bits.data > 0 { bits.nominal.saturating_sub(FD_TAIL) } else { bits.nominal };
         let data = sent.saturating_sub(head).min(bits.data);
         Some(Bits { nominal: sent - data + ERROR_FRAME, data })

@@ -13,7 +13,7 @@ use super::calls;
 use super::slot::Slot;
 use crate::can::FD_BYTES;
 
-pub use super::slot::Notes;
+pub use super::slot::DatagramInfo;
 
 /// Maximum number of datagrams per system call.
 pub const BATCH: usize = 64;
@@ -116,9 +116,9 @@ impl<'a> Datagram<'a> {
     /// Returns the datagram's time of arrival and the socket's drop count. Each is `None` if the kernel did not report
     /// it.
     #[must_use]
-    pub fn notes(self) -> Notes {
+    pub fn info(self) -> DatagramInfo {
         let words = self.0.control.map(u64::to_ne_bytes);
-        Notes::read(words.as_flattened().get(..self.0.control_len).unwrap_or_default())
+        DatagramInfo::read(words.as_flattened().get(..self.0.control_len).unwrap_or_default())
     }
 }
 
@@ -296,7 +296,7 @@ mod tests {
             assert_eq!(batch.receive(&b).unwrap(), 1);
             let datagram = batch.datagrams().next().unwrap();
             assert_eq!(datagram.bytes().unwrap(), [7; 16]);
-            assert!(datagram.notes().at_nanos.is_some());
+            assert!(datagram.info().at_nanos.is_some());
             // All write ends of the pipe are closed, so the read returns 0.
             assert_eq!(rustix::io::read(&read, &mut [0]).unwrap(), 0, "{count}");
         }

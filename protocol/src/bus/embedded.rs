@@ -11,8 +11,8 @@ use super::{Filter, calls};
 pub use client::seqpacket;
 pub(super) use client::{Embedded, closed_error};
 pub use directory::{
-    DirectoryError, MARK, address, default_directory, make_directory, mark, open_directory, remove_directory,
-    socket_name,
+    DirectoryError, MARKER_FILE, address, default_directory, make_directory, open_directory,
+    remove_directory, socket_name, write_marker,
 };
 
 mod client;
@@ -93,20 +93,20 @@ pub struct FilterPart {
 }
 
 impl FilterPart {
-    const HEAD: u8 = b'F';
-    const FIRST: u8 = 1;
-    const LAST: u8 = 2;
+    const FILTER_TAG: u8 = b'F';
+    const FIRST_PART: u8 = 1;
+    const LAST_PART: u8 = 2;
     /// Maximum number of filters in a piece. The datagram must not be longer than an FD frame, because a server reads
     /// no longer ones.
-    const FILTERS: usize = 8;
+    const MAX_FILTERS: usize = 8;
 
     /// Splits a list of filters into pieces for one datagram each.
     pub fn split(filters: &[Filter]) -> impl Iterator<Item = Self> + use<'_> {
-        let parts = filters.len().div_ceil(Self::FILTERS).max(1);
+        let parts = filters.len().div_ceil(Self::MAX_FILTERS).max(1);
         (0..parts).map(move |part| Self {
             first: part == 0,
             last: part == parts - 1,
-            filters: filters.iter().skip(part * Self::FILTERS).take(Self::FILTERS).copied().collect(),
+            filters: filters.iter().skip(part * Self::MAX_FILTERS).take(Self::MAX_FILTERS).copied().collect(),
         })
     }
 
@@ -114,7 +114,8 @@ impl FilterPart {
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
         let flag = |set, flag| if set { flag } else { 0 };
-        let mut bytes = vec![Self::HEAD, flag(self.first, Self::FIRST) | flag(self.last, Self::LAST)];
+        let mut bytes =
+            vec![Self::FILTER_TAG, flag(self.first, Self::FIRST_PART) | flag(self.last, Self::LAST_PART)];
         encode_filters(&self.filters, &mut bytes);
         bytes
     }
@@ -122,9 +123,9 @@ impl FilterPart {
     /// Decodes a datagram. Returns `None` if it is not a piece of a list of filters. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
-        let &[Self::HEAD, flags @ 0..=3, ref rest @ ..] = bytes else { return None };
-        let filters = decode_filters(rest).filter(|filters| filters.len() <= Self::FILTERS)?;
-        Some(Self { first: flags & Self::FIRST != 0, last: flags & Self::LAST != 0, filters })
+        let &[Self::FILTER_TAG, flags @ 0..=3, ref rest @ ..] = bytes else { return None };
+        let filters = decode_filters(rest).filter(|filters| filters.len() <= Self::MAX_FILTERS)?;
+        Some(Self { first: flags & Self::FIRST_PART != 0, last: flags & Self::LAST_PART != 0, filters })
     }
 }
 

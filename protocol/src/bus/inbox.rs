@@ -77,7 +77,7 @@ impl Inbox {
                 return true;
             }
             if let Some(Ok(frame)) = bytes.map(Frame::from_bytes) {
-                let notes = datagram.notes();
+                let notes = datagram.info();
                 *dropped = notes.dropped.unwrap_or(*dropped);
                 let at_nanos = notes.at_nanos.unwrap_or(0);
                 frames.push(Received { frame, at_nanos, own: carrier.is_own(datagram) });

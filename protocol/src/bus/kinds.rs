@@ -201,13 +201,13 @@ pub enum KindsError {
 impl KindChoices {
     /// Requests the same kind for every bus.
     #[must_use]
-    pub const fn all(kind: KindChoice) -> Self {
+    pub const fn same_for_all(kind: KindChoice) -> Self {
         Self { named: BTreeMap::new(), others: kind }
     }
 
     /// Requests the given kind for each of these buses, and [`KindChoice::Auto`] for others.
     #[must_use]
-    pub fn exactly<'a>(buses: impl IntoIterator<Item = (&'a str, BusKind)>) -> Self {
+    pub fn from_kinds<'a>(buses: impl IntoIterator<Item = (&'a str, BusKind)>) -> Self {
         let named = buses.into_iter().map(|(name, kind)| (name.to_owned(), KindChoice::Only(kind)));
         Self { named: named.collect(), others: KindChoice::Auto }
     }
@@ -277,8 +277,8 @@ mod tests {
         assert_eq!(["vcan0", "vcan1"].map(|bus| mixed.kind_of(bus)), [SOCKETCAN, EMBEDDED]);
         let rest = kinds(&["vcan1=socketcan"]).unwrap();
         assert_eq!(["vcan0", "vcan1"].map(|bus| rest.kind_of(bus)), [KindChoice::Auto, SOCKETCAN]);
-        assert_eq!(KindChoices::all(EMBEDDED).kind_of("vcan9"), EMBEDDED);
-        assert_eq!(KindChoices::exactly([("can0", BusKind::SocketCan)]).kind_of("can0"), SOCKETCAN);
+        assert_eq!(KindChoices::same_for_all(EMBEDDED).kind_of("vcan9"), EMBEDDED);
+        assert_eq!(KindChoices::from_kinds([("can0", BusKind::SocketCan)]).kind_of("can0"), SOCKETCAN);
     }
 
     #[test]

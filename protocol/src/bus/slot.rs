@@ -14,14 +14,14 @@ pub(super) struct Slot {
 
 /// The kernel's control messages about a datagram, decoded.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Notes {
+pub struct DatagramInfo {
     /// Time of arrival in nanoseconds of the wall clock (`SO_TIMESTAMPNS`).
     pub at_nanos: Option<u64>,
     /// Number of datagrams that the socket has dropped so far (`SO_RXQ_OVFL`).
     pub dropped: Option<u32>,
 }
 
-impl Notes {
+impl DatagramInfo {
     /// Decodes control messages.
     pub(super) fn read(control: &[u8]) -> Self {
         let mut notes = Self::default();
@@ -49,17 +49,17 @@ impl<'a> Iterator for ControlMessages<'a> {
     type Item = ControlMessage<'a>;
 
     fn next(&mut self) -> Option<ControlMessage<'a>> {
-        const WORD: usize = size_of::<usize>();
-        const HEAD: usize = size_of::<libc::cmsghdr>();
+        const WORD_LEN: usize = size_of::<usize>();
+        const HEADER_LEN: usize = size_of::<libc::cmsghdr>();
         loop {
-            let (head, _) = self.0.split_first_chunk::<HEAD>()?;
-            let (len, rest) = head.split_at(WORD);
+            let (head, _) = self.0.split_first_chunk::<HEADER_LEN>()?;
+            let (len, rest) = head.split_at(WORD_LEN);
             let len = len.try_into().map_or(0, usize::from_ne_bytes);
             let number = |at| {
                 rest.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |&bytes| i32::from_ne_bytes(bytes))
             };
-            let data = self.0.get(HEAD..len)?;
-            self.0 = self.0.get(len.next_multiple_of(WORD)..).unwrap_or_default();
+            let data = self.0.get(HEADER_LEN..len)?;
+            self.0 = self.0.get(len.next_multiple_of(WORD_LEN)..).unwrap_or_default();
             if number(0) == libc::SOL_SOCKET {
                 return Some(ControlMessage { kind: number(4), data });
             }
@@ -94,7 +94,7 @@ mod tests {
     proptest! {
         #[test]
         fn no_control_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..80)) {
-            let _ = Notes::read(&bytes);
+            let _ = DatagramInfo::read(&bytes);
         }
     }
 }

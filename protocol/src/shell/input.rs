@@ -60,13 +60,13 @@ pub fn open(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
     let kind = file.metadata()?.file_type();
     if !kind.is_file() {
-        claim_descriptor(own_descriptor(path).ok_or_else(|| refused(kind))?)?;
+        claim_descriptor(own_descriptor(path).ok_or_else(|| not_readable_error(kind))?)?;
         fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
     }
     Ok(file)
 }
 
-fn refused(kind: FileType) -> io::Error {
+fn not_readable_error(kind: FileType) -> io::Error {
     let what = if kind.is_dir() {
         "it is a folder, a file is needed"
     } else if kind.is_fifo() {
@@ -98,7 +98,7 @@ pub fn own_descriptor(path: &Path) -> Option<u32> {
     let mut path = path.to_owned();
     // The kernel follows at most 40 links as well.
     for _ in 0..40 {
-        let folder = fs::canonicalize(folder_of(&path)).ok()?;
+        let folder = fs::canonicalize(parent_folder(&path)).ok()?;
         if folder == own {
             return path.file_name()?.to_str()?.parse().ok();
         }
@@ -109,7 +109,7 @@ pub fn own_descriptor(path: &Path) -> Option<u32> {
 
 /// Returns the folder that contains a file.
 #[must_use]
-pub fn folder_of(path: &Path) -> &Path {
+pub fn parent_folder(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
 }
 

@@ -20,8 +20,8 @@ const MAX_WRITE: usize = 4_096;
 /// Returns the stop flag, which the signal handler sets.
 #[must_use]
 pub fn stop_flag() -> &'static Arc<AtomicBool> {
-    static FLAG: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
-    &FLAG
+    static STOP_FLAG: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
+    &STOP_FLAG
 }
 
 /// A writer for pipes and terminals. A reader that does not read blocks the writer only until a stop request: one

@@ -45,7 +45,7 @@ impl Failure {
 
     /// Appends the text of a further error to the message.
     #[must_use]
-    pub fn and(mut self, more: impl Display) -> Self {
+    pub fn append(mut self, more: impl Display) -> Self {
         self.text += &format!("; and {more}");
         self
     }
@@ -233,7 +233,7 @@ mod tests {
         assert_eq!(Failure::usage("no"), Failure::with_code(2, "no"));
         assert_eq!(Failure::run("no"), Failure::with_code(1, "no"));
         assert_eq!(exit_code("test", Err(Failure::with_code(3, ""))), ExitCode::from(3));
-        assert_eq!(Failure::usage("no").and("no again"), Failure::usage("no; and no again"));
+        assert_eq!(Failure::usage("no").append("no again"), Failure::usage("no; and no again"));
     }
     #[test]
     fn a_reader_may_leave_and_a_disk_may_not_be_full() {

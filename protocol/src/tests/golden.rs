@@ -262,7 +262,7 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
         };
         let mut spoilt = sound;
         let expected = match Parameter::from_number(*number) {
-            None => (*number, Answer::UNKNOWN),
+            None => (*number, Answer::UNKNOWN_PARAMETER),
             Some(Parameter::Reply) => (*number, cannot_be(Reply::from_words(*words))),
             Some(Parameter::Sensing) => (*number, cannot_be(Sensing::from_words(*words))),
             Some(Parameter::Events) => (*number, cannot_be(Events::from_words(*words))),
@@ -319,8 +319,9 @@ fn the_documents_torque_comes_out() {
     let (parameters, _) = staged(SESSION);
     let force: i64 = 3 * 1_024;
     assert!(force >= i64::from(parameters.contact.contact_threshold.to_bits()));
-    let fused = Acc::<22>::from_steps(i64::from(parameters.contact.alpha_c.to_bits()) * force).finer::<24>();
-    assert!(fused >= parameters.contact.force_threshold.widen().finer());
+    let fused = Acc::<22>::from_steps(i64::from(parameters.contact.alpha_c.to_bits()) * force)
+        .with_fraction_bits::<24>();
+    assert!(fused >= parameters.contact.force_threshold.widen().with_fraction_bits());
     let rounded = (fused.steps() + (1 << 7)) >> 8;
     let torque =
         [-1_433, 4_260, 0, 0, 0, 0].map(|j| TorqueFormat::Q3_12.round(Acc::<30>::from_steps(j * rounded)));

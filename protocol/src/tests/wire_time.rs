@@ -40,7 +40,7 @@ fn every_counted_frame_has_its_bits() {
 
 #[test]
 fn the_worst_packet_takes_what_the_documents_say() {
-    let fd = Shape { coding: Coding::FdSwitched, extended: false, len: 16 }.worst();
+    let fd = Shape { coding: Coding::FdSwitched, extended: false, len: 16 }.max_bits();
     assert_eq!(fd, Bits { nominal: 32, data: 192 });
     let micros = |text: &str| fd.seconds(text.parse().unwrap()) * 1e6;
     for (rates, expected) in
@@ -48,7 +48,7 @@ fn the_worst_packet_takes_what_the_documents_say() {
     {
         assert!((micros(rates) - expected).abs() < 1e-9, "{rates}: {}", micros(rates));
     }
-    let segment = Shape { coding: Coding::Classic, extended: false, len: 8 }.worst();
+    let segment = Shape { coding: Coding::Classic, extended: false, len: 8 }.max_bits();
     assert_eq!(2 * segment.nanoseconds(BitRates::classic(1_000_000).unwrap()), 266_000);
 }
 
@@ -117,7 +117,7 @@ proptest! {
     #[test]
     fn no_frame_is_shorter_than_the_best_or_longer_than_the_worst(frame in any_frame()) {
         let (bits, shape) = (Bits::from_frame(&frame).unwrap(), Shape::from_frame(&frame));
-        let (best, worst) = (shape.best(), shape.worst());
+        let (best, worst) = (shape.min_bits(), shape.max_bits());
         prop_assert!(best.nominal <= bits.nominal && bits.nominal <= worst.nominal, "{best:?} {bits:?} {worst:?}");
         prop_assert!(best.data <= bits.data && bits.data <= worst.data, "{best:?} {bits:?} {worst:?}");
     }

@@ -88,7 +88,7 @@ impl TorqueFormat {
 
     /// Converts a word to Nm or N.
     #[must_use]
-    pub fn real(self, word: i16) -> f64 {
+    pub fn to_real(self, word: i16) -> f64 {
         f64::from(word) * self.step()
     }
 
@@ -112,7 +112,7 @@ impl TorqueFormat {
     /// Returns the upper bound of the range in Nm or N, exclusive.
     #[must_use]
     pub fn bound(self) -> f64 {
-        -self.real(i16::MIN)
+        -self.to_real(i16::MIN)
     }
 
     /// Rounds an exact torque to the nearest word, ties up. Torques out of range saturate.
@@ -291,13 +291,13 @@ impl<const F: u32> Acc<F> {
 
     /// Adds two sums; saturates at the limits of 64 bits.
     #[must_use]
-    pub const fn plus(self, rhs: Self) -> Self {
+    pub const fn saturating_add(self, rhs: Self) -> Self {
         Self(self.0.saturating_add(rhs.0))
     }
 
     /// Converts to finer steps. `G` must be at least `F`, which is checked at compile time.
     #[must_use]
-    pub const fn finer<const G: u32>(self) -> Acc<G> {
+    pub const fn with_fraction_bits<const G: u32>(self) -> Acc<G> {
         const { assert!(G >= F, "finer means more fractional bits") }
         Acc(self.0.saturating_mul(1_i64 << (G - F)))
     }
@@ -412,7 +412,7 @@ mod tests {
     #[test]
     fn a_torque_format_has_its_range() {
         let format = TorqueFormat::Q3_12;
-        assert_eq!((format.real(i16::MIN), format.real(1), format.bound()), (-8.0, 1.0 / 4_096.0, 8.0));
+        assert_eq!((format.to_real(i16::MIN), format.to_real(1), format.bound()), (-8.0, 1.0 / 4_096.0, 8.0));
         assert_eq!([Q3_12::MIN, Q3_12::ZERO, Q3_12::MAX].map(Q::is_saturated), [true, false, true]);
     }
 }

@@ -73,7 +73,7 @@ impl Rank {
 
     /// Returns the rank of a child, one wire deeper.
     #[must_use]
-    pub const fn below(self) -> Self {
+    pub const fn child(self) -> Self {
         Self { round: self.round, depth: self.depth.saturating_add(1) }
     }
 }
@@ -138,7 +138,7 @@ pub struct Walk {
 }
 
 const RECEIVES: u8 = 1 << 3;
-const UP: u8 = 1 << 4;
+const IS_PARENT: u8 = 1 << 4;
 const UNNUMBERED: u8 = 1 << 5;
 const HAS_RANK: u8 = 1 << 6;
 
@@ -150,7 +150,7 @@ impl PortMessage {
             Self::Hello(hello) => {
                 let flag = |set, flag| if set { flag } else { 0 };
                 let flags = flag(hello.receives, RECEIVES)
-                    | flag(hello.is_parent, UP)
+                    | flag(hello.is_parent, IS_PARENT)
                     | flag(hello.unnumbered, UNNUMBERED)
                     | flag(hello.rank.is_some(), HAS_RANK);
                 let (round, depth) = hello.rank.map_or((0, 0), |rank| (rank.round, rank.depth));
@@ -179,7 +179,7 @@ impl PortMessage {
                 number: b,
                 port: c & 7,
                 receives: c & RECEIVES != 0,
-                is_parent: c & UP != 0,
+                is_parent: c & IS_PARENT != 0,
                 unnumbered: c & UNNUMBERED != 0,
                 rank: if c & HAS_RANK == 0 { None } else { Some(Rank { round: d, depth: e }) },
             }),
@@ -274,7 +274,7 @@ mod tests {
         assert!(rank(0, 9).is_better_than(rank(255, 1)));
         assert!(rank(4, 1).is_better_than(rank(4, 2)));
         assert!(!rank(4, 2).is_better_than(rank(4, 2)));
-        assert!(rank(4, 2).is_better_than(rank(4, 2).below()));
+        assert!(rank(4, 2).is_better_than(rank(4, 2).child()));
     }
 
     proptest! {

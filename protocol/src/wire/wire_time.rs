@@ -35,7 +35,7 @@ const CLASSIC_TAIL: u32 = 13;
 const FD_TAIL: u32 = 12;
 /// Number of bits between data and ACK of an FD frame with up to 16 bytes: stuff bit count, CRC of 17 bits, 6 fixed
 /// stuff bits, CRC delimiter.
-const FD_CHECK: u32 = 28;
+const FD_CRC_BITS: u32 = 28;
 /// Number of bits between data and ACK of an FD frame with more than 16 bytes, with a CRC of 21 bits and 7 fixed stuff
 /// bits.
 const FD_LONG_CHECK: u32 = 33;
@@ -79,9 +79,9 @@ impl Bits {
     /// short, and it is exact if both rates divide 1 GHz.
     #[must_use]
     pub const fn nanoseconds(self, rates: BitRates) -> u64 {
-        const SECOND: u64 = 1_000_000_000;
-        let nominal = (self.nominal as u64 * SECOND).div_ceil(rates.nominal() as u64);
-        let data = (self.data as u64 * SECOND).div_ceil(rates.data() as u64);
+        const NANOS_PER_SECOND: u64 = 1_000_000_000;
+        let nominal = (self.nominal as u64 * NANOS_PER_SECOND).div_ceil(rates.nominal() as u64);
+        let data = (self.data as u64 * NANOS_PER_SECOND).div_ceil(rates.data() as u64);
         nominal + data
     }
 }
@@ -135,7 +135,7 @@ fn fd(frame: &Frame) -> Bits {
 /// Returns the bits of an FD frame. The frame has `head` bits up to BRS (with stuff bits), `bytes` data bytes, and
 /// `stuffed` stuff bits after BRS.
 fn fd_bits(switched: bool, head: u32, bytes: usize, stuffed: u32) -> Bits {
-    let check = if bytes > 16 { FD_LONG_CHECK } else { FD_CHECK };
+    let check = if bytes > 16 { FD_LONG_CHECK } else { FD_CRC_BITS };
     let data = 5 + 8 * u32::try_from(bytes).unwrap_or(0) + check + stuffed;
     let nominal = head + FD_TAIL;
     if switched { Bits { nominal, data } } else { Bits { nominal: nominal + data, data: 0 } }

@@ -10,13 +10,13 @@ use crate::fault::Party;
 use crate::oracle::Truth;
 
 /// The time between two frames on the wire, about that of vcan.
-const FRAME: Span = Span(5);
+const FRAME_INTERVAL: Span = Span(5);
 /// The minimum and the maximum latency from the wire to a receiver, without faults.
 const LATENCY: (u64, u64) = (10, 60);
 
 /// A frame that was on the wire.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct OnTheWire {
+pub struct WireFrame {
     /// The time at which the frame was on the wire.
     pub at: Micros,
     /// The sender of the frame.
@@ -52,12 +52,12 @@ pub(super) struct Inlet {
 
 impl Bench {
     /// Schedules the next time at which the model of the real bus is advanced.
-    pub(super) fn look_at_the_bus(&mut self) {
+    pub(super) fn schedule_bus_advance(&mut self) {
         let Some(real) = &mut self.real else { return };
         if let Some(next) = real.next()
-            && real.look.is_none_or(|look| next < look)
+            && real.next_advance.is_none_or(|look| next < look)
         {
-            real.look = Some(next);
+            real.next_advance = Some(next);
             self.agenda.enter(next, Event::Bus);
         }
     }
@@ -88,30 +88,30 @@ impl Bench {
             }
             return;
         }
-        self.stand(&sent);
+        self.put_on_wire(&sent);
         if let Some(held) = self.held.take() {
-            self.stand(&held);
+            self.put_on_wire(&held);
         }
     }
 
     /// Puts a frame on the wire, or into the queue of the real bus.
-    fn stand(&mut self, sent: &Sent) {
+    fn put_on_wire(&mut self, sent: &Sent) {
         if let Some(real) = &mut self.real {
             real.request(self.agenda.now, &sent.frame, *sent);
-            self.look_at_the_bus();
+            self.schedule_bus_advance();
             return;
         }
         let stood = self.agenda.now.max(self.free);
-        self.free = stood + FRAME;
-        self.reach(stood, sent);
+        self.free = stood + FRAME_INTERVAL;
+        self.distribute(stood, sent);
     }
 
     /// Distributes a frame from the wire to its receivers.
-    pub(super) fn reach(&mut self, stood: Micros, sent: &Sent) {
+    pub(super) fn distribute(&mut self, stood: Micros, sent: &Sent) {
         let from = sent.truth.from;
-        self.wire.push(OnTheWire { at: stood, from, frame: sent.frame });
+        self.wire.push(WireFrame { at: stood, from, frame: sent.frame });
         self.pass(Party::Gateway, stood, sent);
-        let hearers = self.hearers.get(&sent.frame.raw_id()).cloned().unwrap_or_default();
+        let hearers = self.subscribers.get(&sent.frame.raw_id()).cloned().unwrap_or_default();
         for cell_slot in hearers {
             if from != Party::CellSlot(cell_slot) {
                 self.pass(Party::CellSlot(cell_slot), stood, sent);
@@ -161,13 +161,13 @@ impl Bench {
             match to {
                 Party::Gateway => {
                     let own = truth.from == Party::Gateway;
-                    self.gateway.hear(stood, own, &frame);
-                    self.oracle.hear(stood, &truth, &frame);
+                    self.gateway.receive(stood, own, &frame);
+                    self.oracle.receive(stood, &truth, &frame);
                 }
                 Party::CellSlot(cell_slot) => {
                     let now = self.agenda.now;
                     let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
-                    let packets = there.hear(now, stood, frame);
+                    let packets = there.receive(now, stood, frame);
                     self.sends(cell_slot, &packets);
                 }
                 Party::UnknownNode => {}

@@ -8,7 +8,7 @@ use quote::ToTokens;
 use syn::{Expr, Item, ItemMod, Lit, Meta};
 
 use super::Names;
-use super::tokens::{Named, is_of_tests};
+use super::tokens::{UsedNames, is_of_tests};
 
 /// A module: a file, or a part of one in braces.
 #[derive(Default)]
@@ -62,7 +62,7 @@ impl Modules {
         of_file: &[String],
     ) {
         let mut module = Module { file: of_file.to_vec(), ..Module::default() };
-        let mut named = Named::default();
+        let mut named = UsedNames::default();
         for item in items {
             let Item::Mod(it) = item else {
                 if let Item::Macro(it) = item
@@ -71,7 +71,7 @@ impl Modules {
                     self.macros.insert(ident.to_string(), names.to_vec());
                 }
                 module.defined.extend(defined(item));
-                named.take(item.to_token_stream());
+                named.add(item.to_token_stream());
                 continue;
             };
             if it.attrs.iter().any(|attribute| is_of_tests(&attribute.meta.to_token_stream())) {

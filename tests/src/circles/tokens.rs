@@ -8,7 +8,7 @@ use super::Names;
 
 /// The paths and imports that a source contains.
 #[derive(Default)]
-pub(super) struct Named {
+pub(super) struct UsedNames {
     /// Paths as they are written. A single name is included if it is a type, a constant or a call, whose `use` may be a
     /// glob; the name of a macro ends with `!`.
     pub(super) paths: BTreeSet<Names>,
@@ -22,9 +22,9 @@ pub(super) fn is_of_tests(attribute: &TokenStream) -> bool {
     text == "test" || ["cfg (test", "cfg (all (test"].iter().any(|of_tests| text.starts_with(of_tests))
 }
 
-impl Named {
+impl UsedNames {
     /// Adds the names in these tokens.
-    pub(super) fn take(&mut self, tokens: TokenStream) {
+    pub(super) fn add(&mut self, tokens: TokenStream) {
         let tokens: Vec<_> = tokens.into_iter().collect();
         let mut at = 0;
         while let Some(token) = tokens.get(at) {
@@ -35,7 +35,7 @@ impl Named {
                 TokenTree::Ident(_) if is_part_of_another(&tokens, at) => at + 1,
                 TokenTree::Ident(_) => self.path(&tokens, at),
                 TokenTree::Group(group) => {
-                    self.take(group.stream());
+                    self.add(group.stream());
                     at + 1
                 }
                 TokenTree::Punct(sign) if sign.as_char() == '#' => self.attribute(&tokens, at + 1),
@@ -109,7 +109,7 @@ impl Named {
         at += usize::from(is_sign(tokens, at, '!'));
         let Some(TokenTree::Group(group)) = tokens.get(at) else { return at };
         if !is_of_tests(&group.stream()) {
-            self.take(group.stream());
+            self.add(group.stream());
             self.quoted(group.stream());
             return at + 1;
         }

@@ -36,7 +36,7 @@ fn run_cell(from: &mut Unstructured<'_>) -> Result<()> {
     };
     let mut node = Node::new(identity, format, &flash, from.arbitrary()?, Micros(0));
     if from.arbitrary()? {
-        node.wire(from.arbitrary()?);
+        node.set_wired_ports(from.arbitrary()?);
     }
     let mut now = Micros(0);
     while !from.is_empty() {
@@ -118,7 +118,7 @@ fn track(from: &mut Unstructured<'_>) -> Result<()> {
         match from.int_in_range(0..=7)? {
             0 => {
                 now.0 += u64::from(from.arbitrary::<u32>()?);
-                let silent = cell.falls_silent(now);
+                let silent = cell.handle_timeout(now);
                 assert!(!silent || cell.is_dead());
             }
             1 => cell.account.interrupt(),
@@ -126,7 +126,7 @@ fn track(from: &mut Unstructured<'_>) -> Result<()> {
                 cell.account.reject();
                 came += 1;
             }
-            3 => cell.account.without_sums(),
+            3 => cell.account.exclude_sums(),
             _ => {
                 let Ok(message) = Message::decode(&packet(from)?) else { continue };
                 let joints = from.arbitrary::<Option<u16>>()?.map(u64::from);

@@ -80,7 +80,7 @@ pub(super) fn recover(data: &[u8]) {
 /// Makes a report of a recording with any damage: the result must be a report, or an error in one line.
 pub(super) fn report(data: &[u8]) {
     let file = file_of(data);
-    let report = run::report(&[PathBuf::from(file.path())], &run::Options::default());
+    let report = run::report(&[PathBuf::from(file.path())], &run::ReportOptions::default());
     if let Err(error) = report {
         assert!(!error.to_string().contains('\n'), "{error}");
     }

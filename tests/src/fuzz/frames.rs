@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use analysis::shadow::{Options, Shadow};
+use analysis::shadow::{Shadow, ShadowOptions};
 use analysis::stats::Stats;
 use arbitrary::{Result, Unstructured};
 use model::decode::json;
@@ -205,11 +205,14 @@ pub(super) fn decoder(data: &[u8]) {
 
 /// Runs the model of a bus on any traffic: it must end, and transmit each frame exactly once.
 pub(super) fn shadow(data: &[u8]) {
-    let options = Options { each_frame: true, ..Options::new(BitRates::new(1_000_000, 5_000_000).unwrap()) };
+    let options = ShadowOptions {
+        each_frame: true,
+        ..ShadowOptions::new(BitRates::new(1_000_000, 5_000_000).unwrap())
+    };
     let mut shadow = Shadow::new(options).unwrap();
     let (mut sent, mut came) = (0_u64, 0_u64);
     let _ = traffic(&mut Unstructured::new(data), |bus, nanos, frame| {
-        shadow.frame(bus, nanos, &frame);
+        shadow.receive(bus, nanos, &frame);
         sent += 1;
         came += std::iter::from_fn(|| shadow.poll()).count() as u64;
     });

@@ -15,8 +15,8 @@ use protocol::time::Micros;
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 
-use super::{End, positions};
-use crate::life::Life;
+use super::{PortEnd, positions};
+use crate::life::PowerState;
 use protocol::packet::padded;
 
 /// An input of a cell.
@@ -28,11 +28,11 @@ pub(super) enum Inlet {
 
 /// A cell of a wiring.
 #[derive(Debug)]
-pub struct Place {
+pub struct WiredCell {
     /// The cell's node id, once it has one; it survives restarts, as in flash.
     pub node_id: Option<CellId>,
     /// The far end of the wire at each port.
-    pub wires: [Option<End>; PORTS + 1],
+    pub wires: [Option<PortEnd>; PORTS + 1],
     /// True for each port whose incoming direction is down.
     pub deaf: [bool; PORTS + 1],
     /// The last network page by which the cell reported its place in the tree.
@@ -44,7 +44,7 @@ pub struct Place {
     pub(super) serial: u32,
     pub(super) parameters: Parameters,
     pub(super) force: Force,
-    pub(super) life: Life<(Micros, Inlet)>,
+    pub(super) life: PowerState<(Micros, Inlet)>,
     pub(super) wake: Option<Micros>,
     /// Deferred frames, which do not wake the cell, with their times on the bus.
     pub(super) deferred: VecDeque<(Micros, Frame)>,
@@ -53,7 +53,7 @@ pub struct Place {
     pub(super) said: HashMap<u8, Vec<(SumWords, u128)>>,
 }
 
-impl Place {
+impl WiredCell {
     pub(super) fn new(index: usize, dice: &mut Pcg64Mcg) -> Self {
         let mut normal = [0.0_f64; 3].map(|_| dice.random_range(-1.0..1.0_f64));
         let length = normal.iter().map(|n| n * n).sum::<f64>().sqrt().max(1e-3);
@@ -103,7 +103,7 @@ impl Place {
             serial: 1_000 + u32::try_from(index).expect("few cells"),
             parameters,
             force,
-            life: Life::Off,
+            life: PowerState::Off,
             wake: None,
             deferred: VecDeque::new(),
             newest: Micros(0),

@@ -11,11 +11,11 @@ use protocol::packet::{self, Epoch, Length};
 use protocol::parameters::MAX_JOINTS;
 
 use super::place::Inlet;
-use super::{End, Event, Wiring};
+use super::{Event, PortEnd, Wiring};
 
 impl Wiring {
     /// Handles a sum of a cell: finds the cells in it, and its receivers.
-    pub(super) fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: SumWords) {
+    pub(super) fn handle_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: SumWords) {
         let cells = self.decode(cell, epoch, words);
         let said = &mut self.cells[cell].said;
         // A cell that hung continues with sums from long before.
@@ -35,8 +35,8 @@ impl Wiring {
             .wires
             .iter()
             .filter_map(|end| match end {
-                Some(End::Cell(other, _)) => Some(*other),
-                Some(End::Gateway(_)) | None => None,
+                Some(PortEnd::Cell(other, _)) => Some(*other),
+                Some(PortEnd::Gateway(_)) | None => None,
             })
             .collect();
         for other in neighbours {
@@ -75,7 +75,7 @@ impl Wiring {
         let mut heard: Vec<Vec<(SumWords, u128)>> = Vec::new();
         let mut seen = BTreeSet::new();
         for end in place.wires.iter().flatten() {
-            if let End::Cell(other, _) = end
+            if let PortEnd::Cell(other, _) = end
                 && seen.insert(*other)
                 && let Some(said) = self.cells[*other].said.get(&epoch.0)
             {

@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 
 use protocol::id::{CellId, Command, Id};
 
-use super::{End, Wiring};
-use crate::life::Life;
+use super::{PortEnd, Wiring};
+use crate::life::PowerState;
 
 impl Wiring {
     /// Returns true if a cell is on and does not hang.
@@ -18,7 +18,7 @@ impl Wiring {
     #[must_use]
     pub fn waits_for_children(&self, cell: usize) -> bool {
         let joints = Id::command(Command::Joints);
-        matches!(&self.cells[cell].life, Life::Runs(node) if node.defers(joints))
+        matches!(&self.cells[cell].life, PowerState::Runs(node) if node.may_defer(joints))
     }
 
     /// Returns the cells that have a route to the gateway over running cells and wires that work in both directions.
@@ -31,7 +31,7 @@ impl Wiring {
                 continue;
             }
             for (port, end) in self.cells[cell].wires.iter().enumerate() {
-                if let Some(End::Cell(other, at)) = *end {
+                if let Some(PortEnd::Cell(other, at)) = *end {
                     let works = !self.cells[cell].deaf[port] && !self.cells[other].deaf[at];
                     if works && self.runs(other) {
                         next.push(other);
@@ -52,7 +52,7 @@ impl Wiring {
             match tree.parent? {
                 0 => return Some(route),
                 parent => {
-                    let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.parent_port)]? else {
+                    let PortEnd::Cell(other, _) = self.cells[at].wires[usize::from(tree.parent_port)]? else {
                         return None;
                     };
                     if self.cells[other].node_id.map(CellId::get) != Some(parent) || route.contains(&other) {

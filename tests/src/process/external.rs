@@ -1,10 +1,10 @@
 //! Benches whose control loop is closed by another program, an external controller.
 
-use super::{PRESSED, Place, skin};
+use super::{PRESSED, TestDir, skin};
 
 /// Creates a directory for a bench with an external controller, which halts after a number of consecutive bad cycles.
-pub fn place(bad_cycles: u32) -> Place {
-    let place = Place::new();
+pub fn place(bad_cycles: u32) -> TestDir {
+    let place = TestDir::new();
     let socket = place.path("controller.sock");
     let kinesthetic = |line: &&str| !line.starts_with("inertia = ") && !line.starts_with("damping = ");
     let text = skin(8);

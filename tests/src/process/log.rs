@@ -19,7 +19,7 @@ pub struct Log {
 }
 
 /// The cause of a torque, in addition to the cell's parameters: its node id, the joints, and its contact state.
-pub type Cause = (u8, [i16; MAX_JOINTS], [i16; 6]);
+pub type TorqueCause = (u8, [i16; MAX_JOINTS], [i16; 6]);
 
 impl Log {
     /// Reads a log of one bus; every line must be a frame, or a comment of the recorder.
@@ -28,11 +28,11 @@ impl Log {
             Ok(CandumpLine::Frame(record)) => record.frame,
             other => panic!("{line}: {other:?}"),
         };
-        Self::of(text.lines().filter(|line| !line.starts_with("# ")).map(frame).collect(), format)
+        Self::from_frames(text.lines().filter(|line| !line.starts_with("# ")).map(frame).collect(), format)
     }
 
     /// Decodes the frames of one bus.
-    pub fn of(frames: Vec<Frame>, format: Format) -> Self {
+    pub fn from_frames(frames: Vec<Frame>, format: Format) -> Self {
         let mut segments = BTreeMap::new();
         let packet = |frame: &Frame| match format {
             Format::Fd => Packet::from_fd(frame).ok(),
@@ -108,9 +108,9 @@ impl Log {
     }
 
     /// Returns every torque with its cause and the number of the broadcast that it answers.
-    pub fn torques(&self) -> Vec<(usize, Cause, Packet)> {
+    pub fn torques(&self) -> Vec<(usize, TorqueCause, Packet)> {
         let mut contact_state: BTreeMap<u8, ContactState> = BTreeMap::new();
-        let mut causes: BTreeMap<(u8, u8), (usize, Cause)> = BTreeMap::new();
+        let mut causes: BTreeMap<(u8, u8), (usize, TorqueCause)> = BTreeMap::new();
         let (mut number, mut last) = (0, None);
         let mut torques = Vec::new();
         for (message, packet) in &self.messages {
@@ -172,8 +172,8 @@ impl ContactState {
 /// Returns the number of shared causes, and the number of causes in the smaller run.
 pub fn same_torques(one: &Log, other: &Log) -> (usize, usize) {
     let [one, other] = [one, other].map(Log::torques);
-    let mut by_cause: BTreeMap<Cause, [i16; MAX_JOINTS]> = BTreeMap::new();
-    let mut by_number: BTreeMap<(usize, Cause), Packet> = BTreeMap::new();
+    let mut by_cause: BTreeMap<TorqueCause, [i16; MAX_JOINTS]> = BTreeMap::new();
+    let mut by_number: BTreeMap<(usize, TorqueCause), Packet> = BTreeMap::new();
     for (number, cause, packet) in &one {
         let words = *by_cause.entry(*cause).or_insert_with(|| packet.words.padded());
         assert_eq!(words, packet.words.padded(), "one run, twice the same cause: {cause:?}");

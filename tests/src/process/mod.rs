@@ -40,12 +40,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant, SystemTime};
 
-use model::generate::{Format, Target, generate};
+use model::generate::{Format, SkinRequest, generate};
 use rustix::process::{Pid, Signal, kill_process};
 
 use running::proc;
 
-pub use place::Place;
+pub use place::TestDir;
 pub use running::{Ended, Running};
 pub use summary::Summary;
 
@@ -137,12 +137,12 @@ pub fn example(name: &str) -> PathBuf {
 
 /// Returns a skin's text: a number of cells on an arm, on one bus.
 pub fn skin(cells: usize) -> String {
-    generate(&Target { cells, ..Target::default() }).unwrap()
+    generate(&SkinRequest { cells, ..SkinRequest::default() }).unwrap()
 }
 
 /// Returns a skin's text: a number of cells on several buses, with a given format.
 pub fn skin_of(cells: usize, buses: usize, format: Format) -> String {
-    generate(&Target { cells, buses, format, ..Target::default() }).unwrap()
+    generate(&SkinRequest { cells, buses, format, ..SkinRequest::default() }).unwrap()
 }
 
 pub fn names(folder: &Path) -> Vec<String> {
@@ -162,12 +162,12 @@ pub fn signal(pid: Pid, signal: Signal) {
 }
 
 /// Returns true if a bench has reported an event of a cell, alone or with others.
-pub fn tells(text: &str, cell: u8, what: &str) -> bool {
-    tells_on(text, "vcan0", cell, what)
+pub fn reports_event(text: &str, cell: u8, what: &str) -> bool {
+    reports_event_on(text, "vcan0", cell, what)
 }
 
 /// Returns true if a bench has reported an event of a cell on this bus, alone or with others.
-pub fn tells_on(text: &str, bus: &str, cell: u8, what: &str) -> bool {
+pub fn reports_event_on(text: &str, bus: &str, cell: u8, what: &str) -> bool {
     let on_bus = format!(" on {bus} ha");
     let names = |line: &str| {
         let cells = line.strip_prefix("cell ").or_else(|| line.strip_prefix("cells "))?;

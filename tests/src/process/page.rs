@@ -7,7 +7,7 @@ use serde_json::Value;
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Error, Message, WebSocket, client};
 
-use super::{Place, Running, TIMEOUT, skin, until};
+use super::{Running, TIMEOUT, TestDir, skin, until};
 
 /// A scenario without events; the arm gives way.
 pub const QUIET: &str = "version = 1\nduration_s = 600.0\n\n[motion]\nkind = \"kinesthetic\"\n\
@@ -52,7 +52,7 @@ impl Address {
 
 /// Returns the address that the server of a run or a view reports.
 pub fn address(served: &Running) -> Address {
-    served.hears("view: http://");
+    served.wait_for_stderr("view: http://");
     let said = || {
         let said = served.stderr();
         let (line, _) = said.split_once("view: ")?.1.split_once('\n')?;
@@ -62,7 +62,7 @@ pub fn address(served: &Running) -> Address {
 }
 
 /// Requests a WebSocket, with additional or different headers.
-pub fn ask(
+pub fn request_websocket(
     Address { host, query }: &Address,
     headers: &[(&'static str, &str)],
 ) -> Result<(WebSocket<TcpStream>, u16), Error> {
@@ -86,22 +86,22 @@ impl Page {
 
     /// Opens a page, unless it is refused.
     pub fn attempt(address: &Address) -> Result<Self, Error> {
-        let (mut socket, _) = ask(address, &[("Origin", &format!("http://{}", address.host))])?;
+        let (mut socket, _) = request_websocket(address, &[("Origin", &format!("http://{}", address.host))])?;
         let scene = serde_json::from_str(socket.read()?.to_text()?).unwrap();
         Ok(Self { socket, scene })
     }
 
-    pub fn say(&mut self, command: &str) {
+    pub fn send(&mut self, command: &str) {
         self.socket.send(Message::text(command)).unwrap();
     }
 
     pub fn press(&mut self, node: u8, force_n: f64) {
-        self.say(&format!(r#"{{"do":"press","bus":0,"node":{node},"force_n":{force_n}}}"#));
+        self.send(&format!(r#"{{"do":"press","bus":0,"node":{node},"force_n":{force_n}}}"#));
     }
 
     /// Sends a command to the bench, given as JSON fields such as `"on":"bus","down":true,"bus":0`.
     pub fn command(&mut self, command: &str) {
-        self.say(&format!(r#"{{"do":"bench",{command}}}"#));
+        self.send(&format!(r#"{{"do":"bench",{command}}}"#));
     }
 
     /// Sends an action on the process of a cell on the first bus.
@@ -113,12 +113,12 @@ impl Page {
     pub fn answer(&mut self, text: &str) -> bool {
         let is_it = |answer: &&Value| answer["text"].as_str().unwrap().contains(text);
         let answers = |said: &Value| said["bench"]["answers"].as_array().cloned().unwrap_or_default();
-        let said = self.hears(text, |said| answers(said).iter().any(|answer| is_it(&answer)));
+        let said = self.wait_for_status(text, |said| answers(said).iter().any(|answer| is_it(&answer)));
         answers(&said).iter().rfind(is_it).unwrap()["done"].as_bool().unwrap()
     }
 
     /// Waits for a snapshot for which a condition holds.
-    pub fn sees(&mut self, what: &str, mut is: impl FnMut(&Snapshot) -> bool) -> Snapshot {
+    pub fn wait_for_snapshot(&mut self, what: &str, mut is: impl FnMut(&Snapshot) -> bool) -> Snapshot {
         let give_up = Instant::now() + TIMEOUT;
         loop {
             assert!(Instant::now() < give_up, "not there after {TIMEOUT:?}: {what}");
@@ -135,7 +135,7 @@ impl Page {
     }
 
     /// Waits for a status message for which a condition holds.
-    pub fn hears(&mut self, what: &str, mut is: impl FnMut(&Value) -> bool) -> Value {
+    pub fn wait_for_status(&mut self, what: &str, mut is: impl FnMut(&Value) -> bool) -> Value {
         let give_up = Instant::now() + TIMEOUT;
         loop {
             assert!(Instant::now() < give_up, "not there after {TIMEOUT:?}: {what}");
@@ -168,14 +168,14 @@ impl Snapshot {
 }
 
 /// Starts a run with a page, and returns both the run and the page's address.
-pub fn watched(place: &Place, cells: usize, more: &str) -> (Running, Address) {
+pub fn watched(place: &TestDir, cells: usize, more: &str) -> (Running, Address) {
     // A busy machine must not halt the robot.
     place.write("skin.toml", &(skin(cells) + "\n[safety]\nbad_cycles = 10000\n"));
     watched_skin(place, more)
 }
 
 /// Starts a run of the existing `skin.toml` with a page, and returns both the run and the page's address.
-pub fn watched_skin(place: &Place, more: &str) -> (Running, Address) {
+pub fn watched_skin(place: &TestDir, more: &str) -> (Running, Address) {
     place.scenario(QUIET);
     let words = format!(
         "run skin.toml --bus-kind {} --scenario scenario.toml --view --summary run.json {more}",

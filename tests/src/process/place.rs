@@ -14,13 +14,13 @@ use super::running::{Running, all_processes, command_line, proc};
 use super::{PRESSED, Summary, TIMEOUT, names, program, skin};
 
 /// A temporary directory for one test, with its configuration files, results and embedded buses.
-pub struct Place {
+pub struct TestDir {
     directory: TempDir,
     /// The kind of bus on which the benches run.
     kind: BusKind,
 }
 
-impl Place {
+impl TestDir {
     pub fn new() -> Self {
         Self::on(BusKind::Embedded)
     }
@@ -125,7 +125,7 @@ impl Place {
     /// Starts a bench like [`Self::bench`], and waits until its loop runs.
     pub fn running_bench(&self, seconds: f64, more: &str) -> Running {
         let bench = self.bench(seconds, more);
-        bench.hears_the_loop();
+        bench.wait_for_loop();
         bench
     }
 

@@ -5,7 +5,7 @@ use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::time::Duration;
 
-use super::{Ended, Place, Running, program};
+use super::{Ended, Running, TestDir, program};
 
 /// The text of README.md.
 pub const README: &str = include_str!("../../../README.md");
@@ -88,7 +88,7 @@ fn root() -> &'static Path {
 }
 
 /// Runs commands in one shell.
-pub fn run(place: &Place, commands: &[&str]) -> Ended {
+pub fn run(place: &TestDir, commands: &[&str]) -> Ended {
     symlink(root().join("gateway"), place.path("gateway")).unwrap();
     place.write("readme.sh", &script(commands));
     let words = format!("{} bash readme.sh", LIMIT.as_secs());

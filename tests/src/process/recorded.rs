@@ -12,12 +12,12 @@ use std::path::Path;
 
 use mcap::read::{Summary, attachment, metadata};
 use mcap::{MessageStream, Schema};
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use protocol::candump::{CandumpLine, parse};
 use serde_json::{Map, Value, json};
 
 use crate::process::vcan::{Candump, same_by_sender};
-use crate::process::{PRESSED, Place};
+use crate::process::{PRESSED, TestDir};
 
 /// A message of a recording.
 pub struct Message {
@@ -46,7 +46,7 @@ impl Recorded {
         let mut types = BTreeMap::new();
         for schema in summary.schemas.values() {
             assert_eq!(schema.encoding, "ros2msg");
-            types.insert(schema.name.clone(), Types::of(schema));
+            types.insert(schema.name.clone(), Types::from_schema(schema));
         }
         let messages = MessageStream::new(&bytes).unwrap().map(|message| {
             let message = message.unwrap();
@@ -119,7 +119,7 @@ fn line(message: &Message) -> String {
 struct Types(BTreeMap<String, Vec<(String, String)>>);
 
 impl Types {
-    fn of(schema: &Schema<'_>) -> Self {
+    fn from_schema(schema: &Schema<'_>) -> Self {
         let text = str::from_utf8(&schema.data).unwrap();
         let mut types = BTreeMap::new();
         for part in text.split(&"=".repeat(80)) {
@@ -196,12 +196,12 @@ impl<'a> From<'a> {
 }
 
 /// Records a bench of pressed cells, and checks that the recording has exactly the frames that candump saw.
-pub fn has_what_candump_sees(place: &Place, cells: usize, broadcast_hz: f64, more: &str) {
-    let expected = Target { cells, broadcast_hz, ..Target::default() };
+pub fn has_what_candump_sees(place: &TestDir, cells: usize, broadcast_hz: f64, more: &str) {
+    let expected = SkinRequest { cells, broadcast_hz, ..SkinRequest::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(PRESSED);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
-    place.bench(4.0, &format!("--record run.mcap {more}")).end().well();
+    place.bench(4.0, &format!("--record run.mcap {more}")).end().succeeded();
     let (theirs, summary) = (candump.frames(), place.summary());
     assert_eq!(
         (summary.of_bus("/dropped_by_bus"), summary.number("/recording/lost")),

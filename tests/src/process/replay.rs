@@ -14,7 +14,7 @@ use protocol::skin::Skin;
 use serde_json::Value;
 
 use super::test_client::TestClient;
-use super::{Ended, Place, Running};
+use super::{Ended, Running, TestDir};
 
 /// The options of a replay to new cells that are configured by the recording's skin.
 pub const FRESH: &str = "--expect --spawn --skin skin.toml";
@@ -64,16 +64,16 @@ pub fn cell(node: i64) -> CellId {
 
 /// Sends messages while a run is recorded: every command, stimuli of both pages in both ways, and parameters that are
 /// read, written, refused and committed. It needs 48 broadcasts, a fifth of those in four seconds at 62.5 Hz.
-pub fn says_everything(test_client: &TestClient, skin: &Path) {
+pub fn send_every_message(test_client: &TestClient, skin: &Path) {
     let configure = |to, tag, request| Message::Configure { to, tag, request };
     let write = |parameter: Parameter, words| Request::Write { number: parameter.number(), words };
     test_client.waits_for_epoch(10);
-    test_client.sends(&Message::Report);
-    test_client.sends(&Message::Sync);
+    test_client.send(&Message::Report);
+    test_client.send(&Message::Sync);
     let page = SensorPage::Acceleration([Q3_12::nearest(0.5), Q3_12::ZERO, Q3_12::nearest(-1.0)]);
-    test_client.sends(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page });
+    test_client.send(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page });
     let skin_page = SkinSensors { contact: [Q5_10::nearest(0.7); 3], ..SkinSensors::default() };
-    test_client.sends(&Message::Stimulus {
+    test_client.send(&Message::Stimulus {
         to: Node::Cell(cell(6)),
         from: AppliesFrom::Next,
         page: SensorPage::Skin(skin_page),
@@ -84,24 +84,24 @@ pub fn says_everything(test_client: &TestClient, skin: &Path) {
     let described = skin.cells.iter().find(|it| it.node.get() == 4).unwrap();
     let mut parameters = skin.parameters(described);
     let to = Node::Cell(cell(4));
-    test_client.sends(&configure(to, 1, Request::Read { number: Parameter::Pose.number() }));
-    test_client.sends(&configure(to, 2, write(Parameter::Commit, [1, 0, 0, 0, 0, 0])));
+    test_client.send(&configure(to, 1, Request::Read { number: Parameter::Pose.number() }));
+    test_client.send(&configure(to, 2, write(Parameter::Commit, [1, 0, 0, 0, 0, 0])));
     let [_, y, z] = parameters.pose.position;
     parameters.pose.position = [protocol::fixed::Q1_14::nearest(0.05), y, z];
-    test_client.sends(&configure(to, 3, write(Parameter::Pose, parameters.words(Parameter::Pose))));
+    test_client.send(&configure(to, 3, write(Parameter::Pose, parameters.words(Parameter::Pose))));
     let hash = [parameters.hash().cast_signed(), 0, 0, 0, 0, 0];
-    test_client.sends(&configure(to, 4, write(Parameter::Commit, hash)));
-    test_client.sends(&configure(Node::Everyone, 5, Request::Read { number: 99 }));
+    test_client.send(&configure(to, 4, write(Parameter::Commit, hash)));
+    test_client.send(&configure(Node::Everyone, 5, Request::Read { number: 99 }));
     test_client.waits_for_epoch(30);
-    test_client.sends(&Message::Halt);
+    test_client.send(&Message::Halt);
     test_client.waits_for_epoch(40);
-    test_client.sends(&Message::Resume);
+    test_client.send(&Message::Resume);
     test_client.waits_for_epoch(48);
     // Writing the mode of a cell resets its contact state.
-    test_client.sends(&configure(Node::Cell(cell(5)), 6, write(Parameter::Mode, [1, 0, 0, 0, 0, 0])));
+    test_client.send(&configure(Node::Cell(cell(5)), 6, write(Parameter::Mode, [1, 0, 0, 0, 0, 0])));
 }
 
-impl Place {
+impl TestDir {
     /// Records `run.log` with `skin.toml`: a run of some cells with touches and every message.
     pub fn records(&self, cells: usize) {
         let skin = self.skin(cells);
@@ -112,8 +112,8 @@ impl Place {
     pub fn records_with(&self, skin: &Path) {
         self.scenario(TOUCHED);
         let bench = self.running_bench(4.0, "");
-        says_everything(&self.test_client(), skin);
-        bench.end().well();
+        send_every_message(&self.test_client(), skin);
+        bench.end().succeeded();
         self.is_left_clean();
     }
 
@@ -192,7 +192,7 @@ pub fn changed(
         if left != usize::MAX {
             return line.to_owned();
         }
-        let mut words = packet.words.six();
+        let mut words = packet.words.first_six();
         change(&mut words);
         packet.words = words.into();
         let frame = packet.frames(Format::Fd).next().unwrap();
@@ -219,9 +219,9 @@ pub fn is_torque(message: &Message, cell: u8) -> bool {
 }
 
 /// Starts the embedded bus and the cells of `skin.toml` by hand.
-pub fn by_hand(place: &Place, nodes: &str) -> [Running; 2] {
+pub fn by_hand(place: &TestDir, nodes: &str) -> [Running; 2] {
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let words = format!("--bus vcan0 --bus-kind embedded --nodes {nodes} --skin skin.toml");
     [place.start("cell-node", &words), server]
 }

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
 
-use super::{TIMEOUT, signal, tells, tells_on, until};
+use super::{TIMEOUT, reports_event, reports_event_on, signal, until};
 
 /// A running process whose output is collected; it is ended when this value is dropped.
 pub struct Running {
@@ -40,7 +40,7 @@ impl Ended {
     }
 
     /// Checks that the process succeeded, and returns its result.
-    pub fn well(self) -> Self {
+    pub fn succeeded(self) -> Self {
         assert_eq!(self.code(), Some(0), "{self:#?}");
         self
     }
@@ -64,8 +64,8 @@ impl Running {
     pub fn start(mut command: Command) -> Self {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
-        let out = Output::of(child.stdout.take().unwrap());
-        let err = Output::of(child.stderr.take().unwrap());
+        let out = Output::from_pipe(child.stdout.take().unwrap());
+        let err = Output::from_pipe(child.stderr.take().unwrap());
         Self { child, out, err }
     }
 
@@ -78,27 +78,27 @@ impl Running {
     }
 
     /// Waits for a text on standard error.
-    pub fn hears(&self, words: &str) {
+    pub fn wait_for_stderr(&self, words: &str) {
         self.err.wait_for(words);
     }
 
     /// Waits until a bench has reported an event of a cell.
-    pub fn tells(&self, cell: u8, what: &str) {
-        self.err.wait_until(what, |text| tells(text, cell, what));
+    pub fn wait_for_event(&self, cell: u8, what: &str) {
+        self.err.wait_until(what, |text| reports_event(text, cell, what));
     }
 
     /// Waits until a bench has reported an event of a cell on this bus.
-    pub fn tells_on(&self, bus: &str, cell: u8, what: &str) {
-        self.err.wait_until(what, |text| tells_on(text, bus, cell, what));
+    pub fn wait_for_event_on(&self, bus: &str, cell: u8, what: &str) {
+        self.err.wait_until(what, |text| reports_event_on(text, bus, cell, what));
     }
 
     /// Waits until a bench's loop runs: progress lines then appear.
-    pub fn hears_the_loop(&self) {
+    pub fn wait_for_loop(&self) {
         self.err.wait_until("progress", |text| text.contains(" s  ") || text.contains("\nstarting\n"));
     }
 
     /// Waits for a text on standard output.
-    pub fn prints(&self, words: &str) {
+    pub fn wait_for_stdout(&self, words: &str) {
         self.out.wait_for(words);
     }
 
@@ -166,7 +166,7 @@ struct Output {
 }
 
 impl Output {
-    fn of(mut pipe: impl Read + Send + 'static) -> Self {
+    fn from_pipe(mut pipe: impl Read + Send + 'static) -> Self {
         let text = Arc::new(Mutex::new(String::new()));
         let shared = Arc::clone(&text);
         let read = move || {

@@ -10,15 +10,15 @@ use protocol::id::Id;
 
 /// The exit code and the output of a command.
 #[derive(Debug)]
-pub struct Said {
+pub struct CommandOutput {
     pub code: i32,
     pub out: String,
     pub err: String,
 }
 
-impl Said {
+impl CommandOutput {
     /// Runs a command to its end.
-    pub fn by(command: &mut Command) -> Self {
+    pub fn run(command: &mut Command) -> Self {
         let output = command.output().unwrap();
         let [out, err] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
         Self { code: output.status.code().unwrap(), out, err }
@@ -26,7 +26,7 @@ impl Said {
 }
 
 /// Calls `act` while frames with these identifiers are sent on a bus continuously.
-pub fn while_somebody_says<T>(bus: &Bus, ids: &[Id], act: impl FnOnce() -> T) -> T {
+pub fn while_sending<T>(bus: &Bus, ids: &[Id], act: impl FnOnce() -> T) -> T {
     let frames: Vec<_> = ids.iter().map(|id| Frame::fd(id.to_bits().into(), 1, &[0; 16]).unwrap()).collect();
     std::thread::scope(|scope| {
         // The sender ends when this is dropped, also by a panic; otherwise the scope would wait without end.

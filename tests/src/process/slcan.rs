@@ -71,7 +71,7 @@ impl Peer {
     }
 
     /// Reads the available bytes; returns true while the line is open.
-    pub fn look(&mut self) -> bool {
+    pub fn read_available(&mut self) -> bool {
         let mut buffer = [0; 4_096];
         loop {
             match self.file.read(&mut buffer) {
@@ -89,9 +89,9 @@ impl Peer {
     }
 
     /// Waits until this text has come over the line.
-    pub fn hears(&mut self, text: &str) {
+    pub fn wait_for_text(&mut self, text: &str) {
         until(text, || {
-            self.look();
+            self.read_available();
             self.bytes.windows(text.len()).any(|bytes| bytes == text.as_bytes()).then_some(())
         });
     }
@@ -105,14 +105,14 @@ impl Peer {
     /// Waits until this number of frames has come over the line, and returns them.
     pub fn receives(&mut self, count: usize) -> Vec<Frame> {
         until("frames at the line", || {
-            self.look();
+            self.read_available();
             (self.frames().len() >= count).then_some(())
         });
         self.frames()
     }
 
     /// Writes all bytes, and waits while the line has no room.
-    pub fn says(&mut self, bytes: &[u8]) {
+    pub fn write_bytes(&mut self, bytes: &[u8]) {
         let mut rest = bytes;
         until("the line to take bytes", || {
             match self.file.write(rest) {
@@ -128,7 +128,7 @@ impl Peer {
     pub fn sends(&mut self, frames: &[Frame]) {
         let text: Vec<u8> =
             frames.iter().flat_map(|frame| encode(frame).unwrap().as_bytes().to_vec()).collect();
-        self.says(&text);
+        self.write_bytes(&text);
     }
 }
 

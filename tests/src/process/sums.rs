@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use model::generate::{Reply, Target, generate};
+use model::generate::{Reply, SkinRequest, generate};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage};
@@ -11,7 +11,7 @@ use rustix::process::Signal;
 
 use super::buses::mixed_skin;
 use super::test_client::TestClient;
-use super::{Ended, PRESSED, Place, Running, TIMEOUT, is_stopped, until};
+use super::{Ended, PRESSED, Running, TIMEOUT, TestDir, is_stopped, until};
 
 /// The number of cells, in rows of four; the cells at two opposite corners are roots.
 pub const CELLS: u8 = 12;
@@ -29,12 +29,12 @@ pub fn neighbors(cell: u8) -> [u8; 4] {
 }
 
 /// Writes `skin.toml`: a grid, with a joint rate so low that a busy machine keeps up.
-pub fn grid(place: &Place, format: Format) {
+pub fn grid(place: &TestDir, format: Format) {
     wired(place, format, neighbors);
 }
 
-pub fn wired(place: &Place, format: Format, neighbors: impl Fn(u8) -> [u8; 4]) {
-    let expected = Target { cells: CELLS.into(), reply: Reply::Sum, ..Target::default() };
+pub fn wired(place: &TestDir, format: Format, neighbors: impl Fn(u8) -> [u8; 4]) {
+    let expected = SkinRequest { cells: CELLS.into(), reply: Reply::Sum, ..SkinRequest::default() };
     let classic: &[_] = if format == Format::Classic { &["vcan0"] } else { &[] };
     let text = mixed_skin(&generate(&expected).unwrap(), classic);
     let mut node = 0;
@@ -65,7 +65,7 @@ pub fn wired(place: &Place, format: Format, neighbors: impl Fn(u8) -> [u8; 4]) {
 }
 
 /// Starts a bench that records nothing.
-pub fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
+pub fn unrecorded(place: &TestDir, seconds: f64, more: &str) -> Running {
     let words = format!(
         "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} --summary run.json \
          --overwrite {more}",
@@ -79,9 +79,9 @@ pub fn holds(test_client: &TestClient, expected: u32) {
     let (mut epoch, mut counts, mut row) = (None, BTreeMap::<u8, u8>::new(), 0);
     // A root that found another route is in another root's sum.
     let mut below = BTreeSet::new();
-    test_client.sends(&Message::Report);
+    test_client.send(&Message::Report);
     let mut seen = Vec::new();
-    let whole = test_client.hears(|message| match message {
+    let whole = test_client.receive_until(|message| match message {
         Message::Joints { epoch: of, .. } => {
             let roots = counts.iter().filter(|(root, _)| !below.contains(*root));
             let count: u32 = roots.map(|(_, &count)| u32::from(count)).sum();
@@ -109,15 +109,15 @@ pub fn holds(test_client: &TestClient, expected: u32) {
 }
 
 /// Waits until each of these cells has a route to a root over these cells only, by the reports of the cells.
-fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
+fn wait_for_routes(test_client: &TestClient, cells: &BTreeSet<u8>) {
     let mut parents = BTreeMap::new();
     let leads = |parents: &BTreeMap<u8, Option<u8>>, cell: u8| {
         let up = |cell: &u8| parents.get(cell).copied().flatten();
         let mut route = std::iter::successors(Some(cell), up).take(usize::from(CELLS) + 1);
         route.find(|cell| !cells.contains(cell)) == Some(0)
     };
-    test_client.sends(&Message::Report);
-    let all = test_client.hears(|message| {
+    test_client.send(&Message::Report);
+    let all = test_client.receive_until(|message| {
         if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } = message {
             parents.insert(cell.get(), tree.parent);
         }
@@ -127,26 +127,26 @@ fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
 }
 
 /// Ends a bench, and checks that its counts add up.
-pub fn end(place: &Place, bench: Running) -> Ended {
+pub fn end(place: &TestDir, bench: Running) -> Ended {
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     place.is_left_clean();
     place.summary().adds_up();
     ended
 }
 
 /// Checks that sums bypass a cell that is killed, and one that hangs, until they come back.
-pub fn goes_round_a_cell(place: &Place, format: Format) {
+pub fn goes_round_a_cell(place: &TestDir, format: Format) {
     grid(place, format);
     place.scenario(PRESSED);
     let bench = unrecorded(place, 600.0, "");
-    bench.hears_the_loop();
+    bench.wait_for_loop();
     let test_client = TestClient::on(place, "vcan0", format);
     holds(&test_client, 12);
 
     super::signal(bench.cell(6), Signal::KILL);
     holds(&test_client, 11);
-    bench.tells(6, "fallen silent");
+    bench.wait_for_event(6, "fallen silent");
 
     let stopped = bench.cell(7);
     super::signal(stopped, Signal::STOP);
@@ -158,10 +158,10 @@ pub fn goes_round_a_cell(place: &Place, format: Format) {
     // The restarted cell gets its slot and its stimulus again.
     let words = format!("--bus vcan0 --bus-kind {} --node 6 --skin skin.toml", place.kind());
     let again = place.start("cell-node", &words);
-    bench.hears("cell 6 on vcan0 restarted");
+    bench.wait_for_stderr("cell 6 on vcan0 restarted");
     holds(&test_client, 12);
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     drop(again);
     let summary = place.summary();
     summary.adds_up();
@@ -170,24 +170,24 @@ pub fn goes_round_a_cell(place: &Place, format: Format) {
 }
 
 /// Checks that without a touch hellos show a lost cell, and that the other cells find another route.
-pub fn keeps_ways_without_a_touch(place: &Place, format: Format) {
+pub fn keeps_ways_without_a_touch(place: &TestDir, format: Format) {
     grid(place, format);
     place.scenario(PRESSED.split("[[touch]]").next().unwrap());
     let bench = unrecorded(place, 600.0, "");
-    bench.hears_the_loop();
+    bench.wait_for_loop();
     let test_client = TestClient::on(place, "vcan0", format);
     let mut cells: BTreeSet<u8> = (1..=CELLS).collect();
-    have_ways(&test_client, &cells);
+    wait_for_routes(&test_client, &cells);
     super::signal(bench.cell(6), Signal::KILL);
     cells.remove(&6);
-    have_ways(&test_client, &cells);
+    wait_for_routes(&test_client, &cells);
     let stopped = bench.cell(7);
     super::signal(stopped, Signal::STOP);
     cells.remove(&7);
-    have_ways(&test_client, &cells);
+    wait_for_routes(&test_client, &cells);
     super::signal(stopped, Signal::CONT);
     cells.insert(7);
-    have_ways(&test_client, &cells);
+    wait_for_routes(&test_client, &cells);
     end(place, bench);
 }
 
@@ -213,18 +213,18 @@ for_s = 12.0
 "#;
 
 /// Checks that a bench with links down names an unreachable cell, and that the other cells find another route.
-pub fn goes_on_without_a_wire(place: &Place, format: Format) {
+pub fn goes_on_without_a_wire(place: &TestDir, format: Format) {
     grid(place, format);
     place.scenario(&format!("{PRESSED}{LINKS_DOWN}"));
     let bench = unrecorded(place, 600.0, "");
-    bench.hears_the_loop();
+    bench.wait_for_loop();
     let test_client = TestClient::on(place, "vcan0", format);
-    bench.hears("scenario: link down from cell 6 to cell 5 on vcan0");
+    bench.wait_for_stderr("scenario: link down from cell 6 to cell 5 on vcan0");
     holds(&test_client, 12);
-    bench.hears("cell 4 on vcan0 is unreachable: no route to a root, in no sum for");
+    bench.wait_for_stderr("cell 4 on vcan0 is unreachable: no route to a root, in no sum for");
     holds(&test_client, 11);
-    bench.hears("scenario: link up between cell 8 and cell 4 on vcan0");
-    bench.hears("cell 4 on vcan0 has a route to a root again, after");
+    bench.wait_for_stderr("scenario: link up between cell 8 and cell 4 on vcan0");
+    bench.wait_for_stderr("cell 4 on vcan0 has a route to a root again, after");
     holds(&test_client, 12);
     end(place, bench);
     let summary = place.summary();

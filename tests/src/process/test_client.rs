@@ -12,7 +12,7 @@ use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
 use protocol::time::Micros;
 
-use super::{Place, TIMEOUT, until};
+use super::{TIMEOUT, TestDir, until};
 
 /// A client of a bus with a given format.
 pub struct TestClient {
@@ -21,7 +21,7 @@ pub struct TestClient {
     decoder: RefCell<Decoder>,
 }
 
-impl Place {
+impl TestDir {
     /// Opens a client of the bus `vcan0` with CAN FD frames.
     pub fn test_client(&self) -> TestClient {
         self.test_client_of(Format::Fd)
@@ -34,11 +34,11 @@ impl Place {
 }
 
 impl TestClient {
-    pub fn on(place: &Place, bus: &str, format: Format) -> Self {
+    pub fn on(place: &TestDir, bus: &str, format: Format) -> Self {
         Self::on_kind(place, bus, format, KindChoice::Only(place.kind()))
     }
 
-    pub fn on_kind(place: &Place, bus: &str, format: Format, kind: KindChoice) -> Self {
+    pub fn on_kind(place: &TestDir, bus: &str, format: Format, kind: KindChoice) -> Self {
         let fd = format == Format::Fd;
         let options = BusOptions { directory: Some(place.buses()), fd, ..BusOptions::default() };
         let bus = until("the bus", || Bus::open(bus, kind, &options).ok());
@@ -51,13 +51,13 @@ impl TestClient {
     }
 
     /// Sends a message to all.
-    pub fn sends(&self, message: &Message) {
+    pub fn send(&self, message: &Message) {
         let frames: Vec<_> = message.encode().frames(self.format).collect();
         self.bus.send(&frames).unwrap();
     }
 
     /// Receives messages until `enough` holds, or until `TIMEOUT` is over; returns true if it held.
-    pub fn hears(&self, mut enough: impl FnMut(&Message) -> bool) -> bool {
+    pub fn receive_until(&self, mut enough: impl FnMut(&Message) -> bool) -> bool {
         let mut inbox = Inbox::new();
         let give_up = Instant::now() + TIMEOUT;
         while Instant::now() < give_up {
@@ -77,7 +77,7 @@ impl TestClient {
 
     /// Waits for a message for which `enough` holds.
     pub fn waits_for(&self, what: &str, enough: impl FnMut(&Message) -> bool) {
-        assert!(self.hears(enough), "waited {TIMEOUT:?} for {what} on {}", self.bus.name());
+        assert!(self.receive_until(enough), "waited {TIMEOUT:?} for {what} on {}", self.bus.name());
     }
 
     /// Waits until each of these cells has sent a torque that is not zero.

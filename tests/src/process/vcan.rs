@@ -10,7 +10,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use protocol::bus::BusKind;
 use protocol::can::Frame;
 use protocol::candump::{CandumpLine, parse, parse_frame};
@@ -18,9 +18,9 @@ use protocol::id::{Id, Kind};
 
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-use super::{Place, until};
+use super::{TestDir, until};
 
-impl Place {
+impl TestDir {
     /// Creates a directory whose benches run on `vcan0` of a network that is the test's own.
     pub fn on_vcan() -> Self {
         own_network();
@@ -119,12 +119,12 @@ pub fn backlog_drops() -> u64 {
 
 /// Returns a skin of a few cells at a rate that an emulated machine can follow.
 pub fn small_skin(cells: usize) -> String {
-    generate(&Target { cells, broadcast_hz: 20.0, ..Target::default() }).unwrap()
+    generate(&SkinRequest { cells, broadcast_hz: 20.0, ..SkinRequest::default() }).unwrap()
 }
 
 /// Runs `cansend vcan0 $(skinbus frame ...)`, as a user would.
-pub fn cansend(place: &Place, frame: &str) {
-    let printed = place.start("skinbus", &format!("frame {frame}")).end().well().stdout;
+pub fn cansend(place: &TestDir, frame: &str) {
+    let printed = place.start("skinbus", &format!("frame {frame}")).end().succeeded().stdout;
     for line in printed.lines() {
         tool(&format!("cansend vcan0 {line}"));
     }
@@ -168,9 +168,9 @@ impl Drop for Vcan0 {
 }
 
 /// Another program that runs beside a test, and ends with it.
-pub struct Beside(pub Child);
+pub struct BackgroundProcess(pub Child);
 
-impl Beside {
+impl BackgroundProcess {
     pub fn start(words: &str) -> Self {
         let mut command = command(words);
         command.stdout(Stdio::null()).stderr(Stdio::null());
@@ -178,7 +178,7 @@ impl Beside {
     }
 }
 
-impl Drop for Beside {
+impl Drop for BackgroundProcess {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
@@ -188,7 +188,7 @@ impl Drop for Beside {
 /// `candump -L`, which has room for 300 MB of frames and preempts no process: otherwise it would be woken by every
 /// single frame on one processor.
 pub struct Candump {
-    child: Beside,
+    child: BackgroundProcess,
     bus: String,
     log: PathBuf,
     marks: u32,
@@ -202,7 +202,7 @@ impl Candump {
         let words = format!("chrt --batch 0 candump -L -d -r 300000000 {bus},0:0,#FFFFFFFF");
         let mut command = command(&words);
         command.stdout(File::create(log).unwrap()).stderr(Stdio::null());
-        let child = Beside(command.spawn().unwrap_or_else(|error| missing(&words, &error)));
+        let child = BackgroundProcess(command.spawn().unwrap_or_else(|error| missing(&words, &error)));
         let candump = Self { child, bus: bus.to_owned(), log: log.to_owned(), marks: 0 };
         // The kernel's lists of listeners do not name the process of an entry.
         until("candump to listen", || {

@@ -3,12 +3,12 @@
 
 use std::time::Duration;
 
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use protocol::can::Frame;
 use protocol::id::{Id, Kind};
 
 use super::vcan::{Candump, tool};
-use super::{Place, Running, Summary, program};
+use super::{Running, Summary, TestDir, program};
 
 const CELLS: u64 = 253;
 const SECONDS: u32 = 30;
@@ -40,8 +40,8 @@ profile = "step"
 /// was late, that no frame was lost, and that candump saw exactly the counted frames.
 pub fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     let broadcast_hz = f64::from(broadcasts) / f64::from(SECONDS);
-    let place = Place::on_vcan();
-    let expected = Target { cells: 253, broadcast_hz, ..Target::default() };
+    let place = TestDir::on_vcan();
+    let expected = SkinRequest { cells: 253, broadcast_hz, ..SkinRequest::default() };
     let (skin, usual) = (generate(&expected).unwrap(), "control_hz = 500.0");
     assert!(skin.contains(usual), "{usual}");
     place.write("skin.toml", &skin.replace(usual, &format!("control_hz = {control_hz:?}")));
@@ -50,13 +50,13 @@ pub fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     // would let it pass.
     for name in ["skinbus", "cell-node"] {
         tool(&format!("cp {} {}", program(name).display(), place.path(name).display()));
-        Running::start(place.command_of(&place.path(name), "--version")).end().well();
+        Running::start(place.command_of(&place.path(name), "--version")).end().succeeded();
     }
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let run =
         "run skin.toml --scenario scenario.toml --bus-kind socketcan --quiet --summary run.json --overwrite";
     let bench = Running::start(place.command_of(&place.path("skinbus"), run));
-    let ended = bench.end_after(Duration::from_secs(SECONDS.into()) + Duration::from_secs(60)).well();
+    let ended = bench.end_after(Duration::from_secs(SECONDS.into()) + Duration::from_secs(60)).succeeded();
     eprintln!("{}", ended.stdout);
     let summary = place.summary();
     summary.adds_up();

@@ -11,7 +11,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use bench::emulate::Firmware;
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use protocol::can::Format;
 use protocol::factory::Factory;
 use protocol::id::{CellId, Node};
@@ -190,7 +190,7 @@ impl Drop for Alone {
 }
 
 fn parameters() -> Parameters {
-    let text = generate(&Target { cells: 12, ..Target::default() }).unwrap();
+    let text = generate(&SkinRequest { cells: 12, ..SkinRequest::default() }).unwrap();
     let skin = Skin::parse("a skin", &text).unwrap();
     skin.parameters(skin.cells.iter().find(|cell| cell.node.get() == 12).unwrap())
 }

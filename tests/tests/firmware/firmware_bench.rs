@@ -7,7 +7,7 @@ use std::fs;
 
 use model::generate::Format as SkinFormat;
 use process::log::Log;
-use process::{Ended, PRESSED, Place, Running, skin_of};
+use process::{Ended, PRESSED, Running, TestDir, skin_of};
 use protocol::can::Format;
 use protocol::id::CellId;
 use protocol::message::Message;
@@ -19,7 +19,7 @@ fn firmware() -> String {
 }
 
 /// Starts a bench in which the cells of these node ids are emulated.
-fn bench(place: &Place, seconds: f64, emulate: &str, more: &str) -> Running {
+fn bench(place: &TestDir, seconds: f64, emulate: &str, more: &str) -> Running {
     place.bench(seconds, &format!("--firmware {} --emulate {emulate} {more}", firmware()))
 }
 
@@ -44,15 +44,15 @@ fn kills(cells: std::ops::RangeInclusive<u8>) -> String {
 #[test]
 #[ignore = "needs tests/firmware/run"]
 fn four_emulated_and_eight_process_cells_lose_only_what_was_on_its_way_at_a_kill() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(12);
     place.scenario(&format!("{PRESSED}{}", kills(9..=12)));
     fs::create_dir(place.path("flash")).unwrap();
     let bench = bench(&place, 600.0, "9,10,11,12", "--flash flash");
-    (9..=12).for_each(|cell| bench.hears(&format!("cell {cell} on vcan0 restarted")));
+    (9..=12).for_each(|cell| bench.wait_for_stderr(&format!("cell {cell} on vcan0 restarted")));
     place.test_client().waits_for_torques(1..=12);
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     summary.adds_up();
@@ -88,10 +88,10 @@ fn four_emulated_and_eight_process_cells_lose_only_what_was_on_its_way_at_a_kill
 #[ignore = "needs tests/firmware/run"]
 fn an_emulated_cell_answers_on_fd_and_on_classic_buses() {
     for format in [SkinFormat::Fd, SkinFormat::Classic] {
-        let place = Place::new();
+        let place = TestDir::new();
         place.write("skin.toml", &skin_of(2, 1, format));
         place.scenario(PRESSED);
-        bench(&place, 2.0, "2", "").end().well();
+        bench(&place, 2.0, "2", "").end().succeeded();
         place.is_left_clean();
         let summary = place.summary();
         // If a busy machine stops the emulator for 15 ms between two segments, the packet is lost.
@@ -113,10 +113,10 @@ fn an_emulated_cell_answers_on_fd_and_on_classic_buses() {
 #[test]
 #[ignore = "needs tests/firmware/run"]
 fn an_emulated_cell_sums_with_processes_as_neighbours() {
-    let place = Place::new();
+    let place = TestDir::new();
     process::sums::grid(&place, Format::Fd);
     place.scenario(PRESSED);
-    bench(&place, 4.0, "6", "").end().well();
+    bench(&place, 4.0, "6", "").end().succeeded();
     place.is_left_clean();
     let log = Log::read(&place.read("run.log"), Format::Fd);
     let sums = |is: &dyn Fn(CellId, u8) -> bool| {
@@ -133,10 +133,10 @@ fn an_emulated_cell_sums_with_processes_as_neighbours() {
 #[ignore = "needs tests/firmware/run"]
 fn emulators_end_with_a_gateway_that_is_killed_or_interrupted() {
     for (signal, code) in [(Signal::KILL, None), (Signal::INT, Some(0))] {
-        let place = Place::new();
+        let place = TestDir::new();
         place.pressed();
         let bench = bench(&place, 600.0, "8", "");
-        bench.hears_the_loop();
+        bench.wait_for_loop();
         bench.signal(signal);
         assert_eq!(bench.end().code(), code);
         place.is_left_clean();
@@ -144,7 +144,7 @@ fn emulators_end_with_a_gateway_that_is_killed_or_interrupted() {
 }
 
 /// Returns the message of a run that does not begin.
-fn refused(place: &Place, words: &str) -> String {
+fn refused(place: &TestDir, words: &str) -> String {
     let ended = place.start("skinbus", &format!("run skin.toml --bus-kind embedded --quiet {words}")).end();
     ended.refusal(ended.code().unwrap()).to_owned()
 }
@@ -152,7 +152,7 @@ fn refused(place: &Place, words: &str) -> String {
 #[test]
 #[ignore = "needs tests/firmware/run"]
 fn what_cannot_be_emulated_is_refused_in_one_line() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let elf = firmware();
     let says = |words: &str, expected: &str| {
@@ -171,7 +171,7 @@ fn what_cannot_be_emulated_is_refused_in_one_line() {
 }
 
 /// Runs a bench whose emulator is this script.
-fn with_emulator(place: &Place, script: Option<&str>) -> Ended {
+fn with_emulator(place: &TestDir, script: Option<&str>) -> Ended {
     let folder = place.path("programs");
     let _ = fs::create_dir(&folder);
     if let Some(script) = script {
@@ -186,7 +186,7 @@ fn with_emulator(place: &Place, script: Option<&str>) -> Ended {
 #[test]
 #[ignore = "needs tests/firmware/run"]
 fn an_emulator_that_is_missing_or_ends_is_named_with_its_last_line() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let line = with_emulator(&place, None);
     let missing =

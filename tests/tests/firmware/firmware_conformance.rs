@@ -9,7 +9,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use bench::emulate::Firmware;
-use process::{Place, Running};
+use process::{Running, TestDir};
 use protocol::can::Format;
 use protocol::factory::Factory;
 use protocol::id::CellId;
@@ -25,7 +25,7 @@ echo $! > pid
 "#;
 
 /// Ends the emulator with the test.
-struct Emulator<'a>(&'a Place);
+struct Emulator<'a>(&'a TestDir);
 
 impl Emulator<'_> {
     fn sh(&self, script: &str) {
@@ -42,14 +42,14 @@ impl Drop for Emulator<'_> {
 }
 
 fn conforms(format: Format) {
-    let place = Place::new();
+    let place = TestDir::new();
     let path = std::env::var_os("SKINBUS_FIRMWARE").expect("tests/firmware/run names it");
     let factory =
         Factory { node: CellId::new(12).ok(), serial: 100_012, format, hosted: true, link_ids: [None; 5] };
     fs::write(place.path("cell.elf"), Firmware::read(Path::new(&path)).unwrap().for_cell(&factory)).unwrap();
     place.write("restart.sh", RESTART);
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let emulator = Emulator(&place);
     emulator.sh("sh restart.sh");
     let line = place.path("line");

@@ -17,7 +17,7 @@ use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use process::{Ended, PRESSED, Place, Running, TIMEOUT, program, skin, until};
+use process::{Ended, PRESSED, Running, TIMEOUT, TestDir, program, skin, until};
 use protocol::bus::{Bus, BusKind, BusOptions, Inbox, KindChoice};
 use protocol::can::Frame;
 use proxy::Proxy;
@@ -39,7 +39,7 @@ fn port() -> u16 {
 
 /// A host with an embedded bus `vcan0`, in a network namespace if it has one.
 struct Host {
-    place: Place,
+    place: TestDir,
     name: &'static str,
     namespace: Option<String>,
     _server: Running,
@@ -47,11 +47,11 @@ struct Host {
 
 impl Host {
     fn new(name: &'static str, namespace: Option<String>) -> Self {
-        let place = Place::new();
+        let place = TestDir::new();
         place.write("skin.toml", &skin(CELLS));
         place.scenario(PRESSED);
         let server = place.start("vcan-setup", "serve vcan0");
-        server.prints("serving vcan0 at ");
+        server.wait_for_stdout("serving vcan0 at ");
         Self { place, name, namespace, _server: server }
     }
 
@@ -70,7 +70,7 @@ impl Host {
         let name = self.name;
         let link = self
             .start(&link_program(), &format!("link vcan0 --bus-kind embedded --host {name} --json {how}"));
-        link.hears(&format!("is linked as '{name}'"));
+        link.wait_for_stderr(&format!("is linked as '{name}'"));
         link
     }
 
@@ -83,7 +83,7 @@ impl Host {
     fn bench(&self) -> Running {
         let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 600 --no-spawn --summary run.json";
         let bench = self.start(&program("skinbus"), words);
-        bench.hears_the_loop();
+        bench.wait_for_loop();
         bench
     }
 }
@@ -104,8 +104,8 @@ impl Pair {
         let (robot, cells, proxy) = (Host::new("robot", None), Host::new("cells", None), Proxy::before(port));
         let robot_link = robot.link(&format!("--listen tcp/127.0.0.1:{port}"));
         let cells_link = cells.link(&format!("--connect tcp/127.0.0.1:{}", proxy.port));
-        robot_link.hears("host 'cells' has joined");
-        cells_link.hears("host 'robot' has joined");
+        robot_link.wait_for_stderr("host 'cells' has joined");
+        cells_link.wait_for_stderr("host 'robot' has joined");
         let running = cells.cells();
         Self { robot, cells, proxy, robot_link, cells_link, _cells: running }
     }
@@ -116,7 +116,7 @@ impl Pair {
         happens(self, &bench);
         self.robot.place.test_client().waits_for_torques(1..=12);
         bench.signal(Signal::TERM);
-        let ended = bench.end().well();
+        let ended = bench.end().succeeded();
         let summary = self.robot.place.summary();
         summary.adds_up();
         let bus = summary.0["buses"][0].clone();
@@ -162,7 +162,7 @@ impl Client {
 
 fn ended_link(link: Running) -> Value {
     link.signal(Signal::TERM);
-    serde_json::from_str(&link.end().well().stdout).unwrap()
+    serde_json::from_str(&link.end().succeeded().stdout).unwrap()
 }
 
 #[test]
@@ -171,7 +171,7 @@ fn cells_of_another_host_answer_as_if_they_were_here() {
     let mut pair = Pair::new();
     let (ended, bus) = pair.bench(|pair, _| {
         // `vcan-setup status` shows it too.
-        let status = pair.robot.place.start("vcan-setup", "status vcan0").end().well();
+        let status = pair.robot.place.start("vcan-setup", "status vcan0").end().succeeded();
         assert!(status.stdout.contains("vcan0 is linked as 'robot' with 'cells' (12 cells)"), "{status:#?}");
     });
     let of = |pointer: &str| bus.pointer(pointer).unwrap().as_u64().unwrap();
@@ -186,13 +186,13 @@ fn cells_of_another_host_answer_as_if_they_were_here() {
 fn a_connection_that_is_cut_is_made_again_and_each_missing_reply_explained() {
     let mut pair = Pair::new();
     let (_, bus) = pair.bench(|pair, bench| {
-        bench.hears("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
         pair.proxy.cut(true);
-        bench.hears("host 'cells' of vcan0 is gone, or not reached");
-        bench.hears("fallen silent");
+        bench.wait_for_stderr("host 'cells' of vcan0 is gone, or not reached");
+        bench.wait_for_stderr("fallen silent");
         pair.proxy.cut(false);
-        bench.hears("host 'cells' of vcan0 is reached again");
-        bench.hears("come back");
+        bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
+        bench.wait_for_stderr("come back");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
     pair.end();
@@ -203,11 +203,11 @@ fn a_connection_that_is_cut_is_made_again_and_each_missing_reply_explained() {
 fn a_connection_that_falls_silent_is_noticed_and_made_again() {
     let mut pair = Pair::new();
     let (_, bus) = pair.bench(|pair, bench| {
-        bench.hears("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
         pair.proxy.stall(true);
-        bench.hears("host 'cells' of vcan0 is gone, or not reached");
+        bench.wait_for_stderr("host 'cells' of vcan0 is gone, or not reached");
         pair.proxy.stall(false);
-        bench.hears("host 'cells' of vcan0 is reached again");
+        bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
     pair.end();
@@ -218,13 +218,13 @@ fn a_connection_that_falls_silent_is_noticed_and_made_again() {
 fn links_that_are_killed_are_joined_again() {
     let mut pair = Pair::new();
     let (ended, bus) = pair.bench(|pair, bench| {
-        bench.hears("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
         pair.cells_link.signal(Signal::KILL);
-        bench.hears("host 'cells' of vcan0 is gone, or not reached");
+        bench.wait_for_stderr("host 'cells' of vcan0 is gone, or not reached");
         // A link that is back after 40 ms loses nothing visible.
         thread::sleep(Duration::from_secs(1));
         pair.cells_link = pair.cells.link(&format!("--connect tcp/127.0.0.1:{}", pair.proxy.port));
-        bench.hears("host 'cells' of vcan0 is reached again");
+        bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
     assert!(ended.stderr.contains("come back") || bus["uplink"]["outage"] != 0, "{bus:#}\n{}", ended.stderr);
@@ -237,11 +237,11 @@ fn the_link_of_the_gateways_host_may_be_killed() {
     let mut pair = Pair::new();
     let listen = format!("--listen tcp/127.0.0.1:{}", pair.proxy.to);
     let (_, bus) = pair.bench(|pair, bench| {
-        bench.hears("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
         pair.robot_link.signal(Signal::KILL);
-        bench.hears("the link of vcan0 to other hosts has ended");
+        bench.wait_for_stderr("the link of vcan0 to other hosts has ended");
         pair.robot_link = pair.robot.link(&listen);
-        bench.hears("host 'cells' of vcan0 is reached again");
+        bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
     pair.end();
@@ -252,7 +252,7 @@ fn the_link_of_the_gateways_host_may_be_killed() {
 fn a_connection_with_a_delay_of_20_ms_makes_replies_late_and_none_unexplained() {
     let mut pair = Pair::new();
     let (_, bus) = pair.bench(|pair, bench| {
-        bench.hears("host 'cells' of vcan0 is linked");
+        bench.wait_for_stderr("host 'cells' of vcan0 is linked");
         pair.proxy.delay(Duration::from_millis(20));
         pair.robot.place.test_client().waits_for_joints(100);
     });
@@ -277,7 +277,7 @@ fn in_a_ring_of_three_hosts_no_frame_comes_twice() {
         .collect();
     for (link, name) in links.iter().zip(["a", "b", "c"]) {
         for other in ["a", "b", "c"].iter().filter(|other| **other != name) {
-            link.hears(&format!("host '{other}' has joined"));
+            link.wait_for_stderr(&format!("host '{other}' has joined"));
         }
     }
     let clients: Vec<_> = hosts.iter().map(Client::on).collect();
@@ -325,8 +325,8 @@ fn a_circle_that_something_else_makes_is_cut_and_said() {
         one.link(&format!("--listen tcp/127.0.0.1:{port}")),
         two.link(&format!("--connect tcp/127.0.0.1:{port}")),
     ];
-    links[0].hears("host 'two' has joined");
-    links[1].hears("host 'one' has joined");
+    links[0].wait_for_stderr("host 'two' has joined");
+    links[1].wait_for_stderr("host 'one' has joined");
     // A relay beside the link forwards all frames of one bus to the other.
     let relay = [&one, &two].map(Client::on);
     let (watcher, source) = (Client::on(&one), Client::on(&one));
@@ -370,16 +370,16 @@ fn two_network_namespaces_and_a_cable_that_is_pulled() {
     let [robot, cells] = ["robot", "cells"].map(|name| Host::new(name, Some(name.to_owned())));
     let robot_link = robot.link("--listen tcp/10.99.0.1:7447");
     let cells_link = cells.link("--connect tcp/10.99.0.1:7447");
-    robot_link.hears("host 'cells' has joined");
+    robot_link.wait_for_stderr("host 'cells' has joined");
     let _cells = cells.cells();
     let bench = robot.bench();
-    bench.hears("host 'cells' of vcan0 is linked");
+    bench.wait_for_stderr("host 'cells' of vcan0 is linked");
     ip("-n robot link set cable down");
-    bench.hears("host 'cells' of vcan0 is gone, or not reached");
+    bench.wait_for_stderr("host 'cells' of vcan0 is gone, or not reached");
     ip("-n robot link set cable up");
-    bench.hears("host 'cells' of vcan0 is reached again");
+    bench.wait_for_stderr("host 'cells' of vcan0 is reached again");
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     let summary = robot.place.summary();
     summary.adds_up();
     assert_eq!(summary.0["buses"][0]["hosts"][0]["gone"], 1, "{:#}", summary.0["buses"][0]);

@@ -6,7 +6,7 @@ use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
-use super::process::{Place, Running};
+use super::process::{Running, TestDir};
 use super::{Host, ended_link, link_program, port};
 
 const GUIDE: &str = include_str!("../../../docs/how-to/several-hosts.md");
@@ -27,8 +27,8 @@ fn shell(folder: &Path, script: &str) {
 }
 
 /// Creates the certificates of the guide, and its two configurations at a port of this machine.
-fn secured(port: u16) -> Place {
-    let place = Place::new();
+fn secured(port: u16) -> TestDir {
+    let place = TestDir::new();
     let certificates = block("openssl req -x509").replace("DNS:$host.local", "DNS:localhost");
     shell(&place.path(""), &certificates);
     for (name, mark) in [("robot.json5", "listen: {"), ("cells.json5", "connect: {")] {
@@ -50,11 +50,11 @@ fn link(host: &Host, config: &Path) -> Running {
 struct Secured {
     links: [Running; 2],
     _hosts: [Host; 2],
-    _place: Place,
+    _place: TestDir,
 }
 
 /// Starts a robot with the guide's configuration, and another host with a changed one.
-fn robot_and(change: impl FnOnce(&Place, String) -> String) -> Secured {
+fn robot_and(change: impl FnOnce(&TestDir, String) -> String) -> Secured {
     let place = secured(port());
     let (robot, other) = (Host::new("robot", None), Host::new("cells", None));
     let robot_link = link(&robot, &place.path("robot.json5"));
@@ -77,8 +77,8 @@ fn is_refused(secured: Secured) {
 #[ignore = "tests/hosts runs it"]
 fn the_certificates_of_the_guide_are_taken() {
     let secured = robot_and(|_, text| text);
-    secured.links[0].hears("host 'cells' has joined");
-    secured.links[1].hears("host 'robot' has joined");
+    secured.links[0].wait_for_stderr("host 'cells' has joined");
+    secured.links[1].wait_for_stderr("host 'robot' has joined");
     secured.links.into_iter().for_each(|link| _ = ended_link(link));
 }
 
@@ -112,13 +112,13 @@ fn the_files_of_the_guide_open_one_port_with_tls() {
         [|text| text, |text| text.replace("  listen: { endpoints: [] },\n", "")];
     for change in changes {
         let secured = robot_and(|_, text| change(text));
-        secured.links[0].hears("host 'cells' has joined");
-        secured.links[1].hears("host 'robot' has joined");
+        secured.links[0].wait_for_stderr("host 'cells' has joined");
+        secured.links[1].wait_for_stderr("host 'robot' has joined");
         let [robot, cells] = &secured.links;
         let [port] = listening_ports(robot)[..] else { panic!("{:?}", listening_ports(robot)) };
         assert_eq!(listening_ports(cells), Vec::<u16>::new());
         let refused = Host::new("intruder", None).link(&format!("--connect tcp/127.0.0.1:{port}"));
-        refused.hears("cannot connect to tcp/127.0.0.1");
+        refused.wait_for_stderr("cannot connect to tcp/127.0.0.1");
         assert!(!robot.stderr().contains("intruder"), "{}", robot.stderr());
         _ = ended_link(refused);
         secured.links.into_iter().for_each(|link| _ = ended_link(link));
@@ -148,8 +148,8 @@ fn a_certificate_of_another_authority_is_refused_and_said_on_both_sides() {
         let (mine, others) = (place.path("cells."), folder.join("cells."));
         text.replace(&mine.display().to_string(), &others.display().to_string())
     });
-    secured.links[0].hears("vcan0: ");
-    secured.links[1].hears("cannot connect to tls/localhost");
+    secured.links[0].wait_for_stderr("vcan0: ");
+    secured.links[1].wait_for_stderr("cannot connect to tls/localhost");
     is_refused(secured);
 }
 
@@ -162,8 +162,8 @@ fn no_certificate_is_refused_and_said_on_both_sides() {
         let text: Vec<_> = text.lines().filter(without).collect();
         text.join("\n").replace("enable_mtls: true", "enable_mtls: false")
     });
-    secured.links[0].hears("vcan0: ");
-    secured.links[1].hears("cannot connect to tls/localhost");
+    secured.links[0].wait_for_stderr("vcan0: ");
+    secured.links[1].wait_for_stderr("cannot connect to tls/localhost");
     is_refused(secured);
 }
 
@@ -171,8 +171,8 @@ fn no_certificate_is_refused_and_said_on_both_sides() {
 #[ignore = "tests/hosts runs it"]
 fn an_endpoint_that_is_not_in_the_certificate_is_refused_and_said_on_both_sides() {
     let secured = robot_and(|_, text| text.replace("tls/localhost", "tls/127.0.0.1"));
-    secured.links[0].hears("vcan0: ");
-    secured.links[1].hears("cannot connect to tls/127.0.0.1");
+    secured.links[0].wait_for_stderr("vcan0: ");
+    secured.links[1].wait_for_stderr("cannot connect to tls/127.0.0.1");
     is_refused(secured);
 }
 

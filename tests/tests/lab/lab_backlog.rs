@@ -10,14 +10,14 @@ use skinbus_tests::process;
 use std::fs;
 
 use process::vcan::{Candump, Vcan, backlog_drops, route, small_skin};
-use process::{PRESSED, Place};
+use process::{PRESSED, TestDir};
 
 const MAX_BACKLOG: &str = "/proc/sys/net/core/netdev_max_backlog";
 
 #[test]
 #[ignore = "needs the lab machine"]
 fn what_the_backlog_dropped_is_counted_exactly_and_nothing_stays_unknown() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     let skin = small_skin(4);
     place.write("cells.toml", &skin);
     place.write("skin.toml", &skin.replace("vcan0", "vcan1"));
@@ -36,7 +36,7 @@ fn what_the_backlog_dropped_is_counted_exactly_and_nothing_stays_unknown() {
 
     let before = backlog_drops();
     let candump = Candump::start("vcan0", &place.path("candump.log"));
-    place.bench(3.0, "--no-spawn").end().well();
+    place.bench(3.0, "--no-spawn").end().succeeded();
     let sent = candump.frames().iter().filter(|frame| frame.raw_id() == 0x203).count() as u64;
     let dropped = backlog_drops() - before;
     let summary = place.summary();

@@ -4,10 +4,10 @@
 
 use skinbus_tests::process;
 
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use process::log::Log;
 use process::vcan::tool;
-use process::{PRESSED, Place, whole};
+use process::{PRESSED, TestDir, whole};
 use protocol::can::Format;
 use protocol::message::Message;
 use rustix::process::Signal;
@@ -43,8 +43,8 @@ const SATURATED: f64 = 0.7;
 #[test]
 #[ignore = "needs the lab machine"]
 fn cells_and_gateway_live_through_steps_of_the_walls_clock() {
-    let place = Place::on_vcan();
-    let expected = Target { cells: 4, broadcast_hz: 20.0, ..Target::default() };
+    let place = TestDir::on_vcan();
+    let expected = SkinRequest { cells: 4, broadcast_hz: 20.0, ..SkinRequest::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(PRESSED);
     let bench = place.running_bench(600.0, "");
@@ -57,7 +57,7 @@ fn cells_and_gateway_live_through_steps_of_the_walls_clock() {
     tool(&format!("date --set @{back}"));
     test_client.waits_for_epoch(120);
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.summary().adds_up();
     let log = Log::read(&place.read("run.log"), Format::Fd);
     let joints = |message: &Message| matches!(message, Message::Joints { .. });

@@ -4,9 +4,9 @@
 
 use skinbus_tests::process;
 
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use process::log::Log;
-use process::{Place, whole};
+use process::{TestDir, whole};
 use protocol::can::Format;
 use protocol::id::Kind;
 
@@ -47,11 +47,11 @@ profile = "half-sine"
 #[test]
 #[ignore = "needs the lab machine"]
 fn the_same_run_on_vcan_and_on_the_embedded_bus_differs_in_times_and_interleaving_only() {
-    let [vcan, embedded] = [Place::on_vcan(), Place::new()].map(|place| {
-        let expected = Target { cells: 24, ..Target::default() };
+    let [vcan, embedded] = [TestDir::on_vcan(), TestDir::new()].map(|place| {
+        let expected = SkinRequest { cells: 24, ..SkinRequest::default() };
         place.write("skin.toml", &generate(&expected).unwrap());
         place.scenario(LIVELY);
-        place.bench(4.0, "").end().well();
+        place.bench(4.0, "").end().succeeded();
         place.summary().adds_up();
         assert_eq!(place.summary().number("/loop/ticks_skipped"), 0);
         let log = Log::read(&place.read("run.log"), Format::Fd);

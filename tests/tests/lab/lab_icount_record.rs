@@ -5,13 +5,13 @@
 use skinbus_tests::process;
 use skinbus_tests::process::recorded;
 
-use process::Place;
+use process::TestDir;
 use recorded::has_what_candump_sees;
 
 #[test]
 #[ignore = "needs the lab machine"]
 fn all_253_processes_are_recorded_as_candump_sees_them_and_answer_two_replays_bit_for_bit() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     has_what_candump_sees(&place, 253, 62.5, "");
     let summary = place.summary();
     let broadcasts = summary.number("/loop/broadcasts");

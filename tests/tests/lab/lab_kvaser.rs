@@ -17,10 +17,10 @@ use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use model::generate::{Format as Generated, Target, generate};
+use model::generate::{Format as Generated, SkinRequest, generate};
 use process::log::{Log, same_torques};
 use process::vcan::{Candump, by_identifier, command, frames_of, refused, tool};
-use process::{Place, Running, Summary, TIMEOUT, until};
+use process::{Running, Summary, TIMEOUT, TestDir, until};
 use protocol::bus::{Bus, BusError, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
 use protocol::candump::{CandumpLine, parse};
@@ -149,8 +149,13 @@ fn numbers_until(bus: &Bus, last: u32) -> Vec<u32> {
 }
 
 /// Writes the files of a bench whose gateway and cells are on two interfaces of the same bus.
-fn prepare(place: &Place, gateway: &str, cells: &str) {
-    let target = Target { cells: CELLS, broadcast_hz: 20.0, format: Generated::Classic, ..Target::default() };
+fn prepare(place: &TestDir, gateway: &str, cells: &str) {
+    let target = SkinRequest {
+        cells: CELLS,
+        broadcast_hz: 20.0,
+        format: Generated::Classic,
+        ..SkinRequest::default()
+    };
     let skin = generate(&target).unwrap();
     place.write("skin.toml", &skin.replace("vcan0", gateway));
     place.write("cells.toml", &skin.replace("vcan0", cells));
@@ -158,7 +163,7 @@ fn prepare(place: &Place, gateway: &str, cells: &str) {
 }
 
 /// Starts the cells, in three processes.
-fn start_cells(place: &Place, kind: BusKind, bus: &str) -> Vec<Running> {
+fn start_cells(place: &TestDir, kind: BusKind, bus: &str) -> Vec<Running> {
     let cells = ["--nodes 1-3", "--nodes 4-7", "--node 8"].map(|nodes| {
         let words = format!("--bus {bus} --bus-kind {kind} {nodes} --skin cells.toml");
         place.start("cell-node", &words)
@@ -167,7 +172,7 @@ fn start_cells(place: &Place, kind: BusKind, bus: &str) -> Vec<Running> {
 }
 
 /// Starts a bench with these cells.
-fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
+fn start_bench(place: &TestDir, kind: BusKind, seconds: f64) -> Running {
     let words = format!(
         "run skin.toml --bus-kind {kind} --scenario scenario.toml --duration {seconds} --no-spawn \
          --candump run.log --summary run.json"
@@ -198,7 +203,7 @@ fn pairs(log: &str) -> (u64, u64) {
 }
 
 /// Checks that all packets of a run are accounted for by its log; returns the log and the summary.
-fn packets_add_up(place: &Place) -> (Log, Summary) {
+fn packets_add_up(place: &TestDir) -> (Log, Summary) {
     let (summary, text) = (place.summary(), place.read("run.log"));
     let (whole, incomplete) = pairs(&text);
     let packets = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
@@ -217,7 +222,7 @@ fn packets_add_up(place: &Place) -> (Log, Summary) {
 }
 
 /// Checks that all packets and replies of a run are accounted for; returns its log.
-fn adds_up(place: &Place) -> Log {
+fn adds_up(place: &TestDir) -> Log {
     let (log, summary) = packets_add_up(place);
     summary.adds_up();
     log
@@ -236,11 +241,11 @@ fn torques_come(bus: &str) {
 
 /// Runs a bench across both controllers, which must both see the same frames; returns its log.
 fn across_controllers() -> Log {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     prepare(&place, "can0", "can1");
     let candumps = CONTROLLERS.map(|name| Candump::start(name, &place.path(&format!("{name}.log"))));
     let cells = start_cells(&place, BusKind::SocketCan, "can1");
-    start_bench(&place, BusKind::SocketCan, 5.0).end().well();
+    start_bench(&place, BusKind::SocketCan, 5.0).end().succeeded();
     drop(cells);
     let [near, far] = candumps.map(|candump| {
         let mut frames = candump.frames();
@@ -263,12 +268,12 @@ fn across_controllers() -> Log {
 
 /// Runs the same bench on the embedded bus.
 fn on_the_embedded_bus() -> Log {
-    let place = Place::new();
+    let place = TestDir::new();
     prepare(&place, "vcan0", "vcan0");
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let _cells = start_cells(&place, BusKind::Embedded, "vcan0");
-    start_bench(&place, BusKind::Embedded, 5.0).end().well();
+    start_bench(&place, BusKind::Embedded, 5.0).end().succeeded();
     adds_up(&place)
 }
 
@@ -347,18 +352,18 @@ fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
 #[test]
 #[ignore = "needs Kvaser controllers"]
 fn controllers_that_go_down_and_up_in_mid_run_are_survived() {
-    let (place, _controllers) = (Place::on_vcan(), Controllers::up());
+    let (place, _controllers) = (TestDir::on_vcan(), Controllers::up());
     prepare(&place, "can0", "can1");
     let cells = start_cells(&place, BusKind::SocketCan, "can1");
     let bench = start_bench(&place, BusKind::SocketCan, 600.0);
-    bench.hears_the_loop();
+    bench.wait_for_loop();
     for name in CONTROLLERS {
         torques_come("can0");
         let silent = || bench.stderr().matches("fallen silent").count();
         let before = silent();
         tool(&format!("ip link set {name} down"));
         if name == "can0" {
-            bench.hears("can0 is down: bring it up with `ip link set can0 up`");
+            bench.wait_for_stderr("can0 is down: bring it up with `ip link set can0 up`");
         }
         // For some broadcasts.
         until("silent cells", || (silent() > before).then_some(()));
@@ -366,7 +371,7 @@ fn controllers_that_go_down_and_up_in_mid_run_are_survived() {
     }
     torques_come("can0");
     bench.signal(Signal::INT);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     assert!(ended.stderr.contains("can0 works again"), "{}", ended.stderr);
     for cell in &cells {
         assert!(command(&format!("kill -0 {}", cell.pid().as_raw_nonzero())).status().unwrap().success());
@@ -382,9 +387,9 @@ fn controllers_that_go_down_and_up_in_mid_run_are_survived() {
 fn wires_are_not_simulated_on_a_real_bus() {
     let controllers = Controllers::up();
     assert!(!open("can0", &options(&[])).unwrap().is_virtual().unwrap());
-    let place = Place::new();
+    let place = TestDir::new();
     let (reply, format) = (model::generate::Reply::Sum, Generated::Classic);
-    let text = generate(&Target { cells: CELLS, reply, format, ..Target::default() }).unwrap();
+    let text = generate(&SkinRequest { cells: CELLS, reply, format, ..SkinRequest::default() }).unwrap();
     place.write("skin.toml", &text.replace("\"vcan0\"", "\"can0\""));
     let cell = place.start("cell-node", "--bus can0 --bus-kind socketcan --node 1 --skin skin.toml");
     let said = "cell-node: can0 is real hardware, but cells that answer with sums simulate their wires with frames that \
@@ -396,13 +401,13 @@ fn wires_are_not_simulated_on_a_real_bus() {
 #[test]
 #[ignore = "needs Kvaser controllers"]
 fn error_frames_of_the_driver_are_counted() {
-    let (place, controllers) = (Place::on_vcan(), Controllers::up());
+    let (place, controllers) = (TestDir::on_vcan(), Controllers::up());
     prepare(&place, "can1", "can0");
     let _cells = start_cells(&place, BusKind::SocketCan, "can0");
     let candump = Candump::start("can1", &place.path("candump.log"));
     let errors = open("can1", &BusOptions { error_mask: u32::MAX, ..options(&[]) }).unwrap();
     let bench = start_bench(&place, BusKind::SocketCan, 600.0);
-    bench.hears_the_loop();
+    bench.wait_for_loop();
     for _ in 0..2 {
         torques_come("can1");
         // The gateway's controller has room for 64 bytes, which are not read. The cells' controller does not report its
@@ -426,7 +431,7 @@ fn error_frames_of_the_driver_are_counted() {
     }
     torques_come("can1");
     bench.signal(Signal::INT);
-    bench.end().well();
+    bench.end().succeeded();
     let (ours, theirs) = (frames_of(&place.path("run.log")), candump.frames());
     let [ours, theirs] =
         [&ours, &theirs].map(|frames| frames.iter().filter(|frame| frame.is_error()).count());

@@ -4,15 +4,15 @@
 
 use skinbus_tests::process;
 
-use process::Place;
+use process::TestDir;
 use process::readme::{README, commands, run};
 
 /// The built programs run there; the timing of 253 processes depends on the machine, so it is not checked.
 #[test]
 #[ignore = "needs the lab machine"]
 fn every_command_works_where_the_kernel_has_can() {
-    let place = Place::on_vcan();
-    let ended = run(&place, &commands(README)).well();
+    let place = TestDir::on_vcan();
+    let ended = run(&place, &commands(README)).succeeded();
     assert!(ended.stdout.contains("\n+ skinbus replay run.mcap "), "{ended:#?}");
     place.is_left_clean();
 }

@@ -3,7 +3,7 @@
 
 use skinbus_tests::process::program;
 use skinbus_tests::process::served;
-use skinbus_tests::process::setup::{Said, while_somebody_says};
+use skinbus_tests::process::setup::{CommandOutput, while_sending};
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
@@ -45,8 +45,8 @@ impl Folder {
         command
     }
 
-    fn run(&self, arguments: &str) -> Said {
-        Said::by(&mut self.command(arguments))
+    fn run(&self, arguments: &str) -> CommandOutput {
+        CommandOutput::run(&mut self.command(arguments))
     }
 
     fn write(&self, name: &str, text: &str) {
@@ -151,7 +151,7 @@ fn a_cause_is_told_once() {
     let folder = Folder::new();
     folder.write("file", "");
     let mut command = folder.command("serve vcan0");
-    let said = Said::by(command.env("SKINBUS_DIR", folder.0.path().join("file/buses")));
+    let said = CommandOutput::run(command.env("SKINBUS_DIR", folder.0.path().join("file/buses")));
     assert_eq!(said.err.matches("Not a directory").count(), 1, "{said:?}");
 }
 
@@ -166,13 +166,13 @@ fn names_that_are_not_utf_8_are_files_and_no_buses() {
         ("up --dry-run", [0, 1]),
         ("down --dry-run", [0, 1]),
     ] {
-        let file = Said::by(folder.command(words).arg(skin.file_name().unwrap()));
+        let file = CommandOutput::run(folder.command(words).arg(skin.file_name().unwrap()));
         assert!(codes.contains(&file.code), "{words}: {file:?}");
-        let name = Said::by(folder.command(words).arg(OsStr::from_bytes(b"vcan\xff")));
+        let name = CommandOutput::run(folder.command(words).arg(OsStr::from_bytes(b"vcan\xff")));
         let said = r"vcan-setup: $'vcan\xff' is no bus name: it is not UTF-8";
         assert_eq!((name.code, name.err.trim_end()), (2, said), "{words}");
     }
-    let space = Said::by(
+    let space = CommandOutput::run(
         folder
             .command("up vcan0 --peer vcan1 --dry-run --namespace")
             .arg(OsStr::from_bytes(b"/nowhere/\xff")),
@@ -189,7 +189,8 @@ fn without_threads_nothing_panics() {
         ("serve vcan0 --until-eof", "cannot start a thread"),
         ("doctor skin.toml --bus-kind embedded --json", "cannot start a thread"),
     ] {
-        let ended = Said::by(folder.command(words).env("RUST_MIN_STACK", (1_u64 << 48).to_string()));
+        let ended =
+            CommandOutput::run(folder.command(words).env("RUST_MIN_STACK", (1_u64 << 48).to_string()));
         assert_eq!(ended.code, 1, "{words}: {ended:?}");
         assert!(ended.out.contains(said) || ended.err.contains(said), "{words}: {ended:?}");
         assert!(!ended.err.contains("panicked"), "{words}: {ended:?}");
@@ -232,7 +233,7 @@ fn status_shows_embedded_buses_and_which_are_served() {
 }
 
 /// Returns the findings of one level that `doctor` reports on the embedded bus.
-fn findings(said: &Said, level: &str) -> Vec<String> {
+fn findings(said: &CommandOutput, level: &str) -> Vec<String> {
     let json: Value = serde_json::from_str(&said.out).unwrap();
     assert_eq!(json["bus_kind"], "embedded");
     assert_eq!(json["would_run"], said.code == 0);
@@ -275,10 +276,10 @@ fn the_doctor_rates_the_kernel_by_the_choice() {
 }
 
 /// Runs the doctor while a process sends on the bus continuously.
-fn doctor_hears(folder: &Folder, arguments: &str, ids: &[Id]) -> Said {
+fn doctor_hears(folder: &Folder, arguments: &str, ids: &[Id]) -> CommandOutput {
     let options = BusOptions { filters: vec![], directory: Some(folder.buses()), ..BusOptions::default() };
     let bus = Bus::open("nosuchcan1", KindChoice::Only(BusKind::Embedded), &options).unwrap();
-    while_somebody_says(&bus, ids, || {
+    while_sending(&bus, ids, || {
         folder.run(&format!("doctor skin.toml --bus-kind embedded --json {arguments}"))
     })
 }

@@ -21,11 +21,11 @@ mod place;
 
 const BUS: &str = "vcan0";
 /// A time limit that only failures reach.
-const LONG: Duration = Duration::from_secs(60);
+const FAILURE_TIMEOUT: Duration = Duration::from_secs(60);
 /// The identifier of the frame that marks the end of a test's frames.
-const LAST: u32 = 0x7FF;
+const END_MARKER_ID: u32 = 0x7FF;
 /// The identifier of ignored frames, which are sent until the bus has processed everything.
-const MEANWHILE: u32 = 0x6FF;
+const FILLER_ID: u32 = 0x6FF;
 
 /// A bus of its own for each test, in a directory that does not exist yet.
 struct Bench {
@@ -86,12 +86,12 @@ fn frame(id: u32, number: u32) -> Frame {
 fn read(bus: &Bus, inbox: &mut Inbox) -> Vec<Frame> {
     let mut frames = Vec::new();
     loop {
-        assert!(bus.wait(Some(LONG)).unwrap(), "the last frame comes; {} came", frames.len());
+        assert!(bus.wait(Some(FAILURE_TIMEOUT)).unwrap(), "the last frame comes; {} came", frames.len());
         bus.receive(inbox).unwrap();
         for received in inbox.frames() {
             match received.frame.id() {
-                LAST => return frames,
-                MEANWHILE => {}
+                END_MARKER_ID => return frames,
+                FILLER_ID => {}
                 _ => frames.push(received.frame),
             }
         }
@@ -106,8 +106,8 @@ fn read_all(bus: &Bus) -> Vec<Frame> {
 fn a_broadcast_reaches_everyone_but_its_sender() {
     let bench = Bench::new();
     let sender = bench.open(&[Filter::ALL]);
-    let receivers: Vec<_> = (0..100).map(|_| bench.open(&[exact(1), exact(LAST)])).collect();
-    sender.send(&[frame(1, 7), frame(2, 8), frame(LAST, 0)]).unwrap();
+    let receivers: Vec<_> = (0..100).map(|_| bench.open(&[exact(1), exact(END_MARKER_ID)])).collect();
+    sender.send(&[frame(1, 7), frame(2, 8), frame(END_MARKER_ID, 0)]).unwrap();
     for receiver in &receivers {
         assert_eq!(read_all(receiver), [frame(1, 7)]);
     }
@@ -132,7 +132,7 @@ fn every_senders_order_is_kept_and_all_receivers_see_the_same() {
         }
     });
     wait_until_routed(&bench);
-    bench.open(&[]).send(&[frame(LAST, 0)]).unwrap();
+    bench.open(&[]).send(&[frame(END_MARKER_ID, 0)]).unwrap();
     let seen: Vec<_> = receivers.iter().map(read_all).collect();
     assert!(seen.iter().all(|other| *other == seen[0]));
     for sender in 0..4 {
@@ -147,7 +147,7 @@ fn every_rule_of_can_raw_holds() {
     let bench = Bench::new();
     for case in cases::cases() {
         // The end marker passes the same filters, so the case gets one more filter that accepts it.
-        let filters = [&case.filters[..], &[exact(LAST)]].concat();
+        let filters = [&case.filters[..], &[exact(END_MARKER_ID)]].concat();
         let (own_frames, fd, error_mask) = (case.own_frames, case.fd, case.error_mask);
         let client = bench.open_with(BusOptions { filters, own_frames, fd, error_mask, ..bench.options() });
         let other = bench.open(&[]);
@@ -155,7 +155,7 @@ fn every_rule_of_can_raw_holds() {
         if case.from_self {
             wait_until_routed(&bench);
         }
-        other.send(&[Frame::classic(LAST, &[]).unwrap()]).unwrap();
+        other.send(&[Frame::classic(END_MARKER_ID, &[]).unwrap()]).unwrap();
         let expected = if case.received { vec![case.frame] } else { vec![] };
         assert_eq!(read_all(&client), expected, "{}", case.what);
     }
@@ -164,10 +164,10 @@ fn every_rule_of_can_raw_holds() {
 
 /// Waits until all frames sent before have been routed: this one is read in the same round or a later one.
 fn wait_until_routed(bench: &Bench) {
-    let (a, b) = (bench.open(&[]), bench.open(&[exact(MEANWHILE)]));
+    let (a, b) = (bench.open(&[]), bench.open(&[exact(FILLER_ID)]));
     for _ in 0..2 {
-        a.send(&[frame(MEANWHILE, 0)]).unwrap();
-        assert!(b.wait(Some(LONG)).unwrap());
+        a.send(&[frame(FILLER_ID, 0)]).unwrap();
+        assert!(b.wait(Some(FAILURE_TIMEOUT)).unwrap());
         b.receive(&mut Inbox::new()).unwrap();
     }
 }
@@ -183,23 +183,23 @@ fn filters_change_in_order_with_the_frames() {
     });
     // The order between its own frames and its filters is kept.
     client.send(&[frame(1, 1), frame(3, 1)]).unwrap();
-    client.set_filters(&[exact(2), exact(3), exact(LAST)]).unwrap();
+    client.set_filters(&[exact(2), exact(3), exact(END_MARKER_ID)]).unwrap();
     client.send(&[frame(1, 2), frame(2, 2), frame(3, 2)]).unwrap();
     client.set_filters(&[]).unwrap();
     client.send(&[frame(1, 3), frame(2, 3), frame(3, 3)]).unwrap();
     // More filters than one datagram holds, with the relevant ones at both ends.
-    let many: Vec<_> = [3, LAST].into_iter().chain(0x100..0x200).chain([1]).map(exact).collect();
+    let many: Vec<_> = [3, END_MARKER_ID].into_iter().chain(0x100..0x200).chain([1]).map(exact).collect();
     client.set_filters(&many).unwrap();
     wait_until_routed(&bench);
-    other.send(&[frame(1, 4), frame(2, 4), frame(3, 4), frame(0x1FF, 4), frame(LAST, 0)]).unwrap();
+    other.send(&[frame(1, 4), frame(2, 4), frame(3, 4), frame(0x1FF, 4), frame(END_MARKER_ID, 0)]).unwrap();
     let expected = [(1, 1), (2, 2), (3, 2), (1, 4), (3, 4), (0x1FF, 4)].map(|(id, number)| frame(id, number));
     assert_eq!(read_all(&client), expected);
 
     let error = client.set_filters(&vec![Filter::ALL; 513]).unwrap_err().to_string();
     assert_eq!(error, "513 filters are too many for one socket on vcan0: at most 512");
-    client.set_filters(&vec![exact(LAST); 512]).unwrap();
+    client.set_filters(&vec![exact(END_MARKER_ID); 512]).unwrap();
     wait_until_routed(&bench);
-    other.send(&[frame(1, 5), frame(LAST, 0)]).unwrap();
+    other.send(&[frame(1, 5), frame(END_MARKER_ID, 0)]).unwrap();
     assert_eq!(read_all(&client), []);
     assert_eq!(bench.end().garbage, 0);
 }
@@ -207,7 +207,7 @@ fn filters_change_in_order_with_the_frames() {
 #[test]
 fn filters_that_never_end_are_garbage_and_those_latched_stay() {
     let bench = Bench::new();
-    let client = bench.open(&[exact(1), exact(LAST)]);
+    let client = bench.open(&[exact(1), exact(END_MARKER_ID)]);
     let part = |first, last| FilterPart { first, last, filters: vec![Filter::ALL; 8] }.encode();
     for count in 0..64 {
         rustix::net::send(&client, &part(count == 0, false), SendFlags::empty()).unwrap();
@@ -217,7 +217,7 @@ fn filters_that_never_end_are_garbage_and_those_latched_stay() {
     }
     rustix::net::send(&client, &part(true, false), SendFlags::empty()).unwrap();
     wait_until_routed(&bench);
-    bench.open(&[]).send(&[frame(1, 1), frame(2, 1), frame(LAST, 0)]).unwrap();
+    bench.open(&[]).send(&[frame(1, 1), frame(2, 1), frame(END_MARKER_ID, 0)]).unwrap();
     assert_eq!(read_all(&client), [frame(1, 1)]);
     assert_eq!(bench.end().garbage, 2, "the part that made too many, and one of nothing");
 }
@@ -232,7 +232,7 @@ fn own_frames_are_marked_and_stamped_with_the_wall_clock() {
     let mut inbox = Inbox::new();
     let mut seen = Vec::new();
     while seen.len() < 2 {
-        assert!(bus.wait(Some(LONG)).unwrap());
+        assert!(bus.wait(Some(FAILURE_TIMEOUT)).unwrap());
         bus.receive(&mut inbox).unwrap();
         seen.extend(inbox.frames());
     }
@@ -248,7 +248,7 @@ fn own_frames_are_marked_and_stamped_with_the_wall_clock() {
 fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
     const SENT: u32 = 20_000;
     let bench = Bench::new();
-    let filters = vec![exact(1), exact(2), exact(LAST)];
+    let filters = vec![exact(1), exact(2), exact(END_MARKER_ID)];
     let slow = bench.open_with(BusOptions { filters, receive_buffer: 64 * 1024, ..bench.options() });
     assert!(slow.receive_buffer() >= 64 * 1024);
     let sender = bench.open(&[]);
@@ -261,7 +261,7 @@ fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
     let mut inbox = Inbox::new();
     let mut heard = 0;
     while heard + inbox.dropped() < SENT {
-        assert!(slow.wait(Some(LONG)).unwrap(), "{heard} heard, {} dropped", inbox.dropped());
+        assert!(slow.wait(Some(FAILURE_TIMEOUT)).unwrap(), "{heard} heard, {} dropped", inbox.dropped());
         slow.receive(&mut inbox).unwrap();
         for received in inbox.frames() {
             assert_eq!(received.frame, frame(1, heard), "the oldest are kept");
@@ -272,7 +272,7 @@ fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
     assert_eq!(heard + inbox.dropped(), SENT);
 
     // After that, everything is as before.
-    sender.send(&[frame(2, 0), frame(LAST, 0)]).unwrap();
+    sender.send(&[frame(2, 0), frame(END_MARKER_ID, 0)]).unwrap();
     assert_eq!(read(&slow, &mut inbox), [frame(2, 0)]);
     let dropped = inbox.dropped();
     assert_eq!(bench.end().dropped, u64::from(dropped));
@@ -288,7 +288,7 @@ fn a_slow_client_holds_up_nobody() {
     for round in 0..100 {
         let frames: Vec<_> = (0..64).map(|n| frame(1, 64 * round + n)).collect();
         sender.send(&frames).unwrap();
-        sender.send(&[frame(LAST, 0)]).unwrap();
+        sender.send(&[frame(END_MARKER_ID, 0)]).unwrap();
         assert_eq!(read(&fast, &mut inbox), frames);
     }
     assert_eq!(inbox.dropped(), 0);
@@ -303,7 +303,7 @@ fn a_client_that_vanishes_has_said_what_it_said_and_the_rest_go_on() {
     for round in 0..50 {
         let goes = bench.open(&[Filter::ALL]);
         stays.send(&[frame(3, 0), frame(3, 1)]).unwrap();
-        goes.send(&[frame(1, round), frame(LAST, 0)]).unwrap();
+        goes.send(&[frame(1, round), frame(END_MARKER_ID, 0)]).unwrap();
         // The client leaves without reading, so the system reports an error to the server before the end.
         drop(goes);
         assert_eq!(read_all(&stays), [frame(1, round)]);
@@ -328,7 +328,7 @@ fn garbage_is_counted_and_hurts_nobody() {
         sent += 1;
     }
     wait_until_routed(&bench);
-    worse.send(&[frame(1, 1), frame(LAST, 0)]).unwrap();
+    worse.send(&[frame(1, 1), frame(END_MARKER_ID, 0)]).unwrap();
     assert_eq!(read_all(&bus), [frame(1, 1)]);
     assert_eq!(bench.end().garbage, sent);
 }
@@ -351,7 +351,7 @@ fn who_does_not_say_hello_is_turned_away() {
     drop(bench.raw());
     let silent = bench.raw();
     let bus = bench.open(&[Filter::ALL]);
-    bench.open(&[]).send(&[frame(1, 1), frame(LAST, 0)]).unwrap();
+    bench.open(&[]).send(&[frame(1, 1), frame(END_MARKER_ID, 0)]).unwrap();
     assert_eq!(read_all(&bus), [frame(1, 1)], "who says nothing holds up nobody");
     drop(silent);
     assert_eq!(bench.end().refused, 4);
@@ -388,12 +388,12 @@ fn a_bus_that_ends_is_read_to_its_end_and_then_closed() {
     bench.end();
 
     let mut inbox = Inbox::new();
-    assert!(bus.wait(Some(LONG)).unwrap());
+    assert!(bus.wait(Some(FAILURE_TIMEOUT)).unwrap());
     bus.receive(&mut inbox).unwrap();
     let seen: Vec<_> =
         inbox.frames().map(|received| received.frame).filter(|frame| frame.id() == 1).collect();
     assert_eq!(seen, [frame(1, 1), frame(1, 2)]);
-    assert!(bus.wait(Some(LONG)).unwrap(), "the end can be waited for too");
+    assert!(bus.wait(Some(FAILURE_TIMEOUT)).unwrap(), "the end can be waited for too");
     let error = bus.receive(&mut inbox).unwrap_err();
     assert!(matches!(error, BusError::Closed { .. }) && error.is_closed(), "{error}");
     // A child that another test has just forked holds the server's end open until its `exec`.
@@ -407,14 +407,14 @@ fn a_client_that_alone_is_hung_up_on_is_not_told_that_the_server_ended() {
     let (bus, other) = (bench.open(&[Filter::ALL]), bench.open(&[Filter::ALL]));
     // The server hangs up on a client that will never send again.
     rustix::net::shutdown(&bus, rustix::net::Shutdown::Write).unwrap();
-    assert!(bus.wait(Some(LONG)).unwrap());
+    assert!(bus.wait(Some(FAILURE_TIMEOUT)).unwrap());
     let error = bus.receive(&mut Inbox::new()).unwrap_err();
     let said = "the embedded bus vcan0 was closed: its server hung up on this program alone and serves others still; attach \
                 again";
     assert_eq!((error.to_string().as_str(), error.is_closed(), error.may_open_later()), (said, true, true));
     let sender = bench.open(&[]);
     sender.send(&[frame(1, 1)]).unwrap();
-    assert!(other.wait(Some(LONG)).unwrap(), "the others go on");
+    assert!(other.wait(Some(FAILURE_TIMEOUT)).unwrap(), "the others go on");
     bench.end();
 }
 
@@ -446,7 +446,7 @@ fn one_receives_while_others_send_on_the_same_bus() {
         }
         let (mut inbox, mut next) = (Inbox::new(), [0; 3]);
         while next != [500; 3] {
-            assert!(bus.wait(Some(LONG)).unwrap());
+            assert!(bus.wait(Some(FAILURE_TIMEOUT)).unwrap());
             bus.receive(&mut inbox).unwrap();
             for received in inbox.frames() {
                 let count = &mut next[received.frame.id() as usize];

@@ -10,10 +10,10 @@ use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 
 use model::decode::{Decoded, Decoder};
-use model::generate::{Format as Wire, Reply, Target, generate};
+use model::generate::{Format as Wire, Reply, SkinRequest, generate};
 use process::buses::{carries, mixed_skin};
 use process::test_client::TestClient;
-use process::{PRESSED, Place, Running, signal, skin_of, until};
+use process::{PRESSED, Running, TestDir, signal, skin_of, until};
 use protocol::bus::embedded::{HelloReply, MAX_HELLO_BYTES, address, seqpacket};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
@@ -29,39 +29,39 @@ const CELLS: usize = 12;
 const LOST: &str = "the embedded bus vcan1 was closed: its server ended; the others go on";
 
 /// Creates twelve cells on three buses, all pressed, and an arm that moves under the touch.
-fn place() -> Place {
-    let place = Place::new();
+fn place() -> TestDir {
+    let place = TestDir::new();
     place.write("skin.toml", &mixed_skin(&skin_of(CELLS, 3, Wire::Fd), &["vcan1"]));
     place.scenario(&PRESSED.replace("hold", "kinesthetic"));
     place
 }
 
 /// Serves a bus, as another program would.
-fn serve(place: &Place, bus: &str) -> Running {
+fn serve(place: &TestDir, bus: &str) -> Running {
     let server = place.start("vcan-setup", &format!("serve {bus}"));
-    server.prints(&format!("serving {bus} at "));
+    server.wait_for_stdout(&format!("serving {bus} at "));
     server
 }
 
 /// Returns the process that serves a bus for the gateway.
-fn server(place: &Place, bus: &str) -> Pid {
+fn server(place: &TestDir, bus: &str) -> Pid {
     let found = || place.processes().into_iter().find(|(_, line)| line.contains(&format!(" serve {bus} ")));
     until("a server", found).0
 }
 
 /// Opens a client on each bus.
-fn test_clients(place: &Place) -> [TestClient; 3] {
+fn test_clients(place: &TestDir) -> [TestClient; 3] {
     BUSES.map(|(bus, format)| TestClient::on(place, bus, format))
 }
 
 /// Ends a bench and the server of vcan1; checks that all counts add up on all buses, and that only vcan1 was lost, this
 /// number of times.
-fn ended_well(place: &Place, bench: Running, server: Option<Running>, times: u64) {
+fn ended_well(place: &TestDir, bench: Running, server: Option<Running>, times: u64) {
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     if let Some(server) = server {
         server.signal(Signal::TERM);
-        server.end().well();
+        server.end().succeeded();
     }
     place.is_left_clean();
     let summary = place.summary();
@@ -106,7 +106,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
     // The cells' answers in that time were lost with the bus, and do not count as differences.
     for capture in ["run.mcap", "run.log"] {
-        place.start("skinbus", &format!("convert {capture} notes.log --overwrite")).end().well();
+        place.start("skinbus", &format!("convert {capture} notes.log --overwrite")).end().succeeded();
         let lines = place.read("notes.log");
         assert_eq!(
             lines.lines().filter(|line| *line == "# the bus 'vcan1' was lost").count(),
@@ -120,21 +120,21 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
         );
         let replay =
             format!("replay {capture} --skin skin.toml --spawn --expect --lockstep --bus-kind embedded");
-        place.start("skinbus", &replay).end().well();
+        place.start("skinbus", &replay).end().succeeded();
     }
 }
 
 #[test]
 fn each_bus_has_its_own_tree_which_is_complete_again_when_the_bus_is_back() {
     let place = place();
-    let expected = Target { cells: CELLS, buses: 3, reply: Reply::Sum, ..Target::default() };
+    let expected = SkinRequest { cells: CELLS, buses: 3, reply: Reply::Sum, ..SkinRequest::default() };
     place.write("skin.toml", &mixed_skin(&generate(&expected).unwrap(), &["vcan1"]));
     let bench = place.running_bench(600.0, "");
     let whole = || test_clients(&place).iter().for_each(|bus| bus.waits_for_a_sum_of(4));
     whole();
     let cells = bench.cells();
     signal(server(&place, "vcan1"), Signal::KILL);
-    bench.hears("vcan1 works again");
+    bench.wait_for_stderr("vcan1 works again");
     whole();
     assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, None, 1);
@@ -150,23 +150,23 @@ fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() 
     let cells = bench.cells();
     first.signal(Signal::KILL);
     first.end();
-    bench.hears(LOST);
-    (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "fallen silent"));
+    bench.wait_for_stderr(LOST);
+    (1..=4).for_each(|cell| bench.wait_for_event_on("vcan1", cell, "fallen silent"));
     for (bus, format) in [BUSES[0], BUSES[2]] {
         let test_client = TestClient::on(&place, bus, format);
         test_client.waits_for_joints(30);
         test_client.waits_for_torques(1..=4);
     }
     // The robot is halted and resumed while the bus does not receive that.
-    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
-    bench.hears("the robot is halted: a halt frame was received; `skinbus frame resume --bus vcan0 --bus-kind embedded`");
+    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().succeeded();
+    bench.wait_for_stderr("the robot is halted: a halt frame was received; `skinbus frame resume --bus vcan0 --bus-kind embedded`");
     let second = serve(&place, "vcan1");
-    bench.hears("vcan1 works again");
-    (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "come back"));
+    bench.wait_for_stderr("vcan1 works again");
+    (1..=4).for_each(|cell| bench.wait_for_event_on("vcan1", cell, "come back"));
     let [_, vcan1, _] = test_clients(&place);
     vcan1.waits_for_halted_cells(1..=4);
-    place.start("skinbus", "frame resume --bus vcan2 --bus-kind embedded").end().well();
-    bench.hears("the robot goes on");
+    place.start("skinbus", "frame resume --bus vcan2 --bus-kind embedded").end().succeeded();
+    bench.wait_for_stderr("the robot goes on");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, Some(second), 1);
@@ -191,13 +191,13 @@ fn cells_that_were_away_receive_a_missed_resume_and_a_missed_touch() {
     place.scenario(&[&text[..touch], &others[0], "\n", &others[1], "\n", &vcan1].concat());
     let first = serve(&place, "vcan1");
     let bench = place.running_bench(600.0, "");
-    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
+    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().succeeded();
     TestClient::on(&place, "vcan1", Format::Classic).waits_for_halted_cells(1..=4);
     first.signal(Signal::KILL);
     first.end();
-    bench.hears(LOST);
-    place.start("skinbus", "frame resume --bus vcan0 --bus-kind embedded").end().well();
-    bench.hears("the robot goes on");
+    bench.wait_for_stderr(LOST);
+    place.start("skinbus", "frame resume --bus vcan0 --bus-kind embedded").end().succeeded();
+    bench.wait_for_stderr("the robot goes on");
     // More than the two seconds after which the absent cells are touched.
     TestClient::on(&place, "vcan2", Format::Fd).waits_for_joints(150);
     let second = serve(&place, "vcan1");
@@ -213,7 +213,7 @@ fn a_bus_that_is_lost_at_the_end_makes_the_run_fail_with_its_figures() {
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     vcan1.signal(Signal::KILL);
     vcan1.end();
-    bench.hears(LOST);
+    bench.wait_for_stderr(LOST);
     TestClient::on(&place, "vcan0", Format::Fd).waits_for_joints(30);
     bench.signal(Signal::TERM);
     let ended = bench.end();
@@ -237,11 +237,11 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted_until_it_is_back() {
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     first.signal(Signal::KILL);
     first.end();
-    bench.hears("the robot is halted: too many bad cycles in a row: the torque is not valid");
+    bench.wait_for_stderr("the robot is halted: too many bad cycles in a row: the torque is not valid");
     let second = serve(&place, "vcan1");
-    bench.hears("vcan1 works again");
-    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
-    bench.hears("the robot goes on");
+    bench.wait_for_stderr("vcan1 works again");
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
+    bench.wait_for_stderr("the robot goes on");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     ended_well(&place, bench, Some(second), 1);
     assert!(place.summary().count("/loop/bad_cycles", "the torque is not valid") >= 25);
@@ -255,11 +255,13 @@ fn a_gateway_that_has_no_bus_left_ends() {
     let [vcan0, vcan1, vcan2] = servers;
     for (server, bus) in [(vcan0, "vcan0"), (vcan2, "vcan2")] {
         server.signal(Signal::TERM);
-        server.end().well();
-        bench.hears(&format!("the embedded bus {bus} was closed: its server ended; the others go on"));
+        server.end().succeeded();
+        bench.wait_for_stderr(&format!(
+            "the embedded bus {bus} was closed: its server ended; the others go on"
+        ));
     }
     vcan1.signal(Signal::TERM);
-    vcan1.end().well();
+    vcan1.end().succeeded();
     let ended = bench.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     let said = "skinbus: the embedded bus vcan1 was closed: its server ended\n";
@@ -296,7 +298,7 @@ fn each_bus_has_the_requested_kind() {
         said.starts_with("skinbus: vcan1: this kernel has no") || said.contains("no interface vcan1"),
         "{said}"
     );
-    run("--bus-kind vcan0=embedded --bus-kind vcan1=embedded --bus-kind vcan2=embedded").end().well();
+    run("--bus-kind vcan0=embedded --bus-kind vcan1=embedded --bus-kind vcan2=embedded").end().succeeded();
     place.is_left_clean();
 }
 
@@ -309,7 +311,7 @@ struct PlayedServer {
 }
 
 impl PlayedServer {
-    fn at(place: &Place) -> Self {
+    fn at(place: &TestDir) -> Self {
         let directory = place.buses();
         DirBuilder::new().recursive(true).mode(0o700).create(&directory).unwrap();
         std::fs::set_permissions(&directory, Permissions::from_mode(0o700)).unwrap();
@@ -352,7 +354,7 @@ impl PlayedServer {
 
 #[test]
 fn what_a_cell_counts_as_sent_was_taken_by_its_bus_however_often_it_is_hung_up_on() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &skin_of(CELLS, 1, Wire::Fd));
     let mut server = PlayedServer::at(&place);
     let words = "--bus vcan0 --bus-kind embedded --node 5 --skin skin.toml --reconnect";

@@ -3,14 +3,14 @@
 
 use skinbus_tests::process;
 
-use process::Place;
+use process::TestDir;
 use protocol::skin::Skin;
 use serde_json::Value;
 
 const START: [&str; 2] = ["--start", "0 -1.2 1.0 -1.4 -1.57 0"];
 
 /// Returns the exit code, the result unless it was refused, and standard error.
-fn calibrate(place: &Place, words: &str) -> (Option<i32>, Option<Value>, String) {
+fn calibrate(place: &TestDir, words: &str) -> (Option<i32>, Option<Value>, String) {
     let mut command = place.command("skinbus", &format!("calibrate skin.toml --json --overwrite {words}"));
     let output = command.args(START).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
@@ -21,7 +21,7 @@ fn calibrate(place: &Place, words: &str) -> (Option<i32>, Option<Value>, String)
 
 #[test]
 fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(6);
     let live = "--duration 24s --quiet --bus-kind embedded --record run.mcap -o found.toml --page found.html";
     let (_, found, said) = calibrate(&place, live);
@@ -63,7 +63,7 @@ fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
 
 #[test]
 fn what_cannot_be_calibrated_is_refused_in_one_line() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(2);
     let refused = |words: &str| {
         let output = place.command("skinbus", &format!("calibrate skin.toml {words}")).output().unwrap();

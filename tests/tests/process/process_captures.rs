@@ -13,12 +13,12 @@ use process::program;
 /// Lines of the log, 53 bytes each: 212 MB.
 const LINES: u64 = 4_000_000;
 /// The number of lines that are generated and compared at once.
-const PIECE: u64 = 10_000;
+const LINES_AT_ONCE: u64 = 10_000;
 
 /// Writes the lines from `first` on.
 fn piece(text: &mut String, first: u64) {
     text.clear();
-    for line in first..first + PIECE {
+    for line in first..first + LINES_AT_ONCE {
         let word = line.wrapping_mul(0x9E37_79B9_7F4A_7C15);
         let (sec, micro) = (1_700_000_000 + line / 1_000_000, line % 1_000_000);
         writeln!(text, "({sec}.{micro:06}) vcan{} 20C##5{word:016X}FFFF", line % 2).unwrap();
@@ -49,7 +49,7 @@ fn a_capture_larger_than_memory_goes_there_and_back() {
 
     let mut into = bounded("-", mcap).stdin(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut input = into.stdin.take().unwrap();
-    for first in (0..LINES).step_by(usize::try_from(PIECE).unwrap()) {
+    for first in (0..LINES).step_by(usize::try_from(LINES_AT_ONCE).unwrap()) {
         piece(&mut text, first);
         input.write_all(text.as_bytes()).unwrap();
     }
@@ -59,7 +59,7 @@ fn a_capture_larger_than_memory_goes_there_and_back() {
     let mut out = bounded(mcap, "-").stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut output = out.stdout.take().unwrap();
     let mut back = Vec::new();
-    for first in (0..LINES).step_by(usize::try_from(PIECE).unwrap()) {
+    for first in (0..LINES).step_by(usize::try_from(LINES_AT_ONCE).unwrap()) {
         piece(&mut text, first);
         back.resize(text.len(), 0);
         output.read_exact(&mut back).unwrap();

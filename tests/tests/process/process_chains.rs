@@ -13,7 +13,7 @@ use skinbus_tests::process::recorded;
 use std::collections::BTreeMap;
 use std::fs;
 
-use process::{Ended, Place, example};
+use process::{Ended, TestDir, example};
 use recorded::Recorded;
 use serde_json::Value;
 
@@ -34,13 +34,13 @@ profile = "step"
 
 const HEAD: &str = "link,px,py,pz,nx,ny,nz";
 
-fn run(place: &Place, words: &str) -> Ended {
-    place.start("skinbus", words).end().well()
+fn run(place: &TestDir, words: &str) -> Ended {
+    place.start("skinbus", words).end().succeeded()
 }
 
 /// Writes `skin.toml` of an example robot with these cells, and a scenario that presses all of them.
-fn robot(file: &str, tips: &str, cells: &str) -> Place {
-    let place = Place::new();
+fn robot(file: &str, tips: &str, cells: &str) -> TestDir {
+    let place = TestDir::new();
     fs::copy(example(file), place.path(file)).unwrap();
     place.write("cells.csv", &format!("{HEAD}\n{cells}"));
     run(&place, &format!("skin import {file} {tips} --places cells.csv -o skin.toml"));
@@ -48,11 +48,11 @@ fn robot(file: &str, tips: &str, cells: &str) -> Place {
     place
 }
 
-fn objects(place: &Place, words: &str) -> Vec<Value> {
+fn objects(place: &TestDir, words: &str) -> Vec<Value> {
     run(place, words).stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
-fn explained(place: &Place, epoch: u64, at: u64) -> Value {
+fn explained(place: &TestDir, epoch: u64, at: u64) -> Value {
     let words = format!("explain run.mcap --epoch {epoch} --at {at} --json");
     serde_json::from_str(&run(place, &words).stdout).unwrap()
 }
@@ -70,7 +70,7 @@ fn the_torque_of_a_torso_is_that_of_both_arms() {
     let cells = "torso,0.1,0,0.2,1,0,0\nleft_upper_arm,0.05,0,-0.1,1,0,0\nleft_forearm,0,0.05,-0.1,0,1,0\n\
                  right_upper_arm,0,-0.05,-0.1,0,-1,0\nright_forearm,0.05,0,-0.1,1,0,0\n";
     let place = robot("two-arms.urdf", "--tip left_palm --tip right_palm", cells);
-    place.bench(3.0, "--record run.mcap").end().well();
+    place.bench(3.0, "--record run.mcap").end().succeeded();
 
     // The cells' torques, by bus and epoch; the arms have moved.
     let mut sent = BTreeMap::<(String, u64), Vec<Vec<f64>>>::new();
@@ -137,7 +137,7 @@ fn the_torque_of_a_torso_is_that_of_both_arms() {
 #[test]
 fn a_joint_that_slides_has_its_own_units() {
     let place = robot("lift.urdf", "--tip tool", "tool,0,0.05,0,0.6,0,0.8\n");
-    place.bench(2.0, "--record run.mcap").end().well();
+    place.bench(2.0, "--record run.mcap").end().succeeded();
     let (log, mcap) = ("run.log --skin skin.toml", "run.mcap");
     let shown: Vec<Vec<Value>> = [log, mcap]
         .iter()
@@ -190,7 +190,7 @@ fn a_report_names_the_torque_format_that_would_have_fitted() {
         "{PRESS}\n[motion]\nkind = \"hold\"\nstart = [0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8]\n"
     ));
     let report = || {
-        place.bench(1.5, "--record run.mcap").end().well();
+        place.bench(1.5, "--record run.mcap").end().succeeded();
         run(&place, "report run.mcap -o run.html --overwrite");
         place.read("run.html").split_whitespace().collect::<Vec<_>>().join(" ")
     };

@@ -8,8 +8,8 @@ use std::fs;
 
 use cell_node::flash;
 use cell_node::identity::Identity;
-use model::generate::{Format, Reply, Target, generate};
-use process::{Ended, Place, Running, skin, skin_of, until};
+use model::generate::{Format, Reply, SkinRequest, generate};
+use process::{Ended, Running, TestDir, skin, skin_of, until};
 use protocol::id::CellId;
 use protocol::parameters::Parameters;
 use protocol::skin::Skin;
@@ -29,7 +29,7 @@ fn older(text: &str) -> String {
 
 /// A bus with running cells, which have the older skin in their flash.
 struct Workshop {
-    place: Place,
+    place: TestDir,
     _cells: Running,
     _bus: Running,
 }
@@ -41,12 +41,12 @@ impl Workshop {
 
     /// Starts the cells from 1 on in one process, with the skin `had`.
     fn with(text: &str, had: &str, more: &str) -> Self {
-        let place = Place::new();
+        let place = TestDir::new();
         place.write("skin.toml", text);
         place.write("had.toml", had);
         fs::create_dir(place.path("flash")).unwrap();
         let bus = place.start("vcan-setup", "serve vcan0");
-        bus.prints("serving ");
+        bus.wait_for_stdout("serving ");
         let cells = Skin::parse("skin.toml", had).unwrap().cells.len();
         let cells =
             format!("--bus vcan0 --nodes 1-{cells} --skin had.toml --flash flash --bus-kind embedded {more}");
@@ -121,18 +121,18 @@ fn json(ended: &Ended) -> Value {
 fn cells_get_the_skins_parameters_and_a_repeat_is_a_no_op() {
     for format in [Format::Fd, Format::Classic] {
         let workshop = Workshop::new(&skin_of(20, 1, format));
-        let dry = workshop.commission("--dry-run --json").end().well();
+        let dry = workshop.commission("--dry-run --json").end().succeeded();
         assert_eq!(json(&dry).pointer("/buses/0/would_write"), Some(&20.into()), "{dry:#?}");
         assert_eq!(workshop.none_is_mixed(), 0, "a dry run writes nothing");
 
-        let first = workshop.commission("").end().well();
+        let first = workshop.commission("").end().succeeded();
         assert!(first.stdout.contains("written          20"), "{}", first.stdout);
         workshop.all_have_it();
 
-        let second = workshop.commission("--json").end().well();
+        let second = workshop.commission("--json").end().succeeded();
         let bus = &json(&second)["buses"][0];
         assert_eq!((&bus["already_so"], &bus["requests"]), (&20.into(), &0.into()), "{bus:#}");
-        let third = workshop.commission("--verify --json --quiet").end().well();
+        let third = workshop.commission("--verify --json --quiet").end().succeeded();
         assert_eq!((json(&third)["buses"][0]["verified"].as_u64(), third.stderr.as_str()), (Some(20), ""));
     }
 }
@@ -160,11 +160,11 @@ fn killed_in_the_middle_and_run_again_it_is_complete_and_nothing_is_mixed() {
         // Once more from the start.
         fs::rename(workshop.place.path("skin.toml"), workshop.place.path("new.toml")).unwrap();
         fs::copy(workshop.place.path("had.toml"), workshop.place.path("skin.toml")).unwrap();
-        workshop.commission("--quiet").end().well();
+        workshop.commission("--quiet").end().succeeded();
         fs::rename(workshop.place.path("new.toml"), workshop.place.path("skin.toml")).unwrap();
     }
     assert!(halfway, "it was never killed in the middle");
-    let ended = workshop.commission("--json").end().well();
+    let ended = workshop.commission("--json").end().succeeded();
     let bus = &json(&ended)["buses"][0];
     let (written, already) = (bus["written"].as_u64().unwrap(), bus["already_so"].as_u64().unwrap());
     assert!(written > 0 && already > 0 && written + already == 120, "{bus:#}");
@@ -234,28 +234,28 @@ fn node_ids_on_the_bus_are_written_into_a_copy_of_the_description() {
     };
     let described: String = described.lines().map(|line| renamed(line) + "\n").collect();
     let workshop = Workshop::with(&described, &older(&had), "");
-    let ended = workshop.commission("--node-ids as-is.toml").end().well();
+    let ended = workshop.commission("--node-ids as-is.toml").end().succeeded();
     assert!(
         ended.stderr.contains("the cell with serial number 100001 is 1 on vcan0, 6 in skin.toml"),
         "{ended:#?}"
     );
     assert_eq!(workshop.place.read("as-is.toml"), text, "node ids and neighbors, and nothing else");
-    assert_eq!(workshop.commission("--json").end().well().stdout.matches("\"already so\"").count(), 6);
+    assert_eq!(workshop.commission("--json").end().succeeded().stdout.matches("\"already so\"").count(), 6);
     let listed = workshop.list("--skin as-is.toml").unwrap();
     assert!(listed["cells"].as_array().unwrap().iter().all(|cell| cell["skin"] == "yes"), "{listed:#}");
     // A bench of the copy runs with the existing cells.
     let run = "run as-is.toml --no-spawn --bus-kind embedded --duration 0.5 --quiet";
-    workshop.place.start("skinbus", run).end().well();
+    workshop.place.start("skinbus", run).end().succeeded();
 }
 
 #[test]
 fn new_cells_get_node_ids_from_the_network_and_then_their_parameters() {
-    let place = Place::new();
-    let text = generate(&Target { cells: 8, reply: Reply::Sum, ..Target::default() }).unwrap();
+    let place = TestDir::new();
+    let text = generate(&SkinRequest { cells: 8, reply: Reply::Sum, ..SkinRequest::default() }).unwrap();
     place.write("skin.toml", &text);
     fs::create_dir(place.path("flash")).unwrap();
     let bus = place.start("vcan-setup", "serve vcan0");
-    bus.prints("serving ");
+    bus.wait_for_stdout("serving ");
     let cell = |node: u8| {
         let fresh = format!("--node {node} --skin skin.toml --fresh --flash flash");
         place.start("cell-node", &format!("--bus vcan0 --bus-kind embedded {fresh}"))
@@ -280,19 +280,19 @@ fn new_cells_get_node_ids_from_the_network_and_then_their_parameters() {
             |node: CellId| skin.cells.iter().position(|cell| cell.node == node).map(|at| copy.cells[at].node);
         assert_eq!(described.neighbors.map(|it| it.and_then(renamed)), there.neighbors);
     }
-    let again = commission("--json").well();
+    let again = commission("--json").succeeded();
     assert_eq!(json(&again).pointer("/buses/0/already_so"), Some(&8.into()), "{again:#?}");
 }
 
 #[test]
 fn several_buses_are_commissioned_at_the_same_time_or_one_alone() {
-    let place = Place::new();
+    let place = TestDir::new();
     let text = skin_of(10, 2, Format::Fd);
     place.write("skin.toml", &text);
     place.write("had.toml", &older(&text));
     let buses = ["vcan0", "vcan1"].map(|bus| {
         let served = place.start("vcan-setup", &format!("serve {bus}"));
-        served.prints("serving ");
+        served.wait_for_stdout("serving ");
         let cells = format!("--bus {bus} --nodes 1-5 --skin had.toml --bus-kind embedded");
         (served, place.start("cell-node", &cells))
     });
@@ -317,7 +317,7 @@ fn a_list_is_redrawn_while_it_is_watched() {
         .place
         .start("skinbus", "cells vcan0 --bus-kind embedded --watch --json --duration 2.2")
         .end()
-        .well();
+        .succeeded();
     let lines: Vec<Value> = watched.stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let last = lines.last().unwrap()["cells"].as_array().unwrap();
     assert!(lines.len() >= 2 && last.len() == 3, "{watched:#?}");
@@ -346,13 +346,13 @@ fn unknown_nodes_are_named_and_left_alone_and_missing_cells_are_named() {
     // The unknown cell keeps its parameters.
     workshop.place.write("skin.toml", &text);
     assert_eq!(workshop.none_is_mixed(), 5);
-    workshop.commission("--node-ids out.toml").end().well();
+    workshop.commission("--node-ids out.toml").end().succeeded();
     assert_eq!((workshop.none_is_mixed(), workshop.place.read("out.toml")), (6, text));
 }
 
 #[test]
 fn beside_a_gateway_nothing_is_sent() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     let text = place.read("skin.toml");
@@ -361,13 +361,14 @@ fn beside_a_gateway_nothing_is_sent() {
     assert_eq!(said.refusal(1), "skinbus: another gateway is on vcan0: stop it first");
     // Listing does not disturb other clients.
     let listed = until("all in the list", || {
-        let listed = place.start("skinbus", "cells vcan0 --bus-kind embedded --skin skin.toml").end().well();
+        let listed =
+            place.start("skinbus", "cells vcan0 --bus-kind embedded --skin skin.toml").end().succeeded();
         let all = "8 cells on vcan0 (embedded), 8 in contact, and a gateway\n";
         listed.stdout.ends_with(all).then_some(listed)
     });
     assert_eq!(listed.stdout.lines().count(), 1 + 8 + 1, "{}", listed.stdout);
     bench.signal(Signal::INT);
-    bench.end().well();
+    bench.end().succeeded();
     place.summary().adds_up();
 }
 
@@ -375,7 +376,7 @@ fn beside_a_gateway_nothing_is_sent() {
 fn an_interrupted_commissioning_says_how_far_it_came() {
     let workshop = Workshop::new(&skin(8));
     let running = workshop.commission("");
-    running.hears("listening: ");
+    running.wait_for_stderr("listening: ");
     running.signal(Signal::INT);
     let ended = running.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
@@ -385,7 +386,7 @@ fn an_interrupted_commissioning_says_how_far_it_came() {
 
 #[test]
 fn what_cannot_be_done_is_one_line() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &skin(4));
     let said = |words: &str, code: i32| {
         place.start("skinbus", &format!("{words} --bus-kind embedded")).end().refusal(code).to_owned()
@@ -404,7 +405,7 @@ fn what_cannot_be_done_is_one_line() {
     );
 
     let bus = place.start("vcan-setup", "serve vcan0");
-    bus.prints("serving ");
+    bus.wait_for_stdout("serving ");
     let line = said("commission skin.toml --quiet", 1);
     assert_eq!(line, "skinbus: no cells are on vcan0: start them, or switch them on, and run this again");
     let line = said("cells vcan0 --duration 0.4", 1);

@@ -7,7 +7,7 @@ use skinbus_tests::process;
 use std::fs;
 use std::time::Duration;
 
-use process::{Place, Running, program, until};
+use process::{Running, TestDir, program, until};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{Heartbeat, Message, NetworkPage, State};
@@ -17,14 +17,14 @@ use serde_json::Value;
 
 /// A cell on a bus, which a script switches off and on.
 struct Cell {
-    place: Place,
+    place: TestDir,
     format: Format,
     _bus: Running,
 }
 
 impl Cell {
     fn new(format: Format) -> Self {
-        let place = Place::new();
+        let place = TestDir::new();
         place.write("skin.toml", &process::skin_of(8, 1, format));
         fs::create_dir(place.path("flash")).unwrap();
         let bus = place.start("vcan-setup", "serve vcan0");
@@ -75,7 +75,7 @@ impl Cell {
     fn has(&self) -> Vec<String> {
         let read = |parameter: &&str| {
             let words = format!("frame configure --cell 5 --read {parameter} {}", self.bus());
-            self.place.start("skinbus", &words).end().well().stdout
+            self.place.start("skinbus", &words).end().succeeded().stdout
         };
         ["mount", "pose", "contact", "timing", "mode", "events", "16", "21"].iter().map(read).collect()
     }
@@ -173,7 +173,7 @@ fn after_a_kill_the_file_puts_the_cell_back() {
         "skinbus: conformance-vcan0-5.json is left from an earlier test that did not restore the cell: do that with \
          --restore conformance-vcan0-5.json, or delete it"
     );
-    cell.conformance("--restore conformance-vcan0-5.json").end().well();
+    cell.conformance("--restore conformance-vcan0-5.json").end().succeeded();
     assert_eq!(cell.has(), before);
     assert!(!cell.place.path("conformance-vcan0-5.json").exists());
 }
@@ -191,7 +191,7 @@ fn a_cell_that_dies_is_said_and_its_file_is_kept() {
     assert!(ended.stderr.contains("the cell was not restored: the cell fell silent"), "{ended:#?}");
     assert!(ended.stderr.lines().count() == 1, "{ended:#?}");
     cell.restart();
-    cell.conformance("--restore conformance-vcan0-5.json").end().well();
+    cell.conformance("--restore conformance-vcan0-5.json").end().succeeded();
     assert_eq!(cell.has(), before);
 }
 
@@ -254,7 +254,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     let client = cell.place.test_client();
     let test = cell.conformance("--requirement CMD");
     until("a refusal", || {
-        client.sends(&twin());
+        client.send(&twin());
         (!test.stderr().is_empty()).then_some(())
     });
     assert_eq!(
@@ -264,7 +264,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     // A gateway that begins to command in the middle of a test.
     let test = cell.conformance("");
     cell.is_tested();
-    client.sends(&Message::Resume);
+    client.send(&Message::Resume);
     let ended = test.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert_eq!(
@@ -274,7 +274,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     assert_eq!(cell.has(), before);
     let test = cell.conformance("--requirement CMD");
     until("a refusal", || {
-        client.sends(&Message::Resume);
+        client.send(&Message::Resume);
         (!test.stderr().is_empty()).then_some(())
     });
     let said = test.end();
@@ -293,7 +293,7 @@ fn other_cells_that_send_much_do_not_matter_if_they_are_tolerated() {
         let mut test = cell.conformance("--requirement CMD,STIM,CONF --others-will-stop");
         let file = cell.place.path("conformance-vcan0-5.json");
         while test.is_running() {
-            client.sends(&flood);
+            client.send(&flood);
             std::thread::sleep(Duration::from_micros(300));
         }
         let passed = test.end().stdout.contains(" 0 failed");

@@ -7,14 +7,14 @@ use skinbus_tests::process;
 use std::os::unix::process::CommandExt;
 
 use process::log::Log;
-use process::{Place, Running, is_stopped, until};
+use process::{Running, TestDir, is_stopped, until};
 use protocol::can::Format;
 use protocol::message::Message;
 use rustix::process::{Signal, kill_process_group};
 
 #[test]
 fn all_processes_end_with_a_killed_gateway() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     assert_eq!(bench.cells().len(), 8);
@@ -30,12 +30,12 @@ fn all_processes_end_with_a_killed_gateway() {
 #[test]
 fn a_signal_ends_a_bench_early_and_well() {
     for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
-        let place = Place::new();
+        let place = TestDir::new();
         place.pressed();
         let bench = place.running_bench(600.0, "");
         place.test_client().waits_for_epoch(10);
         bench.signal(signal);
-        let ended = bench.end().well();
+        let ended = bench.end().succeeded();
         place.is_left_clean();
         assert!(ended.stdout.contains("interrupted") && ended.stdout.contains("8 cells"), "{}", ended.stdout);
         assert_eq!(place.files(), ["run.json", "run.log", "scenario.toml", "skin.toml"]);
@@ -56,7 +56,7 @@ fn a_signal_ends_a_bench_early_and_well() {
 
 #[test]
 fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     // A terminal signals the whole process group at once.
     let mut command = place.command(
@@ -67,10 +67,10 @@ fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
         command.process_group(0);
         command
     });
-    bench.hears_the_loop();
+    bench.wait_for_loop();
     place.test_client().waits_for_epoch(10);
     kill_process_group(bench.pid(), Signal::INT).unwrap();
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     place.is_left_clean();
     assert!(
         !ended.stderr.contains("ended (signal") && !ended.stderr.contains("cell-node"),
@@ -84,7 +84,7 @@ fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
 
 #[test]
 fn a_signal_while_starting_is_a_failed_run_with_a_summary_and_a_log() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.bench(600.0, "--quiet --record run.mcap");
     until("the first cells", || (!bench.cells().is_empty()).then_some(()));
@@ -100,7 +100,7 @@ fn a_signal_while_starting_is_a_failed_run_with_a_summary_and_a_log() {
 
 #[test]
 fn a_bus_that_goes_away_ends_the_run_with_one_line_and_the_frames_until_then() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     place.test_client().waits_for_epoch(10);
@@ -128,7 +128,7 @@ fn a_bus_that_goes_away_ends_the_run_with_one_line_and_the_frames_until_then() {
 
 #[test]
 fn a_reader_that_ends_loses_the_table_and_not_the_summary() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let script = "\"$0\" run skin.toml --bus-kind embedded --scenario scenario.toml --duration 0.5 \
                   --summary run.json --quiet | true";

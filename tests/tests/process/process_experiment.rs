@@ -3,13 +3,13 @@
 
 use skinbus_tests::process;
 
-use process::{Place, names};
+use process::{TestDir, names};
 use rustix::process::Signal;
 use serde_json::Value;
 
 #[test]
 fn the_moving_arm_is_run_recorded_drawn_and_rated() {
-    let place = Place::new();
+    let place = TestDir::new();
     let ended = place.start("skinbus", "experiment fig7 fig6 fig8 --quick -o results").end();
     assert!(ended.status.success(), "{}", ended.stderr);
     assert!(ended.stderr.contains("fig6: torques of the moving arm"), "{}", ended.stderr);
@@ -54,7 +54,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_rated() {
 
 #[test]
 fn benches_over_their_cells_are_run_drawn_and_rated() {
-    let place = Place::new();
+    let place = TestDir::new();
     let ended = place.start("skinbus", "experiment scale --quick -o results").end();
     assert!(ended.status.success(), "{}", ended.stderr);
     let results: Value = serde_json::from_str(&place.read("results/results.json")).unwrap();
@@ -93,7 +93,7 @@ fn benches_over_their_cells_are_run_drawn_and_rated() {
 
 #[test]
 fn a_failed_or_interrupted_experiment_leaves_nothing() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("file", "mine");
     for (words, code, said) in [
         ("experiment fig9 --quick", 2, "-o DIR is missing"),
@@ -113,7 +113,7 @@ fn a_failed_or_interrupted_experiment_leaves_nothing() {
     }
     assert_eq!(place.read("file"), "mine");
     let running = place.start("skinbus", "experiment fig7 --quick -o results");
-    running.hears("fig7: ");
+    running.wait_for_stderr("fig7: ");
     running.signal(Signal::INT);
     let ended = running.end();
     assert_eq!(ended.status.code(), Some(1), "{}", ended.stderr);

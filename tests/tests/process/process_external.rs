@@ -8,7 +8,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use process::external::{answer, place};
-use process::{Place, Running, TIMEOUT, example, until};
+use process::{Running, TIMEOUT, TestDir, example, until};
 use protocol::message::Message;
 use rustix::process::Signal;
 
@@ -17,7 +17,7 @@ const NOBODY: &str = "no external controller is connected";
 const NONSENSE: &str = "the external controller sent nonsense";
 
 /// Starts the example in Python.
-fn python(place: &Place) -> Running {
+fn python(place: &TestDir) -> Running {
     let mut command = Command::new("python3");
     command.arg(example("external_controller.py")).arg(place.path("controller.sock"));
     Running::start(command)
@@ -28,12 +28,12 @@ fn the_example_in_python_moves_the_arm() {
     // A busy machine must not halt the robot.
     let place = place(10_000);
     let python = python(&place);
-    python.hears("waiting for a gateway at ");
+    python.wait_for_stderr("waiting for a gateway at ");
     let bench = place.running_bench(600.0, "");
     place.test_client().waits_for_motion();
-    python.prints(" 8 cells ");
+    python.wait_for_stdout(" 8 cells ");
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.is_left_clean();
     assert_eq!(place.files(), ["run.json", "run.log", "scenario.toml", "skin.toml"], "no socket is left");
     let summary = place.summary();
@@ -54,7 +54,7 @@ fn a_controller_that_begins_later_is_waited_for() {
     let python = python(&place);
     place.test_client().waits_for_motion();
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     assert!(!ended.stderr.contains("halted"), "{}", ended.stderr);
     place.is_left_clean();
     let summary = place.summary();
@@ -68,23 +68,23 @@ fn a_controller_that_begins_later_is_waited_for() {
 fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_ack() {
     let place = place(1_000);
     let first = python(&place);
-    first.hears("waiting for a gateway at ");
+    first.wait_for_stderr("waiting for a gateway at ");
     let bench = place.running_bench(600.0, "");
     place.test_client().waits_for_motion();
     first.signal(Signal::KILL);
     assert_eq!(first.end().signal(), Some(9));
-    bench.hears(&format!(
+    bench.wait_for_stderr(&format!(
         "the robot is halted: too many bad cycles in a row: {NOBODY}; `skinbus frame resume --bus vcan0 --bus-kind embedded`"
     ));
     // A hello does not resume the robot; a person has to do that.
     let second = python(&place);
-    second.prints("HALTED");
+    second.wait_for_stdout("HALTED");
     assert!(!bench.stderr().contains("goes on"), "{}", bench.stderr());
-    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
-    bench.hears("the robot goes on");
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
+    bench.wait_for_stderr("the robot goes on");
     place.test_client().waits_for_motion();
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     assert!(summary.count("/loop/bad_cycles", NOBODY) >= 1_000 - 1, "{:#}", summary.0);
@@ -121,7 +121,7 @@ fn a_controllers_nonsense_is_counted_and_ignored() {
         let _ = own.send_to(nonsense[sent % nonsense.len()], &gateway);
         sent += 1;
     }
-    bench.hears("the robot is halted: too many bad cycles in a row: ");
+    bench.wait_for_stderr("the robot is halted: too many bad cycles in a row: ");
     bench.signal(Signal::TERM);
     let ended = bench.end();
     assert_eq!(ended.code(), Some(3), "{ended:#?}");
@@ -142,7 +142,7 @@ fn a_controllers_nonsense_is_counted_and_ignored() {
 
 /// Runs a bench whose controller may take longer to begin than the run lasts; `control` creates the part of it that
 /// exists.
-fn ends_without_controller(control: impl FnOnce(&Place), why: &str) {
+fn ends_without_controller(control: impl FnOnce(&TestDir), why: &str) {
     let place = place(25);
     place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
     let bench = place.bench(600.0, "--quiet");
@@ -181,7 +181,7 @@ fn a_run_to_which_no_controller_comes_has_an_outcome_of_its_own() {
 
 #[test]
 fn a_program_that_says_hello_in_another_version_is_no_controller() {
-    let control = |place: &Place| {
+    let control = |place: &TestDir| {
         let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
         let hello = [b"SKBC".as_slice(), &[2, 0, 3, 0]].concat();
         own.send_to(&hello, place.path("controller.sock")).unwrap();
@@ -192,7 +192,7 @@ fn a_program_that_says_hello_in_another_version_is_no_controller() {
 #[test]
 fn a_controller_that_says_hello_and_does_not_answer_is_none() {
     let mut peer = None;
-    let control = |place: &Place| {
+    let control = |place: &TestDir| {
         let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
         own.send_to(&[b"SKBC".as_slice(), &[1, 0, 3, 0]].concat(), place.path("controller.sock")).unwrap();
         // It stays connected, and reads nothing.

@@ -9,7 +9,7 @@ use std::os::unix::fs::PermissionsExt;
 use model::generate::Format as Wire;
 use process::log::Log;
 use process::test_client::TestClient;
-use process::{PRESSED, Place, Running, Summary, is_stopped, skin, until};
+use process::{PRESSED, Running, Summary, TestDir, is_stopped, skin, until};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, NetworkPage, State};
@@ -49,7 +49,7 @@ fn torque_of(cell: u8) -> impl Fn(&Message) -> bool {
 
 #[test]
 fn a_scenario_kills_restarts_stops_and_continues_cells_and_the_loop_goes_on() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(8);
     place.scenario(&format!("{PRESSED}{TO_PROCESSES}"));
     let bench = place.running_bench(600.0, "");
@@ -58,14 +58,14 @@ fn a_scenario_kills_restarts_stops_and_continues_cells_and_the_loop_goes_on() {
         "the process of cell 2 on vcan0 ended (signal: 9 (SIGKILL))",
         "cell 3 on vcan0 restarted",
     ] {
-        bench.hears(said);
+        bench.wait_for_stderr(said);
     }
     for (cell, what) in [(2, "fallen silent"), (4, "fallen silent"), (4, "come back")] {
-        bench.tells(cell, what);
+        bench.wait_for_event(cell, what);
     }
     place.test_client().waits_for_torques(3..=4);
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     assert_eq!(summary.adds_up().silent(), [2]);
@@ -91,14 +91,14 @@ fn a_scenario_kills_restarts_stops_and_continues_cells_and_the_loop_goes_on() {
 
 #[test]
 fn a_cell_that_is_killed_from_outside_is_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     process::signal(bench.cell(6), Signal::KILL);
-    bench.hears("the process of cell 6 on vcan0 ended (signal: 9 (SIGKILL))");
-    bench.tells(6, "fallen silent");
+    bench.wait_for_stderr("the process of cell 6 on vcan0 ended (signal: 9 (SIGKILL))");
+    bench.wait_for_event(6, "fallen silent");
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     place.is_left_clean();
     assert_eq!(place.summary().adds_up().silent(), [6]);
     assert!(ended.stdout.contains("1 dead"), "{}", ended.stdout);
@@ -106,19 +106,19 @@ fn a_cell_that_is_killed_from_outside_is_named() {
 
 #[test]
 fn a_cell_that_is_stopped_and_continued_skips_what_it_missed_and_comes_back() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     let cell = bench.cell(7);
     process::signal(cell, Signal::STOP);
     until("a stopped cell", || is_stopped(cell).then_some(()));
-    bench.tells(7, "fallen silent");
+    bench.wait_for_event(7, "fallen silent");
     let test_client = place.test_client();
     process::signal(cell, Signal::CONT);
-    bench.tells(7, "come back");
+    bench.wait_for_event(7, "come back");
     test_client.waits_for("a torque of cell 7", torque_of(7));
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     let summary = place.summary();
     assert_eq!(summary.adds_up().silent().len(), 0);
     assert!(summary.of_bus("/replies/skipped") > 0, "{:#}", summary.0);
@@ -127,25 +127,25 @@ fn a_cell_that_is_stopped_and_continued_skips_what_it_missed_and_comes_back() {
 
 #[test]
 fn several_cells_in_a_killed_process_are_all_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "--cells-per-process 4");
     let (first, _) = bench.cells().into_iter().find(|(_, nodes)| nodes == "1-4").unwrap();
     process::signal(first, Signal::KILL);
-    bench.hears("the process of cells 1 to 4 on vcan0 ended");
-    bench.tells(4, "fallen silent");
+    bench.wait_for_stderr("the process of cells 1 to 4 on vcan0 ended");
+    bench.wait_for_event(4, "fallen silent");
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     assert_eq!(place.summary().adds_up().silent(), [1, 2, 3, 4]);
 }
 
 /// Makes the cells of vcan1 end with an error of their own: they lose their bus, and may not search its folder again.
 /// Afterwards the bus is served again.
-fn errors_on_vcan1(place: &Place, bench: &Running, server: Running, processes: usize) -> Running {
+fn errors_on_vcan1(place: &TestDir, bench: &Running, server: Running, processes: usize) -> Running {
     let mode = |mode| std::fs::set_permissions(place.buses(), std::fs::Permissions::from_mode(mode)).unwrap();
     let serve = || {
         let server = place.start("vcan-setup", "serve vcan1");
-        server.prints("serving vcan1 at ");
+        server.wait_for_stdout("serving vcan1 at ");
         server
     };
     let all = bench.cells().len();
@@ -162,11 +162,11 @@ fn errors_on_vcan1(place: &Place, bench: &Running, server: Running, processes: u
 #[test]
 fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason_is_given_once() {
     for (per_process, quiet) in [(1, true), (4, false)] {
-        let place = Place::new();
+        let place = TestDir::new();
         place.write("skin.toml", &process::skin_of(8, 2, Wire::Fd));
         place.scenario(PRESSED);
         let first = place.start("vcan-setup", "serve vcan1");
-        first.prints("serving vcan1 at ");
+        first.wait_for_stdout("serving vcan1 at ");
         let more = if quiet { "--quiet" } else { "" };
         let bench = place.bench(600.0, &format!("{more} --cells-per-process {per_process}"));
         TestClient::on(&place, "vcan1", Format::Fd).waits_for_joints(10);
@@ -174,7 +174,7 @@ fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason
         bench.signal(Signal::TERM);
         let ended = bench.end();
         server.signal(Signal::TERM);
-        server.end().well();
+        server.end().succeeded();
         place.is_left_clean();
         assert_eq!(ended.code(), Some(5), "{ended:#?}");
         let summary = place.summary();
@@ -204,7 +204,7 @@ fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason
 
 #[test]
 fn a_second_gateway_ends_with_one_line_and_the_first_goes_on_undisturbed() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     let second = "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 1 --summary second.json \
@@ -220,7 +220,7 @@ fn a_second_gateway_ends_with_one_line_and_the_first_goes_on_undisturbed() {
     place.test_client().waits_for("a torque", torque_of(1));
     assert_eq!(bench.cells().len(), 8);
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     assert_eq!(summary.adds_up().silent().len(), 0);
@@ -241,10 +241,10 @@ impl<const N: usize> Sorted for [&str; N] {
 
 #[test]
 fn cells_on_the_bus_are_not_started_twice() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 2-3 --skin skin.toml");
     place.test_client().waits_for(
         "cell 3",
@@ -258,7 +258,7 @@ fn cells_on_the_bus_are_not_started_twice() {
 
 #[test]
 fn a_newcomer_with_a_taken_node_id_ends_with_one_line() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     place.write("other.toml", &skin(8).replace("serial = 100003\n", "serial = 777\n"));
     // An unknown cell, and a duplicate with the same description.
@@ -271,7 +271,7 @@ fn a_newcomer_with_a_taken_node_id_ends_with_one_line() {
         assert_eq!(newcomer.end().refusal(1), said);
         place.test_client().waits_for("a torque of cell 3", torque_of(3));
         bench.signal(Signal::TERM);
-        let ended = bench.end().well();
+        let ended = bench.end().succeeded();
         let summary = place.summary();
         assert_eq!(summary.silent().len(), 0);
         // The gateway may also have received from cell 3 before the duplicate sent anything.
@@ -324,7 +324,7 @@ fn odd_frames() -> Vec<(Frame, &'static str)> {
 
 #[test]
 fn frames_that_cannot_be_used_are_counted_by_reason_and_none_is_used() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
@@ -337,7 +337,7 @@ fn frames_that_cannot_be_used_are_counted_by_reason_and_none_is_used() {
     }
     test_client.waits_for("torques after that", torque_of(8));
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     let summary = place.summary();
     let mut expected: Vec<_> = odd.iter().map(|(_, reason)| *reason).collect();
     expected.sort_unstable();
@@ -354,7 +354,7 @@ fn frames_that_cannot_be_used_are_counted_by_reason_and_none_is_used() {
 }
 
 /// Checks that the log has every frame, including unusable ones.
-fn log_has_all(place: &Place, summary: &Summary) {
+fn log_has_all(place: &TestDir, summary: &Summary) {
     let packets = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
     let frames = packets + summary.count("/buses/0/events", "foreign");
     let log = Log::read(&place.read("run.log"), Format::Fd);
@@ -363,7 +363,7 @@ fn log_has_all(place: &Place, summary: &Summary) {
 
 #[test]
 fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
-    let place = Place::new();
+    let place = TestDir::new();
     // A busy machine must not halt the robot.
     place.write("skin.toml", &(skin(8) + "\n[safety]\nbad_cycles = 10000\n"));
     // The touch moves the arm.
@@ -371,17 +371,17 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
     let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
     test_client.waits_for_motion();
-    let sent = place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
+    let sent = place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().succeeded();
     assert_eq!(sent.stderr, "sent on vcan0 (embedded)\n");
-    bench.hears(
+    bench.wait_for_stderr(
         "the robot is halted: a halt frame was received; `skinbus frame resume --bus vcan0 --bus-kind embedded` resumes it",
     );
-    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
-    bench.hears("the robot goes on");
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
+    bench.wait_for_stderr("the robot goes on");
     let test_client = place.test_client();
     test_client.waits_for("a torque", torque_of(1));
     test_client.waits_for_motion();
-    test_client.sends(&Message::Halt);
+    test_client.send(&Message::Halt);
     let halted = || bench.stderr().matches("the robot is halted").count() == 2;
     until("a second halt", || halted().then_some(()));
     bench.signal(Signal::TERM);
@@ -419,17 +419,17 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
 
 #[test]
 fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
     test_client.waits_for("a torque", torque_of(3));
-    test_client.sends(&Message::Halt);
-    bench.hears("the robot is halted");
+    test_client.send(&Message::Halt);
+    bench.wait_for_stderr("the robot is halted");
     process::signal(bench.cell(3), Signal::KILL);
-    bench.hears("the process of cell 3 on vcan0 ended");
+    bench.wait_for_stderr("the process of cell 3 on vcan0 ended");
     let _cell = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml");
-    bench.hears("cell 3 on vcan0 restarted");
+    bench.wait_for_stderr("cell 3 on vcan0 restarted");
     // A gateway that knows nothing of its predecessor.
     let test_client = place.test_client();
     let state = |message: &Message| match message {
@@ -443,10 +443,10 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
     test_client.waits_for("cell 3 that has its node id", settled);
     test_client.waits_for("another halt", |message| *message == Message::Halt);
     test_client.waits_for("a cell 3 that is halted", says(State::HALTED));
-    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
     test_client.waits_for("its torque", torque_of(3));
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.summary().adds_up();
 
     let log = Log::read(&place.read("run.log"), Format::Fd);

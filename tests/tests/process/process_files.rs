@@ -11,7 +11,7 @@ use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use process::log::Log;
-use process::{Place, Running, Summary, names, skin, until};
+use process::{Running, Summary, TestDir, names, skin, until};
 use protocol::can::Format;
 use protocol::fixed::Q1_14;
 use protocol::message::{Joints, Message};
@@ -45,7 +45,7 @@ fn times(path: &Path) -> Vec<u64> {
 /// Kills a gateway that writes a log several times, each at a random moment. Returns the age of the last line at each
 /// kill, in ms.
 fn kill_again_and_again(seed: u64, times_killed: u32) -> Vec<f64> {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let mut random = rand_pcg::Pcg32::seed_from_u64(seed);
     let mut older = Vec::new();
@@ -81,7 +81,7 @@ fn a_log_survives_its_writer_being_killed_at_any_moment() {
 
 #[test]
 fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     place.write("run.log", "of yesterday\n");
     let follow = |name: &str| {
@@ -100,7 +100,7 @@ fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
     for (name, force) in [("new.log", ""), ("run.log", "--overwrite")] {
         let words = format!("{RUN} --duration 600 --summary {name}.json --candump {name} {force}");
         let bench = place.start("skinbus", &words);
-        bench.hears_the_loop();
+        bench.wait_for_loop();
         follow(name);
         let options = ["", "--overwrite"];
         for option in options {
@@ -110,7 +110,7 @@ fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
             assert_eq!(said.refusal(2), format!("skinbus: --candump {name}: {why}"));
         }
         bench.signal(Signal::INT);
-        bench.end().well();
+        bench.end().succeeded();
         place.is_left_clean();
         let summary: serde_json::Value = serde_json::from_str(&place.read(&format!("{name}.json"))).unwrap();
         let frames = Log::read(&place.read(name), Format::Fd).frames.len() as u64;
@@ -138,10 +138,10 @@ const WRITERS: [(&str, &str, &str); 13] = [
 
 #[test]
 fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(3);
     place.write("in.log", "(1.000000) vcan0 123#11\n");
-    place.start("skinbus", "convert in.log in.mcap").end().well();
+    place.start("skinbus", "convert in.log in.mcap").end().succeeded();
     place.write("mine", "mine\n");
     for (option, words, name) in WRITERS {
         let path = place.path(name);
@@ -196,7 +196,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
 
 #[test]
 fn a_log_into_a_pipe_whose_reader_stops_does_not_keep_a_run_from_ending() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let fifo = place.path("log.fifo");
     mknodat(CWD, &fifo, FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
@@ -224,10 +224,10 @@ fn a_log_into_a_pipe_whose_reader_stops_does_not_keep_a_run_from_ending() {
 
 #[test]
 fn no_command_overwrites_what_it_reads_even_with_force() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     place.write("in.log", "(1.000000) vcan0 123#11\n");
-    place.start("skinbus", "convert in.log in.mcap").end().well();
+    place.start("skinbus", "convert in.log in.mcap").end().succeeded();
     let read = |name| fs::read(place.path(name)).unwrap();
     let names = ["skin.toml", "scenario.toml", "in.log", "in.mcap"];
     let before = names.map(read);
@@ -251,10 +251,10 @@ fn no_command_overwrites_what_it_reads_even_with_force() {
 
 #[test]
 fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let run = format!("{RUN} --duration 0.3 --quiet --summary /dev/null --candump /dev/stdout");
-    let ended = place.start("skinbus", &run).end().well();
+    let ended = place.start("skinbus", &run).end().succeeded();
     let (frames, table): (Vec<_>, Vec<_>) = ended.stdout.lines().partition(|line| line.starts_with('('));
     assert!(frames.len() > 16 && table.len() > 10, "{ended:#?}");
     // A file that the shell has opened is not truncated, whatever its content is.
@@ -265,7 +265,7 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
         gateway.display()
     );
     command.args(["-c", &script]);
-    Running::start(command).end().well();
+    Running::start(command).end().succeeded();
     let both = place.read("both");
     assert!(both.starts_with("before\n(") && both.lines().count() > 26, "{both}");
     assert!(both.lines().last().unwrap().starts_with('└'), "the table comes after the frames: {both}");
@@ -273,7 +273,7 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
 }
 
 /// Checks that a run has failed, and that its summary and its last line give the reason.
-fn failed(place: &Place, ended: &process::Ended) -> Summary {
+fn failed(place: &TestDir, ended: &process::Ended) -> Summary {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     let summary = place.summary();
     assert_eq!(summary.0["outcome"], "failed");
@@ -285,7 +285,7 @@ fn failed(place: &Place, ended: &process::Ended) -> Summary {
 
 #[test]
 fn a_failed_run_has_a_summary_with_the_reason() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     // Before its loop begins.
     let ended = place.bench(1.0, "SKINBUS_CELL_NODE=/bin/true").end();
@@ -298,7 +298,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     let positions = [Q1_14::ZERO; WORDS];
     // A single packet of this kind may have any sender; a gateway continues.
     for epoch in 77..81 {
-        test_client.sends(&Message::Joints {
+        test_client.send(&Message::Joints {
             epoch: Epoch(epoch),
             joints: Joints { positions: padded(&positions), in_use: 6 },
         });
@@ -314,7 +314,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     let run = format!("{RUN} --duration 600 --candump run.log --summary run.json --overwrite");
     command.args(["-c", &format!("ulimit -f 64; exec {} {run}", process::program("skinbus").display())]);
     let bench = Running::start(command);
-    bench.hears("run.log: File too large");
+    bench.wait_for_stderr("run.log: File too large");
     place.test_client().waits_for_joints(20);
     bench.signal(Signal::TERM);
     let summary = failed(&place, &bench.end());
@@ -327,7 +327,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     for signal in [Signal::INT, Signal::INT, Signal::TERM] {
         bench.signal(signal);
     }
-    bench.end().well();
+    bench.end().succeeded();
     assert_eq!(place.summary().0["outcome"], "interrupted");
     assert!(place.summary().0["failure"].is_null());
     place.is_left_clean();
@@ -335,7 +335,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
 
 #[test]
 fn any_number_of_demonstrations_go_on_side_by_side() {
-    let place = Place::new();
+    let place = TestDir::new();
     let run = |quiet: &str| {
         let words = format!("demo --duration 600 SKINBUS_CELLS_PER_PROCESS=64 {quiet}");
         let mut command = place.command("skinbus", &words);
@@ -344,15 +344,15 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
     };
     let demos = [run("--quiet"), run(""), run("")];
     for demo in &demos[1..] {
-        demo.hears("frames are recorded in skinbus-demo");
-        demo.hears_the_loop();
+        demo.wait_for_stderr("frames are recorded in skinbus-demo");
+        demo.wait_for_loop();
         let said = demo.stderr();
         // The printed command shows its frames.
         let line = said.lines().find_map(|line| line.strip_prefix("its frames in words: ")).unwrap();
         let (directory, dump) = line.strip_prefix("SKINBUS_DIR=").unwrap().split_once(" skinbus ").unwrap();
         let mut dump = place.command("skinbus", &format!("{dump} --kind torque -n 3"));
         dump.env("SKINBUS_DIR", directory);
-        let dumped = Running::start(dump).end().well();
+        let dumped = Running::start(dump).end().succeeded();
         assert_eq!(dumped.stdout.lines().count(), 3, "{dumped:#?}");
     }
     until("all logs", || {
@@ -361,14 +361,14 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
     });
     for demo in demos {
         demo.signal(Signal::INT);
-        let ended = demo.end().well();
+        let ended = demo.end().succeeded();
         assert!(ended.stdout.contains("253 cells"), "{ended:#?}");
     }
     let files = place.files();
     assert!(files.iter().all(|name| name.ends_with(".log")), "{files:?}");
     // A killed run leaves only its log.
     let killed = run("");
-    killed.hears_the_loop();
+    killed.wait_for_loop();
     killed.signal(Signal::KILL);
     killed.end();
     until("its buses' end", || place.files().iter().all(|name| name.ends_with(".log")).then_some(()));
@@ -377,7 +377,7 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
 
 #[test]
 fn a_demonstration_that_is_refused_announces_nothing() {
-    let place = Place::new();
+    let place = TestDir::new();
     fs::create_dir(place.buses()).unwrap();
     fs::set_permissions(place.buses(), fs::Permissions::from_mode(0o755)).unwrap();
     let refused = place.start("skinbus", "demo --duration 1").end();
@@ -388,9 +388,9 @@ fn a_demonstration_that_is_refused_announces_nothing() {
 
 #[test]
 fn a_skin_that_a_test_makes_is_one_that_generate_makes() {
-    let place = Place::new();
-    place.start("skinbus", "skin generate --cells 8 -o skin.toml").end().well();
+    let place = TestDir::new();
+    place.start("skinbus", "skin generate --cells 8 -o skin.toml").end().succeeded();
     assert_eq!(place.read("skin.toml"), skin(8));
-    place.start("skinbus", "skin generate --cells 9 -o skin.toml --overwrite").end().well();
+    place.start("skinbus", "skin generate --cells 9 -o skin.toml --overwrite").end().succeeded();
     assert_eq!(place.read("skin.toml"), skin(9));
 }

@@ -6,32 +6,32 @@ use skinbus_tests::process;
 use std::fs;
 
 use process::log::Log;
-use process::{Place, names};
+use process::{TestDir, names};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
 use rustix::process::Signal;
 
 /// Runs a bench whose cells have written their parameters.
-fn written() -> Place {
-    let place = Place::new();
+fn written() -> TestDir {
+    let place = TestDir::new();
     place.pressed();
     fs::create_dir(place.path("flash")).unwrap();
-    place.bench(0.5, "--flash flash").end().well();
+    place.bench(0.5, "--flash flash").end().succeeded();
     place.is_left_clean();
     let expected: Vec<_> = (1..=8).map(|node| format!("vcan0-{node}.flash")).collect();
     assert_eq!(names(&place.path("flash")), expected);
     place
 }
 
-fn damage(place: &Place, node: u8) {
+fn damage(place: &TestDir, node: u8) {
     let path = place.path(&format!("flash/vcan0-{node}.flash"));
     let mut bytes = fs::read(&path).unwrap();
     bytes[20] ^= 1;
     fs::write(&path, bytes).unwrap();
 }
 
-fn images(place: &Place) -> Vec<Vec<u8>> {
+fn images(place: &TestDir) -> Vec<Vec<u8>> {
     let files = names(&place.path("flash")).into_iter();
     files.map(|name| fs::read(place.path("flash").join(name)).unwrap()).collect()
 }
@@ -40,7 +40,7 @@ fn images(place: &Place) -> Vec<Vec<u8>> {
 fn what_was_written_is_found_again_and_not_written_again() {
     let place = written();
     let before = images(&place);
-    place.bench(0.5, "--flash flash").end().well();
+    place.bench(0.5, "--flash flash").end().succeeded();
     let summary = place.summary();
     assert!(summary.adds_up().of_bus("/replies/due") > 0);
     assert_eq!(images(&place), before);
@@ -79,7 +79,7 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
     for node in [3, 5] {
         fs::remove_file(place.path(&format!("flash/vcan0-{node}.flash"))).unwrap();
     }
-    place.bench(0.5, "--flash flash").end().well();
+    place.bench(0.5, "--flash flash").end().succeeded();
     assert_eq!(fs::read(&path).unwrap(), image, "deleted, it is written again");
 }
 
@@ -100,10 +100,10 @@ fn a_cell_without_parameters_reports_it_and_sends_no_torque() {
     let place = written();
     damage(&place, 3);
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let cells = place
         .start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-8 --skin skin.toml --flash flash");
-    cells.hears("flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong");
+    cells.wait_for_stderr("flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong");
     place.test_client().waits_for("a heartbeat of cell 3 without parameters", |message| {
         matches!(message, Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. }
             if cell.get() == 3
@@ -112,10 +112,10 @@ fn a_cell_without_parameters_reports_it_and_sends_no_torque() {
                 && heartbeat.configuration == 0)
     });
     let bench = place.running_bench(600.0, "--no-spawn");
-    bench.hears("cells that have no parameters; the run goes on without them: 3 on vcan0");
+    bench.wait_for_stderr("cells that have no parameters; the run goes on without them: 3 on vcan0");
     place.test_client().waits_for_epoch(20);
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     let summary = place.summary();
     assert_eq!(summary.adds_up().silent().len(), 0, "it is there, and sends no torques only");
     let log = Log::read(&place.read("run.log"), Format::Fd);
@@ -151,7 +151,7 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
 
 #[test]
 fn a_directory_that_is_not_there_is_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let said = "skinbus: --flash flash: there is no such directory; make it first";
     assert_eq!(place.bench(1.0, "--flash flash").end().refusal(2), said);
@@ -166,7 +166,7 @@ fn a_directory_that_is_not_there_is_named() {
 #[test]
 fn two_programs_do_not_use_one_cells_file_at_a_time() {
     let place = written();
-    let other = Place::new();
+    let other = TestDir::new();
     other.pressed();
     let running = place.running_bench(600.0, "--flash flash");
     let flash = place.path("flash").display().to_string();
@@ -187,5 +187,5 @@ fn two_programs_do_not_use_one_cells_file_at_a_time() {
     running.signal(Signal::TERM);
     running.end();
     place.is_left_clean();
-    other.bench(0.5, &format!("--flash {flash}")).end().well();
+    other.bench(0.5, &format!("--flash {flash}")).end().succeeded();
 }

@@ -6,7 +6,7 @@ use skinbus_tests::process::recorded;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use process::Place;
+use process::TestDir;
 use recorded::Recorded;
 use serde_json::Value;
 
@@ -34,7 +34,7 @@ fn placed(layout: &Value, panels: &mut Vec<String>) {
 
 #[test]
 fn every_topic_and_path_of_the_layout_is_in_a_recording() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(40);
     let scenario = "duration_s = 1.5\n[[touch]]\ncells = [3, 30]\nforce_n = 4.0\nfor_s = 1.2\n";
     place.scenario(scenario);

@@ -7,7 +7,7 @@ use std::os::unix::net::UnixDatagram;
 use std::time::{Duration, Instant};
 
 use process::external::{answer, place};
-use process::{PRESSED, Place, Running, Summary, TIMEOUT, until};
+use process::{PRESSED, Running, Summary, TIMEOUT, TestDir, until};
 use protocol::message::Message;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -18,7 +18,7 @@ const NOBODY: &str = "no external controller is connected";
 const HISTORY: &str = "; --summary FILE keeps the ticks before it";
 
 /// Answers a number of ticks, then only listens until the robot is halted.
-fn control(place: &Place, bench: &Running, answers: u32) {
+fn control(place: &TestDir, bench: &Running, answers: u32) {
     let gateway = place.path("controller.sock");
     let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
     own.set_read_timeout(Some(Duration::from_secs(1))).unwrap();
@@ -118,19 +118,19 @@ fn without_any_controller_a_run_that_comes_to_its_end_was_halted() {
 
 #[test]
 fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
-    let place = Place::new();
+    let place = TestDir::new();
     let skin = process::skin_of(8, 2, model::generate::Format::Fd);
     // A bus for which only this machine is late is not lost.
     let safety = "[safety]\nlost_bus = \"halt\"\nhold_epochs = 100\nbad_cycles = 100\n\n[controller]";
     place.write("skin.toml", &skin.replacen("[controller]", safety, 1));
     place.scenario(PRESSED.replace("hold", "kinesthetic").as_str());
     let server = place.start("vcan-setup", "serve vcan1");
-    server.prints("serving vcan1 at ");
+    server.wait_for_stdout("serving vcan1 at ");
     let bench = place.running_bench(600.0, "");
     process::test_client::TestClient::on(&place, "vcan1", protocol::can::Format::Fd).waits_for_epoch(20);
     server.signal(Signal::TERM);
-    server.end().well();
-    bench.hears("the robot is halted: too many bad cycles in a row: the torque is not valid");
+    server.end().succeeded();
+    bench.wait_for_stderr("the robot is halted: too many bad cycles in a row: the torque is not valid");
     bench.signal(Signal::TERM);
     let ended = bench.end();
     place.is_left_clean();
@@ -146,17 +146,17 @@ fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
 
 #[test]
 fn a_resumed_halt_is_reported_and_the_run_succeeds() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
     test_client.waits_for_epoch(10);
-    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
-    bench.hears("the robot is halted: a halt frame was received");
-    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
-    bench.hears("the robot goes on");
+    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().succeeded();
+    bench.wait_for_stderr("the robot is halted: a halt frame was received");
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().succeeded();
+    bench.wait_for_stderr("the robot goes on");
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     summary.adds_up();
@@ -186,12 +186,12 @@ fn an_incomplete_recording_takes_precedence_over_a_halt() {
 
 #[test]
 fn cells_that_are_halted_at_the_end_of_a_run_are_no_halt_of_the_robot() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(600.0, "");
     place.test_client().waits_for_epoch(5);
     bench.signal(Signal::INT);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     let log = process::log::Log::read(&place.read("run.log"), protocol::can::Format::Fd);
     assert!(log.messages.iter().any(|(message, _)| *message == Message::Halt), "the cells are halted");
     let summary = place.summary();

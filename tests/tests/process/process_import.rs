@@ -16,7 +16,7 @@ use skinbus_tests::process::recorded;
 use std::collections::BTreeSet;
 use std::fs;
 
-use process::{Ended, Place, example};
+use process::{Ended, TestDir, example};
 use protocol::skin::Skin;
 use recorded::{Message, Recorded};
 use serde_json::Value;
@@ -45,8 +45,8 @@ const COVER: &str =
     "skin import arm.urdf --tip bare --cover upper,fore --pitch 0.04 --package arm_parts=parts";
 
 /// Writes `arm.urdf`, and its mesh in `parts/meshes`: a square of 0.2 m.
-fn arm() -> Place {
-    let place = Place::new();
+fn arm() -> TestDir {
+    let place = TestDir::new();
     place.write("arm.urdf", ARM);
     fs::create_dir_all(place.path("parts/meshes")).unwrap();
     let triangle = |corners: [[f64; 2]; 3]| {
@@ -59,12 +59,12 @@ fn arm() -> Place {
     place
 }
 
-fn run(place: &Place, words: &str) -> Ended {
+fn run(place: &TestDir, words: &str) -> Ended {
     place.start("skinbus", words).end()
 }
 
 /// Checks that a command is refused with exit code 2 in one line, and writes no file.
-fn refused(place: &Place, words: &str, expected: &str) {
+fn refused(place: &TestDir, words: &str, expected: &str) {
     let before = place.files();
     let ended = run(place, words);
     let said = ended.refusal(2);
@@ -72,13 +72,13 @@ fn refused(place: &Place, words: &str, expected: &str) {
     assert_eq!(place.files(), before, "{words}");
 }
 
-fn read(place: &Place, name: &str) -> Skin {
+fn read(place: &TestDir, name: &str) -> Skin {
     Skin::read(&place.path(name)).unwrap()
 }
 
 #[test]
 fn each_example_becomes_a_skin() {
-    let place = Place::new();
+    let place = TestDir::new();
     for (file, tips, joints) in [
         ("panda.urdf", &["hand"][..], 7),
         ("ur10.urdf", &["tool0"], 6),
@@ -87,9 +87,10 @@ fn each_example_becomes_a_skin() {
     ] {
         fs::copy(example(file), place.path(file)).unwrap();
         let tips_words = tips.iter().map(|tip| format!(" --tip {tip}")).collect::<String>();
-        let ended = run(&place, &format!("skin import {file}{tips_words} -o skin.toml --overwrite")).well();
+        let ended =
+            run(&place, &format!("skin import {file}{tips_words} -o skin.toml --overwrite")).succeeded();
         assert_eq!(ended.stderr.lines().count(), tips.len(), "a line for each chain: {}", ended.stderr);
-        let said = run(&place, "check skin.toml").well().stdout;
+        let said = run(&place, "check skin.toml").succeeded().stdout;
         assert!(said.contains(&format!("{joints} joints")), "{file}: {said}");
         let skin = read(&place, "skin.toml");
         assert_eq!((skin.cells.len(), skin.robot.chains.len()), (tips.len(), tips.len()), "{file}");
@@ -100,12 +101,12 @@ fn each_example_becomes_a_skin() {
 #[test]
 fn links_are_covered_and_the_skin_runs() {
     let place = arm();
-    let said = run(&place, &format!("{COVER} --nodes-per-bus 60 -o skin.toml")).well();
+    let said = run(&place, &format!("{COVER} --nodes-per-bus 60 -o skin.toml")).succeeded();
     for link in ["upper: ", "fore: "] {
         let line = said.stderr.lines().find(|line| line.starts_with(link)).unwrap();
         assert!(line.contains(" cells, ") && line.contains(" % of ") && line.contains(" mm from "), "{line}");
     }
-    run(&place, "check skin.toml").well();
+    run(&place, "check skin.toml").succeeded();
     let skin = read(&place, "skin.toml");
     assert!(skin.cells.len() > 100 && skin.buses.len() >= 2, "{} cells", skin.cells.len());
     for (index, bus) in skin.buses.iter().enumerate() {
@@ -116,13 +117,13 @@ fn links_are_covered_and_the_skin_runs() {
         assert!(wired.count() > skin.cells_on_bus(index).count() * 9 / 10);
     }
     // The command in the first line gives the same again; another seed gives other cells.
-    let again = run(&place, &format!("{COVER} --nodes-per-bus 60 -o again.toml")).well();
+    let again = run(&place, &format!("{COVER} --nodes-per-bus 60 -o again.toml")).succeeded();
     assert_eq!((place.read("again.toml"), again.stderr), (place.read("skin.toml"), said.stderr));
-    run(&place, &format!("{COVER} --seed 2 -o other.toml")).well();
+    run(&place, &format!("{COVER} --seed 2 -o other.toml")).succeeded();
     assert_ne!(read(&place, "other.toml").cells, skin.cells);
 
     let words = "run skin.toml --bus-kind embedded --cells-per-process 60 --duration 1.5 --record run.mcap --record-split 1s";
-    run(&place, words).well();
+    run(&place, words).succeeded();
     for part in ["run.mcap", "run-1.mcap"] {
         let recorded = Recorded::read(&place.path(part));
         assert_eq!(recorded.attachments["robot.urdf"], ARM.as_bytes(), "{part}");
@@ -159,8 +160,8 @@ fn links_are_covered_and_the_skin_runs() {
 fn a_box_holds_no_cell_and_a_bus_has_one_chain() {
     let place = arm();
     let box_words = "--keep-out upper:-1,-1,0.2,1,1,1";
-    run(&place, &format!("{COVER} {box_words} -o kept.toml")).well();
-    run(&place, &format!("{COVER} -o all.toml")).well();
+    run(&place, &format!("{COVER} {box_words} -o kept.toml")).succeeded();
+    run(&place, &format!("{COVER} -o all.toml")).succeeded();
     let [kept, all] = ["kept.toml", "all.toml"].map(|name| read(&place, name).cells.len());
     assert!(kept + 20 < all, "{kept} of {all}");
     assert!(place.read("kept.toml").lines().next().unwrap().contains(box_words));
@@ -168,7 +169,7 @@ fn a_box_holds_no_cell_and_a_bus_has_one_chain() {
     fs::copy(example("two-arms.urdf"), place.path("two.urdf")).unwrap();
     let words = "skin import two.urdf --tip left_palm --tip right_palm --pitch 0.05 -o two.toml \
                  --cover torso,left_upper_arm,right_upper_arm";
-    run(&place, words).well();
+    run(&place, words).succeeded();
     let skin = read(&place, "two.toml");
     let chains: Vec<_> = skin.buses.iter().map(|bus| skin.robot.chains[bus.chain].name.as_str()).collect();
     assert_eq!(chains, ["left_palm", "right_palm"]);
@@ -279,7 +280,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
 /// A torso with several arms of 12 joints each.
 #[test]
 fn a_robot_has_at_most_32_joints() {
-    let place = Place::new();
+    let place = TestDir::new();
     let mut inner = "<link name=\"torso\"/>".to_owned();
     for arm in ["a", "b", "c"] {
         for joint in 1..=12 {
@@ -299,7 +300,7 @@ fn a_robot_has_at_most_32_joints() {
             &format!("skin import arms.urdf --tip a12 --tip b12 --tip c12{cells}"),
             "skinbus: arms.urdf: 36 joints move between the root and the tips; a robot has 1 to 32: give fewer --tip",
         );
-        run(&place, &format!("skin import arms.urdf --tip a12 --tip b12{cells}")).well();
+        run(&place, &format!("skin import arms.urdf --tip a12 --tip b12{cells}")).succeeded();
     }
 }
 
@@ -349,9 +350,9 @@ fn each_covered_link_has_a_cell() {
 fn torques_of_a_force_are_computed_in_both_ways() {
     let place = arm();
     place.write("cells.csv", "link,px,py,pz,nx,ny,nz\nupper,0,0,0.3,1,0,0\nfore,0.2,0,0.1,0,0,1\n");
-    run(&place, "skin import arm.urdf --tip bare --places cells.csv -o skin.toml").well();
+    run(&place, "skin import arm.urdf --tip bare --places cells.csv -o skin.toml").succeeded();
     place.write("rows.csv", "cell,force_n,q\nvcan0:1,10,0 0.5\n2,10,0 0.5\n1,10,1.5707963267948966 0.5\n");
-    let said = run(&place, "explain skin.toml --batch rows.csv --json").well().stdout;
+    let said = run(&place, "explain skin.toml --batch rows.csv --json").succeeded().stdout;
     let rows: Vec<Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let numbers = |row: &Value, key: &str| {
         row[key].as_array().unwrap().iter().map(|it| it.as_f64().unwrap()).collect::<Vec<_>>()
@@ -432,11 +433,11 @@ fn torques_of_a_force_are_computed_in_both_ways() {
 
     // The limits of the ranges.
     place.write("rows.csv", "# ends\ncell,force_n,q\n1,0,-6.28 0.5\n1,95.9970703125,2 6.28\n");
-    run(&place, "explain skin.toml --batch rows.csv").well();
+    run(&place, "explain skin.toml --batch rows.csv").succeeded();
     let endless = ARM.replacen("revolute", "continuous", 1).replacen("revolute", "prismatic", 1);
     place.write("arm.urdf", &endless.replace("\"0.5\" upper=\"1.5\"", "\"0\" upper=\"0.5\""));
-    run(&place, "skin import arm.urdf --tip bare -o skin.toml --overwrite").well();
-    run(&place, "explain skin.toml --cell 1 --force 1 --joints -3.14159,0.5").well();
+    run(&place, "skin import arm.urdf --tip bare -o skin.toml --overwrite").succeeded();
+    run(&place, "explain skin.toml --cell 1 --force 1 --joints -3.14159,0.5").succeeded();
     for (joints, expected) in [
         ("-6.3,0", "position -6.3 rad: shoulder takes -6.2832 to 6.2832 rad"),
         ("0,0.6", "position 0.6 m: elbow takes 0.0000 to 0.5000 m"),

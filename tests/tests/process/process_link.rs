@@ -1,7 +1,7 @@
 //! `vcan-setup link`, with a substitute for the program that it runs; `tests/hosts` has the real one.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use skinbus_tests::process::{Place, Running, program};
+use skinbus_tests::process::{Running, TestDir, program};
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
@@ -11,14 +11,14 @@ use std::process::Command;
 use rustix::process::Signal;
 
 /// Returns a command with only the folder of the place on `PATH`.
-fn command(place: &Place, program: &Path, words: &str) -> Command {
+fn command(place: &TestDir, program: &Path, words: &str) -> Command {
     let mut command = place.command_of(program, words);
     command.env("PATH", place.path("")).env_remove("SKINBUS_VCAN_LINK");
     command
 }
 
 /// Copies `vcan-setup` beside the programs of a place.
-fn copy(place: &Place) -> PathBuf {
+fn copy(place: &TestDir) -> PathBuf {
     let path = place.path("vcan-setup");
     // A separate process copies it, for the reason given at [`Place::script`].
     assert!(Command::new("cp").arg(program("vcan-setup")).arg(&path).status().unwrap().success());
@@ -27,15 +27,15 @@ fn copy(place: &Place) -> PathBuf {
 
 #[test]
 fn without_its_program_help_and_wrong_use_are_there_and_a_line_says_how_to_install_it() {
-    let place = Place::new();
+    let place = TestDir::new();
     let run = |words| Running::start(command(&place, &copy(&place), words)).end();
     let install = "cargo install --locked --path vcan-setup/link";
-    let help = run("link --help").well().stdout;
+    let help = run("link --help").succeeded().stdout;
     for words in ["Usage: vcan-setup link ", "--connect <ENDPOINT>", "--listen tcp/192.168.1.7:7447", install]
     {
         assert!(help.contains(words), "{words}: {help}");
     }
-    assert!(run("--help").well().stdout.contains("\n  link "), "among the commands");
+    assert!(run("--help").succeeded().stdout.contains("\n  link "), "among the commands");
     let wrong = run("link vcan0 --conect tcp/a:1");
     assert!(wrong.refusal(2).contains("a similar argument exists: '--connect'"), "{wrong:#?}");
     let absent = run("link vcan0 --listen tcp/127.0.0.1:0");
@@ -45,7 +45,7 @@ fn without_its_program_help_and_wrong_use_are_there_and_a_line_says_how_to_insta
 
 #[test]
 fn its_program_takes_its_place_with_the_same_words_exit_code_and_signals() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.script("vcan-link", "#!/bin/sh\nprintf '%s|' $$ \"$@\"\nexit 7\n");
     let words = ["vcan0", "--host", "a 'b' $c", "--config"].map(OsStr::new);
     let odd = OsStr::from_bytes(b"c\xff.json5");
@@ -67,7 +67,7 @@ fn its_program_takes_its_place_with_the_same_words_exit_code_and_signals() {
             link.env("SKINBUS_VCAN_LINK", script);
             link
         });
-        link.prints("ready");
+        link.wait_for_stdout("ready");
         link.signal(signal);
         assert_eq!(link.end().signal(), Some(signal.as_raw()));
     }
@@ -75,7 +75,7 @@ fn its_program_takes_its_place_with_the_same_words_exit_code_and_signals() {
 
 #[test]
 fn a_program_that_cannot_be_run_is_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     let named = |path: &str| {
         let mut link = command(&place, &program("vcan-setup"), "link vcan0");
         link.env("SKINBUS_VCAN_LINK", path);

@@ -19,7 +19,7 @@ use model::decode::Decoded;
 use model::generate::{Format as Target, Reply, generate};
 use model::network::Uplinks;
 use process::test_client::TestClient;
-use process::{Place, Running, TIMEOUT, names, until};
+use process::{Running, TIMEOUT, TestDir, names, until};
 use protocol::bus::Inbox;
 use protocol::can::Frame;
 use protocol::fixed::Q5_10;
@@ -40,20 +40,20 @@ const CELLS: u8 = 12;
 const UNCONFIGURED: u16 = 0;
 
 /// Writes a skin of cells that answer with sums.
-fn sums(place: &Place, cells: u8, format: Target) -> Skin {
+fn sums(place: &TestDir, cells: u8, format: Target) -> Skin {
     let cells = usize::from(cells);
-    let expected = model::generate::Target { cells, reply: Reply::Sum, format, ..Default::default() };
+    let expected = model::generate::SkinRequest { cells, reply: Reply::Sum, format, ..Default::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     Skin::read(&place.path("skin.toml")).unwrap()
 }
 
-fn server(place: &Place) -> Running {
+fn server(place: &TestDir) -> Running {
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     server
 }
 
-fn cells(place: &Place, which: &str, more: &str) -> Running {
+fn cells(place: &TestDir, which: &str, more: &str) -> Running {
     let words = format!("--bus vcan0 --bus-kind {} {which} --skin skin.toml {more}", place.kind());
     place.start("cell-node", &words)
 }
@@ -72,7 +72,7 @@ struct Side {
 }
 
 impl Side {
-    fn new(place: &Place, skin: &Skin) -> Self {
+    fn new(place: &TestDir, skin: &Skin) -> Self {
         let wires: Wires = skin.wires(0);
         let roots: Vec<_> = wires.roots().collect();
         Self {
@@ -132,7 +132,7 @@ impl Side {
         if let Some(link) = LinkId::from_raw_id(frame.raw_id()) {
             let root = self.roots.iter().position(|(_, ours)| ours.reversed() == link);
             if let (Some(root), Some(message)) = (root, link.decode_frame(frame)) {
-                self.uplinks.handle(now, root, message);
+                self.uplinks.handle_message(now, root, message);
             }
             return;
         }
@@ -143,7 +143,7 @@ impl Side {
         };
         match message {
             Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                self.uplinks.claimed(cell);
+                self.uplinks.mark_used(cell);
                 self.heartbeats.insert(cell.get(), heartbeat);
             }
             Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } => {
@@ -174,7 +174,7 @@ impl Side {
 #[test]
 fn new_cells_get_node_ids_over_their_wires_and_keep_them() {
     for format in [Target::Fd, Target::Classic] {
-        let place = Place::new();
+        let place = TestDir::new();
         let skin = sums(&place, CELLS, format);
         fs::create_dir(place.path("flash")).unwrap();
         let server = server(&place);
@@ -226,7 +226,7 @@ fn sums_reach_the_roots_whichever_cells_share_a_process() {
         // More identifiers and wires than a socket can have filters.
         (Target::Fd, 100, vec!["--nodes 1-99", "--node 100"]),
     ] {
-        let place = Place::new();
+        let place = TestDir::new();
         let skin = sums(&place, count, format);
         let server = server(&place);
         let running: Vec<_> = shared.iter().map(|which| cells(&place, which, "")).collect();
@@ -240,9 +240,9 @@ fn sums_reach_the_roots_whichever_cells_share_a_process() {
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).unwrap();
         let reply = Answers::Sum(Slots { slot_us, deepest, carry: true });
         let request = Request::Write { number: Parameter::Reply.number(), words: reply.words() };
-        side.test_client.sends(&Message::Configure { to: Node::Everyone, tag: 1, request });
+        side.test_client.send(&Message::Configure { to: Node::Everyone, tag: 1, request });
         let touch = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
-        side.test_client.sends(&Message::Stimulus {
+        side.test_client.send(&Message::Stimulus {
             to: Node::Everyone,
             from: AppliesFrom::Next,
             page: SensorPage::Skin(touch),
@@ -253,7 +253,7 @@ fn sums_reach_the_roots_whichever_cells_share_a_process() {
         let mut epoch = 0_u8;
         loop {
             epoch = epoch.wrapping_add(1);
-            side.test_client.sends(&Message::Joints {
+            side.test_client.send(&Message::Joints {
                 epoch: Epoch(epoch),
                 joints: Joints { in_use: 6, ..Joints::default() },
             });
@@ -269,14 +269,14 @@ fn sums_reach_the_roots_whichever_cells_share_a_process() {
 
 #[test]
 fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
-    let place = Place::new();
+    let place = TestDir::new();
     let skin = sums(&place, CELLS, Target::Fd);
     let away = "no embedded bus vcan0 is served in";
     let refused = cells(&place, "--node 1", "").end();
     assert!(refused.refusal(2).contains(away), "{refused:?}");
     // Cells wait for the bus at the start, too.
     let shared = cells(&place, "--nodes 1-11", "--reconnect");
-    shared.hears(away);
+    shared.wait_for_stderr(away);
     let first = server(&place);
     let last = cells(&place, "--node 12", "--reconnect");
     let mut side = Side::new(&place, &skin);
@@ -287,7 +287,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
 
     let before = heard(&mut side);
     first.signal(Signal::TERM);
-    first.end().well();
+    first.end().succeeded();
     let second = server(&place);
     let mut side = Side::new(&place, &skin);
     let after = heard(&mut side);
@@ -295,7 +295,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
         assert!(!heartbeat.state.has(State::CLAIMING), "cell {cell} did not restart");
         assert!(heartbeat.sent.wrapping_sub(before[cell].sent) < 0x8000, "cell {cell} went on counting");
     }
-    side.test_client.sends(&Message::Report);
+    side.test_client.send(&Message::Report);
     side.until("a tree again", Side::is_tree_ready);
     until("no other message", || (shared.stderr().lines().count() == 1).then_some(()));
     assert_eq!(last.stderr(), "");
@@ -307,7 +307,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
     side.until("cell 3", |side| side.heartbeats.contains_key(&3));
     drop(side);
     second.signal(Signal::TERM);
-    second.end().well();
+    second.end().succeeded();
     assert_eq!(leaves.end().refusal(1), "cell-node: the embedded bus vcan0 was closed: its server ended");
 }
 
@@ -320,7 +320,7 @@ fn heard(side: &mut Side) -> BTreeMap<u8, Heartbeat> {
 
 #[test]
 fn flash_of_another_node_id_is_not_used() {
-    let place = Place::new();
+    let place = TestDir::new();
     let skin = sums(&place, CELLS, Target::Fd);
     fs::create_dir(place.path("flash")).unwrap();
     let server = server(&place);
@@ -328,7 +328,7 @@ fn flash_of_another_node_id_is_not_used() {
     let kept = flash::FlashContent { number: CellId::new(7).ok(), parameters: None };
     fs::write(place.path("flash/vcan0-2.flash"), flash::encode(serial, &kept)).unwrap();
     let cell = cells(&place, "--node 2", "--flash flash");
-    cell.hears(&format!(
+    cell.wait_for_stderr(&format!(
         "flash of cell 2 (flash/vcan0-2.flash) is not used: it belongs to cell 7 with serial number {serial}"
     ));
     drop((cell, server));

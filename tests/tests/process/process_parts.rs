@@ -6,10 +6,10 @@ use skinbus_tests::process;
 
 use std::fs;
 
-use analysis::report::run::{Options, report};
-use model::generate::{Format, Reply, Target, generate};
-use process::replay::{TOUCHED, says_everything};
-use process::{Place, skin_of, until};
+use analysis::report::run::{ReportOptions, report};
+use model::generate::{Format, Reply, SkinRequest, generate};
+use process::replay::{TOUCHED, send_every_message};
+use process::{TestDir, skin_of, until};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -26,14 +26,14 @@ fn touched(buses: usize) -> String {
 }
 
 /// Returns the parts of `run.mcap`, by their numbers.
-fn parts(place: &Place) -> Vec<String> {
+fn parts(place: &TestDir) -> Vec<String> {
     let name = |number: u32| if number == 0 { "run.mcap".to_owned() } else { format!("run-{number}.mcap") };
     (0..).map(name).take_while(|name| place.path(name).exists()).collect()
 }
 
 /// Checks that each part, and all together, are answered as recorded, with at least `min` replies, a tenth of those
 /// from a machine that is always in time.
-fn all_come_back(place: &Place, min: u64) {
+fn all_come_back(place: &TestDir, min: u64) {
     place.is_left_clean();
     let parts = parts(place);
     assert!(parts.len() >= 3, "{parts:?}");
@@ -58,82 +58,85 @@ fn all_come_back(place: &Place, min: u64) {
 
 #[test]
 fn parts_of_a_run_with_every_message_come_back() {
-    let place = Place::new();
+    let place = TestDir::new();
     let skin = place.skin(8);
     place.scenario(&touched(1));
     let bench = place.running_bench(4.2, "--record run.mcap --record-split 1s");
-    says_everything(&place.test_client(), &skin);
-    bench.end().well();
+    send_every_message(&place.test_client(), &skin);
+    bench.end().succeeded();
     all_come_back(&place, 75);
 }
 
 #[test]
 fn parts_of_two_buses_of_classic_frames_come_back() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &skin_of(16, 2, Format::Classic));
     place.scenario(&touched(2));
-    place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
+    place.bench(4.2, "--record run.mcap --record-split 1s").end().succeeded();
     all_come_back(&place, 120);
 }
 
 #[test]
 fn parts_of_cells_that_send_events_come_back() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write(
         "skin.toml",
         &skin_of(12, 1, Format::Fd).replace("format = \"fd\"", "format = \"fd\"\nsensing = \"event\""),
     );
     place.scenario(&touched(1));
-    place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
+    place.bench(4.2, "--record run.mcap --record-split 1s").end().succeeded();
     all_come_back(&place, 75);
 }
 
 #[test]
 fn parts_of_cells_that_send_continuously_on_a_slow_bus_come_back() {
-    let place = Place::new();
-    let expected = Target { cells: 9, broadcast_hz: 31.25, format: Format::Classic, ..Target::default() };
+    let place = TestDir::new();
+    let expected =
+        SkinRequest { cells: 9, broadcast_hz: 31.25, format: Format::Classic, ..SkinRequest::default() };
     let sensing = "format = \"classic\"\nsensing = \"continuous\"\nsensing_hz = 5.0";
     place.write("skin.toml", &generate(&expected).unwrap().replace("format = \"classic\"", sensing));
     place.scenario(&touched(1));
-    place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
+    place.bench(4.2, "--record run.mcap --record-split 1s").end().succeeded();
     all_come_back(&place, 40);
 }
 
 #[test]
 fn parts_of_sums_come_back_with_what_rounding_carries() {
-    let place = Place::new();
-    let expected = Target { cells: 10, reply: Reply::Sum, ..Target::default() };
+    let place = TestDir::new();
+    let expected = SkinRequest { cells: 10, reply: Reply::Sum, ..SkinRequest::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(&touched(1));
-    place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
+    place.bench(4.2, "--record run.mcap --record-split 1s").end().succeeded();
     all_come_back(&place, 40);
 }
 
 /// Records a run of four seconds in parts, with a touch all the time.
-fn recorded(place: &Place) {
+fn recorded(place: &TestDir) {
     place.skin(8);
     place.scenario(&touched(1));
-    place.bench(3.4, "--record run.mcap --record-split 1s").end().well();
+    place.bench(3.4, "--record run.mcap --record-split 1s").end().succeeded();
 }
 
 #[test]
 fn explain_dump_and_report_take_a_part_and_all_of_them() {
-    let place = Place::new();
+    let place = TestDir::new();
     recorded(&place);
     let parts = parts(&place);
     let (last, count, parts) = (parts.last().unwrap(), parts.len(), parts.join(" "));
     // Cell 1 is pressed from the beginning of the run: more than half of all epoch numbers ago, unless many were
     // skipped.
-    let torques = place.start("skinbus", &format!("dump {last} --json --kind torque --cell 1")).end().well();
+    let torques =
+        place.start("skinbus", &format!("dump {last} --json --kind torque --cell 1")).end().succeeded();
     let torque: Value = serde_json::from_str(torques.stdout.lines().last().unwrap()).unwrap();
     let epoch = &torque["epoch"];
-    let ended = place.start("skinbus", &format!("explain {last} --epoch {epoch} --cell 1")).end().well();
+    let ended = place.start("skinbus", &format!("explain {last} --epoch {epoch} --cell 1")).end().succeeded();
     assert!(
         ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus of -0.0"),
         "{ended:#?}"
     );
     assert!(!ended.stdout.contains("not known"), "{ended:#?}");
-    let whole = place.start("skinbus", &format!("explain {parts} --epoch {epoch} --cell 1")).end().well();
+    let whole =
+        place.start("skinbus", &format!("explain {parts} --epoch {epoch} --cell 1")).end().succeeded();
     let contact = |text: &str| text.lines().find(|line| line.contains("  contact  ")).unwrap().to_owned();
     assert_eq!(contact(&whole.stdout), contact(&ended.stdout));
     // Seconds count from the first tick, also in a part without it.
@@ -145,27 +148,28 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     assert!((of_all - of_part).abs() < 1e-9 && of_part >= earliest, "{of_all} {of_part}");
     for files in [&parts, last] {
         let dump = format!("dump {files} --brief --from {} --kind joints -n 1", of_part - 1e-5);
-        let first = place.start("skinbus", &dump).end().well().stdout;
+        let first = place.start("skinbus", &dump).end().succeeded().stdout;
         assert!(first.contains(&format!("joints epoch {epoch}:")), "{first}");
     }
-    let beginning = place.start("skinbus", "dump run.mcap --brief").end().well().stdout;
+    let beginning = place.start("skinbus", "dump run.mcap --brief").end().succeeded().stdout;
     let before = beginning.lines().filter(|line| line.starts_with('-')).count();
     let joints = beginning.lines().position(|line| line.contains("joints epoch 0:")).unwrap();
     assert!(before > 0 && before <= joints, "heartbeats come before the loop: {beginning}");
 
     let stats = |files: &str| -> Value {
-        let ended = place.start("skinbus", &format!("dump {files} --stats --json")).end().well();
+        let ended = place.start("skinbus", &format!("dump {files} --stats --json")).end().succeeded();
         serde_json::from_str(&ended.stdout).unwrap()
     };
-    let lines =
-        |files: &str| place.start("skinbus", &format!("dump {files}")).end().well().stdout.lines().count();
+    let lines = |files: &str| {
+        place.start("skinbus", &format!("dump {files}")).end().succeeded().stdout.lines().count()
+    };
     let one_by_one: usize = parts.split(' ').map(lines).sum();
     assert_eq!(lines(&parts), one_by_one);
     let all = stats(&parts);
     assert_eq!(all["source"], format!("run.mcap to {last} ({count} parts)"));
-    let ended = place.start("skinbus", &format!("convert {parts} all.log --plain")).end().well();
+    let ended = place.start("skinbus", &format!("convert {parts} all.log --plain")).end().succeeded();
     assert!(ended.stderr.contains(&format!("{one_by_one} frames")), "{ended:#?}");
-    place.start("skinbus", &format!("fit {parts}")).end().well();
+    place.start("skinbus", &format!("fit {parts}")).end().succeeded();
 
     // No packet of the part before counts as lost in this one.
     let summary = place.summary();
@@ -173,18 +177,18 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     let lost: u64 = ways.iter().map(|route| summary.number(&format!("/buses/0/uplink/{route}"))).sum();
     for files in [parts.as_str(), "run-2.mcap"] {
         let files: Vec<_> = files.split(' ').map(|name| place.path(name)).collect();
-        let report = report(&files, &Options::default()).unwrap();
+        let report = report(&files, &ReportOptions::default()).unwrap();
         let findings = report.page.sections.iter().flat_map(|section| &section.findings);
         let mut found = findings.filter(|finding| finding.what.starts_with("packets of cells lost"));
         assert!(found.next().unwrap().ours.value <= lost as f64, "{files:?}");
     }
-    place.start("skinbus", &format!("report {parts}")).end().well();
+    place.start("skinbus", &format!("report {parts}")).end().succeeded();
     assert!(place.path("run.html").exists());
 }
 
 #[test]
 fn files_that_are_not_the_parts_of_one_recording_are_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     recorded(&place);
     let refused = |files: &str| place.start("skinbus", &format!("dump {files}")).end().refusal(2).to_owned();
     let said = "skinbus: part 1 of the recording is missing between run.mcap and run-2.mcap: name all parts from the \
@@ -198,20 +202,20 @@ fn files_that_are_not_the_parts_of_one_recording_are_named() {
     let line = refused("run.mcap nothing.mcap");
     assert!(line.starts_with("skinbus: there is no file nothing.mcap, and run.mcap is one: "), "{line}");
     fs::rename(place.path("run.mcap"), place.path("run-recovered.mcap")).unwrap();
-    place.bench(0.1, "--record other.mcap").end().well();
+    place.bench(0.1, "--record other.mcap").end().succeeded();
     let line = refused("other.mcap run-1.mcap");
     assert!(
         line.starts_with("skinbus: other.mcap and run-1.mcap belong to different recordings, begun at "),
         "{line}"
     );
     // The file name does not matter, and neither do missing parts at an end.
-    place.start("skinbus", "dump run-2.mcap run-1.mcap run-recovered.mcap").end().well();
-    place.start("skinbus", "dump run-3.mcap run-2.mcap").end().well();
+    place.start("skinbus", "dump run-2.mcap run-1.mcap run-recovered.mcap").end().succeeded();
+    place.start("skinbus", "dump run-3.mcap run-2.mcap").end().succeeded();
 }
 
 #[test]
 fn parts_of_a_killed_run_come_back_recovered_or_as_they_are() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(8);
     place.scenario(&touched(1));
     let bench = place.running_bench(600.0, "--record run.mcap --record-split 1s");
@@ -231,7 +235,7 @@ fn parts_of_a_killed_run_come_back_recovered_or_as_they_are() {
     let (ended, replayed) = place.replayed(&format!("{whole} {last}"), "--expect --spawn --speed max");
     let as_it_is = replayed.all_came_back(&ended);
     assert!(ended.stderr.contains("it has no end"), "{ended:#?}");
-    place.start("skinbus", &format!("recover {last} -o z-recovered.mcap")).end().well();
+    place.start("skinbus", &format!("recover {last} -o z-recovered.mcap")).end().succeeded();
     let (ended, replayed) = place.replayed(&format!("z-recovered.mcap {whole}"), route);
     assert_eq!(replayed.all_came_back(&ended), as_it_is);
     let (ended, replayed) = place.replayed("z-recovered.mcap", route);

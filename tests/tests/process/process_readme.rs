@@ -3,16 +3,16 @@
 
 use skinbus_tests::process;
 
-use process::Place;
+use process::TestDir;
 use process::readme::{PROGRAMS, README, blocks, commands, printed, run};
 
 #[test]
 fn every_command_does_what_it_should() {
-    let place = Place::new();
+    let place = TestDir::new();
     let commands = commands(README);
     assert!(commands.iter().any(|command| command.starts_with("cargo build --release && ")), "{commands:?}");
     assert!(commands.contains(&"tests/run"), "{commands:?}");
-    let ended = run(&place, &commands).well();
+    let ended = run(&place, &commands).succeeded();
     place.is_left_clean();
 
     // Each line of the quoted output begins like a line of the demo's output.
@@ -50,7 +50,10 @@ fn failing_and_unknown_commands_fail_here() {
     let path = "export PATH=$PWD/target/release:$PATH";
     let version = "skinbus --version";
     assert!(
-        run(&Place::new(), &[build, path, version]).well().stdout.contains("+ skinbus --version\nskinbus ")
+        run(&TestDir::new(), &[build, path, version])
+            .succeeded()
+            .stdout
+            .contains("+ skinbus --version\nskinbus ")
     );
     for commands in [
         vec![version],
@@ -62,7 +65,7 @@ fn failing_and_unknown_commands_fail_here() {
         vec![build, path, "sudo vcan-setup status"],
         vec![build, path, "skinbus skin generate | nothing"],
     ] {
-        let ended = run(&Place::new(), &commands);
+        let ended = run(&TestDir::new(), &commands);
         assert!(ended.code().is_some_and(|code| code != 0), "{commands:?}: {ended:#?}");
     }
 }

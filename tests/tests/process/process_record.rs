@@ -11,7 +11,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use analysis::dbc;
 use model::generate::Format;
-use process::{PRESSED, Place, Summary, example, skin_of, until};
+use process::{PRESSED, Summary, TestDir, example, skin_of, until};
 use protocol::skin::Skin;
 use rand::{RngExt, SeedableRng};
 use recorded::Recorded;
@@ -19,7 +19,7 @@ use rustix::process::Signal;
 use serde_json::Value;
 
 /// Checks that a run's frames are the same in both formats, and as many as the gateway counted.
-fn frames_are_whole(lines: &[String], place: &Place, summary: &Summary, frames_a_packet: u64) {
+fn frames_are_whole(lines: &[String], place: &TestDir, summary: &Summary, frames_a_packet: u64) {
     let log = place.read("run.log");
     let first = log.lines().zip(lines).position(|(log, line)| log != line);
     assert_eq!(first, None, "the first line that differs");
@@ -46,9 +46,9 @@ fn numbers(value: &Value) -> Vec<f64> {
 
 #[test]
 fn everything_that_a_run_knows_is_in_its_recording() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
-    place.bench(2.0, "--record run.mcap").end().well();
+    place.bench(2.0, "--record run.mcap").end().succeeded();
     assert_eq!(place.files(), ["run.json", "run.log", "run.mcap", "scenario.toml", "skin.toml"]);
     let (summary, recorded) = (place.summary(), Recorded::read(&place.path("run.mcap")));
     frames_are_whole(&recorded.lines("/can/vcan0"), &place, &summary, 1);
@@ -128,26 +128,26 @@ fn everything_that_a_run_knows_is_in_its_recording() {
 
 #[test]
 fn two_hundred_and_fifty_three_cells_are_recorded_without_a_gap() {
-    let place = Place::new();
+    let place = TestDir::new();
     fs::copy(example("ur5-253.toml"), place.path("skin.toml")).unwrap();
     fs::copy(example("all-active.toml"), place.path("scenario.toml")).unwrap();
-    place.bench(3.0, "--record run.mcap").end().well();
+    place.bench(3.0, "--record run.mcap").end().succeeded();
     let (summary, recorded) = (place.summary(), Recorded::read(&place.path("run.mcap")));
     frames_are_whole(&recorded.lines("/can/vcan0"), &place, &summary, 1);
     assert!(recorded.on("/can/notes").next().is_none());
     // The part before the first message is small: a recording of little more than that has messages.
     let file = fs::read(place.path("run.mcap")).unwrap();
     fs::write(place.path("cut.mcap"), &file[..300_000]).unwrap();
-    place.start("skinbus", "recover cut.mcap").end().well();
+    place.start("skinbus", "recover cut.mcap").end().succeeded();
     assert!(Recorded::read(&place.path("cut-recovered.mcap")).messages.len() > 1_000);
 }
 
 #[test]
 fn two_buses_of_classic_frames_have_a_topic_each() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &skin_of(8, 2, Format::Classic));
     place.scenario(PRESSED);
-    place.bench(1.0, "--record run.mcap").end().well();
+    place.bench(1.0, "--record run.mcap").end().succeeded();
     let recorded = Recorded::read(&place.path("run.mcap"));
     // The log has both buses' frames in the recorder's order, each bus in its own order.
     for bus in ["vcan0", "vcan1"] {
@@ -156,7 +156,7 @@ fn two_buses_of_classic_frames_have_a_topic_each() {
         let log: Vec<_> = log.lines().filter(|line| line.split(' ').nth(1) == Some(bus)).collect();
         assert!(!log.is_empty() && log == lines, "{bus}");
     }
-    let described = place.start("skinbus", "skin dbc run.mcap --bus vcan1 --joined").end().well();
+    let described = place.start("skinbus", "skin dbc run.mcap --bus vcan1 --joined").end().succeeded();
     assert_eq!(
         described.stdout,
         dbc::dbc(&Skin::parse("skin.toml", &skin_of(8, 2, Format::Classic)).unwrap(), 1)
@@ -172,13 +172,13 @@ fn parts(summary: &Summary) -> Vec<String> {
 
 #[test]
 fn a_recording_in_parts_is_one_recording_and_each_part_can_be_read_alone() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     // Files of an earlier and longer recording.
     for name in ["run.mcap", "run-1.mcap", "run-2.mcap", "run-3.mcap", "run-4.mcap"] {
         place.write(name, "old");
     }
-    place.bench(3.0, "--record run.mcap --record-split 1s").end().well();
+    place.bench(3.0, "--record run.mcap --record-split 1s").end().succeeded();
     let summary = place.summary();
     let parts = parts(&summary);
     assert!(parts.len() >= 3 && parts[0] == "run.mcap" && parts[2] == "run-2.mcap", "{parts:?}");
@@ -208,7 +208,7 @@ fn a_recording_in_parts_is_one_recording_and_each_part_can_be_read_alone() {
 
 #[test]
 fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let run = "run skin.toml --bus-kind embedded --duration 1";
     let refused = |more: &str| {
@@ -251,7 +251,7 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
 
 #[test]
 fn a_file_that_another_program_moves_while_it_is_written_counts_as_lost_and_the_next_one_begins() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = place.running_bench(4.0, "--record run.mcap");
     place.test_client().waits_for_joints(20);
@@ -271,7 +271,7 @@ fn a_file_that_another_program_moves_while_it_is_written_counts_as_lost_and_the_
 }
 
 /// Runs a bench in a shell that first runs a command.
-fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::Ended {
+fn in_shell(place: &TestDir, before: &str, run: &str, after: &str) -> process::Ended {
     let gateway = process::program("skinbus");
     let script = format!("{before} && {{ {} {run}; code=$?; {after}; exit $code; }}", gateway.display());
     let mut command = place.command_of(Path::new("/bin/sh"), "");
@@ -280,8 +280,8 @@ fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::End
 }
 
 /// Ends a bench in a shell some broadcasts after its recording broke off.
-fn until_it_broke_off(place: &Place, shell: process::Running) -> process::Ended {
-    shell.hears("the run goes on without it");
+fn until_it_broke_off(place: &TestDir, shell: process::Running) -> process::Ended {
+    shell.wait_for_stderr("the run goes on without it");
     place.test_client().waits_for_joints(20);
     // The shell's own command line contains the name as well.
     let is_it = |line: &str| line.split(' ').next().is_some_and(|program| program.ends_with("/skinbus"));
@@ -292,7 +292,7 @@ fn until_it_broke_off(place: &Place, shell: process::Running) -> process::Ended 
 }
 
 /// Checks that a run whose recording broke off came to its end, and that everything is in the file or counted.
-fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
+fn broke_off(place: &TestDir, ended: &process::Ended, why: &str) {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(ended.stdout.contains("8 cells"), "the table is complete: {ended:#?}");
     let said: Vec<_> =
@@ -332,7 +332,7 @@ const RUN: &str =
 
 #[test]
 fn a_limit_on_the_size_of_files_ends_the_recording_and_not_the_run() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     // In blocks of 512 bytes; a pipe has no size.
     let run = format!("{RUN} --record run.mcap --candump /dev/stderr");
@@ -348,7 +348,7 @@ fn a_limit_on_the_size_of_files_ends_the_recording_and_not_the_run() {
 
 #[test]
 fn a_full_disk_ends_the_recording_and_not_the_run() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     fs::create_dir(place.path("disk")).unwrap();
     fs::create_dir(place.path("saved")).unwrap();
@@ -369,11 +369,11 @@ fn a_full_disk_ends_the_recording_and_not_the_run() {
 }
 
 /// The frames of a bus, with their times.
-type Heard = std::sync::Arc<std::sync::Mutex<Vec<(u64, protocol::can::Frame)>>>;
+type ReceivedFrames = std::sync::Arc<std::sync::Mutex<Vec<(u64, protocol::can::Frame)>>>;
 
 /// Listens on a place's bus until it is gone.
-fn listen(place: &Place) -> (Heard, std::thread::JoinHandle<()>) {
-    let (heard, test_client) = (Heard::default(), place.test_client());
+fn listen(place: &TestDir) -> (ReceivedFrames, std::thread::JoinHandle<()>) {
+    let (heard, test_client) = (ReceivedFrames::default(), place.test_client());
     let into = std::sync::Arc::clone(&heard);
     let listen = move || {
         let mut inbox = protocol::bus::Inbox::new();
@@ -395,7 +395,7 @@ fn frames_of(path: &Path) -> Vec<(u64, String)> {
 /// Kills a gateway that records several times, each at a random moment; returns the time that each kill lost, in ms.
 /// Every other `.part` is repaired by the next run, the others by hand.
 fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let mut random = rand_pcg::Pcg32::seed_from_u64(seed);
     let mut lost = Vec::new();
@@ -418,7 +418,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
         assert!(part.exists() && !place.path("run.mcap").exists());
         let repaired = place.path("run-recovered.mcap");
         if number % 2 == 0 {
-            let ended = place.start("skinbus", "recover run.mcap.part").end().well();
+            let ended = place.start("skinbus", "recover run.mcap.part").end().succeeded();
             assert!(
                 ended.stdout.starts_with("run-recovered.mcap, ") && ended.stdout.contains(" messages, "),
                 "{ended:#?}"
@@ -427,7 +427,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
         } else {
             // Any run that records in the same folder.
             let run = "run skin.toml --bus-kind embedded --duration 0.01 --record other.mcap --quiet";
-            let ended = place.start("skinbus", run).end().well();
+            let ended = place.start("skinbus", run).end().succeeded();
             let says =
                 "run.mcap.part was left by a run that was killed; repaired, it is run-recovered.mcap: ";
             assert!(ended.stderr.lines().any(|line| line.starts_with(says)), "{ended:#?}");

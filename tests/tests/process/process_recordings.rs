@@ -5,11 +5,11 @@ use skinbus_tests::process;
 
 use std::path::Path;
 
-use process::Place;
+use process::TestDir;
 
 /// Replays a recording of an earlier build in lockstep to new cells; returns the number of equal replies.
 fn replayed(name: &str, more: &str) -> u64 {
-    let place = Place::new();
+    let place = TestDir::new();
     let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings").join(name);
     std::fs::copy(from, place.path(name)).unwrap();
     let (ended, replayed) = place.replayed(name, &format!("--expect --spawn --lockstep {more}"));

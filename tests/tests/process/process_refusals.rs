@@ -6,11 +6,11 @@ use skinbus_tests::process;
 
 use std::os::unix::net::UnixDatagram;
 
-use process::{PRESSED, Place, skin};
+use process::{PRESSED, TestDir, skin};
 use protocol::bus::has_socketcan;
 
 /// Returns the message of a refused command, and checks that it leaves no file.
-fn refusal(place: &Place, program: &str, words: &str, code: i32) -> String {
+fn refusal(place: &TestDir, program: &str, words: &str, code: i32) -> String {
     let before = place.files();
     let ended = place.start(program, words).end();
     let said = ended.refusal(code).to_owned();
@@ -21,7 +21,7 @@ fn refusal(place: &Place, program: &str, words: &str, code: i32) -> String {
 
 /// Replaces something in a skin of three cells, and checks that the gateway and a cell refuse it.
 fn skin_refusal(old: &str, new: &str, expected: &str) {
-    let place = Place::new();
+    let place = TestDir::new();
     let text = skin(3);
     let at = text.find(old).unwrap_or_else(|| panic!("{old:?} is not in\n{text}"));
     // A table's first line is its header.
@@ -74,7 +74,7 @@ fn an_invalid_skin_is_refused_with_line_key_value_and_what_is_allowed() {
 
 #[test]
 fn a_fault_that_processes_cannot_make_is_refused() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(3);
     place.scenario(&format!(
         "{PRESSED}\n[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\nbus = \"vcan0\"\n"
@@ -85,7 +85,7 @@ fn a_fault_that_processes_cannot_make_is_refused() {
 
 #[test]
 fn a_scenario_that_does_not_fit_the_skin_is_refused() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(3);
     for (scenario, expected) in [
         (
@@ -114,7 +114,7 @@ fn a_scenario_that_does_not_fit_the_skin_is_refused() {
 
 #[test]
 fn files_that_are_not_there_are_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     for (words, expected) in [
         ("run nowhere.toml", "nowhere.toml: No such file or directory (os error 2)"),
@@ -140,7 +140,7 @@ fn files_that_are_not_there_are_named() {
 
 #[test]
 fn a_file_that_is_no_program_is_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let said = refusal(
         &place,
@@ -164,7 +164,7 @@ fn a_file_that_is_no_program_is_named() {
 
 #[test]
 fn files_that_cannot_be_written_are_noticed_before_the_run() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     std::fs::create_dir(place.path("folder")).unwrap();
     for option in ["--candump", "--summary"] {
@@ -188,7 +188,7 @@ fn files_that_cannot_be_written_are_noticed_before_the_run() {
 
 #[test]
 fn a_run_that_fails_to_start_leaves_old_recordings_and_has_a_summary() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     place.write("run.log", "of yesterday\n");
     place.write("run.json", "{}\n");
@@ -203,7 +203,7 @@ fn a_run_that_fails_to_start_leaves_old_recordings_and_has_a_summary() {
 
 #[test]
 fn a_bus_that_does_not_exist_is_named_with_its_hint() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &skin(3).replace("\"vcan0\"", "\"nosuch0\""));
     let expected = match has_socketcan() {
         true => {
@@ -231,7 +231,7 @@ fn a_bus_that_does_not_exist_is_named_with_its_hint() {
 
 #[test]
 fn buses_are_not_kept_where_others_may_look() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     std::fs::create_dir(place.path("open")).unwrap();
     let mut command = place.command("skinbus", "run skin.toml --bus-kind embedded --candump run.log");
@@ -244,7 +244,7 @@ fn buses_are_not_kept_where_others_may_look() {
 
 #[test]
 fn an_unusable_socket_of_an_external_controller_is_named_before_cells_are_started() {
-    let place = Place::new();
+    let place = TestDir::new();
     let kinesthetic = |line: &&str| !line.starts_with("inertia = ") && !line.starts_with("damping = ");
     let text = skin(3);
     let text: String = text.lines().filter(kinesthetic).map(|line| format!("{line}\n")).collect();
@@ -263,7 +263,7 @@ fn an_unusable_socket_of_an_external_controller_is_named_before_cells_are_starte
 
 #[test]
 fn wrong_options_are_one_line() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let seconds = "a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h); try '--help'";
     let needed = "the following required arguments were not provided";

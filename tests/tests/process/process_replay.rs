@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use model::generate::{self, Format};
 use process::replay::{FRESH, Replayed, TOUCHED, by_hand, cell, changed, is_torque, without};
-use process::{Place, example, skin_of};
+use process::{TestDir, example, skin_of};
 use protocol::candump::{CandumpLine, parse};
 use protocol::id::Node;
 use protocol::message::{AppliesFrom, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
@@ -21,7 +21,7 @@ use rustix::process::Signal;
 
 #[test]
 fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_can() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let mut counts = Vec::new();
     for route in
@@ -61,10 +61,10 @@ fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_c
 
 #[test]
 fn a_recording_brings_its_own_skin() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(5);
     place.scenario(process::PRESSED);
-    place.bench(2.0, "--record run.mcap").end().well();
+    place.bench(2.0, "--record run.mcap").end().succeeded();
     fs::remove_file(place.path("skin.toml")).unwrap();
     let mut counts = Vec::new();
     for file in ["run.mcap", "run.log"] {
@@ -81,10 +81,10 @@ fn a_recording_brings_its_own_skin() {
 
 #[test]
 fn the_second_file_of_a_recording_begins_with_what_was_latched() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(5);
     place.scenario(process::PRESSED);
-    place.bench(2.5, "--record run.mcap --record-split 1s").end().well();
+    place.bench(2.5, "--record run.mcap --record-split 1s").end().succeeded();
     let (ended, first) = place.replayed("run.mcap", &format!("{FRESH} --speed max"));
     let first = first.all_came_back(&ended);
     let (ended, second) = place.replayed("run-1.mcap", &format!("{FRESH} --speed max"));
@@ -96,10 +96,10 @@ fn the_second_file_of_a_recording_begins_with_what_was_latched() {
 
 #[test]
 fn two_buses_of_classic_frames_come_back_too() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &skin_of(9, 2, Format::Classic));
     place.scenario(process::PRESSED);
-    place.bench(2.0, "").end().well();
+    place.bench(2.0, "").end().succeeded();
     for route in ["--speed max", "--lockstep --from 1"] {
         let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
         assert!(replayed.all_came_back(&ended) > 50, "{:#}", replayed.0);
@@ -136,7 +136,7 @@ fn begins_and_changes(log: &str) -> [f64; 2] {
 
 #[test]
 fn from_the_middle_on_the_torques_are_the_same() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let log = place.read("run.log");
     let [begins, changes] = begins_and_changes(&log);
@@ -163,7 +163,7 @@ fn from_the_middle_on_the_torques_are_the_same() {
 
 #[test]
 fn cells_with_another_history_answer_as_they_did_then() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let [begins, changes] = begins_and_changes(&place.read("run.log"));
     let _bench = by_hand(&place, "1-8");
@@ -174,12 +174,12 @@ fn cells_with_another_history_answer_as_they_did_then() {
             contact: [protocol::fixed::Q5_10::nearest(3.0); 3],
             ..SkinSensors::default()
         });
-        test_client.sends(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page });
-        test_client.sends(&Message::Joints {
+        test_client.send(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page });
+        test_client.send(&Message::Joints {
             epoch: protocol::packet::Epoch(3),
             joints: protocol::message::Joints { in_use: 6, ..Default::default() },
         });
-        test_client.sends(&Message::Halt);
+        test_client.send(&Message::Halt);
         // The configuration was changed in the middle of the run, and a replay from there applies it again.
         let (part, at) =
             if round == 0 { ("--to", (begins + changes) / 2.0) } else { ("--from", changes + 0.5) };
@@ -194,7 +194,7 @@ fn cells_with_another_history_answer_as_they_did_then() {
 
 #[test]
 fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let text = place.read("skin.toml");
     // Cell 3 is 10 cm elsewhere.
@@ -235,7 +235,7 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
 
 #[test]
 fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let log = place.read("run.log");
     let wrong = changed(&log, 5, |message| is_torque(message, 2), |words| words[1] += 3);
@@ -305,11 +305,12 @@ fn is_sum(message: &Message, cell: u8) -> bool {
 
 #[test]
 fn sums_without_their_children_come_back_in_any_tree() {
-    let place = Place::new();
-    let expected = generate::Target { cells: 12, reply: generate::Reply::Sum, ..generate::Target::default() };
+    let place = TestDir::new();
+    let expected =
+        generate::SkinRequest { cells: 12, reply: generate::Reply::Sum, ..generate::SkinRequest::default() };
     place.write("skin.toml", &generate::generate(&expected).unwrap());
     place.scenario(TOUCHED);
-    place.bench(4.0, "--record run.mcap").end().well();
+    place.bench(4.0, "--record run.mcap").end().succeeded();
     place.is_left_clean();
     for file in ["run.mcap", "run.log"] {
         let (ended, replayed) = place.replayed(file, &format!("{FRESH} --lockstep"));
@@ -345,7 +346,7 @@ fn sums_without_their_children_come_back_in_any_tree() {
 
 #[test]
 fn a_killed_cell_is_named_and_its_replies_are_missing() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let replay = place.replay("run.log", &format!("{FRESH} --lockstep"));
     place.test_client().waits_for_epoch(30);
@@ -363,17 +364,17 @@ fn a_killed_cell_is_named_and_its_replies_are_missing() {
 
 #[test]
 fn a_foreign_capture_goes_to_another_bus_as_it_is() {
-    let place = Place::new();
+    let place = TestDir::new();
     let log = "(10.000000) can7 123#DEADBEEF\n(10.001000) can7 1F334455#R4\n# a comment\n\
                (10.002000) can8 00C##3AABB\n(10.002000) can7 20000004#0001000000000000\n(10.003000) can7 7FF#\n";
     place.write("foreign.log", log);
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let dump = place.start("skinbus", "dump vcan0 --bus-kind embedded -n 4");
-    dump.hears("vcan0 is embedded");
+    dump.wait_for_stderr("vcan0 is embedded");
     let (ended, replayed) = place.replayed("foreign.log", "--map can7=vcan0 --map can8=vcan0");
-    ended.well();
-    let ended = dump.end().well();
+    ended.succeeded();
+    let ended = dump.end().succeeded();
     let seen: Vec<_> = ended.stdout.lines().map(|line| line.split([' ', '\t']).nth(2).unwrap()).collect();
     assert_eq!(seen, ["123#DEADBEEF", "1F334455#R4", "00C##7AABB", "7FF#"]);
     assert_eq!(replayed.number("/sent"), 4);
@@ -382,7 +383,7 @@ fn a_foreign_capture_goes_to_another_bus_as_it_is() {
 
 #[test]
 fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let [begins, changes] = begins_and_changes(&place.read("run.log"));
     let to = format!("--to {:.6}", (begins + changes) / 2.0);
@@ -400,7 +401,7 @@ fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
         matches!(message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
             if *from == Node::Cell(cell(3)) && !beat.state.has(State::CLAIMING))
     });
-    test_client.sends(&mode(1, Request::Write { number, words: [0; WORDS] }));
+    test_client.send(&mode(1, Request::Write { number, words: [0; WORDS] }));
     test_client.waits_for("a cell that measures", answers(1, 0));
     let ended = place.replay("run.log", &format!("--expect {to} --quiet")).end();
     let said = "skinbus: cells measure and do not obey stimuli, as they did in the recording: 3; --test-mode lets them \
@@ -408,17 +409,17 @@ fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
     assert_eq!(ended.refusal(1), said);
     let (ended, replayed) = place.replayed("run.log", &format!("--expect --speed max {to} --test-mode"));
     assert!(replayed.all_came_back(&ended) > 5, "{:#}", replayed.0);
-    test_client.sends(&mode(2, Request::Read { number }));
+    test_client.send(&mode(2, Request::Read { number }));
     test_client.waits_for("a cell that measures again", answers(2, 0));
 }
 
 /// The whole skin, while it is stroked: a few seconds of it, twice.
 #[test]
 fn two_hundred_and_fifty_three_fresh_cells_answer_as_the_others_did_twice() {
-    let place = Place::new();
+    let place = TestDir::new();
     fs::copy(example("ur5-253.toml"), place.path("skin.toml")).unwrap();
     fs::copy(example("demo.toml"), place.path("scenario.toml")).unwrap();
-    place.bench(4.0, "").end().well();
+    place.bench(4.0, "").end().succeeded();
     place.is_left_clean();
     let mut counts = Vec::new();
     for route in ["--lockstep", "--speed max"] {

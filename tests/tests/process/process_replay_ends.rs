@@ -7,13 +7,13 @@ use std::fs;
 use std::time::Duration;
 
 use process::replay::{FRESH, Replayed, by_hand};
-use process::{Place, until};
+use process::{TestDir, until};
 use protocol::message::Message;
 use rustix::process::Signal;
 
 #[test]
 fn an_interrupted_replay_says_how_far_it_came_and_leaves_nothing() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let replay = place.replay("run.log", &format!("{FRESH} --loop 0"));
     place.test_client().waits_for_epoch(30);
@@ -28,7 +28,7 @@ fn an_interrupted_replay_says_how_far_it_came_and_leaves_nothing() {
 
 #[test]
 fn a_bus_that_ends_in_mid_replay_is_one_line_and_a_table() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     let [cells, server] = by_hand(&place, "1-8");
     let replay = place.replay("run.log", "--only inputs");
@@ -44,12 +44,12 @@ fn a_bus_that_ends_in_mid_replay_is_one_line_and_a_table() {
 
 #[test]
 fn frames_that_a_full_bus_does_not_take_are_refused_and_counted() {
-    let place = Place::new();
+    let place = TestDir::new();
     let frames: String =
         (0..20_000_u32).map(|at| format!("(1.{:06}) vcan0 123##1{at:032X}\n", at * 50)).collect();
     place.write("many.log", &frames);
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let replay = place.replay("many.log", "SKINBUS_SEND_TIMEOUT_MS=1 --loop 3");
     let test_client = place.test_client();
     until("a frame", || test_client.bus.wait(Some(Duration::from_millis(5))).unwrap().then_some(()));
@@ -69,7 +69,7 @@ fn frames_that_a_full_bus_does_not_take_are_refused_and_counted() {
 
 #[test]
 fn a_gateway_and_a_replay_notice_each_other() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.records(8);
     // The next run overwrites its log.
     fs::rename(place.path("run.log"), place.path("old.log")).unwrap();
@@ -81,12 +81,12 @@ fn a_gateway_and_a_replay_notice_each_other() {
         assert_eq!(ended.refusal(1), said);
     }
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     // A bus that comes while the replay lasts.
     let replay = place.replay("old.log", FRESH);
     place.test_client().waits_for_epoch(10);
     let joints = protocol::message::Joints { in_use: 6, ..Default::default() };
-    place.test_client().sends(&Message::Joints { epoch: protocol::packet::Epoch(200), joints });
+    place.test_client().send(&Message::Joints { epoch: protocol::packet::Epoch(200), joints });
     let ended = replay.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(ended.stderr.contains("skinbus: another gateway is on vcan0"), "{ended:#?}");
@@ -95,7 +95,7 @@ fn a_gateway_and_a_replay_notice_each_other() {
 
 #[test]
 fn invalid_input_is_refused_in_one_line() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(3);
     place.write("empty.log", "");
     place.write("none.log", "# nothing\n");
@@ -162,14 +162,14 @@ fn invalid_input_is_refused_in_one_line() {
 
 #[test]
 fn an_unreadable_line_is_named_and_omitted_and_times_that_run_backwards_are_reported_once() {
-    let place = Place::new();
+    let place = TestDir::new();
     let log = "(5.000000) vcan0 001#\n(1.) vcan0 123#00\n(5.100000) vcan0 002#00\n(1.000000) vcan0 003#00\n\
                (2.000000) vcan0 004#00\n(5.150000) vcan0 005#00\nDROPCOUNT: dropped 7 CAN frames on 'vcan0' socket (total drops 7)\n";
     place.write("odd.log", log);
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let (ended, replayed) = place.replayed("odd.log", "");
-    let ended = ended.well();
+    let ended = ended.succeeded();
     let said: Vec<_> = ended.stderr.lines().collect();
     assert_eq!(
         said[..4],

@@ -9,8 +9,8 @@ use skinbus_tests::process::recorded;
 use std::fs;
 
 use analysis::report::figure::{Drawing, Figure, Page, Table, quantity};
-use analysis::report::run::{Options, report};
-use process::{PRESSED, Place, names, skin};
+use analysis::report::run::{ReportOptions, report};
+use process::{PRESSED, TestDir, names, skin};
 use recorded::Recorded;
 use serde_json::Value;
 
@@ -18,15 +18,15 @@ const ERRORS: &str =
     "Absolute errors, joint by joint: single cells where the joint carries them, and the whole skin's sum";
 
 /// Runs a bench of eight cells that push the arm, compared all the time. Late cells halt it only after 20 s.
-fn recorded_bench(place: &Place, seconds: f64) -> Recorded {
+fn recorded_bench(place: &TestDir, seconds: f64) -> Recorded {
     place.write("skin.toml", &(skin(8) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(&PRESSED.replace("\"hold\"", "\"kinesthetic\""));
-    place.bench(seconds, "--record run.mcap").end().well();
+    place.bench(seconds, "--record run.mcap").end().succeeded();
     Recorded::read(&place.path("run.mcap"))
 }
 
-fn page(place: &Place, name: &str) -> (Page, Option<String>) {
-    let report = report(&[place.path(name)], &Options::default()).unwrap();
+fn page(place: &TestDir, name: &str) -> (Page, Option<String>) {
+    let report = report(&[place.path(name)], &ReportOptions::default()).unwrap();
     (report.page, report.missing)
 }
 
@@ -83,7 +83,7 @@ fn drawn(figure: &Figure, series: usize) -> [f64; 4] {
 
 #[test]
 fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
-    let place = Place::new();
+    let place = TestDir::new();
     let recorded = recorded_bench(&place, 3.0);
     let (page, missing) = page(&place, "run.mcap");
     assert_eq!(missing, None);
@@ -203,10 +203,10 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
 
 #[test]
 fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_what_is_missing() {
-    let place = Place::new();
+    let place = TestDir::new();
     recorded_bench(&place, 2.0);
     let before = place.files();
-    let ended = place.start("skinbus", "report run.mcap --svg figures").end().well();
+    let ended = place.start("skinbus", "report run.mcap --svg figures").end().succeeded();
     let (whole, _) = page(&place, "run.mcap");
     let all: Vec<_> =
         figures(&whole).map(|it| it.name.as_str()).chain(drawings(&whole).map(Drawing::name)).collect();
@@ -247,7 +247,7 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
 
     let bytes = fs::read(place.path("run.mcap")).unwrap();
     fs::write(place.path("cut.mcap"), &bytes[..bytes.len() / 2]).unwrap();
-    let ended = place.start("skinbus", "report cut.mcap").end().well();
+    let ended = place.start("skinbus", "report cut.mcap").end().succeeded();
     assert_eq!(ended.stderr.matches('\n').count(), 1, "{ended:?}");
     for words in ["skinbus: cut.mcap: it has no end", "of the 2 s that the run was to last", "s are missing"]
     {
@@ -255,7 +255,7 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
     }
     assert!(place.read("cut.html").contains("The run is incomplete: it has no end"));
     // As much as a recovery finds.
-    place.start("skinbus", "recover cut.mcap -o recovered.mcap").end().well();
+    place.start("skinbus", "recover cut.mcap -o recovered.mcap").end().succeeded();
     let recovered = Recorded::read(&place.path("recovered.mcap"));
     let ticks = recovered.on("/gateway/timing").count();
     let (link_down, missing) = page(&place, "cut.mcap");
@@ -282,7 +282,7 @@ fn recorded_forces(recorded: &Recorded) -> Vec<(u64, u64, f64)> {
 
 #[test]
 fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells_fell_silent() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(8);
     let scenario = "duration_s = 3.0\n[motion]\nkind = \"hold\"\nstart = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n\
                     [[touch]]\nat_s = 0.4\nfor_s = 2.0\ncells = [2, 3]\nforce_n = 5.0\nprofile = \"half-sine\"\n\

@@ -7,7 +7,7 @@ use std::fs;
 
 use process::log::{Log, same_torques};
 use process::replay::{by_hand, cell};
-use process::{PRESSED, Place, Summary, example, skin_of, until};
+use process::{PRESSED, Summary, TestDir, example, skin_of, until};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, Request, State};
@@ -17,7 +17,7 @@ use rustix::process::{Pid, Signal};
 
 /// Checks that every frame on the buses is in the log: packets by their kinds, as both sides counted them, and other
 /// frames.
-fn log_is_whole(place: &Place, summary: &Summary, frames_a_packet: u64) {
+fn log_is_whole(place: &TestDir, summary: &Summary, frames_a_packet: u64) {
     let buses = summary.0["buses"].as_array().unwrap().len();
     let packets = |bus| {
         ["received", "sent"].map(|route| summary.total(&format!("/buses/{bus}/{route}"))).iter().sum::<u64>()
@@ -31,10 +31,10 @@ fn log_is_whole(place: &Place, summary: &Summary, frames_a_packet: u64) {
 
 #[test]
 fn two_hundred_and_fifty_three_cells_answer_and_every_reply_is_accounted_for() {
-    let place = Place::new();
+    let place = TestDir::new();
     fs::copy(example("ur5-253.toml"), place.path("skin.toml")).unwrap();
     fs::copy(example("all-active.toml"), place.path("scenario.toml")).unwrap();
-    let ended = place.bench(3.0, "").end().well();
+    let ended = place.bench(3.0, "").end().succeeded();
     place.is_left_clean();
     assert!(ended.stdout.contains("253 cells"), "{}", ended.stdout);
     assert_eq!(place.files(), ["run.json", "run.log", "scenario.toml", "skin.toml"]);
@@ -65,10 +65,10 @@ fn two_hundred_and_fifty_three_cells_answer_and_every_reply_is_accounted_for() {
 
 #[test]
 fn buses_of_classic_frames_carry_the_same_bench() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &skin_of(9, 2, Format::Classic));
     place.scenario(PRESSED);
-    place.bench(1.5, "").end().well();
+    place.bench(1.5, "").end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     summary.adds_up();
@@ -83,11 +83,11 @@ fn buses_of_classic_frames_carry_the_same_bench() {
 
 /// Runs this scenario twice, the second time with more options.
 fn twice(scenario: &str, more: &str) {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(8);
     place.scenario(scenario);
     let logs = ["", more].map(|more| {
-        place.bench(2.0, more).end().well();
+        place.bench(2.0, more).end().succeeded();
         place.summary().adds_up();
         Log::read(&place.read("run.log"), Format::Fd)
     });
@@ -157,7 +157,7 @@ fn eight_cells_in_one_process_answer_as_eight_processes_do() {
 
 #[test]
 fn cells_share_processes_as_requested() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     for (more, expected) in
         [("", vec!["1", "2", "3", "4", "5", "6", "7", "8"]), ("--cells-per-process 5", vec!["1-5", "6-8"])]
@@ -167,17 +167,17 @@ fn cells_share_processes_as_requested() {
         nodes.sort();
         assert_eq!(nodes, expected);
         bench.signal(Signal::TERM);
-        bench.end().well();
+        bench.end().succeeded();
         place.is_left_clean();
     }
 }
 
 #[test]
 fn cells_started_by_hand_serve_one_gateway_after_the_other() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let cells = ["--nodes 1-5", "--nodes 6-7", "--node 8"].map(|nodes| {
         place.start("cell-node", &format!("--bus vcan0 --bus-kind embedded {nodes} --skin skin.toml"))
     });
@@ -188,7 +188,7 @@ fn cells_started_by_hand_serve_one_gateway_after_the_other() {
             place.test_client().waits_for_epoch(10);
             bench.signal(Signal::INT);
         }
-        let ended = bench.end().well();
+        let ended = bench.end().succeeded();
         assert!(ended.stdout.contains("8 cells"), "{}", ended.stdout);
         let summary = place.summary();
         summary.adds_up();
@@ -203,7 +203,7 @@ fn cells_started_by_hand_serve_one_gateway_after_the_other() {
     assert_eq!(place.processes().len(), 4);
 
     server.signal(Signal::TERM);
-    server.end().well();
+    server.end().succeeded();
     for cell in cells {
         let ended = cell.end();
         let said = "cell-node: the embedded bus vcan0 was closed: its server ended";
@@ -214,7 +214,7 @@ fn cells_started_by_hand_serve_one_gateway_after_the_other() {
 
 #[test]
 fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let bench = by_hand(&place, "1-8");
     let test_client = place.test_client();
@@ -224,10 +224,10 @@ fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
             if from == Node::Cell(third) && !beat.state.has(State::CLAIMING))
     });
     let request = Request::Write { number: Parameter::Mode.number(), words: [0; WORDS] };
-    test_client.sends(&Message::Configure { to: Node::Cell(third), tag: 9, request });
+    test_client.send(&Message::Configure { to: Node::Cell(third), tag: 9, request });
     test_client.waits_for("its answer", |message| matches!(message, Message::Configured { tag: 9, .. }));
 
-    let ended = place.bench(1.5, "--no-spawn").end().well();
+    let ended = place.bench(1.5, "--no-spawn").end().succeeded();
     let said = "cells that measure, so the scenario does not press them (`skinbus frame configure --cell N --write \
                 mode 1` puts one into test mode): 3 on vcan0\n";
     assert!(ended.stderr.contains(said), "{ended:#?}");
@@ -247,10 +247,10 @@ fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
 
 #[test]
 fn a_gateway_without_cells_names_the_missing_ones() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let ended = place.bench(1.0, "--no-spawn --quiet").end();
     let said = "skinbus: cells that are not ready: 1, 2, 3, 4, 5, 6, 7, 8 on vcan0; start them with cell-node, \
                 or leave out --no-spawn";
@@ -259,7 +259,7 @@ fn a_gateway_without_cells_names_the_missing_ones() {
 
     // The running cells are enough.
     let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-6 --skin skin.toml");
-    let ended = place.bench(1.0, "--no-spawn").end().well();
+    let ended = place.bench(1.0, "--no-spawn").end().succeeded();
     assert!(ended.stderr.contains("run goes on without them: 7, 8 on vcan0"), "{}", ended.stderr);
     let summary = place.summary();
     assert_eq!(summary.adds_up().silent(), [7, 8]);
@@ -277,7 +277,7 @@ fn wakes(pid: Pid) -> u64 {
 
 #[test]
 fn joints_wake_the_cells_that_are_touched() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(3);
     let held = PRESSED.replace("all = true", "cells = [1]");
     let often: String = (0..8)
@@ -299,7 +299,7 @@ fn joints_wake_the_cells_that_are_touched() {
     // The cell sends heartbeats.
     assert!(of_untouched >= 4 && of_untouched * 3 < of_touched * 2, "{of_untouched} beside {of_touched}");
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     let summary = place.summary();
     summary.adds_up();
     // A touch makes joints wake the cell again: no reply of any of the eight is missing.

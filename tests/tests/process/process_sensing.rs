@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use process::log::Log;
-use process::{PRESSED, Place, Running, skin};
+use process::{PRESSED, Running, TestDir, skin};
 use protocol::bus::{Bus, Inbox};
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q, Q5_10};
@@ -21,8 +21,8 @@ use serde_json::json;
 const CELLS: u8 = 8;
 
 /// Creates a place whose skin has these keys of its bus.
-fn place(sensing: &str, scenario: &str) -> Place {
-    let place = Place::new();
+fn place(sensing: &str, scenario: &str) -> TestDir {
+    let place = TestDir::new();
     let format = "format = \"fd\"";
     let text = skin(CELLS.into());
     assert!(text.contains(format), "{text}");
@@ -33,19 +33,19 @@ fn place(sensing: &str, scenario: &str) -> Place {
 
 fn ends(bench: Running) {
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
 }
 
 /// Runs a command in this place successfully, and returns its output.
-fn switches(place: &Place, words: &str) -> String {
+fn switches(place: &TestDir, words: &str) -> String {
     place
         .start("skinbus", &format!("frame sensing {words} --bus vcan0 --bus-kind embedded"))
         .end()
-        .well()
+        .succeeded()
         .stdout
 }
 
-fn refusal(place: &Place, words: &str, code: i32) -> String {
+fn refusal(place: &TestDir, words: &str, code: i32) -> String {
     place
         .start("skinbus", &format!("frame sensing {words} --bus vcan0 --bus-kind embedded"))
         .end()
@@ -108,7 +108,7 @@ fn a_cell_that_restarts_is_switched_again_to_what_it_was() {
     let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
     let fifth = CellId::new(5).unwrap();
-    bench.hears("cell 5 on vcan0 restarted");
+    bench.wait_for_stderr("cell 5 on vcan0 restarted");
     test_client.waits_for("its confirmation", |message| {
         matches!(message, Message::Configured { from, answer: Answer::Value { number: 7, written: true, words }, .. }
             if *from == fifth && words[..2] == [1, 50])
@@ -135,14 +135,14 @@ fn sizes(log: &Log, cell: u8) -> Vec<i32> {
 /// Ten degrees in eight seconds, with offsets that would all be contacts without a baseline.
 #[test]
 fn cells_whose_sensors_drift_feel_what_touches_them_and_nothing_else() {
-    let place = Place::new();
+    let place = TestDir::new();
     let head = skin(4);
     place.write("skin.toml", &head.replacen("[controller]", "[baseline]\nlimit_n = 2.0\n\n[controller]", 1));
     place.scenario(
         "duration_s = 8.0\n[motion]\nkind = \"hold\"\n[[touch]]\nat_s = 2.0\nfor_s = 5.0\ncells = [2]\nforce_n = 1.0\n\
          [sensors]\ntemperature_c = [[0.0, 25.0], [8.0, 35.0]]\n[sensors.force]\nkind = \"piezoresistive\"\n",
     );
-    place.bench(8.0, "").end().well();
+    place.bench(8.0, "").end().succeeded();
     place.is_left_clean();
     let log = Log::read(&place.read("run.log"), Format::Fd);
     let torques = sizes(&log, 2);
@@ -167,7 +167,7 @@ fn accelerometers_of_a_robot_at_rest_show_gravity_in_the_frames_of_their_cells()
             "sensing = \"continuous\"\nsensing_hz = 20.0",
             &format!("[motion]\nkind = \"{motion}\"\n[sensors.acceleration]\nkind = \"perfect\"\n"),
         );
-        place.bench(2.0, "").end().well();
+        place.bench(2.0, "").end().succeeded();
         place.is_left_clean();
         let log = Log::read(&place.read("run.log"), Format::Fd);
         let mut shown = std::collections::BTreeMap::new();
@@ -188,7 +188,7 @@ fn accelerometers_of_a_robot_at_rest_show_gravity_in_the_frames_of_their_cells()
 
 #[test]
 fn an_invalid_request_is_refused_in_one_line() {
-    let place = Place::new();
+    let place = TestDir::new();
     assert_eq!(
         refusal(&place, "continuous", 2),
         "skinbus: continuous needs a rate, such as `continuous 62.5`"
@@ -205,11 +205,11 @@ fn an_invalid_request_is_refused_in_one_line() {
 /// Cells that have accepted stimuli before a gateway listens: from another sender, and from a gateway that was killed.
 #[test]
 fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(8);
     let head = "version = 1\n[motion]\nkind = \"hold\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-8 --skin skin.toml");
     let test_client = place.test_client();
     let third = Node::Cell(process::replay::cell(3));
@@ -219,11 +219,11 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     });
     let contact = [Q5_10::nearest(1.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    test_client.sends(&Message::Stimulus { to: third, from: AppliesFrom::Next, page });
+    test_client.send(&Message::Stimulus { to: third, from: AppliesFrom::Next, page });
 
     // A run without touches leaves the cell as it is, and reports that its contact is unknown.
     place.scenario(head);
-    let ended = place.bench(1.5, "--no-spawn").end().well();
+    let ended = place.bench(1.5, "--no-spawn").end().succeeded();
     let said = "the contact of these cells is unknown, so their torques are not compared: 3 on vcan0;";
     assert!(ended.stderr.contains(said), "{}", ended.stderr);
     let summary = place.summary();
@@ -242,7 +242,7 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     killed.signal(Signal::KILL);
     killed.end();
     place.scenario(&format!("{head}{touch}cells = [5]\n"));
-    place.bench(1.5, "--no-spawn").end().well();
+    place.bench(1.5, "--no-spawn").end().succeeded();
     let summary = place.summary();
     summary.adds_up();
     let due = summary.of_bus("/replies/due");
@@ -277,7 +277,7 @@ fn pass_on(from: &Bus, to: &Bus, stop: &AtomicBool, mut change: impl FnMut(&Fram
 #[test]
 fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_the_report() {
     // The cell is on a bus of its own, and its packets arrive changed at the others.
-    let [place, behind] = [Place::new(), Place::new()];
+    let [place, behind] = [TestDir::new(), TestDir::new()];
     let moving = PRESSED
         .replace("hold", "sine")
         .replace("start_rad", "period_s = 2.0\namplitude = [0.4, 0.4, 0.4, 0.0, 0.0, 0.0]\nstart");
@@ -306,7 +306,7 @@ fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_t
             });
         });
         place.test_client().waits_for_settled_cells(8);
-        let ended = place.bench(6.0, "--no-spawn --record run.mcap").end().well();
+        let ended = place.bench(6.0, "--no-spawn --record run.mcap").end().succeeded();
         drop(stops);
         assert!(ended.stdout.contains("stuck: cell 5"), "{}", ended.stdout);
     });
@@ -316,7 +316,7 @@ fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_t
     let stuck: Vec<_> =
         stuck.map(|cell| (&cell["node"], cell["stuck"]["torque"].as_u64() > Some(31))).collect();
     assert_eq!(stuck, [(&json!(5), true)], "{:#}", summary.0["cells"]);
-    place.start("skinbus", "report run.mcap -o run.html").end().well();
+    place.start("skinbus", "report run.mcap -o run.html").end().succeeded();
     let page = place.read("run.html");
     assert!(
         page.contains("stuck cells, which sent constant words while the expected words changed (vcan0 5: "),

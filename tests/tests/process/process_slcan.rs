@@ -9,7 +9,7 @@ use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixListener;
 use std::time::Duration;
 
-use process::{Place, Running, until};
+use process::{Running, TestDir, until};
 use protocol::bus::{Bus, BusOptions, Inbox};
 use protocol::can::{ERROR, ERROR_STATE, EXTENDED, EXTENDED_MASK, Frame};
 use rustix::process::Signal;
@@ -18,16 +18,16 @@ use slcan::{Peer, Pty, carry};
 
 /// A bus in a place.
 struct Bench {
-    place: Place,
+    place: TestDir,
     server: Running,
     client: Bus,
 }
 
-fn client(place: &Place) -> Bus {
+fn client(place: &TestDir) -> Bus {
     client_with(place, 0)
 }
 
-fn client_with(place: &Place, error_mask: u32) -> Bus {
+fn client_with(place: &TestDir, error_mask: u32) -> Bus {
     let options = BusOptions {
         error_mask,
         directory: Some(place.buses()),
@@ -40,9 +40,9 @@ fn client_with(place: &Place, error_mask: u32) -> Bus {
 
 impl Bench {
     fn new() -> Self {
-        let place = Place::new();
+        let place = TestDir::new();
         let server = place.start("vcan-setup", "serve vcan0");
-        server.prints("serving vcan0");
+        server.wait_for_stdout("serving vcan0");
         let client = client(&place);
         Self { place, server, client }
     }
@@ -54,7 +54,7 @@ impl Bench {
     /// Starts the same, and waits until all lines are open.
     fn joined(&self, words: &str) -> Running {
         let bridge = self.slcan(&format!("{words} --json"));
-        bridge.hears(" on vcan0 (embedded)");
+        bridge.wait_for_stderr(" on vcan0 (embedded)");
         bridge
     }
 
@@ -74,7 +74,7 @@ impl Bench {
 /// Ends the bridge, and returns the account of each line.
 fn ended(bridge: Running) -> Vec<Value> {
     bridge.signal(Signal::TERM);
-    let ended = bridge.end().well();
+    let ended = bridge.end().succeeded();
     let mut report: Value = serde_json::from_str(&ended.stdout).unwrap();
     let lines: Vec<Value> = serde_json::from_value(report["lines"].take()).unwrap();
     for line in &lines {
@@ -109,17 +109,17 @@ fn frames_of_every_kind_pass_both_ways_and_the_adapter_is_opened_and_closed() {
         let bench = Bench::new();
         let mut pty = Pty::new();
         let bridge = bench.slcan(&format!("{} --bit-rates 1M/5M --baud 1000000", pty.path.display()));
-        bridge.prints("1 line on vcan0 (embedded)\n");
-        pty.peer.hears("\rC\rS8\rY5\rO\r");
+        bridge.wait_for_stdout("1 line on vcan0 (embedded)\n");
+        pty.peer.wait_for_text("\rC\rS8\rY5\rO\r");
         let all = frames(100);
         bench.client.send(&all).unwrap();
         assert_eq!(pty.peer.receives(all.len()), all);
         pty.peer.sends(&all);
         assert_eq!(bench.receives(all.len()), all);
         bridge.signal(end);
-        let ended = bridge.end().well();
-        pty.peer.hears("O\r");
-        pty.peer.look();
+        let ended = bridge.end().succeeded();
+        pty.peer.wait_for_text("O\r");
+        pty.peer.read_available();
         assert!(pty.peer.bytes.ends_with(b"C\r"));
         let name = pty.path.display();
         assert!(
@@ -156,12 +156,12 @@ fn garbage_is_counted_and_what_follows_it_is_read() {
     let bench = Bench::new();
     let mut pty = Pty::new();
     let bridge = bench.joined(&format!("{} --classic", pty.path.display()));
-    pty.peer.says(b"\x00\xff\xfe\r\x07z\rV1013\rt12\rt1239\rt9990\r");
-    pty.peer.says(&[b'x'; 100_000]);
-    pty.peer.says(b"\rt123");
+    pty.peer.write_bytes(b"\x00\xff\xfe\r\x07z\rV1013\rt12\rt1239\rt9990\r");
+    pty.peer.write_bytes(&[b'x'; 100_000]);
+    pty.peer.write_bytes(b"\rt123");
     let frame = Frame::classic(0x123, &[5]).unwrap();
     std::thread::sleep(Duration::from_millis(20));
-    pty.peer.says(b"105\r");
+    pty.peer.write_bytes(b"105\r");
     assert_eq!(bench.receives(1), [frame]);
     bench.client.send(&[Frame::fd(1, 1, &[]).unwrap(), frame]).unwrap();
     assert_eq!(pty.peer.receives(1), [frame]);
@@ -178,20 +178,20 @@ fn an_adapter_that_was_deaf_when_it_was_opened_is_opened_again_at_its_first_refu
     let bench = Bench::new();
     let mut pty = Pty::new();
     let bridge = bench.joined(&format!("{} --bit-rates 500k", pty.path.display()));
-    pty.peer.hears("\rC\rS6\rY0\rO\r");
+    pty.peer.wait_for_text("\rC\rS6\rY0\rO\r");
     pty.peer.bytes.clear();
     let frames = [1, 2].map(|id| Frame::classic(id, &[]).unwrap());
     bench.client.send(&frames[..1]).unwrap();
-    pty.peer.hears("t0010\r");
-    pty.peer.says(b"\x07");
-    pty.peer.hears("\rC\rS6\rY0\rO\r");
-    bridge.hears("its adapter refuses frames (BEL)");
-    bridge.hears("1 more frames to the line lost, in all 1 dropped (1 refused by the adapter)");
+    pty.peer.wait_for_text("t0010\r");
+    pty.peer.write_bytes(b"\x07");
+    pty.peer.wait_for_text("\rC\rS6\rY0\rO\r");
+    bridge.wait_for_stderr("its adapter refuses frames (BEL)");
+    bridge.wait_for_stderr("1 more frames to the line lost, in all 1 dropped (1 refused by the adapter)");
     // It is open now.
-    pty.peer.says(b"\r\r\r");
+    pty.peer.write_bytes(b"\r\r\r");
     bench.client.send(&frames[1..]).unwrap();
-    pty.peer.hears("t0020\r");
-    pty.peer.says(b"z\r\x07z\r");
+    pty.peer.wait_for_text("t0020\r");
+    pty.peer.write_bytes(b"z\r\x07z\r");
     pty.peer.sends(&frames);
     assert_eq!(bench.receives(2), frames);
     let [line] = ended(bridge).try_into().unwrap();
@@ -205,12 +205,12 @@ fn a_bit_rate_that_an_adapter_does_not_have_is_reported() {
     let mut pty = Pty::new();
     let bridge = bench.joined(&format!("{} --bit-rates 500k/2M", pty.path.display()));
     // Closing a closed channel is refused as well, and has no effect.
-    pty.peer.hears("C\r");
-    pty.peer.says(b"\x07");
-    pty.peer.hears("S6\r");
-    pty.peer.says(b"\x07");
-    bridge.hears("its adapter refused a command of S6, Y2 (BEL)");
-    pty.peer.hears("Y2\rO\r");
+    pty.peer.wait_for_text("C\r");
+    pty.peer.write_bytes(b"\x07");
+    pty.peer.wait_for_text("S6\r");
+    pty.peer.write_bytes(b"\x07");
+    bridge.wait_for_stderr("its adapter refused a command of S6, Y2 (BEL)");
+    pty.peer.wait_for_text("Y2\rO\r");
     let [line] = ended(bridge).try_into().unwrap();
     assert_eq!((&line["reopened"], &line["to_line"]["dropped"]["refused"]), (&0.into(), &0.into()), "{line}");
 }
@@ -220,9 +220,9 @@ fn faults_of_an_adapter_are_reported_counted_and_error_frames_on_the_bus() {
     let bench = Bench::new();
     let mut pty = Pty::new();
     let bridge = bench.joined(&pty.path.display().to_string());
-    pty.peer.hears("O\r");
+    pty.peer.wait_for_text("O\r");
     let errors = client_with(&bench.place, EXTENDED_MASK);
-    pty.peer.says(b"e1a\rsb256256\rF80\r");
+    pty.peer.write_bytes(b"e1a\rsb256256\rF80\r");
     let expected = [(0xA8, [0, 0, 0, 0x19]), (0x40, [0; 4]), (0x88, [0; 4])]
         .map(|(class, [a, b, c, d])| Frame::classic(ERROR | class, &[a, b, c, d, 0, 0, 0, 0]).unwrap());
     let (mut inbox, mut frames) = (Inbox::new(), Vec::new());
@@ -246,7 +246,7 @@ fn the_state_of_a_sender_behind_the_data_is_that_of_the_frame() {
     let bench = Bench::new();
     let mut pty = Pty::new();
     let bridge = bench.joined(&pty.path.display().to_string());
-    pty.peer.says(b"t1232AABB0\rt1232AABB0A510\rt1232AABB0000000F1\rb1232AABBS\rd1232AABB1\r");
+    pty.peer.write_bytes(b"t1232AABB0\rt1232AABB0A510\rt1232AABB0000000F1\rb1232AABBS\rd1232AABB1\r");
     let data = [0xAA, 0xBB];
     let classic = Frame::classic(0x123, &data).unwrap();
     let fd = [1, 0].map(|flags| Frame::fd(0x123, flags | ERROR_STATE, &data).unwrap());
@@ -261,12 +261,12 @@ fn a_board_that_opening_its_line_resets_is_left_alone_until_it_has_started() {
     let [mut slow, mut quick] = [Pty::new(), Pty::new()];
     let bridge =
         bench.joined(&format!("{},settle=60 {},settle=0.01", slow.path.display(), quick.path.display()));
-    quick.peer.hears("\rC\rO\r");
+    quick.peer.wait_for_text("\rC\rO\r");
     let frame = Frame::classic(1, &[]).unwrap();
     bench.client.send(&[frame]).unwrap();
     assert_eq!(quick.peer.receives(1), [frame]);
     let [first, second] = ended(bridge).try_into().unwrap();
-    slow.peer.look();
+    slow.peer.read_available();
     assert_eq!(slow.peer.bytes, b"", "nothing was written");
     assert_eq!(
         (&first["to_line"]["dropped"]["line_away"], &second["to_line"]["sent"]),
@@ -282,16 +282,16 @@ fn goes_and_returns(
     gone: impl Fn(Peer),
 ) -> u64 {
     let bridge = bench.slcan(&format!("{address} --json --wait"));
-    bridge.hears(" on vcan0 (embedded)");
+    bridge.wait_for_stderr(" on vcan0 (embedded)");
     for round in 0..3_u8 {
         let mut peer = connect();
-        peer.hears("\rC\rO\r");
+        peer.wait_for_text("\rC\rO\r");
         let frame = Frame::classic(0x100 + u32::from(round), &[round]).unwrap();
         peer.sends(&[frame]);
         assert_eq!(bench.receives(1), [frame], "{address}");
         bench.client.send(&[frame]).unwrap();
         assert_eq!(peer.receives(1), [frame], "{address}");
-        peer.says(b"t12");
+        peer.write_bytes(b"t12");
         let before = bridge.stderr().matches(": away (").count();
         gone(peer);
         until("the end to be noticed", || {
@@ -367,7 +367,7 @@ fn what_a_line_is_too_slow_for_is_counted_exactly_and_holds_up_nobody() {
     until("a report", || bridge.stderr().contains("line too slow").then_some(()));
     // While it ends, the data in the socket and unfinished lines are read.
     bridge.signal(Signal::TERM);
-    while slow.look() {
+    while slow.read_available() {
         std::thread::sleep(Duration::from_millis(1));
     }
     assert!(!bridge.stderr().contains("not closed"), "{}", bridge.stderr());
@@ -388,7 +388,7 @@ fn what_a_line_is_too_slow_for_is_counted_exactly_and_holds_up_nobody() {
 
 /// Returns the accounts of lines after the bridge got a signal.
 fn ended_already(bridge: Running) -> Vec<Value> {
-    let mut report: Value = serde_json::from_str(&bridge.end().well().stdout).unwrap();
+    let mut report: Value = serde_json::from_str(&bridge.end().succeeded().stdout).unwrap();
     serde_json::from_value(report["lines"].take()).unwrap()
 }
 
@@ -398,12 +398,12 @@ fn a_bus_goes_and_returns() {
     let mut pty = Pty::new();
     let bridge = bench.joined(&pty.path.display().to_string());
     bench.server.signal(Signal::TERM);
-    bridge.hears("its bus is away (the embedded bus vcan0 was closed: its server ended)");
+    bridge.wait_for_stderr("its bus is away (the embedded bus vcan0 was closed: its server ended)");
     let frame = Frame::classic(0x123, &[5]).unwrap();
     pty.peer.sends(&[frame]);
     let server = bench.place.start("vcan-setup", "serve vcan0");
-    server.prints("serving");
-    bridge.hears("its bus is back");
+    server.wait_for_stdout("serving");
+    bridge.wait_for_stderr("its bus is back");
     let client = client(&bench.place);
     client.send(&[frame]).unwrap();
     assert_eq!(pty.peer.receives(1), [frame]);
@@ -456,7 +456,7 @@ fn what_cannot_be_is_refused_in_one_line() {
     ended(bridge);
     drop(bench.joined(&tty.to_string()));
     ended(bench.joined(&tty.to_string()));
-    let nowhere = Place::new();
+    let nowhere = TestDir::new();
     let refused = nowhere.start("vcan-setup", &format!("slcan vcan0 {tty} --bus-kind embedded")).end();
     assert!(refused.refusal(1).contains("no embedded bus vcan0 is served"));
 }
@@ -484,7 +484,7 @@ fn a_cell_behind_a_line_answers_as_one_on_the_bus() {
         heard.extend(bench.receives(1));
         heartbeats(&heard).then_some(())
     });
-    bench.place.bench(3.0, "--no-spawn").end().well();
+    bench.place.bench(3.0, "--no-spawn").end().succeeded();
     let summary = bench.place.summary();
     let [line] = ended(near).try_into().unwrap();
     assert_eq!(line["to_line"]["received"], line["to_line"]["sent"], "{line}");

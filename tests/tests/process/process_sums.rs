@@ -11,18 +11,18 @@ use process::sums::{
     neighbors, unrecorded, wired,
 };
 use process::test_client::TestClient;
-use process::{PRESSED, Place};
+use process::{PRESSED, TestDir};
 use protocol::can::Format;
 use protocol::id::Kind;
 use rustix::process::Signal;
 
 #[test]
 fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
-    let place = Place::new();
+    let place = TestDir::new();
     grid(&place, Format::Fd);
     place.scenario(PRESSED);
     let bench = unrecorded(&place, 600.0, "");
-    bench.hears_the_loop();
+    bench.wait_for_loop();
     holds(&TestClient::on(&place, "vcan0", Format::Fd), CELLS.into());
     let said = end(&place, bench).stderr;
     assert!(said.contains("the cells of vcan0 are a tree of depth "), "{said}");
@@ -54,7 +54,7 @@ fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
 
 #[test]
 fn a_recording_holds_every_sum_and_no_wire() {
-    let place = Place::new();
+    let place = TestDir::new();
     grid(&place, Format::Fd);
     place.scenario(PRESSED);
     let bench = place.running_bench(600.0, "");
@@ -79,33 +79,33 @@ fn a_recording_holds_every_sum_and_no_wire() {
 
 #[test]
 fn sums_bypass_a_cell_that_is_killed_or_hangs_until_it_comes_back() {
-    goes_round_a_cell(&Place::new(), Format::Fd);
+    goes_round_a_cell(&TestDir::new(), Format::Fd);
 }
 
 #[test]
 fn sums_bypass_a_cell_in_classic_frames_too() {
-    goes_round_a_cell(&Place::new(), Format::Classic);
+    goes_round_a_cell(&TestDir::new(), Format::Classic);
 }
 
 #[test]
 fn without_a_touch_hellos_show_lost_cells_and_the_rest_finds_another_route() {
-    keeps_ways_without_a_touch(&Place::new(), Format::Fd);
+    keeps_ways_without_a_touch(&TestDir::new(), Format::Fd);
 }
 
 // JOIN-6
 #[test]
 fn an_unreachable_cell_is_named_and_the_rest_finds_another_route() {
-    goes_on_without_a_wire(&Place::new(), Format::Fd);
+    goes_on_without_a_wire(&TestDir::new(), Format::Fd);
 }
 
 #[test]
 fn an_unreachable_cell_is_named_in_classic_frames_too() {
-    goes_on_without_a_wire(&Place::new(), Format::Classic);
+    goes_on_without_a_wire(&TestDir::new(), Format::Classic);
 }
 
 #[test]
 fn cells_that_are_wired_otherwise_than_described_are_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     // The wires from 6 to 10 and from 7 to 11 are swapped: they lead to 11 and 10; 8 and 12 are not wired.
     wired(&place, Format::Fd, |cell| {
         let [left, right, up, down] = neighbors(cell);
@@ -123,14 +123,14 @@ fn cells_that_are_wired_otherwise_than_described_are_named() {
     grid(&place, Format::Fd);
     place.scenario(PRESSED);
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     let words = format!("--bus vcan0 --bus-kind {} --nodes 1-12 --skin wired.toml", place.kind());
     let cells = place.start("cell-node", &words);
     let bench = unrecorded(&place, 600.0, "--no-spawn");
-    bench.hears_the_loop();
+    bench.wait_for_loop();
     holds(&TestClient::on(&place, "vcan0", Format::Fd), 12);
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     drop((cells, server));
     let summary = place.summary();
     let differences = summary.0["buses"][0]["network"]["differences"].as_array().unwrap();

@@ -10,14 +10,14 @@ use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::os::unix::fs::PermissionsExt;
 
-use process::page::{Address, Page, QUIET, address, ask, watched};
-use process::{Place, Running, TIMEOUT, skin, until};
+use process::page::{Address, Page, QUIET, address, request_websocket, watched};
+use process::{Running, TIMEOUT, TestDir, skin, until};
 use serde_json::Value;
 use tungstenite::{Error, Message};
 
 #[test]
 fn a_press_is_a_torque_and_a_release_takes_it_away() {
-    let place = Place::new();
+    let place = TestDir::new();
     let (run, address) = watched(&place, 12, "--candump run.log");
     let mut page = Page::new(&address);
     assert_eq!(page.scene["cells"].as_array().unwrap().len(), 12);
@@ -25,17 +25,18 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
         (&page.scene["may_press"], &page.scene["joints"][1]["torque_unit"]),
         (&true.into(), &"Nm".into())
     );
-    let rest = page.sees("all cells quiet", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    let rest = page.wait_for_snapshot("all cells quiet", |it| it.cells.iter().all(|cell| cell.0 == 1));
     assert!(rest.cells.iter().all(|cell| cell.1 == 0 && cell.2 == 0));
-    page.say(r#"{"do":"choose","bus":0,"node":5}"#);
+    page.send(r#"{"do":"choose","bus":0,"node":5}"#);
     page.press(5, 6.0);
-    let pressed = page.sees("the torque of the cell", |it| it.joints.iter().any(|joint| joint[1] != 0.0));
+    let pressed =
+        page.wait_for_snapshot("the torque of the cell", |it| it.joints.iter().any(|joint| joint[1] != 0.0));
     assert_eq!((pressed.cells[4].1, pressed.cells[4].2), (16, 6_000), "pressed by a page, 6 N");
-    let both = page.sees("the central computation", |it| {
+    let both = page.wait_for_snapshot("the central computation", |it| {
         it.joints.iter().any(|joint| joint[1] != 0.0)
             && it.joints.iter().all(|joint| (joint[1] - joint[2]).abs() < 0.01)
     });
-    let said = page.hears("the cell in detail", |said| {
+    let said = page.wait_for_status("the cell in detail", |said| {
         said["detail"]["torque"].is_object() && said["detail"]["status"] == "active"
     });
     let detail = &said["detail"];
@@ -52,23 +53,23 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
         assert!((ours.as_f64().unwrap() - central.as_f64().unwrap()).abs() < 2e-3, "{detail}");
     }
     let start = rest.joints[1][0];
-    page.sees("the arm gives way", |it| (it.joints[1][0] - start).abs() > 0.01);
+    page.wait_for_snapshot("the arm gives way", |it| (it.joints[1][0] - start).abs() > 0.01);
     assert!(both.time >= rest.time);
-    page.say(r#"{"do":"release"}"#);
-    page.sees("no torque", |it| {
+    page.send(r#"{"do":"release"}"#);
+    page.wait_for_snapshot("no torque", |it| {
         it.joints.iter().all(|joint| joint[1] == 0.0) && it.cells[4].0 == 1 && it.cells[4].1 == 0
     });
 
     // The touch of a page ends when the page goes.
     let mut other = Page::new(&address);
     other.press(7, 3.0);
-    page.sees("a touch of the other page", |it| it.cells[6].2 == 3_000);
+    page.wait_for_snapshot("a touch of the other page", |it| it.cells[6].2 == 3_000);
     drop(other);
-    page.sees("that it is gone", |it| it.cells[6].2 == 0);
-    page.say(r#"{"do":"halt"}"#);
-    page.hears("the halt", |said| said["halted"] == true);
-    page.say(r#"{"do":"resume"}"#);
-    page.hears("the resume", |said| said["halted"] == false);
+    page.wait_for_snapshot("that it is gone", |it| it.cells[6].2 == 0);
+    page.send(r#"{"do":"halt"}"#);
+    page.wait_for_status("the halt", |said| said["halted"] == true);
+    page.send(r#"{"do":"resume"}"#);
+    page.wait_for_status("the resume", |said| said["halted"] == false);
     run.signal(rustix::process::Signal::INT);
     run.end();
     place.is_left_clean();
@@ -80,11 +81,11 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
 
 #[test]
 fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
-    let place = Place::new();
+    let place = TestDir::new();
     let (run, address) = watched(&place, 4, "");
     let Address { host, query } = &address;
     let port = host.rsplit(':').next().unwrap();
-    let status = |headers: &[(&'static str, &str)]| match ask(&address, headers) {
+    let status = |headers: &[(&'static str, &str)]| match request_websocket(&address, headers) {
         Ok((_, status)) => status,
         Err(Error::Http(response)) => response.status().as_u16(),
         Err(error) => panic!("{error}"),
@@ -139,7 +140,7 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
     });
     let mut page = Page::new(&address);
     let mut seen = 0;
-    page.sees("snapshots during the flood", |_| {
+    page.wait_for_snapshot("snapshots during the flood", |_| {
         seen += 1;
         seen > 60
     });
@@ -156,7 +157,7 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
         }
     });
     page.press(1, 2.0);
-    page.sees("a press as before", |it| {
+    page.wait_for_snapshot("a press as before", |it| {
         it.cells[0].2 == 2_000 && it.joints.iter().any(|joint| joint[1] != 0.0)
     });
     drop(stalled);
@@ -169,7 +170,7 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
 
 #[test]
 fn pages_that_may_only_look_press_nothing() {
-    let place = Place::new();
+    let place = TestDir::new();
     // A busy machine must not halt the robot.
     place.write("skin.toml", &(skin(4) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(QUIET);
@@ -178,19 +179,19 @@ fn pages_that_may_only_look_press_nothing() {
     let mut page = Page::new(&address(&view));
     assert_eq!(page.scene["may_press"], false);
     page.press(2, 5.0);
-    page.say(r#"{"do":"halt"}"#);
+    page.send(r#"{"do":"halt"}"#);
     page.act("kill", 3);
     let mut seen = 0;
-    let last = page.sees("snapshots", |_| {
+    let last = page.wait_for_snapshot("snapshots", |_| {
         seen += 1;
         seen > 30
     });
     assert!(last.cells.iter().all(|cell| cell.2 == 0 && cell.1 == 0));
-    let said = page.hears("words", |_| true);
+    let said = page.wait_for_status("words", |_| true);
     assert!(said["bench"].is_null(), "it belongs to no run: {said}");
     assert_eq!(run.cells().len(), 4);
     view.signal(rustix::process::Signal::INT);
-    view.end().well();
+    view.end().succeeded();
     run.signal(rustix::process::Signal::INT);
     run.end();
     for (words, expected) in [
@@ -211,8 +212,8 @@ fn pages_that_may_only_look_press_nothing() {
 
 #[test]
 fn one_bus_of_a_skin_is_shown_alone() {
-    let place = Place::new();
-    place.start("skinbus", "skin generate --cells 10 --buses 2 -o skin.toml").end().well();
+    let place = TestDir::new();
+    place.start("skinbus", "skin generate --cells 10 --buses 2 -o skin.toml").end().succeeded();
     place.scenario(QUIET);
     let run = place.running_bench(600.0, "");
     let view = place.start("skinbus", "view vcan1 --skin skin.toml --bus-kind embedded");
@@ -221,9 +222,11 @@ fn one_bus_of_a_skin_is_shown_alone() {
     assert_eq!(page.scene["buses"][0]["name"], "vcan1");
     let cells = page.scene["cells"].as_array().unwrap().len();
     assert!((1..10).contains(&cells), "{cells}");
-    page.sees("its cells quiet", |it| it.cells.len() == cells && it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("its cells quiet", |it| {
+        it.cells.len() == cells && it.cells.iter().all(|cell| cell.0 == 1)
+    });
     view.signal(rustix::process::Signal::INT);
-    view.end().well();
+    view.end().succeeded();
     run.signal(rustix::process::Signal::INT);
     run.end();
     for (words, expected) in [
@@ -238,15 +241,15 @@ fn one_bus_of_a_skin_is_shown_alone() {
 
 #[test]
 fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
-    let place = Place::new();
+    let place = TestDir::new();
     std::fs::copy(
         concat!(env!("CARGO_MANIFEST_DIR"), "/../gateway/examples/lift.urdf"),
         place.path("lift.urdf"),
     )
     .unwrap();
-    place.start("skinbus", "skin import lift.urdf --tip arm7 -o skin.toml").end().well();
+    place.start("skinbus", "skin import lift.urdf --tip arm7 -o skin.toml").end().succeeded();
     let view = place.start("skinbus", "view skin.toml --wait --bus-kind embedded");
-    view.hears("view: http://");
+    view.wait_for_stderr("view: http://");
     let address = address(&view);
     let scene = Page::new(&address).scene;
     let shells = scene["shells"].as_array().unwrap();
@@ -279,7 +282,7 @@ fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
 
 #[test]
 fn a_page_that_acts_tells_and_does_nothing_without_its_token() {
-    let place = Place::new();
+    let place = TestDir::new();
     let (run, address) = watched(&place, 4, "--address-file address");
     let Address { host, query } = address.clone();
     assert_eq!(query.len(), "?token=".len() + 32, "{query}");
@@ -291,7 +294,7 @@ fn a_page_that_acts_tells_and_does_nothing_without_its_token() {
     let origin = format!("http://{host}");
     for wrong in ["", "?token=", "?token=00000000000000000000000000000000"] {
         let without = Address { host: host.clone(), query: wrong.to_owned() };
-        match ask(&without, &[("Origin", &origin)]) {
+        match request_websocket(&without, &[("Origin", &origin)]) {
             Err(Error::Http(answer)) => {
                 let body = String::from_utf8(answer.body().clone().unwrap_or_default()).unwrap();
                 assert_eq!(answer.status().as_u16(), 403);
@@ -301,7 +304,7 @@ fn a_page_that_acts_tells_and_does_nothing_without_its_token() {
         }
     }
     let mut page = Page::new(&address);
-    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
     run.signal(rustix::process::Signal::INT);
     run.end();
     assert!(!place.path("address").exists(), "it goes with the page");
@@ -311,7 +314,7 @@ fn a_page_that_acts_tells_and_does_nothing_without_its_token() {
 #[test]
 fn a_token_is_taken_from_a_file_or_the_environment() {
     const SECRET: &str = "0123456789abcdefXYZ";
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(2);
     place.write("token", &format!("{SECRET}\n"));
     std::fs::set_permissions(place.path("token"), Permissions::from_mode(0o600)).unwrap();
@@ -331,7 +334,7 @@ fn a_token_is_taken_from_a_file_or_the_environment() {
         assert_eq!(address.query, format!("?token={SECRET}"), "{words}");
         Page::new(&address);
         let without = Address { query: String::new(), ..address };
-        assert!(matches!(ask(&without, &[]), Err(Error::Http(_))), "{words}");
+        assert!(matches!(request_websocket(&without, &[]), Err(Error::Http(_))), "{words}");
         served.signal(rustix::process::Signal::INT);
         served.end();
     }
@@ -342,7 +345,7 @@ fn a_token_is_taken_from_a_file_or_the_environment() {
         assert_eq!(!address.query.is_empty(), has_token, "{words}: {}", address.url());
         Page::new(&address);
         served.signal(rustix::process::Signal::INT);
-        served.end().well();
+        served.end().succeeded();
     }
     let mut command = place.command("skinbus", &format!("{run} --candump run.log"));
     command.env("SKINBUS_TOKEN", "short");

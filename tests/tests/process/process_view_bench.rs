@@ -5,14 +5,14 @@ use skinbus_tests::process;
 use skinbus_tests::process::recorded;
 
 use process::page::{Page, watched, watched_skin};
-use process::{Place, Running, is_stopped, signal, skin, until};
+use process::{Running, TestDir, is_stopped, signal, skin, until};
 use protocol::can::Format;
 use recorded::Recorded;
 use rustix::process::{Pid, Signal};
 use serde_json::{Value, json};
 
 /// Ends a run with a page, checks the files that it left, and returns its exit code.
-fn end(place: &Place, run: Running) -> Option<i32> {
+fn end(place: &TestDir, run: Running) -> Option<i32> {
     run.signal(Signal::INT);
     let ended = run.end();
     place.is_left_clean();
@@ -21,7 +21,7 @@ fn end(place: &Place, run: Running) -> Option<i32> {
 }
 
 /// Returns the process that serves a run's page.
-fn server(place: &Place) -> Pid {
+fn server(place: &TestDir) -> Pid {
     until("the server of the page", || {
         place
             .processes()
@@ -33,21 +33,21 @@ fn server(place: &Place) -> Pid {
 
 #[test]
 fn a_page_kills_stops_and_restarts_cells() {
-    let place = Place::new();
+    let place = TestDir::new();
     let (run, address) = watched(&place, 6, "--record run.mcap");
     let mut page = Page::new(&address);
-    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
-    page.say(r#"{"do":"choose","bus":0,"node":5}"#);
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.send(r#"{"do":"choose","bus":0,"node":5}"#);
     let running = json!([{ "bus": 0, "nodes": [5, 5], "phase": "running" }]);
-    let said = page.hears("its process", |said| said["bench"]["processes"] == running);
+    let said = page.wait_for_status("its process", |said| said["bench"]["processes"] == running);
     assert_eq!(said["bench"]["buses"], json!([{ "down": false, "links": false }]));
 
     page.act("kill", 5);
-    run.hears("view: kill cell 5 on vcan0\n");
+    run.wait_for_stderr("view: kill cell 5 on vcan0\n");
     assert!(page.answer("kill cell 5 on vcan0"));
-    page.hears("its end", |said| said["bench"]["processes"][0]["phase"] == "ended");
+    page.wait_for_status("its end", |said| said["bench"]["processes"][0]["phase"] == "ended");
     assert!(run.cells().iter().all(|(_, nodes)| nodes != "5"));
-    page.sees("that it is silent", |it| it.cells[4].0 == 4);
+    page.wait_for_snapshot("that it is silent", |it| it.cells[4].0 == 4);
     for (action, node, why) in [
         ("kill", 5, "kill cell 5 on vcan0: its process is ended: restart starts it again"),
         ("continue", 2, "continue cell 2 on vcan0: its process is running"),
@@ -57,16 +57,16 @@ fn a_page_kills_stops_and_restarts_cells() {
         assert!(!page.answer(why), "{why}");
     }
     page.act("restart", 5);
-    run.hears("view: restart cell 5 on vcan0\n");
-    page.sees("that it is back", |it| it.cells[4].0 == 1);
+    run.wait_for_stderr("view: restart cell 5 on vcan0\n");
+    page.wait_for_snapshot("that it is back", |it| it.cells[4].0 == 1);
     let back = run.cell(5);
 
     page.act("stop", 5);
     until("a stopped cell", || is_stopped(back).then_some(()));
-    page.sees("that it is silent again", |it| it.cells[4].0 == 4);
-    page.hears("that it is stopped", |said| said["bench"]["processes"][0]["phase"] == "stopped");
+    page.wait_for_snapshot("that it is silent again", |it| it.cells[4].0 == 4);
+    page.wait_for_status("that it is stopped", |said| said["bench"]["processes"][0]["phase"] == "stopped");
     page.act("continue", 5);
-    page.sees("that it goes on", |it| it.cells[4].0 == 1);
+    page.wait_for_snapshot("that it goes on", |it| it.cells[4].0 == 1);
     assert_eq!(run.cell(5), back);
 
     for (command, why) in [
@@ -80,8 +80,9 @@ fn a_page_kills_stops_and_restarts_cells() {
         page.command(command);
         assert!(!page.answer(why), "{why}");
     }
-    let said =
-        page.hears("a full second", |said| said["bench"]["lateness"]["second"]["count"].as_u64() > Some(0));
+    let said = page.wait_for_status("a full second", |said| {
+        said["bench"]["lateness"]["second"]["count"].as_u64() > Some(0)
+    });
     let late = &said["bench"]["lateness"];
     assert!(
         late["all"]["max"].as_f64() >= late["second"]["p50"].as_f64() && late["skipped"].is_u64(),
@@ -100,38 +101,40 @@ fn a_page_kills_stops_and_restarts_cells() {
 
 #[test]
 fn a_process_of_several_cells_is_acted_on_as_a_whole() {
-    let place = Place::new();
+    let place = TestDir::new();
     let (run, address) = watched(&place, 6, "--cells-per-process 4");
     let mut page = Page::new(&address);
-    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
-    page.say(r#"{"do":"choose","bus":0,"node":3}"#);
-    page.hears("its process", |said| said["bench"]["processes"][0]["nodes"] == json!([1, 4]));
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.send(r#"{"do":"choose","bus":0,"node":3}"#);
+    page.wait_for_status("its process", |said| said["bench"]["processes"][0]["nodes"] == json!([1, 4]));
     page.act("kill", 3);
     assert!(page.answer("kill cells 1 to 4 on vcan0"));
     let silent = |cells: &[(u8, u8, u16)]| cells.iter().map(|cell| cell.0 == 4).collect::<Vec<_>>();
-    page.sees("four silent cells", |it| silent(&it.cells) == [true, true, true, true, false, false]);
+    page.wait_for_snapshot("four silent cells", |it| {
+        silent(&it.cells) == [true, true, true, true, false, false]
+    });
     page.act("restart", 1);
-    page.sees("all cells again", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("all cells again", |it| it.cells.iter().all(|cell| cell.0 == 1));
     end(&place, run);
 }
 
 #[test]
 fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &(skin(6) + "\n[safety]\nbad_cycles = 250\n"));
     let (run, address) = watched_skin(&place, "");
     let mut page = Page::new(&address);
-    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
     let served = || place.processes().iter().any(|(_, line)| line.contains("vcan-setup serve"));
     assert!(served());
     page.command(r#""on":"bus","down":true,"bus":0"#);
     assert!(page.answer("bus vcan0 down"));
-    page.hears("the bus down", |said| {
+    page.wait_for_status("the bus down", |said| {
         said["buses"][0]["up"] == false && said["bench"]["buses"][0]["down"] == true
     });
-    run.hears("the robot is halted: ");
+    run.wait_for_stderr("the robot is halted: ");
     let why = |said: &Value| said["bench"]["halted"].as_str().map(str::to_owned);
-    let said = page.hears("why it is halted", |said| why(said).is_some());
+    let said = page.wait_for_status("why it is halted", |said| why(said).is_some());
     assert!(run.stderr().contains(&format!("the robot is halted: {};", why(&said).unwrap())), "{said}");
     assert!(!served(), "it is not served again by itself");
     page.command(r#""on":"bus","down":true,"bus":0"#);
@@ -139,31 +142,31 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
 
     page.command(r#""on":"bus","down":false,"bus":0"#);
     assert!(page.answer("bus vcan0 up"));
-    run.hears("vcan0 works again");
-    page.hears("the bus up", |said| {
+    run.wait_for_stderr("vcan0 works again");
+    page.wait_for_status("the bus up", |said| {
         said["buses"][0]["up"] == true && said["bench"]["buses"][0]["down"] == false
     });
-    page.say(r#"{"do":"resume"}"#);
-    page.hears("that it goes on", |said| why(said).is_none());
-    page.sees("all cells again", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.send(r#"{"do":"resume"}"#);
+    page.wait_for_status("that it goes on", |said| why(said).is_none());
+    page.wait_for_snapshot("all cells again", |it| it.cells.iter().all(|cell| cell.0 == 1));
     page.press(2, 3.0);
-    page.sees("a torque", |it| it.joints.iter().any(|joint| joint[1] != 0.0));
-    page.say(r#"{"do":"release"}"#);
+    page.wait_for_snapshot("a torque", |it| it.joints.iter().any(|joint| joint[1] != 0.0));
+    page.send(r#"{"do":"release"}"#);
 
     // As after any other loss: a bus that is down at the end is a bus that the run has lost.
     page.command(r#""on":"bus","down":true,"bus":0"#);
-    page.hears("the bus down again", |said| said["buses"][0]["up"] == false);
+    page.wait_for_status("the bus down again", |said| said["buses"][0]["up"] == false);
     assert_eq!(end(&place, run), Some(1));
     assert_eq!(place.summary().0["buses"][0]["outages"]["times"], 2);
 }
 
 #[test]
 fn a_bus_that_a_page_takes_down_and_up_at_once_is_no_loss_of_the_run() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &(skin(4) + "\n[safety]\nbad_cycles = 10000\n"));
     let (run, address) = watched_skin(&place, "");
     let mut page = Page::new(&address);
-    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
     // In one go, before the run has noticed that the bus was away: once, and again while it comes up.
     for times in [1, 1, 2, 3] {
         let seen = run.stderr().matches("vcan0 works again").count();
@@ -172,26 +175,26 @@ fn a_bus_that_a_page_takes_down_and_up_at_once_is_no_loss_of_the_run() {
         }
         (0..times).for_each(|_| assert!(page.answer("bus vcan0 down") && page.answer("bus vcan0 up")));
         until("the bus", || (run.stderr().matches("vcan0 works again").count() > seen).then_some(()));
-        page.hears("the bus up", |said| said["bench"]["buses"][0]["down"] == false);
+        page.wait_for_status("the bus up", |said| said["bench"]["buses"][0]["down"] == false);
     }
-    page.sees("all cells again", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("all cells again", |it| it.cells.iter().all(|cell| cell.0 == 1));
     assert_eq!(end(&place, run), Some(0));
 }
 
 #[test]
 fn a_cell_that_a_page_restarts_while_its_node_id_is_taken_ends_by_an_error_of_its_own() {
-    let place = Place::new();
+    let place = TestDir::new();
     let (run, address) = watched(&place, 4, "");
     let mut page = Page::new(&address);
-    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
     page.act("kill", 3);
-    page.sees("that it is silent", |it| it.cells[2].0 == 4);
+    page.wait_for_snapshot("that it is silent", |it| it.cells[2].0 == 4);
     place.write("other.toml", &place.read("skin.toml").replace("serial = 100003\n", "serial = 777\n"));
     let other = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin other.toml");
-    page.sees("another cell 3", |it| it.cells[2].0 == 1);
+    page.wait_for_snapshot("another cell 3", |it| it.cells[2].0 == 1);
     page.act("restart", 3);
     let why = "cell 3 is on vcan0 already, with serial number ";
-    run.hears(&format!("the process of cell 3 on vcan0 ended (exit status: 1: {why}"));
+    run.wait_for_stderr(&format!("the process of cell 3 on vcan0 ended (exit status: 1: {why}"));
     drop(other);
     assert_eq!(end(&place, run), Some(5));
     let errors = &place.summary().0["cell_errors"];
@@ -201,7 +204,7 @@ fn a_cell_that_a_page_restarts_while_its_node_id_is_taken_ends_by_an_error_of_it
 
 #[test]
 fn a_page_at_an_address_that_is_taken_is_refused_before_the_run() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(4);
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();
@@ -215,11 +218,11 @@ fn a_page_at_an_address_that_is_taken_is_refused_before_the_run() {
 
 #[test]
 fn a_link_that_a_page_takes_down_leaves_a_cell_unreachable() {
-    let place = Place::new();
+    let place = TestDir::new();
     process::sums::grid(&place, Format::Fd);
     let (run, address) = watched_skin(&place, "");
     let mut page = Page::new(&address);
-    let said = page.hears("the bench", |said| said["bench"].is_object());
+    let said = page.wait_for_status("the bench", |said| said["bench"].is_object());
     assert_eq!(said["bench"]["buses"], json!([{ "down": false, "links": true }]));
     let link = |down: bool, one: u8, other: u8| {
         format!(r#""on":"link","down":{down},"bus":0,"nodes":[{one},{other}]"#)
@@ -228,23 +231,25 @@ fn a_link_that_a_page_takes_down_leaves_a_cell_unreachable() {
     assert!(!page.answer("link down between cell 1 and cell 12 on vcan0: the skin has no wire between them"));
     page.command(&link(true, 4, 3));
     page.command(&link(true, 8, 4));
-    run.hears("view: link down between cell 4 and cell 3 on vcan0");
-    run.hears("cell 4 on vcan0 is unreachable");
+    run.wait_for_stderr("view: link down between cell 4 and cell 3 on vcan0");
+    run.wait_for_stderr("cell 4 on vcan0 is unreachable");
     let down = json!([{ "bus": 0, "nodes": [3, 4] }, { "bus": 0, "nodes": [4, 8] }]);
-    page.hears("both links", |said| said["bench"]["links_down"] == down);
+    page.wait_for_status("both links", |said| said["bench"]["links_down"] == down);
     page.command(&link(false, 3, 4));
-    run.hears("cell 4 on vcan0 has a route to a root again, after");
-    page.hears("one link", |said| said["bench"]["links_down"] == json!([{ "bus": 0, "nodes": [4, 8] }]));
+    run.wait_for_stderr("cell 4 on vcan0 has a route to a root again, after");
+    page.wait_for_status("one link", |said| {
+        said["bench"]["links_down"] == json!([{ "bus": 0, "nodes": [4, 8] }])
+    });
     end(&place, run);
 }
 
 #[test]
 fn a_server_that_hangs_or_ends_does_not_hold_the_run_up() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("skin.toml", &(skin(4) + "\n[safety]\nbad_cycles = 10000\n"));
     let (run, address) = watched_skin(&place, "");
     let mut page = Page::new(&address);
-    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
     let server = server(&place);
     signal(server, Signal::STOP);
     until("a stopped server", || is_stopped(server).then_some(()));
@@ -261,9 +266,11 @@ fn a_server_that_hangs_or_ends_does_not_hold_the_run_up() {
     page.command(r#""on":"bus","down":true,"bus":0"#);
     assert!(page.answer("bus vcan0 down"));
     signal(server, Signal::KILL);
-    run.hears("--view: the process that served the page has ended; the run goes on without a page\n");
-    run.hears("the process that served vcan0 ended (exit status: 0); it is served again");
-    run.hears("vcan0 works again");
+    run.wait_for_stderr(
+        "--view: the process that served the page has ended; the run goes on without a page\n",
+    );
+    run.wait_for_stderr("the process that served vcan0 ended (exit status: 0); it is served again");
+    run.wait_for_stderr("vcan0 works again");
     goes_on(&run);
     assert_eq!(end(&place, run), Some(0));
     assert_eq!(place.summary().silent(), [2]);

@@ -7,12 +7,12 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use process::page::{Page, address};
-use process::{Place, Running};
+use process::{Running, TestDir};
 use serde_json::Value;
 
 /// A page of a recording, which stays at its beginning.
 struct Recording {
-    place: Place,
+    place: TestDir,
     files: Vec<String>,
     _served: Running,
     page: Page,
@@ -20,7 +20,7 @@ struct Recording {
 
 impl Recording {
     fn new(names: &[&str], more: &str) -> Self {
-        let place = Place::new();
+        let place = TestDir::new();
         for name in names {
             let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings").join(name);
             std::fs::copy(from, place.path(name)).unwrap();
@@ -29,27 +29,27 @@ impl Recording {
         let served = place.start("skinbus", &format!("view {} --at 0 {more}", files.join(" ")));
         let page = Page::new(&address(&served));
         let mut it = Self { place, files, _served: served, page };
-        it.page.hears("all is read", |said| said["playback"]["read"] == 1.0);
+        it.page.wait_for_status("all is read", |said| said["playback"]["read"] == 1.0);
         it
     }
 
     /// Returns the output of `dump` with these options.
     fn dumped(&self, more: &str) -> Vec<Value> {
         let words = format!("dump {} --json {more}", self.files.join(" "));
-        let dumped = self.place.start("skinbus", &words).end().well();
+        let dumped = self.place.start("skinbus", &words).end().succeeded();
         dumped.stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
     }
 
     fn at(&mut self, at_s: f64) -> Value {
-        self.page.say(&format!(r#"{{"do":"seek","at_s":{at_s}}}"#));
-        self.page.hears("the position", |said| {
+        self.page.send(&format!(r#"{{"do":"seek","at_s":{at_s}}}"#));
+        self.page.wait_for_status("the position", |said| {
             let at = said["playback"]["at_s"].as_f64().unwrap();
             (at - at_s).abs() < 1e-6
         })
     }
 
     fn length(&mut self) -> f64 {
-        self.page.hears("words", |_| true)["playback"]["of_s"].as_f64().unwrap()
+        self.page.wait_for_status("words", |_| true)["playback"]["of_s"].as_f64().unwrap()
     }
 }
 
@@ -81,10 +81,10 @@ fn agrees_with_dump(names: &[&str], more: &str) {
             let index =
                 recording.page.scene["buses"].as_array().unwrap().iter().position(|it| it["name"] == bus);
             let bus = index.unwrap();
-            recording.page.say(&format!(r#"{{"do":"choose","bus":{bus},"node":{node}}}"#));
-            let said = recording
-                .page
-                .hears("the cell", |said| said["detail"]["node"] == node && said["detail"]["bus"] == bus);
+            recording.page.send(&format!(r#"{{"do":"choose","bus":{bus},"node":{node}}}"#));
+            let said = recording.page.wait_for_status("the cell", |said| {
+                said["detail"]["node"] == node && said["detail"]["bus"] == bus
+            });
             let torque = &said["detail"]["torque"];
             assert_eq!(torque["epoch"], epoch, "{names:?} at {at_s}, {bus}:{node}");
             let shown: Vec<_> =
@@ -95,7 +95,7 @@ fn agrees_with_dump(names: &[&str], more: &str) {
         // Two buses have joints at different times.
         let Some(last) = last.filter(|_| names[0] != "two.mcap") else { continue };
         let positions = last["values"]["position_rad"].as_array().unwrap().clone();
-        let snapshot = recording.page.sees("the position", |it| (it.time - at_s).abs() < 1e-6);
+        let snapshot = recording.page.wait_for_snapshot("the position", |it| (it.time - at_s).abs() < 1e-6);
         for (joint, position) in snapshot.joints.iter().zip(positions) {
             assert!((f64::from(joint[0]) - position.as_f64().unwrap()).abs() < 1e-6, "{names:?} {at_s}");
         }
@@ -118,7 +118,7 @@ fn the_parts_of_a_split_recording_are_one_in_any_order() {
 
 #[test]
 fn a_log_needs_a_skin_and_is_shown_with_it() {
-    let place = Place::new();
+    let place = TestDir::new();
     let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings");
     std::fs::copy(from.join("classic.log"), place.path("classic.log")).unwrap();
     let ended = place.start("skinbus", "view classic.log").end();
@@ -127,7 +127,7 @@ fn a_log_needs_a_skin_and_is_shown_with_it() {
 
 #[test]
 fn what_cannot_be_shown_is_named() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.write("text.log", "(1.000000) can0 123#00\n");
     place.write("empty.mcap", "");
     for (words, expected) in [
@@ -151,12 +151,12 @@ fn what_cannot_be_shown_is_named() {
 fn pages_play_and_nothing_they_send_ends_it() {
     let mut recording = Recording::new(&["fd.mcap"], "");
     let page = &mut recording.page;
-    page.say(r#"{"do":"play","speed":1}"#);
-    page.hears("it plays", |said| {
+    page.send(r#"{"do":"play","speed":1}"#);
+    page.wait_for_status("it plays", |said| {
         said["playback"]["playing"] == true && said["playback"]["at_s"].as_f64() > Some(0.05)
     });
-    page.say(r#"{"do":"pause"}"#);
-    page.hears("it stays", |said| said["playback"]["playing"] == false);
+    page.send(r#"{"do":"pause"}"#);
+    page.wait_for_status("it stays", |said| said["playback"]["playing"] == false);
     for wrong in [
         r#"{"do":"seek","at_s":-1e308}"#,
         r#"{"do":"seek","at_s":1e308}"#,
@@ -169,16 +169,16 @@ fn pages_play_and_nothing_they_send_ends_it() {
         r#"{"do":"choose","bus":99,"node":1,"frame":18446744073709551615}"#,
         r#"{"do":"choose","bus":0,"node":1,"frame":0}"#,
     ] {
-        page.say(wrong);
+        page.send(wrong);
     }
     for _ in 0..50 {
-        page.say(r#"{"do":"seek","at_s":0.5}"#);
-        page.say(r#"{"do":"step","forward":true}"#);
+        page.send(r#"{"do":"seek","at_s":0.5}"#);
+        page.send(r#"{"do":"step","forward":true}"#);
     }
-    page.hears("the next epoch", |said| {
+    page.wait_for_status("the next epoch", |said| {
         let at = said["playback"]["at_s"].as_f64().unwrap();
         (0.5..0.52).contains(&at)
     });
-    page.say(r#"{"do":"seek","at_s":0.25}"#);
-    page.hears("the last position", |said| said["playback"]["at_s"] == 0.25);
+    page.send(r#"{"do":"seek","at_s":0.25}"#);
+    page.wait_for_status("the last position", |said| said["playback"]["at_s"] == 0.25);
 }

@@ -16,7 +16,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use process::{Place, Running};
+use process::{Running, TestDir};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{Parameter, RowKind};
 use protocol::skin::Skin;
@@ -56,7 +56,7 @@ fn numbers(text: &str) -> Vec<f64> {
 }
 
 /// Writes `skin.toml`: a cell for each row, by `cells.csv`.
-fn import(place: &Place, rows: &[Vec<&str>], torque_format: &str) -> PathBuf {
+fn import(place: &TestDir, rows: &[Vec<&str>], torque_format: &str) -> PathBuf {
     let mut cells = "link,px,py,pz,nx,ny,nz\n".to_owned();
     for row in rows {
         writeln!(cells, "{}", row[4..11].join(",")).unwrap();
@@ -65,7 +65,7 @@ fn import(place: &Place, rows: &[Vec<&str>], torque_format: &str) -> PathBuf {
     let urdf = robots().join(rows[0][1]);
     let words =
         format!("skin import {} --tip {} --places cells.csv -o skin.toml", urdf.display(), rows[0][3]);
-    place.start("skinbus", &words).end().well();
+    place.start("skinbus", &words).end().succeeded();
     let name = "name = \"vcan0\"\n";
     let skin = place.read("skin.toml");
     assert_eq!(skin.matches(name).count(), 1);
@@ -75,7 +75,7 @@ fn import(place: &Place, rows: &[Vec<&str>], torque_format: &str) -> PathBuf {
 
 /// Checks the torque of a force, by the central computation and by the code of a cell.
 fn check_calculator(robot: &str) {
-    let place = Place::new();
+    let place = TestDir::new();
     let rows = rows(robot);
     import(&place, &rows, "Q3.12");
     let mut batch = "cell,force_n,q\n".to_owned();
@@ -83,7 +83,7 @@ fn check_calculator(robot: &str) {
         writeln!(batch, "{node},{},{}", row[11], row[13]).unwrap();
     }
     place.write("rows.csv", &batch);
-    let said = place.start("skinbus", "explain skin.toml --batch rows.csv --json").end().well().stdout;
+    let said = place.start("skinbus", "explain skin.toml --batch rows.csv --json").end().succeeded().stdout;
     let answers: Vec<Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(answers.len(), rows.len());
     let (mut central_off, mut fixed_off) = (0.0_f64, Vec::new());
@@ -113,19 +113,19 @@ fn check_calculator(robot: &str) {
 
 /// Runs every seventh cell as a process, pressed while the robot gives way.
 fn check_moving(robot: &str) {
-    let place = Place::new();
+    let place = TestDir::new();
     let rows: Vec<_> = rows(robot).into_iter().step_by(7).collect();
     let urdf = import(&place, &rows, "Q3.12");
     place.scenario(
         "version = 1\nduration_s = 6.0\n\n[[touch]]\nat_s = 0.3\nfor_s = 9.0\nall = true\nforce_n = 1.5\nprofile = \"step\"\n",
     );
-    place.bench(4.0, "--record run.mcap").end().well();
-    let dump = place.start("skinbus", "dump run.mcap --json --kind joints,stimulus,torque").end().well();
+    place.bench(4.0, "--record run.mcap").end().succeeded();
+    let dump = place.start("skinbus", "dump run.mcap --json --kind joints,stimulus,torque").end().succeeded();
     place.write("dump.jsonl", &dump.stdout);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tools/chains.py");
     let joints = rows[0][12].replace(' ', ",");
     let words = format!("{} {} cells.csv {joints} dump.jsonl", script.display(), urdf.display());
-    let said = Running::start(place.command_of(&tools().join("bin/python"), &words)).end().well().stdout;
+    let said = Running::start(place.command_of(&tools().join("bin/python"), &words)).end().succeeded().stdout;
     let [torques, mean, max, moved, saturated] = numbers(said.trim()).try_into().unwrap();
     println!(
         "{robot}: {torques} torques, mean {mean:.2e}, max {max:.1e}; moved by {moved:.2}; {saturated} saturated"
@@ -137,14 +137,14 @@ fn check_moving(robot: &str) {
 
 /// Writes the contacts in words, as cells on these robots are configured and receive them.
 fn in_words(robot: &str, text: &mut String) {
-    let place = Place::new();
+    let place = TestDir::new();
     let rows = rows(robot);
     import(&place, &rows, "Q3.12");
     let skin = Skin::parse("skin.toml", &place.read("skin.toml")).unwrap();
     let said = |words: &[i16]| words.iter().map(i16::to_string).collect::<Vec<_>>().join(" ");
     for (cell, row) in skin.cells.iter().zip(&rows) {
         let parameters = skin.parameters(cell);
-        let kinds = parameters.table().iter().filter(|row| row.moves()).map(|row| row.kind);
+        let kinds = parameters.all_rows().iter().filter(|row| row.has_joint()).map(|row| row.kind);
         let positions = numbers(row[13]).into_iter().zip(kinds).map(|(position, kind)| match kind {
             RowKind::Prismatic => Q1_14::nearest(position).to_bits(),
             RowKind::Revolute | RowKind::Fixed => Q1_14::from_radians(position).unwrap().to_bits(),
@@ -153,7 +153,7 @@ fn in_words(robot: &str, text: &mut String) {
         let force = (row[11].parse::<f64>().unwrap() * 65_536.0).round();
         let positions = said(&positions.collect::<Vec<_>>());
         let table = (0_u8..)
-            .take(parameters.table().len())
+            .take(parameters.all_rows().len())
             .flat_map(|row| parameters.words(Parameter::Row(row))[..5].to_vec());
         let (joint, row) = (parameters.joint, parameters.chain().len());
         writeln!(

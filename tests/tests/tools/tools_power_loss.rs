@@ -11,7 +11,7 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use process::{Place, until};
+use process::{TestDir, until};
 use recorded::Recorded;
 use rustix::process::Signal;
 
@@ -67,7 +67,7 @@ impl Drop for Disk {
 #[test]
 #[ignore = "needs root and loop devices"]
 fn a_recordings_file_that_has_its_name_is_whole_after_a_loss_of_power() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     let disk = Disk::new(&place.path(""));
     let record = disk.mounted.join("run.mcap");

@@ -9,7 +9,7 @@ use skinbus_tests::process::recorded;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use process::{PRESSED, Place};
+use process::{PRESSED, TestDir};
 use recorded::{Message, Recorded};
 use serde_json::Value;
 
@@ -43,10 +43,10 @@ fn line(message: &Message) -> String {
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn the_mcap_library_and_rosbags_read_every_value_on_every_topic() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.pressed();
     place.scenario(PRESSED);
-    place.bench(2.5, "--record run.mcap --record-split 1s").end().well();
+    place.bench(2.5, "--record run.mcap --record-split 1s").end().succeeded();
     let tests = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = tests.join("../target/tools/bin/python");
     assert!(python.exists(), "{} is missing: tests/tools/install makes it ready", python.display());
@@ -59,7 +59,7 @@ fn the_mcap_library_and_rosbags_read_every_value_on_every_topic() {
     let mut ours: Vec<_> = recorded.messages.iter().map(line).collect();
     let read = |by: &str| {
         let words = format!("{} {by} {name}", script.display());
-        let read = process::Running::start(place.command_of(&python, &words)).end().well();
+        let read = process::Running::start(place.command_of(&python, &words)).end().succeeded();
         read.stdout.lines().map(str::to_owned).collect::<Vec<_>>()
     };
     let first = |ours: &[String], theirs: &[String]| {
@@ -77,18 +77,18 @@ fn the_mcap_library_and_rosbags_read_every_value_on_every_topic() {
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn the_robot_and_its_cells_are_where_forward_kinematics_says() {
-    let place = Place::new();
+    let place = TestDir::new();
     let tests = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = tests.join("../target/tools/bin/python");
     let script = tests.join("tools/recording.py");
     let examples = tests.join("../gateway/examples");
-    place.start("skinbus", "skin generate --cells 12 -o rows.toml").end().well();
+    place.start("skinbus", "skin generate --cells 12 -o rows.toml").end().succeeded();
     for (skin, file, tips) in [
         ("urdf.toml", "panda.urdf", "--tip hand"),
         ("two.toml", "two-arms.urdf", "--tip left_palm --tip right_palm"),
     ] {
         let import = format!("skin import {}/{file} {tips} -o {skin}", examples.display());
-        place.start("skinbus", &import).end().well();
+        place.start("skinbus", &import).end().succeeded();
     }
     // The same arms, by the description of their rows.
     let two = place.read("two.toml");
@@ -107,9 +107,9 @@ fn the_robot_and_its_cells_are_where_forward_kinematics_says() {
         let run = format!(
             "run {skin}.toml --scenario moving.toml --bus-kind embedded --duration 1 --quiet --record {skin}.mcap"
         );
-        place.start("skinbus", &run).end().well();
+        place.start("skinbus", &run).end().succeeded();
         let words = format!("{} tf {skin}.mcap", script.display());
-        let compared = process::Running::start(place.command_of(&python, &words)).end().well();
+        let compared = process::Running::start(place.command_of(&python, &words)).end().succeeded();
         println!("{skin}: {}", compared.stdout.trim());
     }
 }

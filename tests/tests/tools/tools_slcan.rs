@@ -12,7 +12,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use process::{Place, TIMEOUT};
+use process::{TIMEOUT, TestDir};
 use protocol::bus::{Bus, BusOptions, Inbox};
 use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
 use rustix::process::Signal;
@@ -77,15 +77,15 @@ fn check(format: Format, options: &str) {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = here.join("../target/tools/bin/python");
     assert!(python.exists(), "{} is missing: tests/tools/install makes it ready", python.display());
-    let place = Place::new();
+    let place = TestDir::new();
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0");
+    server.wait_for_stdout("serving vcan0");
     let [ours, theirs] = [Pty::new(), Pty::new()];
     carry(&ours.peer, &theirs.peer);
     carry(&theirs.peer, &ours.peer);
     let words = format!("slcan vcan0 --bus-kind embedded --json {options} {}", ours.path.display());
     let bridge = place.start("vcan-setup", &words);
-    bridge.hears("1 line on vcan0");
+    bridge.wait_for_stderr("1 line on vcan0");
     let bus = Bus::open(
         "vcan0",
         "embedded".parse().unwrap(),
@@ -137,7 +137,7 @@ fn check(format: Format, options: &str) {
     assert!(child.0.wait().unwrap().success());
 
     bridge.signal(Signal::TERM);
-    let account: Value = serde_json::from_str(&bridge.end().well().stdout).unwrap();
+    let account: Value = serde_json::from_str(&bridge.end().succeeded().stdout).unwrap();
     for way in ["to_line", "to_bus"] {
         assert_eq!(account["lines"][0][way]["received"], FRAMES, "{account}");
         assert_eq!(account["lines"][0][way]["sent"], FRAMES, "{account}");

@@ -14,7 +14,7 @@ use skinbus_tests::process;
 use skinbus_tests::process::browser;
 
 use browser::Browser;
-use process::Place;
+use process::TestDir;
 use process::log::Log;
 use process::page::{address, watched};
 use protocol::can::Format;
@@ -62,7 +62,7 @@ fn is_content(browser: &Browser, url: &str) {
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
-    let place = Place::new();
+    let place = TestDir::new();
     let (run, address) = watched(&place, 24, "--candump run.log");
     let url = address.url();
     let mut browser = Browser::new(1400, 900);
@@ -143,7 +143,7 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
-    let place = Place::new();
+    let place = TestDir::new();
     let (run, address) = watched(&place, 12, "");
     let mut browser = Browser::new(1400, 900);
     browser.scheme("dark");
@@ -244,7 +244,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_recording_is_gone_through_in_a_browser() {
-    let place = Place::new();
+    let place = TestDir::new();
     let from = concat!(env!("CARGO_MANIFEST_DIR"), "/recordings/fd.mcap");
     std::fs::copy(from, place.path("fd.mcap")).unwrap();
     let view = place.start("skinbus", "view fd.mcap");
@@ -291,15 +291,15 @@ fn a_recording_is_gone_through_in_a_browser() {
     is_content(&browser, &url);
     drop(browser);
     view.signal(rustix::process::Signal::INT);
-    view.end().well();
+    view.end().succeeded();
 }
 
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_skin_is_looked_at_in_a_file_without_a_server() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(24);
-    place.start("skinbus", "skin show skin.toml -o skin.html").end().well();
+    place.start("skinbus", "skin show skin.toml -o skin.html").end().succeeded();
     let url = format!("file://{}", place.path("skin.html").display());
     let mut browser = Browser::new(1400, 900);
     browser.open(&format!("{url}#vcan0:7"));
@@ -353,7 +353,7 @@ fn a_skin_is_looked_at_in_a_file_without_a_server() {
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_page_in_software_draws_an_arm_that_moves() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(253);
     place.scenario(
         "version = 1\nduration_s = 120.0\n\n[motion]\nkind = \"sine\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n\

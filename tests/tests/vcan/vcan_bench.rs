@@ -4,8 +4,8 @@
 
 use skinbus_tests::process;
 
-use model::generate::{Target, generate};
-use process::Place;
+use model::generate::{SkinRequest, generate};
+use process::TestDir;
 use process::log::{Log, same_torques};
 use process::vcan::{Candump, frames_of, same_by_sender};
 use protocol::can::Format;
@@ -27,8 +27,8 @@ profile = "half-sine"
 "#;
 
 /// Writes a skin of twelve cells with a rate that an emulated machine can follow.
-fn prepare(place: &Place) {
-    let expected = Target { cells: 12, broadcast_hz: 20.0, ..Target::default() };
+fn prepare(place: &TestDir) {
+    let expected = SkinRequest { cells: 12, broadcast_hz: 20.0, ..SkinRequest::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(SCENARIO);
 }
@@ -36,10 +36,10 @@ fn prepare(place: &Place) {
 #[test]
 #[ignore = "needs vcan"]
 fn candump_sees_exactly_what_the_gateway_counts_in_the_same_order_by_sender() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     prepare(&place);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
-    place.bench(6.0, "").end().well();
+    place.bench(6.0, "").end().succeeded();
     let (ours, theirs) = (frames_of(&place.path("run.log")), candump.frames());
     let summary = place.summary();
     assert_eq!(summary.0["buses"][0]["kind"], "socketcan");
@@ -57,21 +57,22 @@ fn candump_sees_exactly_what_the_gateway_counts_in_the_same_order_by_sender() {
 #[test]
 #[ignore = "needs vcan"]
 fn what_candump_logged_is_the_same_run_when_we_decode_it() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     prepare(&place);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
-    place.bench(3.0, "").end().well();
+    place.bench(3.0, "").end().succeeded();
     let frames = candump.frames();
     let dumped = |file: &str| {
         let dump =
-            place.start("skinbus", &format!("dump {file} --kind torque,stimulus,command")).end().well();
+            place.start("skinbus", &format!("dump {file} --kind torque,stimulus,command")).end().succeeded();
         let mut lines: Vec<_> = dump.stdout.lines().map(without_time).map(str::to_owned).collect();
         lines.sort();
         lines
     };
     let (ours, theirs) = (dumped("run.log"), dumped("candump.log"));
     assert!(ours.len() > 12 * 6 && ours == theirs, "{} and {} lines", ours.len(), theirs.len());
-    let [ours, theirs] = [Log::read(&place.read("run.log"), Format::Fd), Log::of(frames, Format::Fd)];
+    let [ours, theirs] =
+        [Log::read(&place.read("run.log"), Format::Fd), Log::from_frames(frames, Format::Fd)];
     let (shared, all) = same_torques(&ours, &theirs);
     assert!(shared == all && ours.torques().len() == theirs.torques().len(), "{shared} of {all}");
 }
@@ -84,9 +85,9 @@ fn without_time(line: &str) -> &str {
 #[test]
 #[ignore = "needs vcan"]
 fn torques_are_the_same_bit_for_bit_on_vcan_and_on_the_embedded_bus() {
-    let [on_vcan, on_embedded] = [Place::on_vcan(), Place::new()].map(|place| {
+    let [on_vcan, on_embedded] = [TestDir::on_vcan(), TestDir::new()].map(|place| {
         prepare(&place);
-        place.bench(6.0, "").end().well();
+        place.bench(6.0, "").end().succeeded();
         place.summary().adds_up();
         Log::read(&place.read("run.log"), Format::Fd)
     });

@@ -5,12 +5,12 @@
 
 use skinbus_tests::process;
 
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use process::buses::{carries, mixed_skin};
 use process::page::{Page, watched_skin};
 use process::test_client::TestClient;
 use process::vcan::{Vcan, tool};
-use process::{PRESSED, Place, Running, until};
+use process::{PRESSED, Running, TestDir, until};
 use protocol::bus::{BusKind, KindChoice};
 use protocol::can::Format;
 use rustix::process::Signal;
@@ -26,29 +26,30 @@ const BUSES: [(&str, Format, BusKind); 4] = [
 const CELLS: usize = 8;
 
 /// Creates eight cells on four buses, all pressed, and an arm that moves under the touch.
-fn prepare() -> (Place, Vcan, Vcan) {
-    let place = Place::on_vcan();
-    let expected = Target { cells: CELLS, buses: BUSES.len(), broadcast_hz: 20.0, ..Target::default() };
+fn prepare() -> (TestDir, Vcan, Vcan) {
+    let place = TestDir::on_vcan();
+    let expected =
+        SkinRequest { cells: CELLS, buses: BUSES.len(), broadcast_hz: 20.0, ..SkinRequest::default() };
     place.write("skin.toml", &mixed_skin(&generate(&expected).unwrap(), &["vcan1"]));
     place.scenario(&PRESSED.replace("hold", "kinesthetic"));
     (place, Vcan::with_mtu("vcan1", 16), Vcan::make("vcan2"))
 }
 
-fn run(place: &Place) -> Running {
+fn run(place: &TestDir) -> Running {
     let bench = place.running_bench(600.0, "--bus-kind vcan3=embedded --cells-per-process 2");
     for (bus, _, kind) in BUSES {
-        bench.hears(&format!("{bus} is {kind}, with a receive buffer"));
+        bench.wait_for_stderr(&format!("{bus} is {kind}, with a receive buffer"));
     }
     all_answer(place);
     bench
 }
 
-fn answers(place: &Place, bus: usize) {
+fn answers(place: &TestDir, bus: usize) {
     let (bus, format, kind) = BUSES[bus];
     TestClient::on_kind(place, bus, format, KindChoice::Only(kind)).waits_for_torques(1..=2);
 }
 
-fn all_answer(place: &Place) {
+fn all_answer(place: &TestDir) {
     (0..BUSES.len()).for_each(|bus| answers(place, bus));
 }
 
@@ -58,9 +59,9 @@ fn says(bench: &Running, words: &str, times: usize) {
 }
 
 /// Ends a bench, and checks that all counts add up, and how many times each bus was lost.
-fn ended_well(place: &Place, bench: Running, times: [u64; 4]) {
+fn ended_well(place: &TestDir, bench: Running, times: [u64; 4]) {
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     summary.adds_up();
@@ -89,7 +90,7 @@ fn an_interface_that_goes_down_is_lost_alone_and_works_again_when_it_is_up() {
         let name = BUSES[bus].0;
         tool(&format!("ip link set {name} down"));
         says(&bench, &format!("{name} is down: bring it up with `"), times);
-        (1..=2).for_each(|cell| bench.tells_on(name, cell, "fallen silent"));
+        (1..=2).for_each(|cell| bench.wait_for_event_on(name, cell, "fallen silent"));
         (0..BUSES.len()).filter(|&other| other != bus).for_each(|other| answers(&place, other));
         tool(&format!("ip link set {name} up"));
         says(&bench, &format!("{name} works again"), times);
@@ -108,24 +109,24 @@ fn an_interface_that_is_removed_and_made_again_is_opened_again() {
     let removed =
         |name: &str| format!("{name} was removed while it was in use: make it again and open it again");
     vcan2.remove();
-    bench.hears(&format!("{}; the others go on", removed("vcan2")));
+    bench.wait_for_stderr(&format!("{}; the others go on", removed("vcan2")));
     vcan1.remove();
-    bench.hears(&format!("{}; the others go on", removed("vcan1")));
+    bench.wait_for_stderr(&format!("{}; the others go on", removed("vcan1")));
     for cell in 1..=2 {
-        bench.tells_on("vcan1", cell, "fallen silent");
-        bench.tells_on("vcan2", cell, "fallen silent");
+        bench.wait_for_event_on("vcan1", cell, "fallen silent");
+        bench.wait_for_event_on("vcan2", cell, "fallen silent");
     }
     answers(&place, 0);
     answers(&place, 3);
     let _vcan1 = Vcan::with_mtu("vcan1", 16);
-    bench.hears("vcan1 works again");
+    bench.wait_for_stderr("vcan1 works again");
     answers(&place, 1);
     // First with the wrong setting, which is reported, and then with the right one.
     let narrow = Vcan::with_mtu("vcan2", 16);
-    bench.hears("vcan2 cannot be opened again yet: vcan2 has MTU 16 and CAN FD needs 72");
+    bench.wait_for_stderr("vcan2 cannot be opened again yet: vcan2 has MTU 16 and CAN FD needs 72");
     narrow.remove();
     let _vcan2 = Vcan::make("vcan2");
-    bench.hears("vcan2 works again");
+    bench.wait_for_stderr("vcan2 works again");
     all_answer(&place);
     assert_eq!(bench.cells(), cells, "no cell was restarted");
     ended_well(&place, bench, [0, 1, 1, 0]);
@@ -152,12 +153,12 @@ fn a_bus_that_is_missing_when_a_run_begins_is_refused_with_its_hint() {
 #[test]
 #[ignore = "needs vcan"]
 fn a_page_takes_an_interface_down_and_up() {
-    let place = Place::on_vcan();
-    let slow = Target { cells: 4, broadcast_hz: 20.0, ..Target::default() };
+    let place = TestDir::on_vcan();
+    let slow = SkinRequest { cells: 4, broadcast_hz: 20.0, ..SkinRequest::default() };
     place.write("skin.toml", &generate(&slow).unwrap());
     let (run, address) = watched_skin(&place, "");
     let mut page = Page::new(&address);
-    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.wait_for_snapshot("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
     page.command(r#""on":"bus","down":true,"bus":0"#);
     assert!(page.answer("bus vcan0 down"));
     let is_up = || {
@@ -165,20 +166,20 @@ fn a_page_takes_an_interface_down_and_up() {
         shown[0]["flags"].as_array().unwrap().iter().any(|flag| flag == "UP")
     };
     assert!(!is_up());
-    page.hears("the bus down", |said| {
+    page.wait_for_status("the bus down", |said| {
         said["buses"][0]["up"] == false && said["bench"]["buses"][0]["down"] == true
     });
-    page.sees("silent cells", |it| it.cells.iter().all(|cell| cell.0 == 4));
-    let said = page.hears("words", |_| true);
+    page.wait_for_snapshot("silent cells", |it| it.cells.iter().all(|cell| cell.0 == 4));
+    let said = page.wait_for_status("words", |_| true);
     assert_eq!(said["buses"][0]["up"], false, "frames from before are no sign that it works again");
     page.command(r#""on":"bus","down":false,"bus":0"#);
     assert!(page.answer("bus vcan0 up"));
     assert!(is_up());
-    run.hears("vcan0 works again");
-    page.hears("the bus up", |said| {
+    run.wait_for_stderr("vcan0 works again");
+    page.wait_for_status("the bus up", |said| {
         said["buses"][0]["up"] == true && said["bench"]["buses"][0]["down"] == false
     });
-    page.sees("all cells again", |it| it.cells.iter().all(|cell| cell.0 != 4));
+    page.wait_for_snapshot("all cells again", |it| it.cells.iter().all(|cell| cell.0 != 4));
     run.signal(Signal::INT);
     run.end();
     place.is_left_clean();

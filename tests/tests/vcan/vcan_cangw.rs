@@ -13,7 +13,7 @@ use skinbus_tests::process;
 
 use process::log::Log;
 use process::vcan::{Candump, Vcan, command, frames_of, route, small_skin};
-use process::{PRESSED, Place, Running, until};
+use process::{PRESSED, Running, TestDir, until};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage};
@@ -24,7 +24,7 @@ const CELLS: usize = 8;
 
 /// The bus of the cells and that of the gateway, not connected yet.
 struct Parted {
-    place: Place,
+    place: TestDir,
     _cells: Vec<Running>,
     _rules: Rules,
     _vcan1: Vcan,
@@ -41,7 +41,7 @@ impl Drop for Rules {
 
 impl Parted {
     fn new() -> Self {
-        let place = Place::on_vcan();
+        let place = TestDir::on_vcan();
         let skin = small_skin(CELLS);
         place.write("cells.toml", &skin);
         place.write("skin.toml", &skin.replace("vcan0", "vcan1"));
@@ -106,7 +106,7 @@ fn damaged_torques_are_counted_by_their_crc_and_none_is_used() {
     route("vcan0", "vcan1", others, "");
     route("vcan0", "vcan1", harmed, &turned("00400000000001"));
     let candump = Candump::start("vcan1", &bench.place.path("candump.log"));
-    let ended = bench.place.bench(3.0, "--no-spawn").end().well();
+    let ended = bench.place.bench(3.0, "--no-spawn").end().succeeded();
     let (ours, theirs) = (frames_of(&bench.place.path("run.log")), candump.frames());
     let summary = bench.place.summary();
     summary.adds_up();
@@ -127,7 +127,7 @@ fn damaged_torques_are_counted_by_their_crc_and_none_is_used() {
     assert_eq!(summary.of_bus("/replies/lost"), wrong, "each was a reply that was due: {:#}", summary.0);
 
     // The torques of the other six are all used, and none of the two.
-    let log = Log::of(theirs, Format::Fd);
+    let log = Log::from_frames(theirs, Format::Fd);
     let used = summary.of_bus("/replies/in_time") + summary.of_bus("/replies/late");
     assert_eq!(used + summary.count("/buses/0/events", "stale torque"), torques(&log));
     assert_eq!(summary.count("/buses/0/received", "torque"), torques(&log) + wrong);
@@ -164,7 +164,7 @@ fn cells_refuse_damaged_joints_count_them_and_are_not_blamed() {
     with_joints(&turned(""));
     more(5);
     run.signal(Signal::TERM);
-    let ended = run.end().well();
+    let ended = run.end().succeeded();
     let [gateways, cells] = [gateways, cells].map(Candump::frames);
 
     let wrong = damaged(&cells);
@@ -184,7 +184,7 @@ fn cells_refuse_damaged_joints_count_them_and_are_not_blamed() {
     assert!(complete > 0 && complete <= sent as u64 - wrong, "{complete} of {sent}");
 
     // Each cell reports it itself, at the end of the run.
-    let log = Log::of(gateways, Format::Fd);
+    let log = Log::from_frames(gateways, Format::Fd);
     for cell in 1..=CELLS {
         let refused = log.messages.iter().rev().find_map(|(message, _)| match message {
             Message::Network { from: Node::Cell(from), page: NetworkPage::Rejected(refused), .. } => {
@@ -207,7 +207,7 @@ fn a_torque_under_another_cells_number_is_refused_because_the_crc_covers_the_ide
     route("vcan0", "vcan1", others, "");
     route("vcan0", "vcan1", third, &format!("-M SET:I:205.0.0.{:0<128}", ""));
     let candump = Candump::start("vcan1", &bench.place.path("candump.log"));
-    let ended = bench.place.bench(3.0, "--no-spawn").end().well();
+    let ended = bench.place.bench(3.0, "--no-spawn").end().succeeded();
     let theirs = candump.frames();
     let wrong = damaged(&theirs);
     let fifth = |frame: &&Frame| frame.raw_id() == 0x205;
@@ -225,7 +225,7 @@ fn a_torque_under_another_cells_number_is_refused_because_the_crc_covers_the_ide
     assert_eq!((of("/replies/lost"), of("/replies/unknown")), (wrong, 0), "{:#}", summary.0);
     let used =
         of("/replies/in_time") + of("/replies/late") + summary.count("/buses/0/events", "stale torque");
-    assert_eq!(used, torques(&Log::of(theirs, Format::Fd)), "{:#}", summary.0);
+    assert_eq!(used, torques(&Log::from_frames(theirs, Format::Fd)), "{:#}", summary.0);
     assert!(summary.count("/buses/0/cells", "active") < CELLS as u64, "{:#}", summary.0);
     assert!(summary.figure("/accuracy/single/max_nm") < 0.002, "{:#}", summary.0["accuracy"]);
 }

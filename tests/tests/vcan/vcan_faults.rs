@@ -6,7 +6,7 @@ use skinbus_tests::process;
 
 use process::log::Log;
 use process::vcan::{Candump, Vcan, Vcan0, cansend, small_skin};
-use process::{Ended, PRESSED, Place, Running, Summary, is_stopped, until};
+use process::{Ended, PRESSED, Running, Summary, TestDir, is_stopped, until};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
@@ -18,8 +18,8 @@ const INVALID: &str = "the torque is not valid";
 const ON_CELLS: &str = "--bus vcan0 --nodes 1-6 --skin skin.toml";
 
 /// Creates six cells that are all pressed, and an arm that moves under the touch.
-fn prepare() -> Place {
-    let place = Place::on_vcan();
+fn prepare() -> TestDir {
+    let place = TestDir::on_vcan();
     place.write("skin.toml", &small_skin(CELLS));
     place.scenario(&PRESSED.replace("hold", "kinesthetic"));
     place
@@ -33,7 +33,7 @@ fn torque_of(cell: u8) -> impl Fn(&Message) -> bool {
     }
 }
 
-fn all_answer(place: &Place) {
+fn all_answer(place: &TestDir) {
     for cell in 1..=6 {
         place.test_client().waits_for("torques", torque_of(cell));
     }
@@ -61,21 +61,21 @@ fn adds_up_though_the_bus_took_nothing(summary: &Summary) {
 }
 
 /// Waits until a cell reports that the robot is halted, acknowledges, and checks that the same cells answer again.
-fn goes_on_when_reported(place: &Place, bench: &Running, cells: &[(Pid, String)]) {
+fn goes_on_when_reported(place: &TestDir, bench: &Running, cells: &[(Pid, String)]) {
     place.test_client().waits_for("the cells to be halted", |message| {
         matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
             if heartbeat.state.has(State::HALTED))
     });
-    place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end().well();
-    bench.hears("the robot goes on");
+    place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end().succeeded();
+    bench.wait_for_stderr("the robot goes on");
     all_answer(place);
     assert_eq!(bench.cells(), cells, "no cell was restarted");
 }
 
 /// Ends a bench whose bus accepted nothing for a while, and checks that the losses are exactly the expected ones.
-fn ends_well_after_a_pause(place: &Place, bench: Running) {
+fn ends_well_after_a_pause(place: &TestDir, bench: Running) {
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     adds_up_though_the_bus_took_nothing(&summary);
@@ -112,19 +112,19 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     all_answer(&place);
     let cells = bench.cells();
     vcan0.down();
-    bench.hears(DOWN);
+    bench.wait_for_stderr(DOWN);
     let hint = "`skinbus frame resume --bus vcan0 --bus-kind socketcan` resumes it";
-    bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}; {hint}"));
+    bench.wait_for_stderr(&format!("the robot is halted: too many bad cycles in a row: {INVALID}; {hint}"));
     for cell in 1..=6 {
-        bench.tells(cell, "fallen silent");
+        bench.wait_for_event(cell, "fallen silent");
     }
     let refused = place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end();
     let said = refused.refusal(2);
     assert!(said.starts_with(&format!("skinbus: {DOWN}")), "{said}");
     vcan0.up();
-    bench.hears("vcan0 works again");
+    bench.wait_for_stderr("vcan0 works again");
     for cell in 1..=6 {
-        bench.tells(cell, "come back");
+        bench.wait_for_event(cell, "come back");
     }
     assert!(!bench.stderr().contains("the robot goes on"), "{}", bench.stderr());
     goes_on_when_reported(&place, &bench, &cells);
@@ -140,15 +140,15 @@ fn a_transmit_queue_that_stays_full_costs_what_could_not_be_sent_and_nothing_aft
     all_answer(&place);
     let cells = bench.cells();
     vcan0.fill();
-    bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}"));
-    bench.tells(1, "fallen silent");
+    bench.wait_for_stderr(&format!("the robot is halted: too many bad cycles in a row: {INVALID}"));
+    bench.wait_for_event(1, "fallen silent");
     let full = place.start("skinbus", "frame sync --bus vcan0 --bus-kind socketcan").end();
     let said = "skinbus: vcan0 accepted no frame for 100 ms: its queue is full; send less, or check that another node is on \
                 the bus";
     assert_eq!(full.refusal(1), said);
     vcan0.empty();
     for cell in 1..=6 {
-        bench.tells(cell, "come back");
+        bench.wait_for_event(cell, "come back");
     }
     goes_on_when_reported(&place, &bench, &cells);
     ends_well_after_a_pause(&place, bench);
@@ -249,20 +249,20 @@ fn cells_that_are_killed_started_by_hand_stopped_and_continued_are_named_and_acc
     all_answer(&place);
     let (killed, stopped) = (bench.cell(3), bench.cell(5));
     process::signal(killed, Signal::KILL);
-    bench.hears("the process of cell 3 on vcan0 ended (signal: 9 (SIGKILL))");
-    bench.tells(3, "fallen silent");
+    bench.wait_for_stderr("the process of cell 3 on vcan0 ended (signal: 9 (SIGKILL))");
+    bench.wait_for_event(3, "fallen silent");
     process::signal(stopped, Signal::STOP);
     until("a stopped cell", || is_stopped(stopped).then_some(()));
-    bench.tells(5, "fallen silent");
+    bench.wait_for_event(5, "fallen silent");
     let by_hand = place.start("cell-node", "--bus vcan0 --node 3 --skin skin.toml");
-    bench.hears("cell 3 on vcan0 restarted");
+    bench.wait_for_stderr("cell 3 on vcan0 restarted");
     // Its contact state is restored: the touch is as long as the run, and the bench resends it.
     place.test_client().waits_for("a torque of the new cell", torque_of(3));
     process::signal(stopped, Signal::CONT);
-    bench.tells(5, "come back");
+    bench.wait_for_event(5, "come back");
     all_answer(&place);
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     drop(by_hand);
     place.is_left_clean();
     let summary = place.summary();
@@ -289,7 +289,7 @@ fn a_gateway_after_one_that_was_killed_goes_on_with_the_next_epoch_on_cells_that
     assert_eq!(first.end().signal(), Some(9));
     let left = ["candump.log", "run.log", "scenario.toml", "skin.toml"];
     assert_eq!(place.files(), left, "its log is there, and nothing half done");
-    place.bench(3.0, "--no-spawn").end().well();
+    place.bench(3.0, "--no-spawn").end().succeeded();
     let summary = place.summary();
     summary.adds_up();
     assert_eq!((summary.odd(0), summary.of_bus("/uplink/restarts")), (0, 0), "{:#}", summary.0);
@@ -297,7 +297,7 @@ fn a_gateway_after_one_that_was_killed_goes_on_with_the_next_epoch_on_cells_that
     cells.signal(Signal::TERM);
     assert_eq!(cells.end().signal(), Some(15));
 
-    let log = Log::of(candump.frames(), Format::Fd);
+    let log = Log::from_frames(candump.frames(), Format::Fd);
     let epochs = log.messages.iter().filter_map(|(message, _)| match message {
         Message::Joints { epoch, .. } => Some(*epoch),
         _ => None,
@@ -330,7 +330,7 @@ fn a_second_gateway_is_refused_and_the_first_is_undisturbed() {
     assert_eq!(place.files(), ["run.log", "scenario.toml", "second.json", "second.log", "skin.toml"]);
     all_answer(&place);
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     place.is_left_clean();
     let summary = place.summary();
     assert_eq!(summary.adds_up().silent().len(), 0);
@@ -361,7 +361,7 @@ fn of_two_gateways_that_start_at_the_same_time_at_most_one_goes_on() {
         let good = both.iter().filter(|ended| ended.code() == Some(0)).count();
         assert!(good <= 1, "{both:#?}");
         // The next run finds a bus that works.
-        place.bench(2.0, more).end().well();
+        place.bench(2.0, more).end().succeeded();
         let summary = place.summary();
         assert_eq!(summary.adds_up().silent().len(), 0);
         assert!(summary.of_bus("/replies/in_time") > 24, "{:#}", summary.0);

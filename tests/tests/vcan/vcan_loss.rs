@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use process::vcan::{Candump, backlog_drops, frames_of, own_network, small_skin, tool};
-use process::{PRESSED, Place, TIMEOUT, is_stopped, until};
+use process::{PRESSED, TIMEOUT, TestDir, is_stopped, until};
 use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{EXTENDED, Frame};
 use protocol::candump::{CandumpLine, parse};
@@ -39,7 +39,7 @@ struct Pair {
 }
 
 impl Pair {
-    fn open(kind: BusKind, place: &Place, filters: &[Filter]) -> Self {
+    fn open(kind: BusKind, place: &TestDir, filters: &[Filter]) -> Self {
         let options = |filters: &[Filter], receive_buffer| BusOptions {
             filters: filters.to_vec(),
             receive_buffer,
@@ -120,7 +120,7 @@ impl Pair {
 }
 
 /// Checks that the bus reports exactly the frames as dropped that were sent and not received.
-fn what_is_lost_is_counted(kind: BusKind, place: &Place) {
+fn what_is_lost_is_counted(kind: BusKind, place: &TestDir) {
     let exact = Filter { id: EXPECTED, mask: Filter::EXACT_MASK };
     // A frame that matches several filters arrives once and is dropped once; a frame that matches none is not a loss.
     let several = [exact, Filter { id: EXPECTED, mask: 0x700 }, Filter { id: EXTENDED, mask: EXTENDED }];
@@ -159,14 +159,14 @@ fn what_is_lost_is_counted(kind: BusKind, place: &Place) {
 #[ignore = "needs vcan"]
 fn what_is_lost_is_counted_on_vcan() {
     own_network();
-    what_is_lost_is_counted(BusKind::SocketCan, &Place::new());
+    what_is_lost_is_counted(BusKind::SocketCan, &TestDir::new());
 }
 
 #[test]
 fn what_is_lost_is_counted_on_the_embedded_bus() {
-    let place = Place::new();
+    let place = TestDir::new();
     let server = place.start("vcan-setup", "serve vcan0");
-    server.prints("serving vcan0 at ");
+    server.wait_for_stdout("serving vcan0 at ");
     what_is_lost_is_counted(BusKind::Embedded, &place);
 }
 
@@ -183,7 +183,7 @@ fn counts(frames: &[Frame]) -> BTreeMap<u32, usize> {
 #[ignore = "needs vcan"]
 fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     const FOREIGN: u32 = 600;
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     place.write("skin.toml", &small_skin(8));
     place.scenario(PRESSED);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
@@ -198,7 +198,7 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     // The next frame brings the whole count.
     place.test_client().waits_for_joints(20);
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     // The log itself records its missing frames.
     let log = place.read("run.log");
     let (missing, lines): (Vec<_>, Vec<_>) = log.lines().partition(|line| line.starts_with("DROPCOUNT: "));

@@ -7,18 +7,18 @@ use std::fmt::Write as _;
 use std::fs;
 use std::time::Duration;
 
-use model::generate::{Target, generate};
-use process::replay::{Replayed, says_everything};
+use model::generate::{SkinRequest, generate};
+use process::replay::{Replayed, send_every_message};
 use process::vcan::{Candump, Vcan0, refused, tool};
-use process::{Place, until};
+use process::{TestDir, until};
 use protocol::candump::{CandumpLine, parse};
 
 /// The options for new cells with the recording's skin.
 const FRESH: &str = "--expect --spawn --skin skin.toml";
 
 /// Writes a skin with a rate that an emulated machine can follow, and touches on some of its cells.
-fn prepare(place: &Place, cells: usize) {
-    let expected = Target { cells, broadcast_hz: 20.0, ..Target::default() };
+fn prepare(place: &TestDir, cells: usize) {
+    let expected = SkinRequest { cells, broadcast_hz: 20.0, ..SkinRequest::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(process::replay::TOUCHED);
 }
@@ -26,11 +26,11 @@ fn prepare(place: &Place, cells: usize) {
 #[test]
 #[ignore = "needs vcan"]
 fn a_run_on_vcan_comes_back_bit_for_bit() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     prepare(&place, 8);
     let bench = place.running_bench(12.0, "");
-    says_everything(&place.test_client(), &place.path("skin.toml"));
-    bench.end().well();
+    send_every_message(&place.test_client(), &place.path("skin.toml"));
+    bench.end().succeeded();
     let mut counts = Vec::new();
     for route in ["--lockstep", "--speed max", "--speed max", ""] {
         let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
@@ -47,10 +47,10 @@ fn a_run_on_vcan_comes_back_bit_for_bit() {
 #[test]
 #[ignore = "needs vcan"]
 fn two_hundred_and_fifty_three_fresh_cells_on_vcan_answer_as_the_others_did_twice() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     prepare(&place, 253);
     // Sixteen in a process: an emulated machine would need more than a period to wake 253 processes.
-    place.bench(4.0, "--cells-per-process 16").end_after(Duration::from_secs(60)).well();
+    place.bench(4.0, "--cells-per-process 16").end_after(Duration::from_secs(60)).succeeded();
     let mut counts = Vec::new();
     for _ in 0..2 {
         let replay = place.replay("run.log", &format!("{FRESH} --speed max SKINBUS_CELLS_PER_PROCESS=16"));
@@ -65,7 +65,7 @@ fn two_hundred_and_fifty_three_fresh_cells_on_vcan_answer_as_the_others_did_twic
 #[test]
 #[ignore = "needs vcan"]
 fn an_outage_costs_what_was_due_and_is_said_once() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     let frames: String = (0..3_000_u32).fold(String::new(), |mut text, at| {
         writeln!(text, "(1.{:06}) vcan0 123##1{at:032X}", at * 300).unwrap();
         text
@@ -74,12 +74,12 @@ fn an_outage_costs_what_was_due_and_is_said_once() {
     let vcan0 = Vcan0;
     let mut candump = Candump::start("vcan0", &place.path("candump.log"));
     let replay = place.replay("steady.log", "--loop 5");
-    replay.hears("vcan0 is socketcan");
+    replay.wait_for_stderr("vcan0 is socketcan");
     candump.catch_up();
     vcan0.down();
-    replay.hears("vcan0 is down: ");
+    replay.wait_for_stderr("vcan0 is down: ");
     vcan0.up();
-    replay.hears("vcan0 works again");
+    replay.wait_for_stderr("vcan0 works again");
     let ended = replay.end();
     let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
     let [sent, refused, lost] = ["/sent", "/refused", "/lost"].map(|what| replayed.number(what));
@@ -92,7 +92,7 @@ fn an_outage_costs_what_was_due_and_is_said_once() {
 #[test]
 #[ignore = "needs vcan"]
 fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     // For five seconds.
     let frames: String = (0..500).fold(String::new(), |mut text, at| {
         writeln!(text, "({}.{:02}0000) vcan0 123#{:02X}", 1 + at / 100, at % 100, at % 256).unwrap();
@@ -132,7 +132,7 @@ fn lateness(log: &str, period_us: i64) -> [i64; 3] {
 #[test]
 #[ignore = "needs vcan"]
 fn lateness_at_two_milliseconds_is_printed_beside_canplayers() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     let grid: String = (0..1_000_u32).fold(String::new(), |mut text, at| {
         let (us, [low, high]) = (at * 2_000, u16::try_from(at).unwrap().to_le_bytes());
         writeln!(text, "({}.{:06}) vcan0 123#{low:02X}{high:02X}", 1 + us / 1_000_000, us % 1_000_000)
@@ -153,7 +153,7 @@ fn lateness_at_two_milliseconds_is_printed_beside_canplayers() {
     });
     let ours = run("ours.log", &|| {
         let (ended, replayed) = place.replayed("grid.log", "");
-        ended.well();
+        ended.succeeded();
         assert_eq!(replayed.number("/late_us/count"), 1_000);
         eprintln!("by its own count {}, idle {}", replayed.0["late_us"], replayed.0["idle_late_us"]);
     });

@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process::program;
-use skinbus_tests::process::setup::{Said, while_somebody_says};
+use skinbus_tests::process::setup::{CommandOutput, while_sending};
 
 use std::fs::File;
 use std::os::fd::AsFd;
@@ -25,13 +25,13 @@ fn thread_id() -> u32 {
     rustix::thread::gettid().as_raw_nonzero().get().cast_unsigned()
 }
 
-fn run_as(user: u32, arguments: &str) -> Said {
+fn run_as(user: u32, arguments: &str) -> CommandOutput {
     let mut command = Command::new(program("vcan-setup"));
     command.args(arguments.split_whitespace());
     if user != 0 {
         command.uid(user).gid(user);
     }
-    Said::by(&mut command)
+    CommandOutput::run(&mut command)
 }
 
 /// Runs a command that must succeed.
@@ -461,8 +461,8 @@ fn the_doctor_finds_what_is_wrong_and_its_hints_repair_it() {
         (1, [format!("there is no interface vcan20 | {program} up vcan20")].as_slice())
     );
     repair(&faults[0]);
-    assert_eq!(while_somebody_says(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
-    let other_gateway = while_somebody_says(&open("vcan20"), &[heartbeat, joints], || doctor("vcan20"));
+    assert_eq!(while_sending(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
+    let other_gateway = while_sending(&open("vcan20"), &[heartbeat, joints], || doctor("vcan20"));
     assert!(
         other_gateway.0 == 1 && other_gateway.1[0].starts_with("another gateway sends joints on vcan20"),
         "{other_gateway:?}"
@@ -483,7 +483,7 @@ fn the_doctor_finds_what_is_wrong_and_its_hints_repair_it() {
         let (code, faults) = doctor("vcan20");
         assert!(code == 1 && faults[0].ends_with(&hint), "{faults:?}");
         repair(&faults[0]);
-        assert_eq!(while_somebody_says(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
+        assert_eq!(while_sending(&open("vcan20"), &[heartbeat], || doctor("vcan20")), (0, vec![]));
     }
     let (code, faults) = doctor("lo");
     assert!(

@@ -6,7 +6,7 @@ use skinbus_tests::process;
 use skinbus_tests::process::slcan;
 
 use process::vcan::tool;
-use process::{Place, until};
+use process::{TestDir, until};
 use protocol::bus::{Bus, BusOptions, Inbox};
 use protocol::can::{EXTENDED, Frame};
 use rustix::process::Signal;
@@ -16,11 +16,11 @@ use slcan::Pty;
 #[test]
 #[ignore = "needs vcan"]
 fn a_line_is_a_participant_of_a_vcan() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     let [mut all, mut one] = [Pty::new(), Pty::new()];
     let words = format!("slcan vcan0 --json {} {},cell=12", all.path.display(), one.path.display());
     let bridge = place.start("vcan-setup", &words);
-    bridge.hears("2 lines on vcan0 (socketcan)");
+    bridge.wait_for_stderr("2 lines on vcan0 (socketcan)");
     let open = || Bus::open("vcan0", "socketcan".parse().unwrap(), &BusOptions::default()).unwrap();
     let bus = open();
     let frames = [
@@ -44,7 +44,7 @@ fn a_line_is_a_participant_of_a_vcan() {
     assert_eq!(received, frames);
 
     tool("ip link set vcan0 down");
-    bridge.hears("its bus is away (vcan0 is down");
+    bridge.wait_for_stderr("its bus is away (vcan0 is down");
     all.peer.sends(&frames[..1]);
     tool("ip link set vcan0 up");
     until("both to be back", || (bridge.stderr().matches("its bus is back").count() == 2).then_some(()));
@@ -53,7 +53,7 @@ fn a_line_is_a_participant_of_a_vcan() {
     assert_eq!(all.peer.receives(2 * frames.len() + 1)[2 * frames.len()..], frames[..1]);
 
     bridge.signal(Signal::TERM);
-    let account: Value = serde_json::from_str(&bridge.end().well().stdout).unwrap();
+    let account: Value = serde_json::from_str(&bridge.end().succeeded().stdout).unwrap();
     let [all, one] = [0, 1].map(|at| &account["lines"][at]);
     assert_eq!((&all["to_line"]["sent"], &all["to_line"]["received"]), (&11.into(), &11.into()), "{all}");
     assert_eq!((&one["to_line"]["sent"], &one["to_bus"]["sent"]), (&3.into(), &5.into()), "{one}");

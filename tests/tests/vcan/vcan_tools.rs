@@ -9,9 +9,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
-use process::log::{Cause, Log, same_torques};
+use process::log::{Log, TorqueCause, same_torques};
 use process::vcan::{Candump, backlog_drops, cansend, frames_of, small_skin, tool};
-use process::{PRESSED, Place, Summary};
+use process::{PRESSED, Summary, TestDir};
 use protocol::can::{Format, Frame};
 use protocol::candump::{CandumpLine, parse};
 use protocol::id::{Id, Kind, Node};
@@ -75,7 +75,7 @@ fn joints_before(log: &Log, index: usize) -> usize {
 #[test]
 #[ignore = "needs vcan"]
 fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     let text = small_skin(4);
     place.write("skin.toml", &text);
     place.scenario(ALONE);
@@ -95,7 +95,7 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
         joints.get() == 5
     });
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
 
     let summary = place.summary();
     summary.adds_up();
@@ -129,21 +129,21 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
     assert!(summary.figure("/accuracy/single/mean_nm") < 3e-4, "{:#}", summary.0);
     assert!(summary.figure("/accuracy/single/max_nm") < 2e-3, "{:#}", summary.0);
     // The compared torques are not small.
-    let max = pressed.iter().flat_map(|(_, _, packet)| packet.words.six()).map(i16::unsigned_abs).max();
+    let max = pressed.iter().flat_map(|(_, _, packet)| packet.words.first_six()).map(i16::unsigned_abs).max();
     assert!(max > Some(1_024), "a quarter of a newton metre: {max:?}");
 }
 
 #[test]
 #[ignore = "needs vcan"]
 fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     place.write("skin.toml", &small_skin(4));
     place.scenario(PRESSED);
     let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
     test_client.waits_for("a torque", torque_of(1, true));
     cansend(&place, "halt");
-    bench.hears(
+    bench.wait_for_stderr(
         "the robot is halted: a halt frame was received; `skinbus frame resume --bus vcan0 --bus-kind socketcan` resumes it",
     );
     let test_client = place.test_client();
@@ -152,14 +152,14 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
         joints.set(joints.get() + u32::from(matches!(message, Message::Joints { .. })));
         joints.get() == 10
     });
-    place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end().well();
-    bench.hears("the robot goes on");
+    place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end().succeeded();
+    bench.wait_for_stderr("the robot goes on");
     let test_client = place.test_client();
     for cell in 1..=4 {
         test_client.waits_for("torques again", torque_of(cell, true));
     }
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
 
     let summary = place.summary();
     summary.adds_up();
@@ -181,10 +181,13 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
 }
 
 /// A reply, with the number of its broadcast.
-type Reply = (usize, Cause, [i16; WORDS]);
+type Reply = (usize, TorqueCause, [i16; WORDS]);
 
 fn replies(log: &Log) -> BTreeSet<Reply> {
-    log.torques().into_iter().map(|(number, cause, packet)| (number, cause, packet.words.six())).collect()
+    log.torques()
+        .into_iter()
+        .map(|(number, cause, packet)| (number, cause, packet.words.first_six()))
+        .collect()
 }
 
 /// Returns the times and frames of a log that cells receive: joints and stimuli.
@@ -202,12 +205,12 @@ fn joints_and_stimuli(log: &Path) -> String {
 #[ignore = "needs vcan"]
 fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
     const CELLS: usize = 6;
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     place.write("skin.toml", &small_skin(CELLS));
     place.scenario(MOVING);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
-    place.bench(4.0, "").end().well();
-    let recorded = Log::of(candump.frames(), Format::Fd);
+    place.bench(4.0, "").end().succeeded();
+    let recorded = Log::from_frames(candump.frames(), Format::Fd);
     let summary = place.summary();
     summary.adds_up();
     let unanswered = summary.of_bus("/replies/skipped") + summary.of_bus("/replies/not_heard");
@@ -235,7 +238,7 @@ fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
     drop(cells);
     let sent = frames.iter().filter(|frame| text.contains(&frame_text(frame))).count();
     assert!(sent >= text.lines().count(), "{sent} of {} frames were played", text.lines().count());
-    let replayed = Log::of(frames, Format::Fd);
+    let replayed = Log::from_frames(frames, Format::Fd);
     // Equal causes have equal torques. Cells skip joints when a machine pauses for more than a period, and count them:
     // the same number of replies may be missing, and as many ends of contacts come with later joints.
     same_torques(&recorded, &replayed);
@@ -362,7 +365,7 @@ fn all_are_counted(frames: &[Frame], summary: &Summary) {
 #[test]
 #[ignore = "needs vcan"]
 fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     place.write("skin.toml", &small_skin(CELLS.into()));
     place.scenario(PRESSED);
     let mut candump = Candump::start("vcan0", &place.path("candump.log"));
@@ -390,7 +393,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
         reported.borrow().len() == usize::from(CELLS)
     });
     bench.signal(Signal::TERM);
-    let ended = bench.end().well();
+    let ended = bench.end().succeeded();
     assert!(!ended.stderr.contains("panicked") && !ended.stderr.contains(" ended ("), "{}", ended.stderr);
 
     let frames = candump.frames();
@@ -440,7 +443,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
 #[test]
 #[ignore = "needs vcan"]
 fn the_stock_tools_read_our_log() {
-    let place = Place::on_vcan();
+    let place = TestDir::on_vcan();
     place.write("skin.toml", &small_skin(4));
     place.scenario(PRESSED);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
@@ -450,7 +453,7 @@ fn the_stock_tools_read_our_log() {
         tool(&format!("cangen vcan0 -i -g 0 {noise}"));
     }
     bench.signal(Signal::TERM);
-    bench.end().well();
+    bench.end().succeeded();
     let path = place.path("run.log");
     let ours = frames_of(&path);
     assert_eq!(ours.len() as u64, place.summary().number("/recording/frames"));

@@ -48,7 +48,7 @@ fn rule() -> BaselineSettings {
 
 fn write(to: Node, parameter: Parameter, words: [i16; 6]) -> Act {
     let request = Request::Write { number: parameter.number(), words };
-    Act::Say(Message::Configure { to, tag: 1, request })
+    Act::SendFromGateway(Message::Configure { to, tag: 1, request })
 }
 
 /// Returns a bench with this scenario, whose cells have this baseline before the first joints.

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
-use analysis::shadow::{BusShadow, FrameTiming, Options, Shadow};
+use analysis::shadow::{BusShadow, FrameTiming, Shadow, ShadowOptions};
 use model::table::Replies;
 use protocol::can::Format;
 use protocol::id::{Command, Id};
@@ -48,9 +48,9 @@ fn over_epochs(bench: &mut Bench, epochs: u64) -> (u64, u64, u64) {
 /// Runs the traffic of a bench, as a capture, through the bus model.
 fn shadow(bench: &Bench, rates: BitRates) -> (Vec<FrameTiming>, BusShadow) {
     // This bus carried stimuli too.
-    let options = Options { each_frame: true, bench_traffic: true, ..Options::new(rates) };
+    let options = ShadowOptions { each_frame: true, bench_traffic: true, ..ShadowOptions::new(rates) };
     let mut shadow = Shadow::new(options).unwrap();
-    bench.requested().iter().for_each(|(at, frame)| shadow.frame("vcan0", at.0 * 1_000, frame));
+    bench.requested().iter().for_each(|(at, frame)| shadow.receive("vcan0", at.0 * 1_000, frame));
     shadow.finish();
     let frames = std::iter::from_fn(|| shadow.poll()).collect();
     (frames, shadow.report().buses.remove(0))

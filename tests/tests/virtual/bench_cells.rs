@@ -5,7 +5,7 @@
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::{CLAIM_TIME, HEARTBEAT_INTERVAL, MAX_PENDING};
-use model::table::{Event, Notice, Replies, Status};
+use model::table::{CellStatus, Event, Notice, Replies};
 use model::tracker::DEAD_AFTER;
 use protocol::can::Format;
 use protocol::id::{Kind, Node};
@@ -25,9 +25,9 @@ fn bench(seed: u64) -> Bench {
 }
 
 /// A time longer than a cell needs from its start to its first torque.
-const START: Span = Span(2 * CLAIM_TIME.0 + 2 * HEARTBEAT_INTERVAL.0);
+const START_TIMEOUT: Span = Span(2 * CLAIM_TIME.0 + 2 * HEARTBEAT_INTERVAL.0);
 
-fn status(bench: &Bench, place: usize) -> Status {
+fn status(bench: &Bench, place: usize) -> CellStatus {
     bench.gateway.table.statuses(bench.now()).nth(place).unwrap().1
 }
 
@@ -52,7 +52,12 @@ fn a_stale_cells_torque_is_held_and_then_decays_to_zero() {
     let whole = magnitude(&bench.gateway.table.snapshot().sums.torque);
     assert!(whole > 0.01);
     // The cell goes on to report a contact, but none of its torques arrives.
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque).from(Party::CellSlot(CELL)));
+    bench.fault(
+        Fault::new(Harm::Lose, 1.0)
+            .at_receiver(Party::Gateway)
+            .of_kind(Kind::Torque)
+            .from(Party::CellSlot(CELL)),
+    );
     let course: Vec<_> = (0..10)
         .map(|_| {
             bench.run_epochs(1);
@@ -75,10 +80,14 @@ fn a_stale_cells_torque_is_held_and_then_decays_to_zero() {
     for (got, expected) in course.iter().zip(&expected) {
         assert_eq!(got, expected, "{course:?}");
     }
-    assert_eq!(status(&bench, CELL), Status::Stale, "it says that it is in contact, so zero is not known");
+    assert_eq!(
+        status(&bench, CELL),
+        CellStatus::Stale,
+        "it says that it is in contact, so zero is not known"
+    );
     bench.faults.clear();
     bench.run_epochs(2);
-    assert_eq!(status(&bench, CELL), Status::Active);
+    assert_eq!(status(&bench, CELL), CellStatus::Active);
     finish(&mut bench);
 }
 
@@ -89,7 +98,7 @@ fn a_heartbeat_of_a_quiet_cell_clears_a_held_torque() {
     let mut bench = Bench::new(&skin, 2).started();
     bench.press(CELL, 3.0);
     bench.run_epochs(3);
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at_receiver(Party::Gateway).of_kind(Kind::Torque));
     bench.press(CELL, 0.0);
     let released = bench.now();
     while bench.gateway.table.snapshot().sums.contributing > 0 {
@@ -100,7 +109,7 @@ fn a_heartbeat_of_a_quiet_cell_clears_a_held_torque() {
         );
     }
     assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; MAX_JOINTS]);
-    assert_eq!(status(&bench, CELL), Status::Quiet);
+    assert_eq!(status(&bench, CELL), CellStatus::Quiet);
     finish(&mut bench);
 }
 
@@ -121,14 +130,14 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
         // It answered every epoch, so its last packet is at most an epoch old.
         let after = dead.elapsed_since(killed);
         assert!((DEAD_AFTER.0 - bench.epoch().0..DEAD_AFTER.0 + 5_000).contains(&after.0), "{after:?}");
-        assert_eq!((status(&bench, CELL), bench.gateway.table.snapshot().sums.dead), (Status::Dead, 1));
+        assert_eq!((status(&bench, CELL), bench.gateway.table.snapshot().sums.dead), (CellStatus::Dead, 1));
         assert_eq!(bench.gateway.table.snapshot().sums.contributing, 0);
 
         bench.act(Act::Start(CELL));
-        bench.run(START);
+        bench.run(START_TIMEOUT);
         let notices: Vec<_> = bench.gateway.notices[1..].iter().map(|(_, notice)| *notice).collect();
-        assert_eq!(notices, [Notice::Back(node), Notice::Restarted(node)]);
-        assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
+        assert_eq!(notices, [Notice::Revived(node), Notice::Restarted(node)]);
+        assert_eq!(status(&bench, CELL), CellStatus::Active, "it was told what touches it");
         assert_eq!(bench.gateway.table.snapshot().sums.dead, 0);
         let before = replies(&bench, CELL);
         bench.run_epochs(20);
@@ -181,12 +190,14 @@ fn a_restart_without_its_claim_is_detected_by_the_counter() {
         bench.act(Act::Start(CELL));
         // Its claim is lost; the first received packet comes when the node id is its own.
         let claim = bench.now()..bench.now() + CLAIM_TIME;
-        bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).from(Party::CellSlot(CELL)).during(claim));
-        bench.run(START);
+        bench.fault(
+            Fault::new(Harm::Lose, 1.0).at_receiver(Party::Gateway).from(Party::CellSlot(CELL)).during(claim),
+        );
+        bench.run(START_TIMEOUT);
         let node = bench.cell_slots[CELL].identity.cell.unwrap();
         let notices: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
         assert_eq!(notices, [Notice::Restarted(node)]);
-        assert_eq!(status(&bench, CELL), Status::Active, "it was told what touches it");
+        assert_eq!(status(&bench, CELL), CellStatus::Active, "it was told what touches it");
         finish(&mut bench);
         let uplink = bench.gateway.table.cells()[CELL].uplink();
         assert!(uplink.restarts == 1 && uplink.lost <= 1 && uplink.sent < 1_000, "{uplink:?}");
@@ -201,14 +212,14 @@ fn a_restarted_cell_is_not_in_contact_until_the_stimulus_is_sent_again() {
     bench.run_epochs(10);
     bench.act(Act::Kill(CELL));
     bench.act(Act::Start(CELL));
-    bench.run(START);
-    assert_eq!(status(&bench, CELL), Status::Quiet);
+    bench.run(START_TIMEOUT);
+    assert_eq!(status(&bench, CELL), CellStatus::Quiet);
     let (due, sent) = (replies(&bench, CELL).due, bench.torques(CELL).len());
     bench.run_epochs(20);
     assert_eq!((replies(&bench, CELL).due, bench.torques(CELL).len()), (due, sent), "nothing is due");
     bench.press(CELL, 1.0);
     bench.run_epochs(3);
-    assert_eq!(status(&bench, CELL), Status::Active);
+    assert_eq!(status(&bench, CELL), CellStatus::Active);
     finish(&mut bench);
 }
 
@@ -218,11 +229,11 @@ fn joints_older_than_a_period_are_skipped_and_explain_what_is_missing() {
         let mut bench = bench(seed);
         bench.press(CELL, 2.0);
         bench.run_epochs(10);
-        bench.act(Act::Say(Message::Report));
+        bench.act(Act::SendFromGateway(Message::Report));
         bench.run(Span(2_000));
         bench.act(Act::Hang(CELL));
         bench.run(Span(100_000 + seed * 3_137));
-        bench.act(Act::GoOn(CELL));
+        bench.act(Act::Continue(CELL));
         bench.run_epochs(20);
         finish(&mut bench);
         assert_eq!(bench.gateway.notices, [], "too short to be dead");
@@ -241,9 +252,9 @@ fn lost_joints_and_skipped_joints_are_counted_apart() {
     let mut bench = bench(4);
     bench.press(CELL, 2.0);
     bench.run_epochs(5);
-    bench.act(Act::Say(Message::Report));
+    bench.act(Act::SendFromGateway(Message::Report));
     bench.run(Span(2_000));
-    bench.fault(Fault::new(Harm::Lose, 0.3).at(Party::CellSlot(CELL)).of(Kind::Command));
+    bench.fault(Fault::new(Harm::Lose, 0.3).at_receiver(Party::CellSlot(CELL)).of_kind(Kind::Command));
     bench.run_epochs(100);
     bench.faults.clear();
     finish(&mut bench);
@@ -259,7 +270,7 @@ fn a_long_run_does_not_confuse_the_count_of_joints() {
     let mut skin = skins::arm(1, Format::Fd);
     (skin.timing.control_hz, skin.timing.ticks_per_broadcast) = (62.5, 1);
     let mut bench = Bench::new(&skin, 5).started();
-    bench.act(Act::Say(Message::Report));
+    bench.act(Act::SendFromGateway(Message::Report));
     bench.run_epochs(65_536 + 1_000);
     finish(&mut bench);
     assert_eq!(bench.gateway.table.cells()[0].unanswered(), Some((0, 0)));
@@ -276,9 +287,9 @@ fn a_cell_that_hung_takes_the_stimuli_of_meanwhile_and_refuses_none() {
     }
     bench.press(CELL, 0.0);
     bench.run_epochs(2);
-    bench.act(Act::GoOn(CELL));
+    bench.act(Act::Continue(CELL));
     bench.run_epochs(5);
-    assert_eq!(status(&bench, CELL), Status::Quiet);
+    assert_eq!(status(&bench, CELL), CellStatus::Quiet);
     finish(&mut bench);
     assert_eq!(bench.gateway.table.cells()[CELL].pages().rejected.unwrap().stimuli, 0);
 }
@@ -356,8 +367,8 @@ fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
     let flash = FlashState::Valid(skin.parameters(&skin.cells[0]));
     let other = bench.add(Identity { serial: 77, ..bench.cell_slots[0].identity }, flash);
     bench.act(Act::Start(other));
-    bench.run(START);
-    assert_eq!(status(&bench, 0), Status::Active, "it was told what touches it");
+    bench.run(START_TIMEOUT);
+    assert_eq!(status(&bench, 0), CellStatus::Active, "it was told what touches it");
     assert_eq!(bench.gateway.table.cells()[0].heartbeat().unwrap().serial, 77);
     finish(&mut bench);
     let uplink = bench.gateway.table.cells()[0].uplink();
@@ -418,11 +429,11 @@ fn a_right_cell_is_not_stuck_whether_pressed_or_not_measuring_or_halted() {
     }
     bench.act(Act::Kill(0));
     bench.run_epochs(40);
-    bench.act(Act::Say(Message::Halt));
+    bench.act(Act::SendFromGateway(Message::Halt));
     bench.run_epochs(100);
     let (node, number) = (Node::Everyone, Parameter::Mode.number());
     let request = Request::Write { number, words: padded_words([0]) };
-    bench.act(Act::Say(Message::Configure { to: node, tag: 0, request }));
+    bench.act(Act::SendFromGateway(Message::Configure { to: node, tag: 0, request }));
     bench.run_epochs(100);
     assert_eq!(stuck(&bench), []);
 }

@@ -56,11 +56,11 @@ fn some_fault(dice: &mut Pcg64Mcg) -> Fault {
     let fault = match dice.random_range(0..4) {
         0 => fault,
         1 => fault.on_the_wire(),
-        2 => fault.at(Party::Gateway),
-        _ => fault.at(Party::CellSlot(dice.random_range(0..usize::from(CELLS)))),
+        2 => fault.at_receiver(Party::Gateway),
+        _ => fault.at_receiver(Party::CellSlot(dice.random_range(0..usize::from(CELLS)))),
     };
     match dice.random_range(0..3) {
-        0 => fault.of(Kind::ALL[dice.random_range(0..Kind::ALL.len())]),
+        0 => fault.of_kind(Kind::ALL[dice.random_range(0..Kind::ALL.len())]),
         1 => fault.from(Party::CellSlot(dice.random_range(0..usize::from(CELLS)))),
         _ => fault,
     }
@@ -75,7 +75,7 @@ fn some_trouble(bench: &mut Bench, dice: &mut Pcg64Mcg) {
         let (first, then) = if dice.random() {
             (Act::Kill(cell_slot), Act::Start(cell_slot))
         } else {
-            (Act::Hang(cell_slot), Act::GoOn(cell_slot))
+            (Act::Hang(cell_slot), Act::Continue(cell_slot))
         };
         bench.at(at, first);
         bench.at(later, then);
@@ -140,7 +140,7 @@ fn everything_at_once() {
 fn loss_alone_is_found_to_the_last_packet() {
     let skin = skins::arm(CELLS, Format::Fd);
     for seed in 0..SEEDS {
-        let fault = Fault::new(Harm::Lose, 0.2).at(Party::Gateway).of(Kind::Torque);
+        let fault = Fault::new(Harm::Lose, 0.2).at_receiver(Party::Gateway).of_kind(Kind::Torque);
         let bench = campaign(&skin, seed, |bench, _| bench.fault(fault.clone()));
         let torques = |bench: &Bench| {
             let on_the_wire =
@@ -160,7 +160,7 @@ fn no_torque_with_turned_bits_is_ever_used() {
     let mut flipped = 0;
     for seed in 0..SEEDS {
         // Only torques are damaged, and most of them: those that are used must still be right.
-        let fault = Fault::new(Harm::Flip, 0.7).of(Kind::Torque);
+        let fault = Fault::new(Harm::Flip, 0.7).of_kind(Kind::Torque);
         let bench = campaign(&skin, seed, |bench, _| bench.fault(fault.clone()));
         let table = &bench.gateway.table;
         assert!(table.accuracy().single.max() < 1e-3, "{:?}", table.accuracy());
@@ -208,7 +208,7 @@ fn nonsense_on_the_bus_does_no_harm() {
                     _ => Frame::fd(id, 1, &data[..length]),
                 };
                 let at = bench.now() + Span(dice.random_range(0..1_500_000));
-                bench.at(at, Act::Babble(frame.unwrap()));
+                bench.at(at, Act::InjectFrame(frame.unwrap()));
             }
         });
         assert!(bench.gateway.table.accuracy().single.max() < 1e-3, "{:?}", bench.gateway.table.accuracy());

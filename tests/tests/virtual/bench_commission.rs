@@ -73,7 +73,7 @@ fn cells_with_other_parameters_without_any_and_with_damaged_flash_all_get_the_sk
             1 => FlashState::Empty,
             _ => FlashState::Damaged,
         };
-        let mut workshop = Workshop::of(&skin, 1, flash);
+        let mut workshop = Workshop::with_cells(&skin, 1, flash);
         let report = workshop.commission(&skin, WISH, None);
         all(&report, Outcome::Written);
         assert_eq!(workshop.holding(&new), usize::from(CELLS));
@@ -87,8 +87,9 @@ fn cells_with_other_parameters_without_any_and_with_damaged_flash_all_get_the_sk
 #[test]
 fn a_configured_cell_is_left_alone_and_read_back_only_if_requested() {
     let (skin, old, new) = skin();
-    let mut workshop =
-        Workshop::of(&skin, 2, |place| FlashState::Valid(if place == 3 { old(place) } else { new(place) }));
+    let mut workshop = Workshop::with_cells(&skin, 2, |place| {
+        FlashState::Valid(if place == 3 { old(place) } else { new(place) })
+    });
     let report = workshop.commission(&skin, WISH, None);
     let mut expected = vec![Outcome::AlreadySo; CELLS.into()];
     expected[3] = Outcome::Written;
@@ -114,15 +115,15 @@ fn a_configured_cell_is_left_alone_and_read_back_only_if_requested() {
 fn a_dry_run_writes_nothing_and_reports_what_would_be_written() {
     let (skin, old, new) = skin();
     let flash = |place| FlashState::Valid(if place < 5 { new(place) } else { old(place) });
-    let mut workshop = Workshop::of(&skin, 3, flash);
+    let mut workshop = Workshop::with_cells(&skin, 3, flash);
     workshop.rest(Span::from_millis(1_000));
-    let said = workshop.said;
+    let said = workshop.messages_sent;
     let report = workshop.commission(&skin, CommissionOptions { dry_run: true, verify: false }, None);
     let expected = |place| if place < 5 { Outcome::AlreadySo } else { Outcome::WouldWrite };
     assert_eq!(outcomes(&report), (0..CELLS.into()).map(expected).collect::<Vec<_>>());
     assert_eq!(report.requests, 0);
     // Two heartbeats of each cell, and no packet of the commissioning.
-    assert!(workshop.said - said <= 3 * u64::from(CELLS), "{}", workshop.said - said);
+    assert!(workshop.messages_sent - said <= 3 * u64::from(CELLS), "{}", workshop.messages_sent - said);
     assert!(workshop.pieces.iter().all(|piece| piece.history.len() == 1));
 }
 
@@ -134,8 +135,8 @@ fn loss_and_repetition_and_damage_cost_time_and_nothing_else() {
     for seed in 0..SEEDS {
         let (skin, old, new) = skin_of(CELLS, if seed % 2 == 0 { Format::Fd } else { Format::Classic });
         let flash = |place| if place % 2 == 0 { FlashState::Valid(old(place)) } else { FlashState::Empty };
-        let mut workshop = Workshop::of(&skin, seed, flash);
-        (workshop.loss, workshop.twice, workshop.damage) = (0.05, 0.05, 0.05);
+        let mut workshop = Workshop::with_cells(&skin, seed, flash);
+        (workshop.loss, workshop.duplication, workshop.damage) = (0.05, 0.05, 0.05);
         let mut report = workshop.commission(&skin, WISH, None);
         nothing_is_mixed(&workshop, flash, &new);
         // A cell with six failures in a row is named, and commissioned in the next run.
@@ -160,7 +161,7 @@ fn killed_at_any_moment_and_run_again_it_is_complete_and_nothing_is_mixed() {
     for seed in 0..SEEDS / 4 {
         let (skin, old, new) = skin_of(MANY, if seed % 2 == 0 { Format::Fd } else { Format::Classic });
         let flash = |place| if place % 4 == 3 { FlashState::Empty } else { FlashState::Valid(old(place)) };
-        let mut workshop = Workshop::of(&skin, seed, flash);
+        let mut workshop = Workshop::with_cells(&skin, seed, flash);
         // With lost frames, most of the time is spent waiting for them.
         workshop.loss = if seed % 4 == 0 { 0.02 } else { 0.0 };
         workshop.rest(Span::from_millis(700));
@@ -186,7 +187,7 @@ fn cells_that_are_switched_off_and_on_in_the_middle_are_rewritten_or_named() {
     for seed in 0..SEEDS {
         let (skin, old, new) = skin();
         let flash = |place| FlashState::Valid(old(place));
-        let mut workshop = Workshop::of(&skin, seed, flash);
+        let mut workshop = Workshop::with_cells(&skin, seed, flash);
         workshop.rest(Span::from_millis(700));
         let mut lost = Vec::new();
         for place in 0..usize::from(CELLS) {
@@ -243,7 +244,7 @@ fn an_undetected_restart_is_found_at_the_commit() {
     for seed in 0..SEEDS / 2 {
         let (skin, old, new) = skin();
         let flash = |place| FlashState::Valid(old(place));
-        let mut workshop = Workshop::of(&skin, seed, flash);
+        let mut workshop = Workshop::with_cells(&skin, seed, flash);
         workshop.rest(Span::from_millis(700));
         workshop.forgers = Some((|packet| packet, nobody_claims));
         for place in 0..usize::from(CELLS) {
@@ -278,7 +279,7 @@ fn cells_are_identified_by_serial_number_with_any_node_id() {
 #[test]
 fn missing_cells_are_named_and_unknown_ones_left_alone() {
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 5, |place| FlashState::Valid(old(place)));
+    let mut workshop = Workshop::with_cells(&skin, 5, |place| FlashState::Valid(old(place)));
     workshop.switch_off_in(Span(0), 4);
     let unknown_node = workshop.add(Identity { cell: Some(cell(77)), serial: 9 }, FlashState::Valid(old(0)));
     let report = workshop.commission(&skin, WISH, None);
@@ -293,7 +294,7 @@ fn missing_cells_are_named_and_unknown_ones_left_alone() {
     let mut words = [0; WORDS];
     words[0] = old(0).hash().cast_signed();
     let request = Request::Write { number: Parameter::Commit.number(), words };
-    workshop.say(&Message::Configure { to: Node::Cell(cell(77)), tag: 1, request });
+    workshop.send(&Message::Configure { to: Node::Cell(cell(77)), tag: 1, request });
     workshop.rest(Span::from_millis(10));
     assert_eq!(workshop.pieces[unknown_node].history, [FlashState::Valid(old(0)); 2]);
 }
@@ -301,7 +302,7 @@ fn missing_cells_are_named_and_unknown_ones_left_alone() {
 #[test]
 fn a_late_cell_is_commissioned_too() {
     let (skin, old, new) = skin();
-    let mut workshop = Workshop::of(&skin, 6, |place| FlashState::Valid(old(place)));
+    let mut workshop = Workshop::with_cells(&skin, 6, |place| FlashState::Valid(old(place)));
     for place in 0..3 {
         workshop.switch_off_in(Span(0), place);
         workshop.switch_on_in(Span::from_millis(1_500), place);
@@ -314,7 +315,7 @@ fn a_late_cell_is_commissioned_too() {
 #[test]
 fn two_cells_with_one_serial_number_are_named_and_neither_is_written() {
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 7, |place| FlashState::Valid(old(place)));
+    let mut workshop = Workshop::with_cells(&skin, 7, |place| FlashState::Valid(old(place)));
     let serial = skin.cells[2].serial;
     let twin = workshop.add(Identity { cell: Some(cell(90)), serial }, FlashState::Valid(old(2)));
     workshop.rest(Span::from_millis(700));
@@ -334,11 +335,11 @@ fn joints_or_another_configuration_on_the_bus_end_it_before_it_sends() {
     let write = Request::Write { number: Parameter::Pose.number(), words: [1; WORDS] };
     for (message, trouble) in [
         (Message::Joints { epoch: Epoch(3), joints }, AbortReason::OtherGateway),
-        (Message::Configure { to: Node::Cell(cell(3)), tag: 0, request: write }, AbortReason::Meddler),
+        (Message::Configure { to: Node::Cell(cell(3)), tag: 0, request: write }, AbortReason::OtherWriter),
     ] {
-        let mut workshop = Workshop::of(&skin, 8, |place| FlashState::Valid(old(place)));
+        let mut workshop = Workshop::with_cells(&skin, 8, |place| FlashState::Valid(old(place)));
         workshop.rest(Span::from_millis(700));
-        workshop.overhear(&message);
+        workshop.send_from_other(&message);
         let report = workshop.commission(&skin, WISH, None);
         assert_eq!((report.trouble, report.requests), (Some(trouble), 0));
         assert!(workshop.pieces.iter().all(|piece| piece.history.len() == 1));
@@ -348,7 +349,7 @@ fn joints_or_another_configuration_on_the_bus_end_it_before_it_sends() {
 #[test]
 fn flash_that_cannot_be_written_is_named_and_the_old_remains() {
     let (skin, old, new) = skin();
-    let mut workshop = Workshop::of(&skin, 9, |place| FlashState::Valid(old(place)));
+    let mut workshop = Workshop::with_cells(&skin, 9, |place| FlashState::Valid(old(place)));
     workshop.pieces[6].worn = true;
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[6].outcome else { panic!("{report:#?}") };
@@ -363,7 +364,7 @@ fn flash_that_cannot_be_written_is_named_and_the_old_remains() {
 fn other_pose(packet: Packet) -> Packet {
     let is_pose = packet.id.kind == Kind::Configure && packet.count & 0x7F == Parameter::Pose.number();
     let mut packet = packet;
-    packet.words = packet.words.with(0, packet.words.six()[0].wrapping_add(i16::from(is_pose)));
+    packet.words = packet.words.with_word(0, packet.words.first_six()[0].wrapping_add(i16::from(is_pose)));
     packet
 }
 
@@ -371,14 +372,14 @@ fn other_pose(packet: Packet) -> Packet {
 fn pose_back(packet: Packet) -> Packet {
     let is_pose = packet.id.kind == Kind::Configured && packet.count == Parameter::Pose.number() | 0x80;
     let mut packet = packet;
-    packet.words = packet.words.with(0, packet.words.six()[0].wrapping_sub(i16::from(is_pose)));
+    packet.words = packet.words.with_word(0, packet.words.first_six()[0].wrapping_sub(i16::from(is_pose)));
     packet
 }
 
 #[test]
 fn a_pose_that_came_wrong_is_refused_at_the_commit_and_the_old_one_stays() {
     let (skin, old, new) = skin();
-    let mut workshop = Workshop::of(&skin, 10, |place| FlashState::Valid(old(place)));
+    let mut workshop = Workshop::with_cells(&skin, 10, |place| FlashState::Valid(old(place)));
     workshop.forgers = Some((other_pose, pose_back));
     let report = workshop.commission(&skin, WISH, None);
     for cell in &report.cells {
@@ -400,7 +401,7 @@ fn a_pose_that_came_wrong_is_refused_at_the_commit_and_the_old_one_stays() {
 #[test]
 fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 11, |place| FlashState::Valid(old(place)));
+    let mut workshop = Workshop::with_cells(&skin, 11, |place| FlashState::Valid(old(place)));
     workshop.rest(Span::from_millis(700));
     let refused = |workshop: &Workshop| {
         let node = workshop.pieces[0].node().unwrap();
@@ -410,7 +411,7 @@ fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
     workshop.damage = 1.0;
     let words = skin.parameters(&skin.cells[0]).words(Parameter::Pose);
     let request = Request::Write { number: Parameter::Pose.number(), words };
-    workshop.say(&Message::Configure { to: Node::Cell(cell(1)), tag: 1, request });
+    workshop.send(&Message::Configure { to: Node::Cell(cell(1)), tag: 1, request });
     workshop.rest(Span::from_millis(5));
     assert_eq!(refused(&workshop), '1');
     workshop.damage = 0.0;
@@ -418,7 +419,7 @@ fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
     let mixed = Parameters { pose: skin.parameters(&skin.cells[0]).pose, ..old(0) };
     let words = [mixed.hash().cast_signed(), 0, 0, 0, 0, 0];
     let commit = Request::Write { number: Parameter::Commit.number(), words };
-    workshop.say(&Message::Configure { to: Node::Cell(cell(1)), tag: 2, request: commit });
+    workshop.send(&Message::Configure { to: Node::Cell(cell(1)), tag: 2, request: commit });
     workshop.rest(Span::from_millis(5));
     assert_eq!(workshop.pieces[0].history, [FlashState::Valid(old(0))]);
 }
@@ -427,15 +428,16 @@ fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
 fn liar(packet: Packet) -> Packet {
     let is_period = packet.id.kind == Kind::Configured && packet.count == Parameter::Timing.number();
     let mut packet = packet;
-    packet.words =
-        packet.words.with(0, packet.words.six()[0].wrapping_add(i16::from(is_period && packet.id.node == 5)));
+    packet.words = packet
+        .words
+        .with_word(0, packet.words.first_six()[0].wrapping_add(i16::from(is_period && packet.id.node == 5)));
     packet
 }
 
 #[test]
 fn wrong_words_are_written_again_and_named_in_the_end() {
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 12, |place| FlashState::Valid(old(place)));
+    let mut workshop = Workshop::with_cells(&skin, 12, |place| FlashState::Valid(old(place)));
     workshop.forgers = Some((|packet| packet, liar));
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[4].outcome else { panic!("{report:#?}") };
@@ -456,7 +458,7 @@ fn a_refusal_is_named_in_words() {
         }
     }
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 13, |place| FlashState::Valid(old(place)));
+    let mut workshop = Workshop::with_cells(&skin, 13, |place| FlashState::Valid(old(place)));
     workshop.forgers = Some((|packet| packet, refuses));
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[4].outcome else { panic!("{report:#?}") };

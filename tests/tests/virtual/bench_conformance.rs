@@ -13,7 +13,7 @@ mod lesser;
 mod mutants;
 mod wrong;
 
-use cell::{Mutant, Right, Virtual};
+use cell::{FaultlessCell, Mutant, VirtualBus};
 use conformance::Session;
 use conformance::findings::{Finding, RequirementFilter, Verdict};
 use conformance::survey::Survey;
@@ -24,7 +24,7 @@ use protocol::time::Span;
 
 /// Returns the findings on a cell and the failed requirements.
 fn test(
-    bus: &mut Virtual,
+    bus: &mut VirtualBus,
     format: Format,
     number: u8,
     only: &RequirementFilter,
@@ -56,7 +56,7 @@ fn failures(findings: &[Finding]) -> String {
 fn this_projects_cell_passes() {
     for (format, number) in [(Format::Fd, 12), (Format::Classic, 12), (Format::Fd, 254), (Format::Classic, 1)]
     {
-        let mut bus = Virtual::new(format, number, Box::new(Right) as Box<dyn Mutant>);
+        let mut bus = VirtualBus::new(format, number, Box::new(FaultlessCell) as Box<dyn Mutant>);
         let (findings, failed) = test(&mut bus, format, number, &RequirementFilter::default());
         assert_eq!(failed, [""; 0], "{format:?}\n{}", failures(&findings));
         let untested: Vec<_> = findings
@@ -70,7 +70,7 @@ fn this_projects_cell_passes() {
 
 #[test]
 fn without_a_restart_what_shows_only_at_a_start_is_not_tested() {
-    let mut bus = Virtual::new(Format::Fd, 7, Box::new(Right)).without_restart();
+    let mut bus = VirtualBus::new(Format::Fd, 7, Box::new(FaultlessCell)).without_restart();
     let (findings, failed) = test(&mut bus, Format::Fd, 7, &RequirementFilter::default());
     assert_eq!(failed, [""; 0], "{}", failures(&findings));
     let untested: Vec<_> = findings
@@ -93,7 +93,8 @@ fn a_right_cell_that_is_cut_off_anywhere_passes() {
     for run in 0..runs {
         // The last restart of a run comes while a commit is answered, at another place in each run.
         let first = Span(run * longest.0 / runs);
-        let mut bus = Virtual::new(Format::Classic, 12, Box::new(Right)).cut(first, Span(233), longest);
+        let mut bus =
+            VirtualBus::new(Format::Classic, 12, Box::new(FaultlessCell)).cut(first, Span(233), longest);
         let (findings, failed) = test(&mut bus, Format::Classic, 12, &only);
         assert_eq!(failed, [""; 0], "run {run} of {runs}\n{}", failures(&findings));
         let (now, torn_now) = bus.restarted();
@@ -114,7 +115,7 @@ fn a_cell_that_waits_for_a_processor_is_not_blamed() {
     };
     for (seed, format) in (1..=6).zip([Format::Fd, Format::Classic].into_iter().cycle()) {
         for is_seen in [true, false] {
-            let mut bus = Virtual::new(format, 12, Box::new(Right)).starved(seed, is_seen);
+            let mut bus = VirtualBus::new(format, 12, Box::new(FaultlessCell)).starved(seed, is_seen);
             let (findings, failed) = test(&mut bus, format, 12, &RequirementFilter::default());
             let failed: Vec<_> = failed.into_iter().filter(|id| !timed(id)).collect();
             assert_eq!(failed, [""; 0], "seed {seed}, {format:?}, {is_seen}\n{}", failures(&findings));
@@ -129,14 +130,14 @@ fn a_cell_that_waits_for_a_processor_is_not_blamed() {
 fn cells_with_less_pass() {
     for (name, lessen) in lesser::ALL {
         for format in [Format::Fd, Format::Classic] {
-            let mut lesser = wrong::Wrong::new(format, mutants::NODE);
+            let mut lesser = wrong::FaultyCell::new(format, mutants::NODE);
             lessen(&mut lesser);
             // The first of two segments has the first words, which are not changed on the way.
             let measures = lesser.memory.measures;
             if measures && format == Format::Classic {
                 continue;
             }
-            let mut bus = Virtual::new(format, mutants::NODE, Box::new(lesser));
+            let mut bus = VirtualBus::new(format, mutants::NODE, Box::new(lesser));
             if measures {
                 bus = bus.measuring();
             }
@@ -170,9 +171,9 @@ fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
         }),
     ];
     for (mistake, format, put) in all {
-        let mut wrong = wrong::Wrong::new(format, mutants::NODE);
+        let mut wrong = wrong::FaultyCell::new(format, mutants::NODE);
         wrong.put = put;
-        let mut bus = Virtual::new(format, mutants::NODE, Box::new(wrong));
+        let mut bus = VirtualBus::new(format, mutants::NODE, Box::new(wrong));
         let survey = Survey::listen(&mut bus, "vcan0").unwrap();
         let cell = CellId::new(mutants::NODE.into()).unwrap();
         let why = survey.check(cell, "vcan0", None, false).unwrap_err();
@@ -204,12 +205,12 @@ fn spoilt(packet: &Packet, format: Format, crc: fn(&[u8], u16) -> u16) -> Vec<Fr
 }
 
 /// Checks that each faulty cell fails the requirement that it breaks.
-fn are_found(spoilt: &[mutants::Spoilt], format: Format) {
+fn are_found(spoilt: &[mutants::FaultCase], format: Format) {
     let mut found_out = Vec::new();
     for (name, id, spoil) in spoilt {
-        let mut wrong = wrong::Wrong::new(format, mutants::NODE);
+        let mut wrong = wrong::FaultyCell::new(format, mutants::NODE);
         spoil(&mut wrong);
-        let mut bus = Virtual::new(format, mutants::NODE, Box::new(wrong));
+        let mut bus = VirtualBus::new(format, mutants::NODE, Box::new(wrong));
         let (findings, failed) = test(&mut bus, format, mutants::NODE, &RequirementFilter::default());
         let is_found = findings
             .iter()
@@ -304,7 +305,7 @@ fn commits_that_take_something_along_are_found() {
 fn each_requirement_is_broken_by_a_wrong_cell() {
     let mut passed = std::collections::BTreeSet::new();
     for format in [Format::Fd, Format::Classic] {
-        let mut bus = Virtual::new(format, 12, Box::new(Right));
+        let mut bus = VirtualBus::new(format, 12, Box::new(FaultlessCell));
         let (findings, _) = test(&mut bus, format, 12, &RequirementFilter::default());
         let is_passed = |it: &&Finding| matches!(it.verdict, Verdict::Passed { .. });
         passed.extend(findings.iter().filter(is_passed).map(|it| it.requirement.id));

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use analysis::explain::{Explanation, Origin, RequestedJoints, Verdict, Watch, explain};
+use analysis::explain::{Explanation, JointsWatcher, Origin, RequestedJoints, WordVerdict, explain};
 use model::decode::{Decoded, Decoder};
 use protocol::can::Format;
 use protocol::id::Kind;
@@ -11,7 +11,7 @@ use protocol::message::AppliesFrom;
 use protocol::packet::{Epoch, WORDS};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use skinbus_tests::bench::{Act, Bench, OnTheWire};
+use skinbus_tests::bench::{Act, Bench, WireFrame};
 use skinbus_tests::fault::{Fault, Harm};
 use skinbus_tests::skins;
 
@@ -19,10 +19,10 @@ use skinbus_tests::skins;
 const EPOCHS: u64 = 60;
 
 /// Explains an epoch from a capture of these frames.
-fn explained(bench: &Bench, wire: &[OnTheWire], epoch: u8) -> Explanation {
+fn explained(bench: &Bench, wire: &[WireFrame], epoch: u8) -> Explanation {
     let requested = RequestedJoints { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
     let bus = &bench.skin.buses[0].name;
-    let (mut watch, mut decoder) = (Watch::new(&bench.skin, requested), Decoder::new(None));
+    let (mut watch, mut decoder) = (JointsWatcher::new(&bench.skin, requested), Decoder::new(None));
     for sent in wire {
         let decoded = decoder.decode(sent.at, bus, &sent.frame);
         let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
@@ -73,13 +73,13 @@ fn every_word_of_every_cell_is_explained() {
                     compared += 1;
                     sums[usize::from(row.joint) - 1] += i64::from(row.word.unwrap());
                     match row.verdict {
-                        Verdict::Nearest => assert_eq!(row.difference_steps, Some(0)),
-                        Verdict::Rounded { jacobian_steps, .. } => {
+                        WordVerdict::Nearest => assert_eq!(row.difference_steps, Some(0)),
+                        WordVerdict::Rounded { jacobian_steps, .. } => {
                             assert!(jacobian_steps.abs() <= 8.0, "{row:?}");
                             rounded += 1;
                         }
-                        Verdict::Saturated => saturated += 1,
-                        Verdict::Unexplained | Verdict::Open => {
+                        WordVerdict::Saturated => saturated += 1,
+                        WordVerdict::Unexplained | WordVerdict::Open => {
                             unreachable!("epoch {epoch}, cell {}: {row:?}", cell.node)
                         }
                     }
@@ -127,7 +127,7 @@ fn unknown_causes_are_named_and_not_guessed() {
     bench.run_epochs(1);
     let explanation = explained(&bench, &late, epoch);
     let cell = |node: u8| explanation.cells.iter().find(|cell| cell.node == node).unwrap();
-    assert!(cell(zero).force.is_none() && cell(zero).rows.iter().all(|row| row.verdict == Verdict::Open));
+    assert!(cell(zero).force.is_none() && cell(zero).rows.iter().all(|row| row.verdict == WordVerdict::Open));
     assert!(matches!(cell(one).force.unwrap().origin, Origin::Stimulus { from_epoch: None, .. }));
     let said = explanation.missing.join("\n");
     let unknown = format!(
@@ -142,7 +142,7 @@ fn unknown_causes_are_named_and_not_guessed() {
     // Without the torque, the sum does not include it.
     let node = u32::from(one);
     let torque =
-        |sent: &OnTheWire| sent.frame.id() >> 8 == Kind::Torque as u32 && sent.frame.id() & 0xFF == node;
+        |sent: &WireFrame| sent.frame.id() >> 8 == Kind::Torque as u32 && sent.frame.id() & 0xFF == node;
     let without: Vec<_> = bench.wire.iter().filter(|sent| !torque(sent)).copied().collect();
     let explanation = explained(&bench, &without, epoch);
     let cell = explanation.cells.iter().find(|cell| cell.node == one).unwrap();
@@ -178,7 +178,7 @@ fn a_cell_that_has_just_started_sends_nothing_and_one_that_releases_sends_zeros(
     assert_eq!(explanation.missing, [why]);
     let released = cell(3).unwrap();
     assert_eq!(released.force.unwrap().force_steps, 0);
-    assert!(released.rows.iter().all(|row| row.word == Some(0) && row.verdict == Verdict::Nearest));
+    assert!(released.rows.iter().all(|row| row.word == Some(0) && row.verdict == WordVerdict::Nearest));
 }
 
 #[test]
@@ -195,8 +195,8 @@ fn a_lossy_bus_loses_no_explanation_of_what_came() {
     for epoch in 0..28 {
         let explanation = explained(&bench, &bench.wire, epoch);
         for row in explanation.cells.iter().flat_map(|cell| &cell.rows) {
-            assert_ne!(row.verdict, Verdict::Unexplained, "epoch {epoch}: {row:?}");
-            explained_words += u32::from(row.verdict != Verdict::Open);
+            assert_ne!(row.verdict, WordVerdict::Unexplained, "epoch {epoch}: {row:?}");
+            explained_words += u32::from(row.verdict != WordVerdict::Open);
         }
     }
     assert!(explained_words > 500, "{explained_words}");

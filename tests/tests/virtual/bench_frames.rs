@@ -49,7 +49,7 @@ fn finish(bench: &mut Bench) {
 fn torques_that_come_twice_are_dropped_and_counted() {
     let mut bench = pressed(Format::Fd, 1);
     let before = bench.gateway.table.counters().received(Kind::Torque);
-    bench.fault(Fault::new(Harm::Duplicate, 1.0).at(Party::Gateway).of(Kind::Torque));
+    bench.fault(Fault::new(Harm::Duplicate, 1.0).at_receiver(Party::Gateway).of_kind(Kind::Torque));
     bench.run_epochs(50);
     finish(&mut bench);
     let twice = events(&bench, Event::RepeatedTorque);
@@ -63,7 +63,7 @@ fn torques_that_come_twice_are_dropped_and_counted() {
 #[test]
 fn joints_that_come_twice_are_answered_once() {
     let mut bench = pressed(Format::Fd, 2);
-    bench.fault(Fault::new(Harm::Duplicate, 1.0).on_the_wire().of(Kind::Command));
+    bench.fault(Fault::new(Harm::Duplicate, 1.0).on_the_wire().of_kind(Kind::Command));
     bench.run_epochs(50);
     finish(&mut bench);
     assert_eq!((replies(&bench).missing, replies(&bench).unasked), (0, 0));
@@ -79,7 +79,7 @@ fn a_torque_that_was_overtaken_by_a_later_one_is_dropped_as_stale() {
     let mut bench = pressed(Format::Fd, 3);
     // Each of them comes one to three epochs late, and some overtake others.
     let delay = Harm::Delay(Span(3 * bench.epoch().0));
-    bench.fault(Fault::new(delay, 0.5).at(Party::Gateway).of(Kind::Torque));
+    bench.fault(Fault::new(delay, 0.5).at_receiver(Party::Gateway).of_kind(Kind::Torque));
     bench.run_epochs(200);
     finish(&mut bench);
     let Replies { due, in_time, late, missing, .. } = replies(&bench);
@@ -98,7 +98,7 @@ fn a_torque_may_be_three_epochs_late_and_not_four() {
         let mut bench = pressed(Format::Fd, 4);
         let epoch = bench.epoch();
         // Another client sends cell 1's next torque some epochs late, while the cell's own torques are lost.
-        bench.fault(Fault::new(Harm::Lose, 1.0).on_the_wire().of(Kind::Torque).from(Party::CellSlot(0)));
+        bench.fault(Fault::new(Harm::Lose, 1.0).on_the_wire().of_kind(Kind::Torque).from(Party::CellSlot(0)));
         bench.run_epochs(1);
         let answers = epoch_of(bench.gateway.broadcasts() - 1);
         let before = bench.gateway.table.cells()[0].replies;
@@ -119,7 +119,9 @@ fn a_torque_may_be_three_epochs_late_and_not_four() {
 fn a_broadcast_that_the_gateway_does_not_read_back_confuses_no_torque() {
     for harm in [Harm::Lose, Harm::Reorder, Harm::Delay(Span::from_millis(40))] {
         let mut bench = pressed(Format::Fd, 5);
-        bench.fault(Fault::new(harm, 0.3).at(Party::Gateway).from(Party::Gateway).of(Kind::Command));
+        bench.fault(
+            Fault::new(harm, 0.3).at_receiver(Party::Gateway).from(Party::Gateway).of_kind(Kind::Command),
+        );
         bench.run_epochs(200);
         finish(&mut bench);
         let accuracy = bench.gateway.table.accuracy();
@@ -132,7 +134,7 @@ fn a_broadcast_that_the_gateway_does_not_read_back_confuses_no_torque() {
 fn broadcasts_that_change_places_on_the_wire_are_answered_forward_and_back() {
     let mut bench = pressed(Format::Fd, 6);
     let fault = Fault::new(Harm::Delay(Span(2 * bench.epoch().0)), 0.3);
-    bench.fault(fault.on_the_wire().of(Kind::Command));
+    bench.fault(fault.on_the_wire().of_kind(Kind::Command));
     bench.run_epochs(200);
     finish(&mut bench);
     let Replies { due, in_time, late, missing, .. } = replies(&bench);
@@ -153,7 +155,7 @@ fn epochs_may_jump_forward_and_back() {
         let ours = bench.gateway.broadcasts();
         let epoch = Epoch(epoch_of(ours).0.wrapping_add(dice.random_range(10..240)));
         let joints = Joints { in_use: 6, ..Joints::default() };
-        bench.act(Act::Say(Message::Joints { epoch, joints }));
+        bench.act(Act::SendFromGateway(Message::Joints { epoch, joints }));
         bench.run(Span(bench.epoch().0 / 2));
     }
     let now = replies(&bench);
@@ -180,7 +182,7 @@ fn a_late_stimulus_holds_from_the_next_joints_on_and_is_counted() {
 #[test]
 fn a_lost_stimulus_of_a_touch_shows_as_missing_replies() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 9).started();
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::CellSlot(0)).of(Kind::Stimulus));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at_receiver(Party::CellSlot(0)).of_kind(Kind::Stimulus));
     bench.press(0, 2.0);
     bench.run_epochs(30);
     finish(&mut bench);
@@ -193,7 +195,7 @@ fn a_lost_stimulus_of_a_touch_shows_as_missing_replies() {
 #[test]
 fn a_lost_stimulus_of_a_release_shows_as_torques_that_are_not_due() {
     let mut bench = pressed(Format::Fd, 10);
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::CellSlot(0)).of(Kind::Stimulus));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at_receiver(Party::CellSlot(0)).of_kind(Kind::Stimulus));
     bench.press(0, 0.0);
     bench.run_epochs(30);
     finish(&mut bench);
@@ -216,7 +218,7 @@ fn a_cell_that_others_switch_is_not_due_to_answer() {
     bench.run_epochs(40);
     finish(&mut bench);
     let replies = replies(&bench);
-    assert_eq!(events(&bench, Event::Switched), 1);
+    assert_eq!(events(&bench, Event::OtherWriter), 1);
     assert_eq!(replies.missing, replies.in_doubt, "{replies:?}");
     assert!(replies.missing <= 4 * bench.skin.cells.len() as u64, "{replies:?}");
 }
@@ -254,7 +256,7 @@ fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
 fn a_lost_segment_loses_its_packet_and_no_other() {
     for seed in 0..20 {
         let mut bench = pressed(Format::Classic, seed);
-        bench.fault(Fault::new(Harm::Lose, 0.1).at(Party::Gateway).of(Kind::Torque));
+        bench.fault(Fault::new(Harm::Lose, 0.1).at_receiver(Party::Gateway).of_kind(Kind::Torque));
         bench.run_epochs(100);
         finish(&mut bench);
         let Replies { due, missing, late, unasked, .. } = replies(&bench);
@@ -271,9 +273,9 @@ fn a_lost_segment_loses_its_packet_and_no_other() {
 fn cells_reassemble_segments_as_the_gateway_does() {
     for seed in 0..20 {
         let mut bench = pressed(Format::Classic, seed);
-        bench.act(Act::Say(Message::Report));
+        bench.act(Act::SendFromGateway(Message::Report));
         bench.run(Span(2_000));
-        bench.fault(Fault::new(Harm::Lose, 0.1).at(Party::CellSlot(0)).of(Kind::Command));
+        bench.fault(Fault::new(Harm::Lose, 0.1).at_receiver(Party::CellSlot(0)).of_kind(Kind::Command));
         bench.run_epochs(100);
         finish(&mut bench);
         let cell = &bench.gateway.table.cells()[0];

@@ -25,7 +25,7 @@ const FRAMES: u32 = 400;
 
 /// The kinds of unexpected frames.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum What {
+enum HostileFrame {
     /// Frames of other protocols.
     Foreign,
     Extended,
@@ -55,42 +55,42 @@ enum What {
     GatewaysHeartbeat,
 }
 
-const ALL: [What; 22] = [
-    What::Foreign,
-    What::Extended,
-    What::Remote,
-    What::ErrorFrame,
-    What::WrongChecksum,
-    What::WrongLength,
-    What::HalfPacket,
-    What::OldHeartbeat,
-    What::HeartbeatAhead,
-    What::LastHeartbeatAgain,
-    What::HeartbeatOfAnother,
-    What::Claim,
-    What::ClaimOfAnother,
-    What::StaleTorque,
-    What::Sensors,
-    What::Counters,
-    What::Place,
-    What::Answer,
-    What::Sum,
-    What::UnknownNode,
-    What::Requests,
-    What::GatewaysHeartbeat,
+const ALL: [HostileFrame; 22] = [
+    HostileFrame::Foreign,
+    HostileFrame::Extended,
+    HostileFrame::Remote,
+    HostileFrame::ErrorFrame,
+    HostileFrame::WrongChecksum,
+    HostileFrame::WrongLength,
+    HostileFrame::HalfPacket,
+    HostileFrame::OldHeartbeat,
+    HostileFrame::HeartbeatAhead,
+    HostileFrame::LastHeartbeatAgain,
+    HostileFrame::HeartbeatOfAnother,
+    HostileFrame::Claim,
+    HostileFrame::ClaimOfAnother,
+    HostileFrame::StaleTorque,
+    HostileFrame::Sensors,
+    HostileFrame::Counters,
+    HostileFrame::Place,
+    HostileFrame::Answer,
+    HostileFrame::Sum,
+    HostileFrame::UnknownNode,
+    HostileFrame::Requests,
+    HostileFrame::GatewaysHeartbeat,
 ];
 
-impl What {
+impl HostileFrame {
     /// Returns true if the gateway counts it as a packet of the cell whose node id it has.
     fn is_of_a_cell(self) -> bool {
-        use What::*;
+        use HostileFrame::*;
         let none = [Foreign, Extended, Remote, ErrorFrame, UnknownNode, Requests, GatewaysHeartbeat];
         !none.contains(&self)
     }
 
     /// Returns true for a heartbeat that is not the cell's own.
     fn is_an_outsider(self) -> bool {
-        use What::*;
+        use HostileFrame::*;
         [OldHeartbeat, HeartbeatAhead, HeartbeatOfAnother, Claim, ClaimOfAnother].contains(&self)
     }
 
@@ -107,25 +107,25 @@ impl What {
             packet.frames(format).next().unwrap()
         };
         match self {
-            Self::Foreign => Act::Babble(Frame::classic(0x0F1, &dice.random::<[u8; 8]>()).unwrap()),
-            Self::Extended => Act::Babble(Frame::classic(0x18F0_0400 | EXTENDED, &[1, 2, 3]).unwrap()),
+            Self::Foreign => Act::InjectFrame(Frame::classic(0x0F1, &dice.random::<[u8; 8]>()).unwrap()),
+            Self::Extended => Act::InjectFrame(Frame::classic(0x18F0_0400 | EXTENDED, &[1, 2, 3]).unwrap()),
             Self::Remote => {
-                Act::Babble(Frame::remote(frame(Kind::Torque, from.get(), Format::Fd).id(), 8).unwrap())
+                Act::InjectFrame(Frame::remote(frame(Kind::Torque, from.get(), Format::Fd).id(), 8).unwrap())
             }
             Self::ErrorFrame => {
-                Act::Babble(Frame::classic(0x4 | ERROR, &[0, 0x20, 0, 0, 0, 0, 96, 0]).unwrap())
+                Act::InjectFrame(Frame::classic(0x4 | ERROR, &[0, 0x20, 0, 0, 0, 0, 96, 0]).unwrap())
             }
             Self::WrongChecksum => {
                 let torque = frame(Kind::Torque, from.get(), Format::Fd);
                 let mut data = [0; 16];
                 data.copy_from_slice(torque.data());
                 data[3] ^= 0x10;
-                Act::Babble(Frame::fd(torque.id(), 0, &data).unwrap())
+                Act::InjectFrame(Frame::fd(torque.id(), 0, &data).unwrap())
             }
-            Self::WrongLength => {
-                Act::Babble(Frame::fd(frame(Kind::Torque, from.get(), Format::Fd).id(), 0, &[7; 12]).unwrap())
-            }
-            Self::HalfPacket => Act::Babble(frame(Kind::Torque, from.get(), Format::Classic)),
+            Self::WrongLength => Act::InjectFrame(
+                Frame::fd(frame(Kind::Torque, from.get(), Format::Fd).id(), 0, &[7; 12]).unwrap(),
+            ),
+            Self::HalfPacket => Act::InjectFrame(frame(Kind::Torque, from.get(), Format::Classic)),
             Self::OldHeartbeat => beat(Heartbeat { sent: own.sent.wrapping_sub(1_000), ..settled }),
             Self::HeartbeatAhead => beat(Heartbeat { sent: own.sent.wrapping_add(9_000), ..settled }),
             Self::LastHeartbeatAgain => beat(settled),

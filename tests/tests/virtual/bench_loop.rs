@@ -108,7 +108,7 @@ fn bad_cycles_in_a_row_halt_the_robot_until_someone_resumes() {
 #[test]
 fn a_cell_that_lost_a_halt_is_found_by_its_heartbeat() {
     let mut bench = pressed(3);
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::CellSlot(0)).from(Party::UnknownNode));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at_receiver(Party::CellSlot(0)).from(Party::UnknownNode));
     bench.act(Act::Inject(Message::Halt));
     bench.faults.clear();
     bench.run(Span(400_000));

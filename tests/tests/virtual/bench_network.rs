@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::id::CellId;
 use protocol::time::Span;
-use skinbus_tests::network::{End, PERIOD, Wiring};
+use skinbus_tests::network::{PERIOD, PortEnd, Wiring};
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -50,12 +50,12 @@ fn check_tree_ready(wiring: &Wiring, seed: u64) {
         let ports = wiring.cells[place].ports.expect("a settled cell reports its ports").ports;
         for (port, state) in ports.iter().enumerate() {
             match wiring.cells[place].wires[port] {
-                Some(End::Cell(other, at)) => {
+                Some(PortEnd::Cell(other, at)) => {
                     assert!(state.works, "seed {seed}: cell {place} port {port}");
                     let there = wiring.cells[other].node_id.map_or(0, CellId::get);
                     assert_eq!((state.number, usize::from(state.port)), (there, at), "seed {seed}");
                 }
-                Some(End::Gateway(_)) | None => assert!(!state.receives, "seed {seed}"),
+                Some(PortEnd::Gateway(_)) | None => assert!(!state.receives, "seed {seed}"),
             }
         }
     }
@@ -122,7 +122,7 @@ fn inject_fault(wiring: &mut Wiring, dice: &mut Pcg64Mcg) -> String {
         }
         4 => {
             wiring.set_link_down(cell, port, true);
-            if let Some(End::Cell(other, at)) = wiring.cells[cell].wires[port] {
+            if let Some(PortEnd::Cell(other, at)) = wiring.cells[cell].wires[port] {
                 wiring.set_link_down(other, at, true);
             }
             format!("link_down {cell} port {port} both ways")

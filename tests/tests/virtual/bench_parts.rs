@@ -3,7 +3,7 @@
 //! split, are replayed to cells that were just started: they must answer as recorded.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use analysis::explain::{RequestedJoints, Watch};
+use analysis::explain::{JointsWatcher, RequestedJoints};
 use bench::replay::comparator::{Comparator, Tally};
 use bench::replay::replay_plan::{FrameRole, PlayerStep, ReplayPlan, Selection, SenderFilter};
 use bench::replay::survey::{Survey, TimeRange};
@@ -36,19 +36,19 @@ const EPOCHS: u64 = 190;
 
 /// The faults during the recording.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Trouble {
+enum RecordingFault {
     None,
     /// Cells hang for a while, torques come late, and some packets of cells are not in the recording.
     Late,
 }
 
 /// Records a bench in which cells are pressed and released all the time.
-fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<ReceivedFrame>) {
+fn recorded(seed: u64, format: Format, trouble: RecordingFault) -> (Skin, Vec<ReceivedFrame>) {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(&skins::arm(CELLS, format), seed);
     bench.settle();
-    bench.act(Act::Say(Message::Resume));
-    bench.act(Act::Say(Message::Report));
+    bench.act(Act::SendFromGateway(Message::Resume));
+    bench.act(Act::SendFromGateway(Message::Report));
     bench.run(Span::from_millis(20));
     bench.begin();
     for epoch in 0..EPOCHS {
@@ -60,11 +60,15 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<ReceivedF
         if place < 5 || epoch % 60 == 7 {
             bench.press_from(place, newtons, from);
         }
-        if trouble == Trouble::Late {
+        if trouble == RecordingFault::Late {
             match rng.random_range(0..40) {
                 0 => bench.act(Act::Hang(place)),
-                1..8 => (0..usize::from(CELLS)).for_each(|place| bench.act(Act::GoOn(place))),
-                11 => bench.act(Act::Say(if epoch % 2 == 0 { Message::Halt } else { Message::Resume })),
+                1..8 => (0..usize::from(CELLS)).for_each(|place| bench.act(Act::Continue(place))),
+                11 => bench.act(Act::SendFromGateway(if epoch % 2 == 0 {
+                    Message::Halt
+                } else {
+                    Message::Resume
+                })),
                 12 => {
                     let page = SensorPage::Skin(touch(2.0));
                     bench.act(Act::Inject(Message::Stimulus {
@@ -86,19 +90,19 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<ReceivedF
                 _ => {}
             }
         }
-        if trouble == Trouble::Late && epoch == 20 {
+        if trouble == RecordingFault::Late && epoch == 20 {
             bench.fault(
                 Fault::new(Harm::Delay(Span::from_millis(40)), 0.05)
-                    .of(protocol::id::Kind::Torque)
+                    .of_kind(protocol::id::Kind::Torque)
                     .on_the_wire(),
             );
         }
         bench.run_epochs(1);
     }
-    (0..usize::from(CELLS)).for_each(|place| bench.act(Act::GoOn(place)));
+    (0..usize::from(CELLS)).for_each(|place| bench.act(Act::Continue(place)));
     bench.finish();
     let is_recorded = |from: Party, rng: &mut Pcg64Mcg| {
-        trouble == Trouble::None
+        trouble == RecordingFault::None
             || from == Party::Gateway
             || from == Party::UnknownNode
             || !rng.random_ratio(1, 200)
@@ -194,7 +198,7 @@ fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[ReceivedFrame
     let mut cells = Cells::of(skin);
     cells.tell(&Message::Report, format, &mut comparator);
     if !bus.state.is_fresh() {
-        let PlayerStep::Restore(states) = replay_plan.restoring() else { unreachable!() };
+        let PlayerStep::Restore(states) = replay_plan.restore_step() else { unreachable!() };
         for message in &states[0].1 {
             if let Message::Joints { epoch, .. } = message {
                 comparator.sent_joints(0, None, *epoch);
@@ -234,7 +238,7 @@ fn a_recording_that_is_split_anywhere_replays_from_there() {
     let (mut equal, mut explained) = (0, 0);
     for seed in 0..SEEDS {
         let format = if seed % 3 == 2 { Format::Classic } else { Format::Fd };
-        let (skin, seen) = recorded(seed, format, Trouble::Late);
+        let (skin, seen) = recorded(seed, format, RecordingFault::Late);
         let whole = replayed(&skin, &[], &seen);
         assert!(whole.tally().is_good(), "seed {seed}: {:#?} {:#?}", whole.tally(), whole.first());
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
@@ -268,7 +272,7 @@ fn a_recording_that_is_split_anywhere_replays_from_there() {
 fn where_nothing_was_lost_or_late_nothing_is_explained() {
     for seed in 100..112 {
         let format = if seed % 2 == 0 { Format::Classic } else { Format::Fd };
-        let (skin, seen) = recorded(seed, format, Trouble::None);
+        let (skin, seen) = recorded(seed, format, RecordingFault::None);
         for at in (0..seen.len() - 200).step_by(seen.len() / 15) {
             let (from, before) = split(&seen, at);
             // Up to the next joints: all requests before are answered.
@@ -291,13 +295,13 @@ fn where_nothing_was_lost_or_late_nothing_is_explained() {
 
 #[test]
 fn a_word_that_is_another_one_is_found_in_every_part() {
-    let (skin, mut seen) = recorded(7, Format::Fd, Trouble::Late);
+    let (skin, mut seen) = recorded(7, Format::Fd, RecordingFault::Late);
     let mut found = 0;
     for at in (200..seen.len() - 200).step_by(97) {
         let is_torque = |seen: &ReceivedFrame| {
             let packet = protocol::packet::Packet::from_fd(&seen.frame).ok()?;
             let Ok(Message::Torque { torque, .. }) = Message::decode(&packet) else { return None };
-            (torque.six()[0] != 0).then_some(packet)
+            (torque.first_six()[0] != 0).then_some(packet)
         };
         let Some((place, mut packet)) =
             seen.iter().enumerate().skip(at + 60).find_map(|(place, seen)| Some((place, is_torque(seen)?)))
@@ -305,7 +309,7 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
             continue;
         };
         let (from, before) = split(&seen, at);
-        packet.words = packet.words.with(0, packet.words.six()[0] + 1);
+        packet.words = packet.words.with_word(0, packet.words.first_six()[0] + 1);
         let kept = seen[place].frame;
         seen[place].frame = packet.frames(Format::Fd).next().unwrap();
         let comparator = replayed(&skin, &before, &seen[from..]);
@@ -321,14 +325,14 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
 #[test]
 fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
     for seed in 200..210 {
-        let (skin, seen) = recorded(seed, Format::Fd, Trouble::None);
+        let (skin, seen) = recorded(seed, Format::Fd, RecordingFault::None);
         let frames_of = |from: usize, before: &[capture::LatchedFrame], requested: RequestedJoints| {
-            let (mut watch, mut decoder) = (Watch::new(&skin, requested), Decoder::new(None));
+            let (mut watch, mut decoder) = (JointsWatcher::new(&skin, requested), Decoder::new(None));
             for kept in before {
                 if let Decoded::Message(message) =
                     decoder.decode(Micros(kept.nanos / 1_000), BUS, &kept.frame)
                 {
-                    watch.begin(kept.nanos, BUS, &message);
+                    watch.receive_latched(kept.nanos, BUS, &message);
                 }
             }
             for seen in &seen[from..] {
@@ -346,7 +350,7 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
             assert_eq!(whole.at_ns, part.at_ns);
             for (whole, part) in whole.cells.iter().zip(&part.cells) {
                 let contact_state =
-                    |cell: &analysis::explain::CellMoment| cell.contact_state.map(|(skin, _)| skin);
+                    |cell: &analysis::explain::ObservedCellState| cell.contact_state.map(|(skin, _)| skin);
                 assert_eq!(
                     (contact_state(whole), whole.test_mode),
                     (contact_state(part), part.test_mode),

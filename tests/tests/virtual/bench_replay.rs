@@ -11,8 +11,8 @@
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
-use model::generate::{Target, generate};
-use model::latched::State;
+use model::generate::{SkinRequest, generate};
+use model::latched::LatchedState;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
@@ -28,7 +28,7 @@ use rand_pcg::Pcg64;
 const CELL: i64 = 12;
 
 fn parameters() -> Parameters {
-    let skin = generate(&Target { cells: 1, ..Target::default() }).unwrap();
+    let skin = generate(&SkinRequest { cells: 1, ..SkinRequest::default() }).unwrap();
     let skin = Skin::parse("skin.toml", &skin).unwrap();
     skin.parameters(&skin.cells[0])
 }
@@ -141,7 +141,7 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
         let script_of_recording = script(&mut random, false);
         let link_down = random.random_range(0..script_of_recording.len());
         let (before, after) = script_of_recording.split_at(link_down);
-        let (mut recorded, mut state) = (started(), State::default());
+        let (mut recorded, mut state) = (started(), LatchedState::default());
         for message in before {
             state.apply(message);
             for answer in tell(&mut recorded, message) {
@@ -158,7 +158,7 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
             tell(&mut other, message);
         }
         tell(&mut other, &mode(1));
-        for message in state.restoring(|_| true, next) {
+        for message in state.restoring_messages(|_| true, next) {
             tell(&mut other, &message);
         }
         let mut has_epoch = before.iter().any(|message| matches!(message, Message::Joints { .. }));
@@ -173,7 +173,7 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
                 then,
                 now,
                 "seed {seed}, {at} messages after {link_down}: {message:?}\nrestored: {:#?}",
-                state.restoring(|_| true, next)
+                state.restoring_messages(|_| true, next)
             );
             let zero =
                 |answer: &&Message| matches!(answer, Message::Torque { torque, .. } if torque.is_zero());

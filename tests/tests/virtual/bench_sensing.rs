@@ -26,7 +26,7 @@ use skinbus_tests::skins;
 
 const AT_62_5_HZ: Sensing = Sensing::Continuous { period_ms: 16 };
 /// The time for which a bench is observed.
-const LOOK: Span = Span::from_millis(8_000);
+const OBSERVATION_TIME: Span = Span::from_millis(8_000);
 const TOUCHED: usize = 100;
 
 /// Returns touches of half a second to two, one after another, each of some of the first 100 cells, of 0.5 to 6 N times
@@ -105,11 +105,11 @@ fn sensors_frames(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPa
 fn looked_at(skin: &Skin, scenario: &Scenario, mode: Sensing) -> (Bench, Micros) {
     let mut bench = Bench::with(skin, scenario, 7, |_| Micros(0));
     bench.settle();
-    bench.act(Act::Say(switch(mode)));
+    bench.act(Act::SendFromGateway(switch(mode)));
     bench.run(Span::from_millis(100));
     let since = bench.now();
     bench.begin();
-    bench.run(LOOK);
+    bench.run(OBSERVATION_TIME);
     (bench, since)
 }
 
@@ -146,7 +146,7 @@ fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
                         !due
                     });
                     let next = touch.next(contact_force(now), events.contact.to_bits(), events.hysteresis);
-                    if next != *touch && it.at + period < since + LOOK {
+                    if next != *touch && it.at + period < since + OBSERVATION_TIME {
                         let within = |&&(at, said): &&(Micros, SkinSensors)| {
                             at >= it.at && at < it.at + period && said == *now
                         };
@@ -167,9 +167,9 @@ fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
 #[test]
 fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
     let skin = skins::ur5_253();
-    let idle = Scenario::idle(LOOK);
+    let idle = Scenario::idle(OBSERVATION_TIME);
     let [moving, hard] = [1.0, 15.0].map(|harder| moving(&skin, harder));
-    let seconds = LOOK.0 as f64 / 1e6;
+    let seconds = OBSERVATION_TIME.0 as f64 / 1e6;
     let count = |scenario, mode| {
         let (bench, since) = looked_at(&skin, scenario, mode);
         let frames = sensors_frames(&bench, since).len();
@@ -219,7 +219,7 @@ fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
 #[test]
 fn cells_of_a_continuous_bus_do_not_send_at_once() {
     let skin = skins::ur5_253();
-    let (bench, since) = looked_at(&skin, &Scenario::idle(LOOK), AT_62_5_HZ);
+    let (bench, since) = looked_at(&skin, &Scenario::idle(OBSERVATION_TIME), AT_62_5_HZ);
     let frames = sensors_frames(&bench, since);
     let skins = frames.iter().filter(|(_, _, page)| matches!(page, SensorPage::Skin(_)));
     let mut busiest = BTreeMap::<u64, usize>::new();
@@ -268,9 +268,9 @@ fn one_cell_is_switched_alone_and_all_at_once_while_the_bench_runs() {
 #[test]
 fn a_heartbeat_makes_up_for_a_lost_event() {
     let mut bench = Bench::new(&skins::arm(4, Format::Fd), 5).started();
-    bench.act(Act::Say(switch(Sensing::Event)));
+    bench.act(Act::SendFromGateway(switch(Sensing::Event)));
     bench.run(Span::from_millis(300));
-    bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Sensors));
+    bench.fault(Fault::new(Harm::Lose, 1.0).at_receiver(Party::Gateway).of_kind(Kind::Sensors));
     bench.press(1, 3.0);
     bench.run_epochs(2);
     let touches = |bench: &Bench| bench.gateway.table.cells()[1].sensed.touches;
@@ -286,7 +286,7 @@ fn a_heartbeat_makes_up_for_a_lost_event() {
 fn sensors_frames_do_not_change_the_expected_torques() {
     let course = |mode| {
         let mut bench = Bench::new(&skins::arm(4, Format::Fd), 11).started();
-        bench.act(Act::Say(switch(mode)));
+        bench.act(Act::SendFromGateway(switch(mode)));
         for epoch in 0..40 {
             bench.press(epoch % 4, 0.3 * (epoch % 7) as f64);
             bench.run_epochs(1);

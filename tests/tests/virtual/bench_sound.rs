@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use model::scenario::Scenario;
-use model::table::{Event, Replies, Status, Uplink};
+use model::table::{CellStatus, Event, Replies, Uplink};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::AppliesFrom;
@@ -54,7 +54,7 @@ fn without_faults_every_reply_that_is_due_comes_in_time_and_is_right() {
         let statuses: Vec<_> = bench.gateway.table.statuses(bench.now()).map(|(_, status)| status).collect();
         for (place, status) in statuses.into_iter().enumerate() {
             let pressed = [0, 3, 5, 11].contains(&place);
-            assert_eq!(status, if pressed { Status::Active } else { Status::Quiet }, "{place}");
+            assert_eq!(status, if pressed { CellStatus::Active } else { CellStatus::Quiet }, "{place}");
         }
         assert_eq!(bench.gateway.table.snapshot().sums.contributing, 4);
         bench.finish();
@@ -152,7 +152,7 @@ fn cells_answer_in_a_few_microseconds_of_virtual_time() {
     (0..4).for_each(|place| bench.press(place, 1.0));
     bench.run_epochs(50);
     bench.finish();
-    let last = bench.gateway.table.delays().of_last_replies();
+    let last = bench.gateway.table.delays().last_replies();
     assert!(last.len() > 49 && last.max() < 500, "{} {}", last.len(), last.max());
     assert_eq!(bench.epoch(), Span(16_000));
 }

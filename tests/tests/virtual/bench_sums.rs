@@ -31,7 +31,7 @@ fn tree(carry: bool) -> SumTree {
 
 /// Runs one epoch, whose sum contains every touched cell.
 fn turn(tree: &mut SumTree, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochResult {
-    let came = tree.turn(q, touch);
+    let came = tree.run_epoch(q, touch);
     assert_eq!(came.count, touch.len());
     came
 }

@@ -33,7 +33,7 @@ fn the_torque_of_a_cell_follows_the_points_of_a_profile() {
     bench.run_epochs(130);
 
     let central = Central::new(&skin);
-    let frames = central.frames_at(&scenario.motion.start);
+    let frames = central.frames_at_positions(&scenario.motion.start);
     let torques = bench.torques(5);
     let mut pressed = 0;
     for (epoch, words) in &torques {

@@ -324,7 +324,7 @@ impl HostLink {
                 let at_nanos = if received.at_nanos == 0 { wall() } else { received.at_nanos };
                 self.outgoing.push(Stamped { at_nanos, frame: received.frame });
             }
-            self.outgoing.miss(self.missed_before + u64::from(inbox.dropped()));
+            self.outgoing.set_missed(self.missed_before + u64::from(inbox.dropped()));
             if count == 0 {
                 break;
             }

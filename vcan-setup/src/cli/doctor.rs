@@ -38,7 +38,7 @@ pub(crate) struct Doctor {
 
 impl Doctor {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let mut buses = named(&self.what, BusFacts::of_skin, BusFacts::named)?;
+        let mut buses = named(&self.what, BusFacts::from_skin, BusFacts::named)?;
         let present = match (query(), self.bus_kind) {
             (Ok((_, present)), _) => present,
             // Only SocketCAN needs an interface.

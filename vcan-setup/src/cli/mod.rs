@@ -96,7 +96,7 @@ enum BusArgument {
     Name(String),
 }
 
-fn word(word: &OsStr) -> Result<BusArgument, Failure> {
+fn parse_argument(word: &OsStr) -> Result<BusArgument, Failure> {
     let bytes = word.as_encoded_bytes();
     if bytes.ends_with(b".toml") || bytes.contains(&b'/') {
         let skin = Skin::read(Path::new(word)).map_err(Failure::usage)?;
@@ -116,7 +116,7 @@ fn named<T>(
 ) -> Result<Vec<T>, Failure> {
     let mut all = Vec::new();
     for given in words {
-        match word(given)? {
+        match parse_argument(given)? {
             BusArgument::File(skin) => all.extend(of_skin(given, &skin)),
             BusArgument::Name(name) => all.push(named(&name)),
         }
@@ -126,7 +126,7 @@ fn named<T>(
 
 /// Returns the interfaces that positional arguments name, directly or by a skin.
 fn targets(words: &[OsString]) -> Result<Vec<InterfaceTarget>, Failure> {
-    named(words, InterfaceTarget::of_skin, InterfaceTarget::named)
+    named(words, InterfaceTarget::from_skin, InterfaceTarget::named)
 }
 
 /// Returns the CAN interfaces of this machine, and the netlink socket that listed them.

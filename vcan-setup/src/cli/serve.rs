@@ -13,7 +13,7 @@ use vcan_setup::embedded::{BusTotals, Server};
 use super::bus_name;
 
 /// The niceness of the server: the highest priority.
-const URGENT: i32 = -20;
+const HIGHEST_PRIORITY: i32 = -20;
 
 /// Serve an embedded bus, for machines whose kernel has no SocketCAN, until SIGINT or SIGTERM
 ///
@@ -67,9 +67,9 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     }
     // The kernel delivers frames at once, but a server process may wait behind hundreds of cells for processor time. If
     // this process may not raise its priority, the bus is only slower.
-    let _ = rustix::process::setpriority_process(None, URGENT);
+    let _ = rustix::process::setpriority_process(None, HIGHEST_PRIORITY);
     protocol::bus::set_batch_scheduling();
-    allow_files();
+    raise_file_limit();
     let server = Server::bind(name)?;
     writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
         .and_then(|()| std::io::stdout().flush())
@@ -99,7 +99,7 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
 }
 
 /// Raises the limit of open files to the maximum that the system allows, because each client needs one.
-fn allow_files() {
+fn raise_file_limit() {
     let Rlimit { maximum, .. } = getrlimit(Resource::Nofile);
     // With a lower limit the server accepts fewer clients.
     let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });

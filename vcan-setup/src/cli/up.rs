@@ -15,7 +15,7 @@ use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::{self, OtherNamespace, Plan, Step, StepAction, TargetPair};
 
-use super::{BusArgument, query, targets, unreadable, word};
+use super::{BusArgument, parse_argument, query, targets, unreadable};
 
 /// Make virtual CAN interfaces, and bring them up
 ///
@@ -72,25 +72,25 @@ impl Up {
         }
         let target = targets(&self.what)?;
         for name in target.iter().map(|target| &target.name) {
-            plain(name)?;
+            check_plain_name(name)?;
         }
         let (mut netlink, present) = query()?;
         let plan = plan::up(&target, &present, self.set_bit_rates)?;
-        Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
+        PlanRunner { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
     }
 
     fn pair(&self, peer: &str) -> Result<(), Failure> {
         let [given] = self.what.as_slice() else {
             return Err(Failure::usage("--peer makes one pair: give one NAME with it"));
         };
-        let BusArgument::Name(name) = word(given)? else {
+        let BusArgument::Name(name) = parse_argument(given)? else {
             return Err(Failure::usage(format!(
                 "--peer goes with the NAME of an interface, and {} is a skin",
                 shell_quoted_os(given)
             )));
         };
-        plain(&name)?;
-        plain(peer)?;
+        check_plain_name(&name)?;
+        check_plain_name(peer)?;
         let (mut netlink, present) = query()?;
         let mut other = self.namespace.as_deref().map(enter).transpose()?.flatten();
         let there = match &mut other {
@@ -103,7 +103,7 @@ impl Up {
         };
         let plan = plan::up_pair(&TargetPair { name: &name, peer, there: there.as_ref() }, &present)?;
         let there = other.as_mut().map(|(_, file, inside)| (&*file, inside));
-        Worker { netlink: &mut netlink, there }.finish(&plan, self.dry_run)
+        PlanRunner { netlink: &mut netlink, there }.finish(&plan, self.dry_run)
     }
 }
 
@@ -112,12 +112,12 @@ impl Down {
         let target = targets(&self.what)?;
         let (mut netlink, present) = query()?;
         let plan = plan::down(&target, &present)?;
-        Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
+        PlanRunner { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
     }
 }
 
 /// Checks that a name is allowed by the kernel, and needs no quotes in a shell.
-fn plain(name: &str) -> Result<(), Failure> {
+fn check_plain_name(name: &str) -> Result<(), Failure> {
     super::bus_name(name).map_err(Failure::usage)?;
     if !is_plain_name(name) || name.starts_with(['-', '.']) {
         return Err(Failure::usage(format!(
@@ -129,7 +129,7 @@ fn plain(name: &str) -> Result<(), Failure> {
 
 /// Opens the network namespace that an argument names. Returns `None` if that is the current one.
 fn enter(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
-    let namespace = Namespace::named(word);
+    let namespace = Namespace::parse(word);
     let not_allowed = || not_allowed(&format!("look into the network namespace {namespace}"));
     let denied = |error: &NamespaceError| matches!(error, NamespaceError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied);
     let file = namespace
@@ -171,12 +171,12 @@ fn not_allowed(what: &str) -> Failure {
 }
 
 /// Executes the steps of a plan, or prints them.
-struct Worker<'a> {
+struct PlanRunner<'a> {
     netlink: &'a mut Netlink,
     there: Option<(&'a File, &'a mut Netlink)>,
 }
 
-impl Worker<'_> {
+impl PlanRunner<'_> {
     /// Prints which interfaces stay unchanged, and executes the plan. With `dry_run`, prints its steps instead.
     fn finish(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
         let mut text = String::new();
@@ -196,13 +196,14 @@ impl Worker<'_> {
         let mut undo = Vec::new();
         for step in &plan.steps {
             let there = self.there.as_mut().map(|(file, inside)| (*file, &mut **inside));
-            match self.netlink.carry_out(step, there) {
+            match self.netlink.execute(step, there) {
                 Ok(done) => undo.extend(done),
                 Err(error) => {
                     let mut failure = explain(step, &error);
                     for done in undo.iter().rev() {
                         if let Err(error) = self.netlink.undo(done) {
-                            failure = failure.and(format_args!("taking back what was done fails: {error}"));
+                            failure =
+                                failure.append(format_args!("taking back what was done fails: {error}"));
                         }
                     }
                     return Err(failure);

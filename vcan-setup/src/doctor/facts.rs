@@ -76,13 +76,13 @@ pub struct BusFacts {
 impl BusFacts {
     /// Returns the buses of a skin.
     #[must_use]
-    pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
+    pub fn from_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
         let of = |(index, target): (usize, InterfaceTarget)| Self {
             cells: Some(skin.cells_on_bus(index).map(|cell| cell.node).collect()),
             sums: skin.buses.get(index).is_some_and(|bus| bus.reply != SkinReply::Torque),
             ..Self::new(target)
         };
-        InterfaceTarget::of_skin(file, skin).into_iter().enumerate().map(of).collect()
+        InterfaceTarget::from_skin(file, skin).into_iter().enumerate().map(of).collect()
     }
 
     /// Returns a bus that was named without a skin.

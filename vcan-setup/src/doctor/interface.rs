@@ -6,7 +6,7 @@ use protocol::can::Format;
 use super::{BusFacts, Facts, Finding, User, would_run};
 use crate::kernel::ModuleState;
 use crate::link::{ControllerState, FD_MTU, Hardware, Interface, InterfaceKind};
-use crate::plan::widen;
+use crate::plan::set_fd_mtu_command;
 
 impl Facts {
     /// Reports whether interfaces that are missing can be created on this machine.
@@ -18,7 +18,7 @@ impl Facts {
         }
         let hints = self.kernel.hints(self.kernel.vcan);
         findings.extend(match self.kernel.vcan {
-            ModuleState::There => None,
+            ModuleState::Available => None,
             ModuleState::Unknown => {
                 let text = "cannot see whether the kernel has vcan; if it has none:";
                 Some(Finding::note(text).hints(hints))
@@ -66,7 +66,7 @@ impl Facts {
         if self.choice != KindChoice::Auto || !self.kernel.has_can {
             return None;
         }
-        let (name, up) = (&bus.target.name, self.up(&bus.target));
+        let (name, up) = (&bus.target.name, self.up_command(&bus.target));
         let is_served = !matches!(bus.traffic, Ok(None));
         Some(match (self.no_spawn, is_served) {
             (false, _) => Finding::note(format!(
@@ -90,7 +90,7 @@ impl Facts {
                 findings.extend(self.traffic(bus, "the embedded bus"));
                 return findings;
             }
-            let (text, up) = (format!("there is no interface {name}"), self.up(&bus.target));
+            let (text, up) = (format!("there is no interface {name}"), self.up_command(&bus.target));
             return vec![if bus.target.hardware().is_some() {
                 Finding::fault(text + ", and the skin gives it a bitrate, so it is hardware")
                     .hint("# plug it in and load its driver; `vcan-setup status` shows when it is there")
@@ -108,7 +108,7 @@ impl Facts {
             InterfaceKind::Hardware(hardware) => self.hardware_faults(bus, interface, hardware),
         };
         if would_run(&findings) {
-            let what = interface.what();
+            let what = interface.description();
             let text = format!("{name} is {what}, up, and carries {}", carries(interface.mtu));
             findings.insert(0, Finding::ok(text));
             if interface.is_virtual() && bus.target.hardware().is_some() {
@@ -128,11 +128,11 @@ impl Facts {
         let Interface { name, mtu, ours, up, .. } = interface;
         let repair = |command: String| {
             let command = if self.user.admin { command } else { format!("sudo sh -c '{command}'") };
-            if *ours { self.up(&bus.target) } else { command }
+            if *ours { self.up_command(&bus.target) } else { command }
         };
         if !bus.target.carried_by(*mtu) {
             let text = format!("{name} has MTU {mtu} and CAN FD needs {FD_MTU}");
-            return vec![Finding::fault(text).hint(repair(widen("ip", name)))];
+            return vec![Finding::fault(text).hint(repair(set_fd_mtu_command("ip", name)))];
         }
         if !up {
             let hint = repair(format!("ip link set {name} up"));
@@ -143,7 +143,7 @@ impl Facts {
 
     fn hardware_faults(&self, bus: &BusFacts, interface: &Interface, hardware: &Hardware) -> Vec<Finding> {
         let Interface { name, mtu, up, .. } = interface;
-        let what = interface.what();
+        let what = interface.description();
         let skin = bus.target.skin.as_ref();
         // The command that sets the bit rates can be given only if the skin has them.
         let set = || match bus.target.hardware() {
@@ -160,7 +160,7 @@ impl Facts {
         };
         let mut findings = Vec::new();
         let has = hardware.rates();
-        if let Some(skin) = skin.filter(|skin| !has.meet(skin.rates)) {
+        if let Some(skin) = skin.filter(|skin| !has.matches(skin.rates)) {
             let text = format!("{name} is {what} at {has}, and the skin says {}", skin.rates);
             findings.push(Finding::fault(text).hint(set()));
         } else if !bus.target.carried_by(*mtu) {

@@ -38,9 +38,9 @@ fn good() -> Facts {
             machine: "x86_64".into(),
             distribution: "debian".into(),
             has_can: true,
-            can_raw: ModuleState::There,
-            vcan: ModuleState::There,
-            vxcan: ModuleState::There,
+            can_raw: ModuleState::Available,
+            vcan: ModuleState::Available,
+            vxcan: ModuleState::Available,
         },
         user: User { root: false, admin: false },
         receive_buffer: Some(2 << 20),
@@ -200,14 +200,14 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     let anybody = User { root: false, admin: false };
     let admin = User { root: true, admin: true };
     assert_eq!(
-        missing(anybody, ModuleState::There),
+        missing(anybody, ModuleState::Available),
         [
             "note: this user may not make interfaces, hence the sudo below",
             "fault: there is no interface vcan0 | sudo vcan-setup up skin.toml",
         ]
     );
     assert_eq!(
-        missing(admin, ModuleState::There),
+        missing(admin, ModuleState::Available),
         ["fault: there is no interface vcan0 | vcan-setup up skin.toml"]
     );
     let loadable =
@@ -220,7 +220,7 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     assert!(
         missing(admin, ModuleState::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan")
     );
-    let contained = missing(User { root: true, admin: false }, ModuleState::There);
+    let contained = missing(User { root: true, admin: false }, ModuleState::Available);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
     let named = about(|facts| {
         facts.choice = KindChoice::Only(BusKind::SocketCan);

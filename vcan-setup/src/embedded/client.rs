@@ -15,7 +15,7 @@ use super::queue::{ClientQueue, QueueEntry};
 use super::routing::ClientId;
 
 /// The maximum number of frames in a client's queue, beyond those in its socket buffer.
-const QUEUE: usize = 256;
+const QUEUE_FRAMES: usize = 256;
 
 /// The objects that are needed to send to any client.
 #[derive(Debug)]
@@ -62,7 +62,7 @@ pub(super) struct Client {
 
 impl Client {
     pub(super) fn new(id: ClientId, socket: OwnedFd) -> Self {
-        let queue = ClientQueue::new(QUEUE);
+        let queue = ClientQueue::new(QUEUE_FRAMES);
         Self {
             id,
             process: peer_process(&socket),
@@ -130,7 +130,7 @@ impl Client {
     /// Drops the frames in the queue, and counts them as abandoned.
     pub(super) fn abandon(&mut self, post: &mut SendContext) {
         post.totals.abandoned += self.queue.frames() as u64;
-        self.queue = ClientQueue::new(QUEUE);
+        self.queue = ClientQueue::new(QUEUE_FRAMES);
     }
 
     /// Sends the queue until it is empty or the socket is full.
@@ -155,7 +155,7 @@ impl Client {
                 };
             }
             match post.outgoing.send(&self.socket) {
-                Ok(count) => post.totals.delivered += self.queue.sent(count) as u64,
+                Ok(count) => post.totals.delivered += self.queue.remove_sent(count) as u64,
                 // The socket is not treated as full, because `epoll` would report room in it at once, again and again.
                 Err(error) if is_memory_shortage(&error) => return SendOutcome::Shortage,
                 Err(error) => match Errno::from_io_error(&error) {

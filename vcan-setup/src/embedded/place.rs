@@ -119,7 +119,7 @@ impl Drop for BusSocket {
 }
 
 /// The maximum number of attempts to lock the directory while other processes remove it.
-const MOST_ABSENT: u32 = 1_000;
+const MAX_ATTEMPTS: u32 = 1_000;
 
 /// Creates the directory if it does not exist, and locks it.
 fn lock(path: &Path) -> Result<OwnedFd, BusSocketError> {
@@ -133,7 +133,7 @@ fn lock(path: &Path) -> Result<OwnedFd, BusSocketError> {
             // limit is needed for a missing parent folder, and for file systems in which no directory can be created,
             // such as /proc.
             Err(error)
-                if error.is_absent() && absent < MOST_ABSENT && path.parent().is_some_and(Path::exists) =>
+                if error.is_absent() && absent < MAX_ATTEMPTS && path.parent().is_some_and(Path::exists) =>
             {
                 absent += 1;
                 continue;

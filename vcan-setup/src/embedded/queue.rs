@@ -58,7 +58,7 @@ impl ClientQueue {
     }
 
     /// Removes the oldest `count` items after they were sent. Returns the number of frames among them.
-    pub fn sent(&mut self, count: usize) -> usize {
+    pub fn remove_sent(&mut self, count: usize) -> usize {
         let sent = self.entries.drain(..count.min(self.entries.len()));
         let frames = sent.filter(|entry| matches!(entry, QueueEntry::Frame(_))).count();
         self.frames -= frames;
@@ -93,7 +93,7 @@ mod tests {
         let mut queue = ClientQueue::new(2);
         let kept: Vec<_> = (0..5).map(|id| queue.push(parcel(id))).collect();
         assert_eq!(kept, [true, true, false, false, false]);
-        assert_eq!(queue.sent(2), 2);
+        assert_eq!(queue.remove_sent(2), 2);
         assert!(queue.push(parcel(5)));
         assert_eq!(
             queue.iter().copied().collect::<Vec<_>>(),
@@ -110,7 +110,7 @@ mod tests {
         queue.report_dropped();
         queue.report_dropped();
         assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [QueueEntry::Dropped(1)]);
-        assert_eq!(queue.sent(1), 0);
+        assert_eq!(queue.remove_sent(1), 0);
     }
 
     proptest! {
@@ -128,7 +128,7 @@ mod tests {
                     }
                     None => {}
                 }
-                queue.sent(1);
+                queue.remove_sent(1);
                 (heard, missing)
             };
             for push in steps {

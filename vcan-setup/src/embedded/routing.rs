@@ -17,7 +17,7 @@ pub struct ClientId(pub usize);
 
 /// The class of a filter. It determines the list in which the filter is stored.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Class {
+enum FilterClass {
     /// A filter for error frames of the classes in this mask.
     Errors(u32),
     /// A filter that is compared with every frame. With `true`, frames that match it pass; with `false`, frames that do
@@ -27,7 +27,7 @@ enum Class {
     Exact(u32),
 }
 
-impl Class {
+impl FilterClass {
     /// Returns the class of a filter. Follows the kernel's `can_rcv_list_find`.
     fn from_filter(filter: Filter) -> Self {
         let Filter { id, mut mask } = filter;
@@ -68,9 +68,9 @@ struct Subscription {
 }
 
 impl Subscription {
-    fn classes(&self) -> impl Iterator<Item = Class> + use<'_> {
-        let errors = (self.error_mask != 0).then_some(Class::Errors(self.error_mask & EXTENDED_MASK));
-        self.filters.iter().copied().map(Class::from_filter).chain(errors)
+    fn classes(&self) -> impl Iterator<Item = FilterClass> + use<'_> {
+        let errors = (self.error_mask != 0).then_some(FilterClass::Errors(self.error_mask & EXTENDED_MASK));
+        self.filters.iter().copied().map(FilterClass::from_filter).chain(errors)
     }
 }
 
@@ -81,7 +81,7 @@ pub struct Router {
     /// The clients that have a filter for exactly one identifier, by the identifier.
     exact: HashMap<u32, Vec<ClientId>>,
     /// The filters that must be compared with every frame, each with its client.
-    walked: Vec<(Class, ClientId)>,
+    masked: Vec<(FilterClass, ClientId)>,
     frames: u64,
 }
 
@@ -120,8 +120,8 @@ impl Router {
     fn list(&mut self, client: ClientId, wants: &Subscription) {
         for class in wants.classes() {
             match class {
-                Class::Exact(id) => self.exact.entry(id).or_default().push(client),
-                Class::Errors(_) | Class::Masked(..) => self.walked.push((class, client)),
+                FilterClass::Exact(id) => self.exact.entry(id).or_default().push(client),
+                FilterClass::Errors(_) | FilterClass::Masked(..) => self.masked.push((class, client)),
             }
         }
     }
@@ -138,7 +138,7 @@ impl Router {
     fn unlist(&mut self, client: ClientId, wants: &Subscription) {
         for class in wants.classes() {
             match class {
-                Class::Exact(id) => {
+                FilterClass::Exact(id) => {
                     if let Entry::Occupied(mut list) = self.exact.entry(id) {
                         list.get_mut().retain(|&other| other != client);
                         if list.get().is_empty() {
@@ -146,7 +146,9 @@ impl Router {
                         }
                     }
                 }
-                Class::Errors(_) | Class::Masked(..) => self.walked.retain(|&(_, other)| other != client),
+                FilterClass::Errors(_) | FilterClass::Masked(..) => {
+                    self.masked.retain(|&(_, other)| other != client)
+                }
             }
         }
     }
@@ -171,7 +173,7 @@ impl Router {
                 deliver(client, own);
             }
         };
-        let walked = self.walked.iter().filter(|(class, _)| class.passes(id));
+        let walked = self.masked.iter().filter(|(class, _)| class.passes(id));
         walked.for_each(|&(_, client)| offer(client));
         let standard = id & (EXTENDED | REMOTE | ERROR) == 0;
         let exact = self.exact.get(&if standard { id & STANDARD_MASK } else { id });
@@ -237,7 +239,7 @@ mod tests {
             });
             router.insert(ClientId(client as usize), &hello(&filters));
         }
-        assert!(router.walked.is_empty());
+        assert!(router.masked.is_empty());
         assert_eq!(receivers(&mut router, 300, 0x001, Format::Fd).len(), 254);
         assert_eq!(receivers(&mut router, 300, 0x407, Format::Fd), [(7, false)]);
         assert_eq!(receivers(&mut router, 300, 0x8000_0007, Format::Fd), [(7, false)]);

@@ -211,7 +211,7 @@ impl Server {
                 let data = EventData::new_u64(LISTENER);
                 let resumed = epoll::modify(&post.epoll, &place.listener, data, EventFlags::IN).is_ok();
                 if self.parting.is_some() || self.spare.is_none() {
-                    self.part();
+                    self.close_parting();
                 }
                 if !resumed {
                     self.pause(LISTENER);
@@ -230,7 +230,7 @@ impl Server {
 
     fn end(&mut self) -> BusTotals {
         for index in 0..self.clients.len() {
-            self.forget(ClientId(index));
+            self.remove_client(ClientId(index));
         }
         self.post.totals
     }
@@ -270,7 +270,7 @@ impl Server {
                     return;
                 }
                 Err(error) => {
-                    return self.fails(id, Errno::from_io_error(&error).unwrap_or(Errno::IO));
+                    return self.handle_failure(id, Errno::from_io_error(&error).unwrap_or(Errno::IO));
                 }
             }
             let mut failure = None;
@@ -279,7 +279,7 @@ impl Server {
                 // Empty datagrams are received from a closed socket, without end.
                 if bytes.is_some_and(<[u8]>::is_empty) {
                     match self.is_hung_up(id) {
-                        Ok(true) => return self.forget(id),
+                        Ok(true) => return self.remove_client(id),
                         Ok(false) => {}
                         Err(errno) => failure = Some(errno),
                     }
@@ -291,7 +291,7 @@ impl Server {
                 }
             }
             if let Some(errno) = failure {
-                return self.fails(id, errno);
+                return self.handle_failure(id, errno);
             }
             if batch.datagrams().len() < BATCH {
                 return;
@@ -325,18 +325,18 @@ impl Server {
     }
 
     /// Stops polling a client whose reception failed. Disconnects it after [`FAILURES`] consecutive failures.
-    fn fails(&mut self, id: ClientId, errno: Errno) {
+    fn handle_failure(&mut self, id: ClientId, errno: Errno) {
         let Some(client) = self.client(id) else { return };
         client.failures += 1;
         if client.failures < MAX_FAILURES {
             return self.pause(id.0 as u64);
         }
-        self.give_up(id, errno);
-        self.forget(id);
+        self.count_failed(id, errno);
+        self.remove_client(id);
     }
 
     /// Disconnects a client whose socket failed, and counts it.
-    fn give_up(&mut self, id: ClientId, errno: Errno) {
+    fn count_failed(&mut self, id: ClientId, errno: Errno) {
         if self.client(id).is_some() {
             self.post.totals.failed += 1;
             self.post.totals.failure = Some(errno);
@@ -368,7 +368,7 @@ impl Server {
             SendOutcome::Shortage => self.pause(id.0 as u64),
             SendOutcome::Gone => self.release(id),
             SendOutcome::Failed(errno) => {
-                self.give_up(id, errno);
+                self.count_failed(id, errno);
                 self.release(id);
             }
         }
@@ -380,7 +380,7 @@ impl Server {
         if let Some(client) = self.client(id) {
             let _ = shutdown(&client.socket, Shutdown::Write);
         }
-        self.silence(id);
+        self.unsubscribe(id);
     }
 
     fn unblock(&mut self, id: ClientId) {
@@ -392,7 +392,7 @@ impl Server {
     }
 
     /// Stops sending to a client that does not read. Frames from the client are still received.
-    fn silence(&mut self, id: ClientId) {
+    fn unsubscribe(&mut self, id: ClientId) {
         self.router.remove(id);
         let Self { clients, post, .. } = self;
         if let Some(client) = clients.get_mut(id.0).and_then(Option::as_mut) {
@@ -400,8 +400,8 @@ impl Server {
         }
     }
 
-    fn forget(&mut self, id: ClientId) {
-        self.silence(id);
+    fn remove_client(&mut self, id: ClientId) {
+        self.unsubscribe(id);
         self.paused.retain(|token| *token != id.0 as u64);
         let client = self.clients.get_mut(id.0).and_then(Option::take);
         if let Some(sibling) = client.and_then(|client| client.sibling).and_then(|id| self.client(id)) {

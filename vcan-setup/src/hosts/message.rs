@@ -23,7 +23,7 @@ pub const MAX_FRAMES: usize = 256;
 /// The length of the header in bytes.
 const HEADER_BYTES: usize = 42;
 /// The length of a frame before its data, in bytes.
-const FRAME_HEAD: usize = 16;
+const FRAME_HEADER_BYTES: usize = 16;
 
 /// A frame with the time at which it was on the bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -137,7 +137,7 @@ fn read(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<MessageHeader, Messag
         return Err(MessageError::Numbers { first, dropped });
     }
     for index in 0..count {
-        let (fixed, tail) = rest.split_first_chunk::<FRAME_HEAD>().ok_or(wrong)?;
+        let (fixed, tail) = rest.split_first_chunk::<FRAME_HEADER_BYTES>().ok_or(wrong)?;
         let &[a, b, c, d, e, f, g, h, i, j, k, l, is_fd, flags, dlc, len] = fixed;
         let at_nanos = u64::from_le_bytes([a, b, c, d, e, f, g, h]);
         let id = u32::from_le_bytes([i, j, k, l]);

@@ -20,7 +20,7 @@ use super::outgoing::BusAccount;
 /// The maximum length of a report as a line, in bytes. A report of 256 hosts is shorter.
 const MAX_LINE_BYTES: usize = 1 << 20;
 /// The maximum length of an abstract address, in bytes.
-const NAME: usize = 107;
+const MAX_ADDRESS_BYTES: usize = 107;
 
 /// The state of a link: the other hosts, and counts of frames.
 #[derive(Clone, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
@@ -60,8 +60,8 @@ fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<Soc
         directory.map_or_else(default_directory, Path::to_owned)
     };
     let mut name = format!("skinbus-link {bus} {}", place.display()).into_bytes();
-    if name.len() > NAME {
-        name.drain(..name.len() - NAME);
+    if name.len() > MAX_ADDRESS_BYTES {
+        name.drain(..name.len() - MAX_ADDRESS_BYTES);
     }
     SocketAddr::from_abstract_name(name)
 }

@@ -14,17 +14,17 @@ use protocol::can::Frame;
 /// The time after a frame has passed in which an equal frame counts as returned, in ns.
 pub const RETURN_WINDOW_NS: u64 = 100_000_000;
 /// The time after a frame has returned for which a circle is assumed, in ns.
-const CIRCLE_NS: u64 = 1_000_000_000;
+const CIRCLE_TIMEOUT_NS: u64 = 1_000_000_000;
 /// The maximum number of frames that are stored for comparison in each direction.
-const REMEMBERED: usize = 16_384;
+const MAX_REMEMBERED: usize = 16_384;
 
 /// The frames that passed the link recently, by direction.
 #[derive(Debug, Default)]
 pub struct CircleDetector {
     hasher: RandomState,
-    put: Recent,
+    put: RecentFrames,
     /// Frames that were received from the bus. They are stored only while a circle is assumed.
-    taken: Recent,
+    taken: RecentFrames,
     /// The time at which a frame that this link had put on the bus last returned.
     noticed: Option<u64>,
     count: u64,
@@ -70,7 +70,7 @@ impl CircleDetector {
     }
 
     fn is_circle(&self, now: u64) -> bool {
-        self.noticed.is_some_and(|at| now.saturating_sub(at) <= CIRCLE_NS)
+        self.noticed.is_some_and(|at| now.saturating_sub(at) <= CIRCLE_TIMEOUT_NS)
     }
 
     fn hash(&self, frame: &Frame) -> u64 {
@@ -80,17 +80,17 @@ impl CircleDetector {
 
 /// Hashes of the frames that passed in the last 100 ms.
 #[derive(Debug, Default)]
-struct Recent {
+struct RecentFrames {
     /// The time and the hash of each frame, oldest first.
     order: VecDeque<(u64, u64)>,
     /// The number of occurrences of each hash.
     times: HashMap<u64, u32>,
 }
 
-impl Recent {
+impl RecentFrames {
     fn insert(&mut self, now: u64, hash: u64) {
         self.forget(now);
-        if self.order.len() >= REMEMBERED {
+        if self.order.len() >= MAX_REMEMBERED {
             self.forget_one();
         }
         self.order.push_back((now, hash));
@@ -153,12 +153,12 @@ mod tests {
     #[test]
     fn no_more_is_remembered_than_may() {
         let mut returned = CircleDetector::default();
-        for number in 0..2 * REMEMBERED as u64 {
+        for number in 0..2 * MAX_REMEMBERED as u64 {
             returned.put(0, &frame(0x201, &(number / 3).to_le_bytes()));
         }
-        assert_eq!(returned.put.order.len(), REMEMBERED);
+        assert_eq!(returned.put.order.len(), MAX_REMEMBERED);
         let sum: u32 = returned.put.times.values().sum();
-        assert_eq!(sum as usize, REMEMBERED);
+        assert_eq!(sum as usize, MAX_REMEMBERED);
     }
 
     /// A bridge copies frames from the second bus to the first. Frames of the first bus go around the circle unnoticed,

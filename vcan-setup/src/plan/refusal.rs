@@ -3,7 +3,7 @@
 use protocol::usage::Failure;
 use thiserror::Error;
 
-use super::widen;
+use super::set_fd_mtu_command;
 use crate::link::{FD_MTU, HardwareRates, Interface};
 
 /// The reason why a plan is refused. Its text is one line that contains a command to fix the cause.
@@ -31,7 +31,7 @@ pub enum Refusal {
     /// The interface has too small an MTU, and another program has made it.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup has not made it and leaves it alone: `sudo sh -c '{}'` fixes it",
-        widen("ip", name)
+        set_fd_mtu_command("ip", name)
     )]
     Narrow {
         /// The name of the interface.
@@ -159,8 +159,8 @@ pub enum Refusal {
 
 impl Refusal {
     /// Returns the refusal to make or remove an interface that is not virtual.
-    pub(super) fn real(interface: &Interface) -> Self {
-        let (name, what) = (interface.name.clone(), interface.what());
+    pub(super) fn not_virtual(interface: &Interface) -> Self {
+        let (name, what) = (interface.name.clone(), interface.description());
         if interface.is_can() { Self::Hardware { name, what } } else { Self::NotCan { name, what } }
     }
 

@@ -104,7 +104,7 @@ impl Step {
             }
             StepAction::MakePair { peer, namespace } => {
                 let (netns, ip) = match namespace {
-                    Some(namespace) => (format!(" netns {namespace}"), namespace.ip()),
+                    Some(namespace) => (format!(" netns {namespace}"), namespace.ip_command()),
                     None => (String::new(), "ip".to_owned()),
                 };
                 format!(
@@ -113,7 +113,7 @@ impl Step {
                 )
             }
             StepAction::BringUp { .. } => format!("ip link set {name} up"),
-            StepAction::Widen { .. } => widen("ip", name),
+            StepAction::Widen { .. } => set_fd_mtu_command("ip", name),
             StepAction::SetRates { rates: HardwareRates { bitrate, data_bitrate }, was_up, .. } => {
                 let down = if *was_up { format!("ip link set {name} down && ") } else { String::new() };
                 let bitrate = bitrate.unwrap_or(0);
@@ -129,7 +129,7 @@ impl Step {
 }
 
 /// Returns the command that gives an interface MTU 72. The command begins with `ip`, which may select a namespace.
-pub(crate) fn widen(ip: &str, name: &str) -> String {
+pub(crate) fn set_fd_mtu_command(ip: &str, name: &str) -> String {
     format!("{ip} link set {name} down && {ip} link set {name} mtu {FD_MTU} up")
 }
 

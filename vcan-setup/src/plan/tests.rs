@@ -3,7 +3,7 @@ use crate::link::{CLASSIC_MTU, Counters};
 
 mod world;
 
-use world::{THERE, World};
+use world::{SimulatedKernel, THERE};
 
 fn interface(name: &str, index: u32, kind: InterfaceKind) -> Interface {
     let mtu = if matches!(kind, InterfaceKind::Other(_)) { 1_500 } else { FD_MTU };
@@ -38,7 +38,7 @@ fn refused(target: &InterfaceTarget, present: &[Interface]) -> String {
 #[test]
 fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
     let target = ["vcan0", "vcan1"].map(InterfaceTarget::named);
-    let world = World::of(vec![interface("vcan0", 2, InterfaceKind::Vcan)]);
+    let world = SimulatedKernel::of(vec![interface("vcan0", 2, InterfaceKind::Vcan)]);
     let plan = up(&target, &world.here, false).unwrap();
     assert_eq!(plan.steps, [Step { name: "vcan1".into(), action: StepAction::MakeVcan }]);
     assert_eq!(plan.unchanged, ["vcan0 is there already, and fits (a vcan, made by another program)"]);
@@ -200,7 +200,7 @@ fn two_skins_that_give_a_bus_two_bit_rates_are_refused() {
 fn a_clock_may_miss_a_bit_rate_by_half_a_percent() {
     let met = |has, target| {
         let rates = |bitrate| HardwareRates { bitrate, data_bitrate: None };
-        rates(has).meet(rates(target))
+        rates(has).matches(rates(target))
     };
     assert!(met(Some(10_000), Some(10_001)) && met(Some(83_333), Some(83_000)));
     assert!(met(Some(995_000), Some(1_000_000)) && !met(Some(994_999), Some(1_000_000)));
@@ -220,8 +220,8 @@ fn a_bus_with_a_bit_rate_is_never_made_of_software() {
 
 #[test]
 fn a_pair_is_made_once_and_told_from_other_pairs() {
-    let mut world = World::of(vec![ours("vcan0", 2)]);
-    let named = |there: &World, id| OtherNamespace {
+    let mut world = SimulatedKernel::of(vec![ours("vcan0", 2)]);
+    let named = |there: &SimulatedKernel, id| OtherNamespace {
         name: Namespace::Name("blue".into()),
         id,
         present: there.there.clone(),

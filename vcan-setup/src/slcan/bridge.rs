@@ -16,7 +16,7 @@ use super::participant::{Participant, Ready};
 use super::settings::{BridgeSettings, open};
 
 /// The time that the program takes at its end to complete a line of text and to close the adapters.
-const CLOSING: Duration = Duration::from_millis(500);
+const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
 /// The interval between two attempts to open a line at the start.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
@@ -125,7 +125,7 @@ impl Bridge {
     }
 
     fn close(mut self, report: &mut impl FnMut(&str, LineEvent)) -> Result<Vec<LineAccount>, BridgeError> {
-        let until = Instant::now() + CLOSING;
+        let until = Instant::now() + CLOSE_TIMEOUT;
         self.participants.iter_mut().for_each(Participant::end);
         loop {
             // `count` visits all participants; `any` would stop at the first that is not finished.

@@ -38,14 +38,14 @@ impl AsFd for Port {
 
 /// Opens a line, and opens it again whenever it was lost.
 #[derive(Debug)]
-pub(super) struct Opener {
+pub(super) struct PortOpener {
     options: LineOptions,
     /// The addresses of the host of a TCP line. They are resolved once, because that may take long.
     hosts: Vec<SocketAddr>,
     next: usize,
 }
 
-impl Opener {
+impl PortOpener {
     pub(super) fn new(options: LineOptions) -> io::Result<Self> {
         let hosts = match &options.address {
             Address::Tcp { host, port } => (host.as_str(), *port).to_socket_addrs()?.collect(),

@@ -110,7 +110,7 @@ pub enum OpeningStage {
 }
 
 /// A description of the bit rates that slcan supports, for an error.
-const RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k, 125k, 250k, 500k, 750k or 800k, and 1M; \
+const ALLOWED_RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k, 125k, 250k, 500k, 750k or 800k, and 1M; \
                      for data 500k and whole Mbit/s up to 8M";
 
 /// A description of the allowed values of [`LineOptions::settle`], for an error.
@@ -156,7 +156,7 @@ impl LineOptions {
         if SlcanCommand::nominal_bit_rate(rates.nominal()).is_none()
             || (data != rates.nominal() && SlcanCommand::data_bit_rate(data).is_none())
         {
-            return Err(RATES.to_owned());
+            return Err(ALLOWED_RATES.to_owned());
         }
         self.bit_rates = Some(rates);
         Ok(())

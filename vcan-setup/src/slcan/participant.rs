@@ -9,7 +9,7 @@ use rustix::event::PollFlags;
 use super::account::{Faults, LineAccount, faults_since};
 use super::event::LineEvent;
 use super::incoming::Incoming;
-use super::link::{Opener, Port};
+use super::link::{Port, PortOpener};
 use super::options::{LineOptions, OpeningStage};
 use super::outgoing::{Outgoing, closing};
 use super::refusals::{RefusalAction, Refusals};
@@ -20,7 +20,7 @@ const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
 /// The interval between two attempts to send to a bus whose queue is full.
 const SEND_RETRY_INTERVAL: Duration = Duration::from_millis(1);
 /// The minimum interval between two reports of lost frames on a line.
-const REPORT: Duration = Duration::from_secs(1);
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 /// The maximum number of batches read from a bus or a line before the next line is served.
 const MAX_BATCHES: usize = 4;
 
@@ -54,7 +54,7 @@ enum ClientState {
 /// A serial line, its client of the bus, and the queues between them.
 #[derive(Debug)]
 pub(super) struct Participant {
-    opener: Opener,
+    opener: PortOpener,
     line: LineState,
     client: ClientState,
     inbox: Inbox,
@@ -81,7 +81,7 @@ impl Participant {
         incoming.up(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
         let now = Instant::now();
         Ok(Self {
-            opener: Opener::new(options)?,
+            opener: PortOpener::new(options)?,
             line: LineState::Away(now),
             client: ClientState::Open(Box::new(bus)),
             inbox: Inbox::new(),
@@ -190,7 +190,7 @@ impl Participant {
         let is_due = self.report_at <= now && self.has_more_to_report();
         if is_due || self.has_new_fault() {
             self.report(report);
-            self.report_at = now + REPORT;
+            self.report_at = now + REPORT_INTERVAL;
         }
     }
 
@@ -276,7 +276,7 @@ impl Participant {
     }
 
     /// Handles lines that the adapter refused.
-    fn heed_refusals(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
+    fn handle_refusals(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         let (bells, replies) = (self.incoming.account().bells, self.incoming.replies());
         match self.refusals.evaluate(now - self.began, self.outgoing.stage(), bells, replies) {
             RefusalAction::Nothing => {}
@@ -324,7 +324,7 @@ impl Participant {
                 Ok(count) => self.incoming.receive(buffer.get(..count).unwrap_or_default()),
                 Err(error) => return self.line_lost(error, now, report),
             }
-            self.heed_refusals(now, report);
+            self.handle_refusals(now, report);
             self.write_bus(now, report);
         }
     }

@@ -8,7 +8,7 @@ use super::options::OpeningStage;
 /// The minimum time between two reopenings of an adapter. Each takes the adapter off its bus for a moment.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// The maximum time between two reopenings if they have no effect.
-const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+const MAX_PAUSE: Duration = Duration::from_secs(30);
 /// The number of consecutive refusals after which an adapter that accepted lines before is reopened. Fewer are ignored,
 /// because the queue of the adapter may be full for a moment.
 const REFUSAL_THRESHOLD: u64 = 8;
@@ -74,7 +74,7 @@ impl Refusals {
             }
             OpeningStage::Open => {
                 self.next = now + self.pause;
-                self.pause = LONGEST_PAUSE.min(2 * self.pause);
+                self.pause = MAX_PAUSE.min(2 * self.pause);
                 self.reopened += 1;
                 RefusalAction::Reopen(more)
             }

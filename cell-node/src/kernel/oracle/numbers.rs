@@ -63,21 +63,21 @@ impl Number for f64 {
         [angle.to_radians().sin(), angle.to_radians().cos(), 1.0]
     }
 
-    fn settle<const F: u32>(constant: Self) -> Self {
+    fn round_constant<const F: u32>(constant: Self) -> Self {
         constant
     }
 }
 
 std::thread_local! {
-    static DONE: Cell<Operations> = Cell::default();
+    static OPERATIONS: Cell<Operations> = Cell::default();
 }
 
 impl Operations {
     /// Runs a computation on [`Counted`] numbers and returns its operation count.
     pub fn count<T>(computation: impl FnOnce() -> T) -> (T, Self) {
-        DONE.set(Self::default());
+        OPERATIONS.set(Self::default());
         let result = computation();
-        (result, DONE.take())
+        (result, OPERATIONS.take())
     }
 }
 
@@ -95,8 +95,8 @@ impl Word for Counted {
     }
 
     fn note(operation: impl FnOnce(&mut Operations)) {
-        let mut done = DONE.get();
+        let mut done = OPERATIONS.get();
         operation(&mut done);
-        DONE.set(done);
+        OPERATIONS.set(done);
     }
 }

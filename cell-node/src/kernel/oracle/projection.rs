@@ -23,9 +23,9 @@ mod sums;
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
-use self::axes::{Axis, Frame, Height, Level, Mix, Rotation, ToBase, Vector, negate};
+use self::axes::{Axis, AxisFrame, Height, Level, Rotation, RotationProducts, ToBase, Vector, negate};
 use self::range::is_bounded;
-use self::sums::Sums;
+use self::sums::VectorSums;
 use crate::kernel::joint::Joint;
 use crate::kernel::rounding::{Bounded, Saturating};
 use crate::kernel::{Kernel, Number, Scalar, Twist, chain, cold_path};
@@ -46,7 +46,7 @@ pub struct Projection<S: Scalar = Q1_14> {
     /// True if no number can leave the range of a word. Saturation is then omitted.
     bounded: bool,
     /// The links from the first row up to the cell. Only the first `rows` are in use.
-    links: [Link<S::Number>; MAX_ROWS],
+    links: [ChainLink<S::Number>; MAX_ROWS],
     rows: usize,
 }
 
@@ -54,13 +54,13 @@ pub struct Projection<S: Scalar = Q1_14> {
 // In this order, the fields that are read first are in reach of a short instruction of a Cortex-M0.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Link<N> {
+struct ChainLink<N> {
     /// The values to compute for this row: bits of [`due`].
     due: u32,
     /// The joint of the row; without meaning for a fixed row.
     joint: Joint,
     /// The products needed to rotate x and y by the turn, and the other two axes by the twist.
-    mixes: [Mix; 2],
+    mixes: [RotationProducts; 2],
     /// The components of z_(l-1) that are known for all joint positions.
     axis: Axis,
     kind: RowKind,
@@ -78,7 +78,7 @@ mod due {
     /// Axis x_l, which requires a sine.
     pub(super) const X: u32 = 1;
     /// All three axes, because the row ends a group of parallel axes.
-    pub(super) const ENDS: u32 = 2;
+    pub(super) const ENDS_GROUP: u32 = 2;
     /// Axis z_(l-1), stored for the joints of this group of parallel axes.
     pub(super) const Z: u32 = 4;
     /// The shift by the length a, for which x_l is stored.
@@ -86,7 +86,7 @@ mod due {
     /// The shift by the offset d.
     pub(super) const D: u32 = 16;
     /// The row has a revolute joint.
-    pub(super) const TURNS: u32 = 32;
+    pub(super) const IS_REVOLUTE: u32 = 32;
     /// The row continues a group of parallel axes. Its turn starts from the axes before the group.
     pub(super) const CONTINUES: u32 = 64;
 }
@@ -97,19 +97,19 @@ type KeptAxes<N> = heapless::Vec<Vector<N>, { 2 * MAX_ROWS }>;
 impl<S: Scalar> Kernel<S> for Projection<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = chain(parameters);
-        let (mut frame, mut goes_on) = (Frame::BASE, false);
+        let (mut frame, mut goes_on) = (AxisFrame::BASE, false);
         let mut joints = Joint::ALL.into_iter();
-        let mut links = [Link::new(&Row::default(), Joint::J1, frame, false); MAX_ROWS];
+        let mut links = [ChainLink::new(&Row::default(), Joint::J1, frame, false); MAX_ROWS];
         for (index, (link, row)) in links.iter_mut().zip(chain).enumerate() {
-            let joint = if row.moves() { joints.next() } else { None }.unwrap_or(Joint::J1);
-            *link = Link::new(row, joint, frame, index + 1 == chain.len());
+            let joint = if row.has_joint() { joints.next() } else { None }.unwrap_or(Joint::J1);
+            *link = ChainLink::new(row, joint, frame, index + 1 == chain.len());
             if goes_on {
                 link.due |= due::CONTINUES;
             }
             if index == 0 && row.kind != RowKind::Prismatic {
                 (link.due, link.d) = (link.due & !due::D, Q1_14::ZERO);
             }
-            goes_on = !link.is_due(due::ENDS);
+            goes_on = !link.is_due(due::ENDS_GROUP);
             if !goes_on {
                 (frame, _) = frame.after(link.twist);
             }
@@ -147,7 +147,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
 impl<S: Scalar> Projection<S> {
     /// Returns the rows from the base to the cell.
     #[inline(always)]
-    fn links(&self) -> &[Link<S::Number>] {
+    fn links(&self) -> &[ChainLink<S::Number>] {
         self.links.get(..self.rows).unwrap_or_default()
     }
 
@@ -168,7 +168,7 @@ impl<S: Scalar> Projection<S> {
             let turn = Rotation(S::Number::sine_cosine(group));
             let [mix, _] = link.mixes;
             // The capacity is two vectors per row.
-            if !link.is_due(due::ENDS) {
+            if !link.is_due(due::ENDS_GROUP) {
                 let _ = kept.push(turn.ahead(mix, x, y));
                 continue;
             }
@@ -187,7 +187,7 @@ impl<S: Scalar> Projection<S> {
     /// Computes J, from the cell down to the base. `slides` are the joint positions, or `None` if the chain has no
     /// prismatic joints.
     #[inline(always)]
-    fn down<R: Sums>(
+    fn down<R: VectorSums>(
         &self,
         axes: [&Vector<S::Number>; 3],
         kept: &KeptAxes<S::Number>,
@@ -233,7 +233,7 @@ impl<S: Scalar> Projection<S> {
 
     /// Transforms the force and the cell's position to the base frame.
     #[inline(always)]
-    fn in_base<R: Sums>(&self, [x, y, z]: [&Vector<S::Number>; 3]) -> [Vector<S::Number>; 2] {
+    fn in_base<R: VectorSums>(&self, [x, y, z]: [&Vector<S::Number>; 3]) -> [Vector<S::Number>; 2] {
         let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (*x, *y, *z);
         let vectors = [self.force, self.position];
         let two = |a: S::Number, x, b: S::Number, y| R::round(R::plus::<S::Number>(a.times(x), b.times(y)));
@@ -261,9 +261,9 @@ impl<S: Scalar> Projection<S> {
     }
 }
 
-impl<N: Number> Link<N> {
+impl<N: Number> ChainLink<N> {
     /// Creates the computation for a row above `frame`. `last` is true for the row that carries the cell.
-    fn new(row: &Row, joint: Joint, frame: Frame, last: bool) -> Self {
+    fn new(row: &Row, joint: Joint, frame: AxisFrame, last: bool) -> Self {
         let ends = last || row.alpha != Q1_14::ZERO;
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
         let twist = Twist::new(row.alpha);
@@ -271,11 +271,11 @@ impl<N: Number> Link<N> {
         let (_, twisting) = frame.after(twist);
         let due = [
             (ends || a, due::X),
-            (ends, due::ENDS),
+            (ends, due::ENDS_GROUP),
             (ends && !axis.is_upright(), due::Z),
             (a, due::A),
             (d, due::D),
-            (row.kind == RowKind::Revolute, due::TURNS),
+            (row.kind == RowKind::Revolute, due::IS_REVOLUTE),
         ];
         Self {
             due: due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all }),
@@ -299,7 +299,7 @@ impl<N: Number> Link<N> {
     #[inline(always)]
     fn angle(&self, group: Q1_14, joints: &[Q1_14; MAX_JOINTS]) -> Q1_14 {
         let mut angle = self.offset;
-        if self.is_due(due::TURNS)
+        if self.is_due(due::IS_REVOLUTE)
             && let Some(position) = self.joint.get(joints)
         {
             angle = N::plus_angle(*position, angle);
@@ -334,7 +334,7 @@ impl<N: Number> Link<N> {
 
     /// Computes p_(l-1) from p_l (Eq. 24), and J of a revolute joint: (z x p) . f (Eq. 8).
     #[inline(always)]
-    fn step_down<'a, R: Sums>(
+    fn step_down<'a, R: VectorSums>(
         &self,
         p: &mut Vector<N>,
         &[f0, f1, f2]: &Vector<N>,
@@ -356,7 +356,7 @@ impl<N: Number> Link<N> {
                     *p0 = R::more(*p0, a.times(x0));
                     *p1 = R::more(*p1, a.times(x1));
                 }
-                if !self.is_due(due::TURNS) {
+                if !self.is_due(due::IS_REVOLUTE) {
                     return None;
                 }
                 if self.axis == Axis::Up {
@@ -375,7 +375,7 @@ impl<N: Number> Link<N> {
                     *p0 = R::more(*p0, d.times(z0));
                     *p1 = R::more(*p1, d.times(z1));
                 }
-                if !self.is_due(due::TURNS) {
+                if !self.is_due(due::IS_REVOLUTE) {
                     return None;
                 }
                 let [m0, m1] = [R::round(p2.times(z1)), R::round(R::negative(*p2).times(z0))];
@@ -393,7 +393,7 @@ impl<N: Number> Link<N> {
                     *p1 = R::more(*p1, d.times(z1));
                     *p2 = R::more(*p2, d.times(z2));
                 }
-                if !self.is_due(due::TURNS) {
+                if !self.is_due(due::IS_REVOLUTE) {
                     return None;
                 }
                 let m0 = R::difference(p2.times(z1), p1.times(z2));
@@ -406,7 +406,7 @@ impl<N: Number> Link<N> {
     }
 
     /// Returns z . f, for a prismatic joint.
-    fn along<R: Sums>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
+    fn along<R: VectorSums>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
         match self.axis {
             Axis::Up => f2,
             Axis::Down => R::negative(f2),
@@ -418,7 +418,7 @@ impl<N: Number> Link<N> {
 
 /// Adds the products with the length a and the offset d to a component of the position.
 #[inline(always)]
-fn shift<R: Sums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N) {
+fn shift<R: VectorSums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N) {
     *position = match d {
         None => R::more(*position, by_a),
         Some(d) => R::more_and_more(*position, by_a, d.times(z)),
@@ -427,6 +427,11 @@ fn shift<R: Sums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N
 
 /// Rotates y and z by a twist that is not a multiple of quarter turns.
 #[inline(never)]
-fn twist_by<N: Number>(turn: Rotation<N>, [_, mix]: [Mix; 2], y: &mut Vector<N>, z: &mut Vector<N>) {
+fn twist_by<N: Number>(
+    turn: Rotation<N>,
+    [_, mix]: [RotationProducts; 2],
+    y: &mut Vector<N>,
+    z: &mut Vector<N>,
+) {
     turn.both(mix, y, z);
 }

@@ -15,7 +15,7 @@ pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> PerComponent<N> {
         (N::fine(row.a), N::fine(row.d)),
     );
     // 14 fraction bits of a word and 28 of the twist; for the moment 14 more of a length.
-    PerComponent { force: force.map(N::settle::<42>), moment: moment.map(N::settle::<56>) }
+    PerComponent { force: force.map(N::round_constant::<42>), moment: moment.map(N::round_constant::<56>) }
 }
 
 /// Returns the same wrench before rounding. With words of 16 bits, no intermediate number exceeds 2^61.

@@ -19,7 +19,7 @@ const MIN_COMMON_EPOCHS: usize = 8;
 
 /// The joints of a capture, each as a hash.
 #[derive(Debug)]
-pub struct Trace {
+pub struct JointTrace {
     bus: Option<String>,
     numbering: Numbering,
     first: Option<Epoch>,
@@ -27,7 +27,7 @@ pub struct Trace {
     joints: Vec<Option<u32>>,
 }
 
-impl Trace {
+impl JointTrace {
     /// Creates an empty trace, which records the joints of the skin's first bus with cells.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
@@ -53,34 +53,36 @@ impl Trace {
             return;
         }
         let last = self.numbering.newest();
-        let Some(key) = self.numbering.take(nanos, *epoch, last).filter(|key| key.run == 0) else { return };
+        let Some(key) = self.numbering.number_joints(nanos, *epoch, last).filter(|key| key.run == 0) else {
+            return;
+        };
         self.first.get_or_insert(*epoch);
         let Some(at) = usize::try_from(key.number).ok().filter(|at| *at < MAX_JOINTS_KEPT) else { return };
         if at >= self.joints.len() {
             self.joints.resize(at + 1, None);
         }
         if let Some(place) = self.joints.get_mut(at) {
-            *place = Some(number_of(joints));
+            *place = Some(joints_hash(joints));
         }
     }
 }
 
 /// Returns the FNV-1a hash of the joint words.
-fn number_of(joints: &Joints) -> u32 {
+fn joints_hash(joints: &Joints) -> u32 {
     let words = joints.positions.iter().flat_map(|word| word.to_bits().to_le_bytes());
     words.fold(0x811C_9DC5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
 }
 
 /// Returns for each of two captures of one skin the number of its first joints since the run began; `None` if unknown.
 #[must_use]
-pub fn starts(a: &Trace, b: &Trace) -> Both<Option<u64>> {
+pub fn start_numbers(a: &JointTrace, b: &JointTrace) -> Both<Option<u64>> {
     let (Some(first_a), Some(first_b)) = (a.first, b.first) else { return Both { a: None, b: None } };
     let of = |first: Epoch, laps: usize| u64::from(first.0) + 256 * laps as u64;
-    let mut best = (share(a, b, of(first_a, 0), of(first_b, 0)).unwrap_or(0.0), 0, 0);
+    let mut best = (equal_share(a, b, of(first_a, 0), of(first_b, 0)).unwrap_or(0.0), 0, 0);
     let most = a.joints.len().max(b.joints.len()) / 256 + 1;
     for laps in 1..=most {
         for (laps_a, laps_b) in [(0, laps), (laps, 0)] {
-            let share = share(a, b, of(first_a, laps_a), of(first_b, laps_b)).unwrap_or(0.0);
+            let share = equal_share(a, b, of(first_a, laps_a), of(first_b, laps_b)).unwrap_or(0.0);
             if share > best.0 && share >= 0.5 {
                 best = (share, laps_a, laps_b);
             }
@@ -91,7 +93,7 @@ pub fn starts(a: &Trace, b: &Trace) -> Both<Option<u64>> {
 
 /// Returns the share of joints that are equal if the captures begin with the numbers `start_a` and `start_b`; `None` if
 /// they then have too few epochs in common.
-fn share(a: &Trace, b: &Trace, start_a: u64, start_b: u64) -> Option<f64> {
+fn equal_share(a: &JointTrace, b: &JointTrace, start_a: u64, start_b: u64) -> Option<f64> {
     let begin = start_a.max(start_b);
     let [skip_a, skip_b] =
         [start_a, start_b].map(|start| usize::try_from(begin - start).unwrap_or(usize::MAX));

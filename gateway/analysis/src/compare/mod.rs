@@ -7,7 +7,7 @@
 //! ```
 //!
 //! A `Key` is the number of a joints packet since the run began. The captures are read in lockstep, always the one that
-//! is behind ([`Comparison::next`]), so that memory does not grow with their length: about 100 joints per bus are held.
+//! is behind ([`Comparison::next_side`]), so that memory does not grow with their length: about 100 joints per bus are held.
 
 mod align;
 mod numbering;
@@ -21,15 +21,15 @@ use protocol::message::Message;
 use protocol::skin::Skin;
 use serde::Serialize;
 
-use self::numbering::Key;
+use self::numbering::JointsKey;
 use self::pair::{FirstDifferences, FoundDifference, Tally, compare};
-use self::side::{Moment, Side};
+use self::side::{AnsweredJoints, Side};
 use crate::explain::NotFound;
 
-pub use self::align::{Trace, starts};
+pub use self::align::{JointTrace, start_numbers};
 pub use self::report::{
-    ASPECTS, CellRow, Contacts, Epochs, ExtraCell, FirstDifference, Joints, Losses, Replies, Report, Source,
-    UnpairedCounts,
+    ASPECTS, CaptureFigures, CellRow, CompareReport, ContactCounts, EpochCounts, ExtraCell, FirstDifference,
+    JointCounts, Losses, ReplyCounts, UnpairedCounts,
 };
 
 /// One of the two captures that are compared.
@@ -67,7 +67,7 @@ impl<T> Both<T> {
     }
 
     /// Returns the mutable value of one capture.
-    pub const fn of_mut(&mut self, which: CaptureSide) -> &mut T {
+    pub const fn get_mut(&mut self, which: CaptureSide) -> &mut T {
         match which {
             CaptureSide::A => &mut self.a,
             CaptureSide::B => &mut self.b,
@@ -77,7 +77,7 @@ impl<T> Both<T> {
 
 /// The tolerances of a comparison, above which two captures count as different.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Options {
+pub struct CompareOptions {
     /// Tolerance for words of torques (in 1/4096 Nm) and sums (in 1/256 Nm).
     pub tolerance: u32,
     /// Tolerance for words of joints, in steps of 2^-14 quarter turns, or m for prismatic joints.
@@ -90,13 +90,13 @@ pub struct Options {
 #[derive(Debug)]
 pub struct Comparison<'a> {
     skin: &'a Skin,
-    options: Options,
+    options: CompareOptions,
     sides: Both<Side<'a>>,
     tallies: Vec<Tally>,
-    epochs: Epochs,
+    epochs: EpochCounts,
     /// The first difference that counts in any case, and the first missing item, each with its joints and bus.
-    first: Option<(Key, usize, FirstDifference)>,
-    first_missing: Option<(Key, usize, FirstDifference)>,
+    first: Option<(JointsKey, usize, FirstDifference)>,
+    first_missing: Option<(JointsKey, usize, FirstDifference)>,
 }
 
 /// Returns the period of epochs, in ns.
@@ -108,7 +108,7 @@ impl<'a> Comparison<'a> {
     /// Creates a comparison of two captures that have not been read yet. The first joints of each capture get the
     /// number in `starts`, or else the number of their epoch.
     #[must_use]
-    pub fn new(skin: &'a Skin, options: Options, starts: Both<Option<u64>>) -> Self {
+    pub fn new(skin: &'a Skin, options: CompareOptions, starts: Both<Option<u64>>) -> Self {
         let period = period_ns(skin);
         let side = |start| Side::new(skin, period, start);
         Self {
@@ -116,7 +116,7 @@ impl<'a> Comparison<'a> {
             options,
             sides: Both { a: side(starts.a), b: side(starts.b) },
             tallies: skin.buses.iter().map(|_| Tally::default()).collect(),
-            epochs: Epochs::default(),
+            epochs: EpochCounts::default(),
             first: None,
             first_missing: None,
         }
@@ -125,7 +125,7 @@ impl<'a> Comparison<'a> {
     /// Returns the capture whose next frame must be read: the one that is behind in the run. Returns `None` when both
     /// have ended.
     #[must_use]
-    pub fn next(&self) -> Option<CaptureSide> {
+    pub fn next_side(&self) -> Option<CaptureSide> {
         let Both { a, b } = &self.sides;
         match (a.is_ended, b.is_ended) {
             (true, true) => None,
@@ -136,39 +136,39 @@ impl<'a> Comparison<'a> {
     }
 
     /// Handles a packet from before the start of a capture, which still has an effect: a recording begins with these.
-    pub fn begin(&mut self, which: CaptureSide, nanos: u64, bus: &str, message: &Message) {
-        self.sides.of_mut(which).begin(nanos, bus, message);
+    pub fn receive_latched(&mut self, which: CaptureSide, nanos: u64, bus: &str, message: &Message) {
+        self.sides.get_mut(which).receive_latched(nanos, bus, message);
     }
 
     /// Handles the next frame of a capture; `message` is the decoded message, if the frame completes one.
     pub fn receive(&mut self, which: CaptureSide, nanos: u64, bus: &str, message: Option<&Message>) {
-        if self.sides.of_mut(which).take(nanos, bus, message) {
-            self.pair();
+        if self.sides.get_mut(which).receive(nanos, bus, message) {
+            self.compare_complete();
         }
     }
 
     /// Counts frames that the recorder of a capture lost.
-    pub fn dropped(&mut self, which: CaptureSide, frames: u64) {
-        let dropped = &mut self.sides.of_mut(which).counts.dropped;
+    pub fn record_dropped(&mut self, which: CaptureSide, frames: u64) {
+        let dropped = &mut self.sides.get_mut(which).counts.dropped;
         *dropped = dropped.saturating_add(frames);
     }
 
     /// Declares that the time stamps of a capture are meaningless.
     pub fn without_times(&mut self, which: CaptureSide) {
-        self.sides.of_mut(which).has_times = false;
+        self.sides.get_mut(which).has_times = false;
     }
 
     /// Declares the end of a capture; `is_unfinished` if it was cut off.
     pub fn end(&mut self, which: CaptureSide, is_unfinished: bool) {
-        let side = self.sides.of_mut(which);
+        let side = self.sides.get_mut(which);
         side.counts.unfinished = is_unfinished;
         side.end();
-        self.pair();
+        self.compare_complete();
     }
 
     /// Returns the reason why a capture that has been read to its end has no joints of the skin; `None` if it has some.
     pub fn not_found(&mut self, which: CaptureSide) -> Option<NotFound> {
-        self.sides.of_mut(which).not_found()
+        self.sides.get_mut(which).not_found()
     }
 
     /// Returns two numbers of cells: those that reported a configuration, and those of them that have the skin's.
@@ -187,7 +187,7 @@ impl<'a> Comparison<'a> {
     }
 
     /// Compares the next joints of all buses, as long as their answers are complete in both captures.
-    fn pair(&mut self) {
+    fn compare_complete(&mut self) {
         for bus in 0..self.skin.buses.len() {
             while self.pair_on(bus).is_some() {}
         }
@@ -199,9 +199,9 @@ impl<'a> Comparison<'a> {
         let both = (front(&self.sides.a), front(&self.sides.b));
         let which = match both {
             (Some(a), Some(b)) if a == b => {
-                let mut take = |which| self.sides.of_mut(which).buses.get_mut(bus)?.ready.pop_front();
+                let mut take = |which| self.sides.get_mut(which).buses.get_mut(bus)?.ready.pop_front();
                 let (a, b) = (take(CaptureSide::A)?, take(CaptureSide::B)?);
-                self.same(bus, &a, &b);
+                self.compare_moments(bus, &a, &b);
                 return Some(());
             }
             (Some(a), Some(b)) => {
@@ -215,20 +215,20 @@ impl<'a> Comparison<'a> {
             (None, Some(b)) if self.sides.a.is_past(bus, b) => CaptureSide::B,
             _ => return None,
         };
-        let moment = self.sides.of_mut(which).buses.get_mut(bus)?.ready.pop_front()?;
-        self.alone(bus, which, &moment);
+        let moment = self.sides.get_mut(which).buses.get_mut(bus)?.ready.pop_front()?;
+        self.count_unpaired(bus, which, &moment);
         Some(())
     }
 
-    fn same(&mut self, bus: usize, a: &Moment, b: &Moment) {
+    fn compare_moments(&mut self, bus: usize, a: &AnsweredJoints, b: &AnsweredJoints) {
         self.epochs.compared += 1;
         let Some(tally) = self.tallies.get_mut(bus) else { return };
         let found = compare(tally, (self.skin, bus), Both { a, b }, &self.options);
-        self.note(bus, Both { a: Some(a), b: Some(b) }, found);
+        self.keep_first(bus, Both { a: Some(a), b: Some(b) }, found);
     }
 
     /// Counts joints that only one capture has.
-    fn alone(&mut self, bus: usize, which: CaptureSide, moment: &Moment) {
+    fn count_unpaired(&mut self, bus: usize, which: CaptureSide, moment: &AnsweredJoints) {
         let other = self.sides.get(which.other());
         let is_a = which == CaptureSide::A;
         match (other.first, other.newest()) {
@@ -245,16 +245,16 @@ impl<'a> Comparison<'a> {
                     CaptureSide::A => Both { a: Some(moment), b: None },
                     CaptureSide::B => Both { a: None, b: Some(moment) },
                 };
-                self.note(bus, moments, FoundDifference::missing_epoch(!is_a));
+                self.keep_first(bus, moments, FoundDifference::missing_epoch(!is_a));
             }
         }
     }
 
     /// Keeps the first differences of these joints if they are the earliest so far; buses are not compared in order of
     /// time.
-    fn note(&mut self, bus: usize, moments: Both<Option<&Moment>>, firsts: FirstDifferences) {
+    fn keep_first(&mut self, bus: usize, moments: Both<Option<&AnsweredJoints>>, firsts: FirstDifferences) {
         let Some(key) = moments.a.or(moments.b).map(|moment| moment.key) else { return };
-        let is_first = |kept: &Option<(Key, usize, FirstDifference)>| {
+        let is_first = |kept: &Option<(JointsKey, usize, FirstDifference)>| {
             kept.as_ref().is_none_or(|(first, on, _)| (*first, *on) > (key, bus))
         };
         if let Some(found) = firsts.other.filter(|_| is_first(&self.first)) {
@@ -268,7 +268,7 @@ impl<'a> Comparison<'a> {
     fn describe(
         &self,
         bus: usize,
-        moments: &Both<Option<&Moment>>,
+        moments: &Both<Option<&AnsweredJoints>>,
         mut found: FoundDifference,
     ) -> Option<FirstDifference> {
         if let Some(cell) = found.cell()

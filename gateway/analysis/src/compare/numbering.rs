@@ -8,7 +8,7 @@ use protocol::packet::Epoch;
 
 /// The position of a joints packet in a capture: a run of epochs, and a number in that run.
 #[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
-pub(super) struct Key {
+pub(super) struct JointsKey {
     /// Number of earlier restarts of the numbering.
     pub(super) run: u32,
     /// The number of the joints since the start of the run.
@@ -32,7 +32,7 @@ pub(super) struct Numbering {
 
 #[derive(Clone, Copy, Debug)]
 struct Newest {
-    key: Key,
+    key: JointsKey,
     epoch: Epoch,
     nanos: u64,
 }
@@ -45,15 +45,20 @@ impl Numbering {
     }
 
     /// Returns the key of the newest joints.
-    pub(super) fn newest(&self) -> Option<Key> {
+    pub(super) fn newest(&self) -> Option<JointsKey> {
         self.newest.map(|newest| newest.key)
     }
 
     /// Returns the key of joints that arrive after those with the key `last` on their bus; `None` if they are repeated
     /// or out of order.
-    pub(super) fn take(&mut self, nanos: u64, epoch: Epoch, last: Option<Key>) -> Option<Key> {
+    pub(super) fn number_joints(
+        &mut self,
+        nanos: u64,
+        epoch: Epoch,
+        last: Option<JointsKey>,
+    ) -> Option<JointsKey> {
         let Some(newest) = self.newest else {
-            let key = Key { run: 0, number: self.start.unwrap_or_else(|| epoch.0.into()) };
+            let key = JointsKey { run: 0, number: self.start.unwrap_or_else(|| epoch.0.into()) };
             self.newest = Some(Newest { key, epoch, nanos });
             return Some(key);
         };
@@ -62,12 +67,12 @@ impl Numbering {
         let back = u64::from(newest.epoch.0.wrapping_sub(epoch.0));
         if back <= MAX_BUS_LAG && elapsed <= MAX_BUS_LAG {
             let number = newest.key.number.checked_sub(back)?;
-            let key = Key { number, ..newest.key };
+            let key = JointsKey { number, ..newest.key };
             return last.is_none_or(|last| last < key).then_some(key);
         }
         let key = match self.steps(newest, epoch, elapsed) {
-            Some(steps) => Key { number: newest.key.number + steps, ..newest.key },
-            None => Key { run: newest.key.run + 1, number: epoch.0.into() },
+            Some(steps) => JointsKey { number: newest.key.number + steps, ..newest.key },
+            None => JointsKey { run: newest.key.run + 1, number: epoch.0.into() },
         };
         self.newest = Some(Newest { key, epoch, nanos });
         last.is_none_or(|last| last < key).then_some(key)
@@ -99,16 +104,16 @@ mod tests {
 
     const PERIOD: u64 = 16_000_000;
 
-    fn key(number: u64) -> Option<Key> {
-        Some(Key { run: 0, number })
+    fn key(number: u64) -> Option<JointsKey> {
+        Some(JointsKey { run: 0, number })
     }
 
     /// Numbers the joints of one bus, each given as its number in the test and its time in periods.
-    fn numbers(joints: &[(u64, u64)]) -> Vec<Option<Key>> {
+    fn numbers(joints: &[(u64, u64)]) -> Vec<Option<JointsKey>> {
         let (mut numbering, mut last) = (Numbering::new(PERIOD, None), None);
         let each = joints.iter().map(|&(number, period)| {
             let epoch = Epoch(u8::try_from(number % 256).unwrap());
-            let key = numbering.take(1_000 + period * PERIOD, epoch, last);
+            let key = numbering.number_joints(1_000 + period * PERIOD, epoch, last);
             last = key.or(last);
             key
         });
@@ -133,7 +138,7 @@ mod tests {
         assert_eq!(numbers(&[(7, 0), (8, 400)])[1], key(8), "the next ones after 6.4 s");
         assert_eq!(numbers(&[(7, 0), (8, 100)])[1], key(8));
         assert_eq!(numbers(&[(7, 0), (20, 90)])[1], key(20), "late by 77 periods");
-        let restarted = Some(Key { run: 1, number: 0 });
+        let restarted = Some(JointsKey { run: 1, number: 0 });
         assert_eq!(numbers(&[(200, 0), (256, 150)])[1], restarted);
         assert_eq!(numbers(&[(100, 0), (256, 30)])[1], restarted);
     }
@@ -141,7 +146,7 @@ mod tests {
     #[test]
     fn buses_share_the_count_and_repeated_joints_are_none() {
         let mut numbering = Numbering::new(PERIOD, Some(1_000));
-        let mut take = |nanos, epoch, last| numbering.take(nanos, Epoch(epoch), last);
+        let mut take = |nanos, epoch, last| numbering.number_joints(nanos, Epoch(epoch), last);
         let (first, next) = (key(1_000), key(1_001));
         assert_eq!(take(5, 232, None), first);
         assert_eq!(take(6, 232, None), first, "on another bus");
@@ -159,11 +164,11 @@ mod tests {
             late in prop::collection::vec(0_u64..PERIOD * 2, 60),
         ) {
             let (mut numbering, mut number) = (Numbering::new(PERIOD, None), first);
-            let mut last = numbering.take(0, Epoch(u8::try_from(first).unwrap()), None);
+            let mut last = numbering.number_joints(0, Epoch(u8::try_from(first).unwrap()), None);
             for (gap, late) in gaps.iter().zip(&late) {
                 number += gap;
                 let nanos = (number - first) * PERIOD + late;
-                last = numbering.take(nanos, Epoch(u8::try_from(number % 256).unwrap()), last);
+                last = numbering.number_joints(nanos, Epoch(u8::try_from(number % 256).unwrap()), last);
                 prop_assert_eq!(last, key(number));
             }
         }

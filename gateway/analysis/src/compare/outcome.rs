@@ -3,17 +3,17 @@
 use model::quantiles::Quantiles;
 use protocol::id::CellId;
 
-use super::numbering::Key;
-use super::report::{CellRow, ExtraCell, Losses, Replies, Report, Source};
+use super::numbering::JointsKey;
+use super::report::{CaptureFigures, CellRow, CompareReport, ExtraCell, Losses, ReplyCounts};
 use super::side::{ComparedCell, Side};
 use super::{ASPECTS, Both, CaptureSide, Comparison};
 
 impl Comparison<'_> {
     /// Returns the report; call it after both captures have ended.
     #[must_use]
-    pub fn report(self) -> Report {
-        let captures = Both { a: source(&self.sides.a), b: source(&self.sides.b) };
-        let mut report = Report {
+    pub fn report(self) -> CompareReport {
+        let captures = Both { a: capture_figures(&self.sides.a), b: capture_figures(&self.sides.b) };
+        let mut report = CompareReport {
             equal: false,
             differs: Vec::new(),
             captures,
@@ -21,8 +21,8 @@ impl Comparison<'_> {
             joints: Default::default(),
             halts: Default::default(),
             contacts: Default::default(),
-            torques: Replies::default(),
-            sums: Replies::default(),
+            torques: ReplyCounts::default(),
+            sums: ReplyCounts::default(),
             cells: Vec::new(),
             extra_cells: self.extra_cells(),
             first: None,
@@ -80,7 +80,7 @@ impl Comparison<'_> {
             side.first.map(|(first, _)| first).zip(side.newest())
         };
         let (Some(a), Some(b)) = (range(CaptureSide::A), range(CaptureSide::B)) else { return Vec::new() };
-        let common: (Key, Key) = (a.0.max(b.0), a.1.min(b.1));
+        let common: (JointsKey, JointsKey) = (a.0.max(b.0), a.1.min(b.1));
         let mut extra = Vec::new();
         for (at, bus) in self.skin.buses.iter().enumerate() {
             for node in CellId::all() {
@@ -100,9 +100,9 @@ impl Comparison<'_> {
 }
 
 /// Returns the names of the aspects in which the captures differ.
-fn differs(report: &Report, lost: u64, are_missing: bool) -> Vec<&'static str> {
-    let Report { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = report;
-    let replies = |it: &Replies| it.different > 0 || are_missing && it.missing() > 0;
+fn differs(report: &CompareReport, lost: u64, are_missing: bool) -> Vec<&'static str> {
+    let CompareReport { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = report;
+    let replies = |it: &ReplyCounts| it.different > 0 || are_missing && it.missing() > 0;
     let differs = [
         epochs.compared == 0 || are_missing && lost > 0,
         joints.different > 0,
@@ -120,7 +120,7 @@ fn losses(cell: &ComparedCell) -> Losses {
     Losses { late: cell.late, too_late: cell.too_late, lost: uplink.lost, restarts: uplink.restarts.into() }
 }
 
-fn source(side: &Side<'_>) -> Source {
+fn capture_figures(side: &Side<'_>) -> CaptureFigures {
     let mut source = side.counts.clone();
     source.first = side.first.map(|(first, _)| first.number);
     source.last = side.newest().map(|last| last.number);

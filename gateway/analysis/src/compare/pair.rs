@@ -8,20 +8,20 @@ use protocol::packet::Words;
 use protocol::schema::Units;
 use protocol::skin::{JointKind, Skin};
 
-use super::report::{Contacts, FirstDifference, Joints, Replies, UnpairedCounts};
-use super::side::Moment;
-use super::{Both, Options};
-use crate::explain::CellMoment;
+use super::report::{ContactCounts, FirstDifference, JointCounts, ReplyCounts, UnpairedCounts};
+use super::side::AnsweredJoints;
+use super::{Both, CompareOptions};
+use crate::explain::ObservedCellState;
 
 /// The counts of a comparison for one bus.
 #[derive(Debug, Default)]
 pub(super) struct Tally {
-    pub(super) joints: Joints,
+    pub(super) joints: JointCounts,
     pub(super) halts: UnpairedCounts,
-    pub(super) contacts: Contacts,
-    pub(super) torques: Replies,
-    pub(super) sums: Replies,
-    pub(super) cells: PerCell<Replies>,
+    pub(super) contacts: ContactCounts,
+    pub(super) torques: ReplyCounts,
+    pub(super) sums: ReplyCounts,
+    pub(super) cells: PerCell<ReplyCounts>,
 }
 
 /// A difference that has been found, not yet described in words.
@@ -31,7 +31,7 @@ pub(super) struct FoundDifference {
     how: &'static str,
     cell: Option<CellId>,
     /// The pair of words that differ most.
-    word: Option<Differing>,
+    word: Option<DifferingWords>,
     pub(super) inputs: Vec<&'static str>,
     unknown: Vec<&'static str>,
 }
@@ -51,7 +51,7 @@ impl FirstDifferences {
 }
 
 #[derive(Debug)]
-struct Differing {
+struct DifferingWords {
     place: usize,
     steps: u32,
     words: [i16; 2],
@@ -74,14 +74,14 @@ impl FoundDifference {
     pub(super) fn describe(
         self,
         (skin, bus): (&Skin, usize),
-        moments: &Both<Option<&Moment>>,
+        moments: &Both<Option<&AnsweredJoints>>,
         time_s: Both<Option<f64>>,
     ) -> Option<FirstDifference> {
         let moment = moments.a.or(moments.b)?;
         let words = self.word.as_ref();
         let place = words.map(|word| word.place);
         let joint = place.and_then(|place| skin.joints_on_bus(bus).nth(place));
-        let pair = |of: fn(&Differing) -> [i16; 2]| words.map(of);
+        let pair = |of: fn(&DifferingWords) -> [i16; 2]| words.map(of);
         let [word_a, word_b] = pair(|word| word.words).map_or([None; 2], |words| words.map(Some));
         let [value_a, value_b] = words.map_or([None; 2], |word| word.values.map(Some));
         Some(FirstDifference {
@@ -115,12 +115,12 @@ const fn missing(in_a: bool) -> &'static str {
 pub(super) fn compare(
     tally: &mut Tally,
     (skin, bus): (&Skin, usize),
-    moments: Both<&Moment>,
-    options: &Options,
+    moments: Both<&AnsweredJoints>,
+    options: &CompareOptions,
 ) -> FirstDifferences {
     let Both { a, b } = moments;
     let mut first = FirstDifferences::default();
-    let joints = joints(skin, bus, moments);
+    let joints = largest_joint_difference(skin, bus, moments);
     let steps = joints.as_ref().map_or(0, |joints| joints.steps);
     tally.joints.max_steps = tally.joints.max_steps.max(steps);
     let same_joints = steps == 0;
@@ -146,42 +146,42 @@ pub(super) fn compare(
         });
     }
     for ((cell, in_a), in_b) in CellId::all().zip(&a.watched.cells).zip(&b.watched.cells) {
-        contact(&mut tally.contacts, cell, (in_a, in_b), &mut first);
+        compare_contact(&mut tally.contacts, cell, (in_a, in_b), &mut first);
         if in_a.answer.is_none() && in_b.answer.is_none() {
             continue;
         }
-        let reply = Reply {
+        let reply = ReplyPair {
             what: "torque",
             cell,
             words: [in_a.answer.map(|(_, words)| words), in_b.answer.map(|(_, words)| words)],
             format: skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default(),
             cells_in: None,
         };
-        let inputs = || inputs(moments, same_joints, (in_a, in_b));
+        let inputs = || differing_inputs(moments, same_joints, (in_a, in_b));
         let all = (&mut tally.torques, tally.cells.get_mut(cell));
         reply.compare(all, moments, (Units::for_bus(skin, bus), options.tolerance), inputs, &mut first);
     }
-    sums(tally, (skin, bus), moments, (options.tolerance, same_joints), &mut first);
+    compare_sums(tally, (skin, bus), moments, (options.tolerance, same_joints), &mut first);
     first
 }
 
 /// Compares the sums of roots.
-fn sums(
+fn compare_sums(
     tally: &mut Tally,
     (skin, bus): (&Skin, usize),
-    moments: Both<&Moment>,
+    moments: Both<&AnsweredJoints>,
     (tolerance, same_joints): (u32, bool),
     first: &mut FirstDifferences,
 ) {
     let Both { a, b } = moments;
-    let of = |moment: &Moment, root: CellId| {
+    let of = |moment: &AnsweredJoints, root: CellId| {
         let sum = moment.sums.iter().find(|(cell, _)| *cell == root);
         sum.map(|(_, sum)| (sum.words, sum.count))
     };
     let in_b_alone = b.sums.iter().filter(|(root, _)| of(a, *root).is_none());
     for (root, _) in a.sums.iter().chain(in_b_alone) {
         let both = [of(a, *root), of(b, *root)];
-        let reply = Reply {
+        let reply = ReplyPair {
             what: "sum",
             cell: *root,
             words: both.map(|sum| sum.map(|(words, _)| words)),
@@ -190,10 +190,11 @@ fn sums(
         };
         let inputs = || {
             let cells = a.watched.cells.iter().zip(&b.watched.cells);
-            let touched = |cell: &CellMoment| cell.contact_state.is_some_and(|(skin, _)| is_touched(&skin));
+            let touched =
+                |cell: &ObservedCellState| cell.contact_state.is_some_and(|(skin, _)| is_touched(&skin));
             let mut all = (Vec::new(), Vec::new());
             for (in_a, in_b) in cells.filter(|(a, b)| touched(a) || touched(b)) {
-                let (differ, unknown) = inputs(moments, same_joints, (in_a, in_b));
+                let (differ, unknown) = differing_inputs(moments, same_joints, (in_a, in_b));
                 all.0.extend(differ);
                 all.1.extend(unknown);
             }
@@ -212,7 +213,7 @@ fn sums(
 }
 
 /// A cell's reply to one joints packet, in both captures.
-struct Reply {
+struct ReplyPair {
     what: &'static str,
     cell: CellId,
     words: [Option<Words>; 2],
@@ -221,21 +222,21 @@ struct Reply {
     cells_in: Option<[u8; 2]>,
 }
 
-impl Reply {
+impl ReplyPair {
     fn compare(
         &self,
-        (all, of_cell): (&mut Replies, Option<&mut Replies>),
-        moments: Both<&Moment>,
+        (all, of_cell): (&mut ReplyCounts, Option<&mut ReplyCounts>),
+        moments: Both<&AnsweredJoints>,
         (units, tolerance): (Units, u32),
         inputs: impl Fn() -> (Vec<&'static str>, Vec<&'static str>),
         first: &mut FirstDifferences,
     ) {
-        let mut once = Replies::default();
+        let mut once = ReplyCounts::default();
         let mut how = None;
         let mut word = None;
         match self.words {
             [Some(a), Some(b)] => {
-                word = self.largest(&a, &b, units);
+                word = self.largest_difference(&a, &b, units);
                 let steps = word.as_ref().map_or(0, |word| word.steps);
                 once.max_steps = steps;
                 let other_cells = self.cells_in.is_some_and(|[a, b]| a != b);
@@ -273,16 +274,16 @@ impl Reply {
     }
 
     /// Returns the pair of words of two replies with the largest difference; `None` if the words are equal.
-    fn largest(&self, a: &Words, b: &Words, units: Units) -> Option<Differing> {
+    fn largest_difference(&self, a: &Words, b: &Words, units: Units) -> Option<DifferingWords> {
         // Tolerances are in steps of 1/4096, for sums in steps of 1/256.
         let fine =
             |word| if self.cells_in.is_some() { i32::from(word) } else { self.format.finest_steps(word) };
         let places = a.padded().into_iter().zip(b.padded()).enumerate();
-        let differing = places.map(|(place, (a, b))| Differing {
+        let differing = places.map(|(place, (a, b))| DifferingWords {
             place,
             steps: fine(a).abs_diff(fine(b)),
             words: [a, b],
-            values: [a, b].map(|word| self.format.real(word)),
+            values: [a, b].map(|word| self.format.to_real(word)),
             unit: units.torque_unit(place),
         });
         let differing = differing.filter(|word| word.steps > 0);
@@ -290,7 +291,7 @@ impl Reply {
     }
 }
 
-impl Replies {
+impl ReplyCounts {
     pub(super) const fn add(&mut self, other: &Self) {
         self.equal += other.equal;
         self.tolerated += other.tolerated;
@@ -306,7 +307,11 @@ impl Replies {
 }
 
 /// Returns the joint whose words differ most.
-fn joints(skin: &Skin, bus: usize, moments: Both<&Moment>) -> Option<Differing> {
+fn largest_joint_difference(
+    skin: &Skin,
+    bus: usize,
+    moments: Both<&AnsweredJoints>,
+) -> Option<DifferingWords> {
     let Both { a, b } = moments;
     let pairs = a.watched.joints.positions.iter().zip(&b.watched.joints.positions);
     let kinds = skin.joints_on_bus(bus).map(|(_, joint)| joint.kind);
@@ -318,8 +323,8 @@ fn joints(skin: &Skin, bus: usize, moments: Both<&Moment>) -> Option<Differing> 
             JointKind::Revolute => u32::from(one.wrapping_sub(other).unsigned_abs()),
             JointKind::Prismatic => u32::from(one.abs_diff(other)),
         };
-        let values = words.map(|word| kind.position(Q1_14::from_bits(word)));
-        Differing { place, steps, words, values, unit: kind.unit() }
+        let values = words.map(|word| kind.word_to_position(Q1_14::from_bits(word)));
+        DifferingWords { place, steps, words, values, unit: kind.unit() }
     });
     let differing = differing.filter(|word| word.steps > 0);
     differing.reduce(|most, word| if word.steps > most.steps { word } else { most })
@@ -330,10 +335,10 @@ fn is_touched(skin: &SkinSensors) -> bool {
 }
 
 /// Compares the contact of a cell.
-fn contact(
-    contacts: &mut Contacts,
+fn compare_contact(
+    contacts: &mut ContactCounts,
     cell: CellId,
-    (in_a, in_b): (&CellMoment, &CellMoment),
+    (in_a, in_b): (&ObservedCellState, &ObservedCellState),
     first: &mut FirstDifferences,
 ) {
     let both = match (&in_a.contact_state, &in_b.contact_state) {
@@ -357,10 +362,10 @@ fn contact(
 }
 
 /// Returns the names of a cell's inputs that differ between the captures, and of those that are unknown in one of them.
-fn inputs(
-    Both { a, b }: Both<&Moment>,
+fn differing_inputs(
+    Both { a, b }: Both<&AnsweredJoints>,
     same_joints: bool,
-    (in_a, in_b): (&CellMoment, &CellMoment),
+    (in_a, in_b): (&ObservedCellState, &ObservedCellState),
 ) -> (Vec<&'static str>, Vec<&'static str>) {
     let (mut differ, mut unknown) = (Vec::new(), Vec::new());
     if !same_joints {

@@ -7,25 +7,25 @@ use super::Both;
 
 /// The outcome of a comparison.
 #[derive(Clone, Debug, Serialize)]
-pub struct Report {
+pub struct CompareReport {
     /// True if the captures have no difference beyond the tolerances.
     pub equal: bool,
     /// The aspects that differ, in the order of [`ASPECTS`].
     pub differs: Vec<&'static str>,
     /// The two captures.
-    pub captures: Both<Source>,
+    pub captures: Both<CaptureFigures>,
     /// Counts of joints packets that are in both captures or missing from one.
-    pub epochs: Epochs,
+    pub epochs: EpochCounts,
     /// Comparison of the words of joints.
-    pub joints: Joints,
+    pub joints: JointCounts,
     /// Epochs at which only one capture was halted.
     pub halts: UnpairedCounts,
     /// Comparison of touches, counted by cell and epoch.
-    pub contacts: Contacts,
+    pub contacts: ContactCounts,
     /// Comparison of the torques of single cells.
-    pub torques: Replies,
+    pub torques: ReplyCounts,
     /// Comparison of the sums of roots.
-    pub sums: Replies,
+    pub sums: ReplyCounts,
     /// Cells with differences or losses, by bus and node id.
     pub cells: Vec<CellRow>,
     /// Cells that send packets in only one of the captures.
@@ -39,7 +39,7 @@ pub const ASPECTS: [&str; 7] = ["epochs", "joints", "halts", "contacts", "torque
 
 /// Counts and times of one of the two captures.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Source {
+pub struct CaptureFigures {
     /// Number of frames.
     pub frames: u64,
     /// Number of joints packets on all buses.
@@ -76,7 +76,7 @@ pub struct Source {
 
 /// Counts of joints packets by their number in the run, over all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Epochs {
+pub struct EpochCounts {
     /// Joints packets that are in both captures.
     pub compared: u64,
     /// Joints packets that B has and A lacks, at times that both captures cover.
@@ -112,7 +112,7 @@ impl UnpairedCounts {
 
 /// Comparison of the words of joints in epochs that both captures have.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Joints {
+pub struct JointCounts {
     /// Epochs whose words are equal.
     pub equal: u64,
     /// Epochs whose words differ within the tolerance.
@@ -125,7 +125,7 @@ pub struct Joints {
 
 /// Counts of touches; a touch of one cell counts once in each epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Contacts {
+pub struct ContactCounts {
     /// Touches in both captures.
     pub both: u64,
     /// Touches in one capture only.
@@ -135,7 +135,7 @@ pub struct Contacts {
 
 /// Comparison of replies in epochs that both captures have.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Replies {
+pub struct ReplyCounts {
     /// Replies whose words are equal.
     pub equal: u64,
     /// Replies whose words differ within the tolerance.
@@ -154,7 +154,7 @@ pub struct Replies {
     pub max_steps: u32,
 }
 
-impl Replies {
+impl ReplyCounts {
     /// Returns the number of replies that only one capture has.
     #[must_use]
     pub const fn missing(&self) -> u64 {
@@ -171,7 +171,7 @@ pub struct CellRow {
     pub node: u8,
     /// Comparison of the cell's torques or sums.
     #[serde(flatten)]
-    pub replies: Replies,
+    pub replies: ReplyCounts,
     /// Losses of the cell in each capture.
     pub losses: Both<Losses>,
 }

@@ -10,31 +10,31 @@ use protocol::packet::{Epoch, Words};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use super::numbering::{Key, Numbering};
-use super::report::Source;
-use crate::explain::{self, NotFound, Watch};
+use super::numbering::{JointsKey, Numbering};
+use super::report::CaptureFigures;
+use crate::explain::{self, JointsWatcher, NotFound};
 
 /// Number of epochs after which a silent bus is no longer waited for, while other buses continue.
 const SILENT_BUS_EPOCHS: u64 = 64;
 
 /// A joints packet on one bus of a capture, and the answers to it.
 #[derive(Debug)]
-pub(super) struct Moment {
-    pub(super) key: Key,
+pub(super) struct AnsweredJoints {
+    pub(super) key: JointsKey,
     pub(super) epoch: Epoch,
     /// The occurrence of this epoch on its bus, from 1, as counted by `skinbus explain`.
     pub(super) occurrence: u32,
     /// The joints, and each cell's contact state and torque.
-    pub(super) watched: explain::Moment,
+    pub(super) watched: explain::ObservedJoints,
     /// The sums of roots.
-    pub(super) sums: Vec<(CellId, Sum)>,
+    pub(super) sums: Vec<(CellId, RootSum)>,
     /// True if enough joints have followed that no more answers can arrive.
     pub(super) is_settled: bool,
 }
 
 /// The sum of a root.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sum {
+pub(super) struct RootSum {
     pub(super) words: Words,
     pub(super) count: u8,
     nanos: u64,
@@ -42,14 +42,14 @@ pub(super) struct Sum {
 
 /// A joints packet whose answers may still arrive.
 #[derive(Debug)]
-struct Pending {
+struct PendingJoints {
     /// Position of the joints in the run; `None` for joints out of order, which are skipped.
-    key: Option<Key>,
+    key: Option<JointsKey>,
     epoch: Epoch,
     occurrence: u32,
     /// The index of the joints on their bus, from 0.
     index: u64,
-    sums: Vec<(CellId, Sum)>,
+    sums: Vec<(CellId, RootSum)>,
 }
 
 /// The packets of one cell in a capture.
@@ -60,7 +60,7 @@ pub(super) struct ComparedCell {
     pub(super) late: u64,
     pub(super) too_late: u64,
     /// The keys of the last joints before the cell's first packet, and before its last packet.
-    pub(super) active_range: Option<(Key, Key)>,
+    pub(super) active_range: Option<(JointsKey, JointsKey)>,
 }
 
 #[derive(Debug, Default)]
@@ -69,17 +69,17 @@ pub(super) struct BusSide {
     chain: usize,
     roots: Vec<CellId>,
     last: Option<Epoch>,
-    last_key: Option<Key>,
+    last_key: Option<JointsKey>,
     occurrences: Vec<u32>,
     joints: u64,
-    pending: VecDeque<Pending>,
+    pending: VecDeque<PendingJoints>,
     /// Joints packets with complete answers, ready to be compared.
-    pub(super) ready: VecDeque<Moment>,
+    pub(super) ready: VecDeque<AnsweredJoints>,
     pub(super) cells: PerCell<ComparedCell>,
 }
 
 /// Returns true if the joints at `key` are so far behind the newest ones that nothing for them can arrive any more.
-const fn is_far(newest: Key, key: Key) -> bool {
+const fn is_far_behind(newest: JointsKey, key: JointsKey) -> bool {
     newest.run > key.run || newest.run == key.run && newest.number > key.number + SILENT_BUS_EPOCHS
 }
 
@@ -87,19 +87,19 @@ const fn is_far(newest: Key, key: Key) -> bool {
 #[derive(Debug)]
 pub(super) struct Side<'a> {
     skin: &'a Skin,
-    watch: Watch<'a>,
+    watch: JointsWatcher<'a>,
     numbering: Numbering,
     period_ns: u64,
     pub(super) buses: Vec<BusSide>,
     /// The first joints packet and its time in ns.
-    pub(super) first: Option<(Key, u64)>,
+    pub(super) first: Option<(JointsKey, u64)>,
     /// The time of the last joints packet in ns.
     last_nanos: Option<u64>,
     pub(super) is_ended: bool,
     pub(super) has_times: bool,
     reply: Times,
     /// The counts of the report that grow with each frame.
-    pub(super) counts: Source,
+    pub(super) counts: CaptureFigures,
 }
 
 impl<'a> Side<'a> {
@@ -112,7 +112,7 @@ impl<'a> Side<'a> {
         };
         Self {
             skin,
-            watch: Watch::all(skin),
+            watch: JointsWatcher::all(skin),
             numbering: Numbering::new(period_ns, start),
             period_ns,
             buses: (0..skin.buses.len()).map(bus_side).collect(),
@@ -121,13 +121,13 @@ impl<'a> Side<'a> {
             is_ended: false,
             has_times: true,
             reply: Times::default(),
-            counts: Source::default(),
+            counts: CaptureFigures::default(),
         }
     }
 
     /// Handles a packet from before the start of the capture, which still has an effect.
-    pub(super) fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
-        self.watch.begin(nanos, bus, message);
+    pub(super) fn receive_latched(&mut self, nanos: u64, bus: &str, message: &Message) {
+        self.watch.receive_latched(nanos, bus, message);
         if let Message::Joints { epoch, joints } = message
             && let Some(bus) = self.bus(bus).filter(|bus| usize::from(joints.in_use) == bus.chain)
         {
@@ -142,15 +142,15 @@ impl<'a> Side<'a> {
 
     /// Handles the next frame; `message` is the decoded message, if the frame completes one. Returns true if the
     /// answers to some joints may be complete now.
-    pub(super) fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
+    pub(super) fn receive(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         self.counts.frames += 1;
         let at = self.skin.bus_named(bus);
         let mut is_new = false;
         if let (Some(at), Some(message)) = (at, message) {
             if let Message::Joints { epoch, joints } = message {
-                is_new = self.joints(at, nanos, *epoch, joints);
+                is_new = self.receive_joints(at, nanos, *epoch, joints);
             } else if let Some(from) = message.sender() {
-                self.packet(at, nanos, from, message);
+                self.receive_packet(at, nanos, from, message);
             }
         }
         self.watch.receive(nanos, bus, message);
@@ -161,19 +161,19 @@ impl<'a> Side<'a> {
     }
 
     /// Handles a joints packet by the same rules as [`Watch`]. Returns true if it begins a new epoch.
-    fn joints(&mut self, at: usize, nanos: u64, epoch: Epoch, joints: &Joints) -> bool {
+    fn receive_joints(&mut self, at: usize, nanos: u64, epoch: Epoch, joints: &Joints) -> bool {
         let Some(bus) = self.buses.get_mut(at) else { return false };
         if usize::from(joints.in_use) != bus.chain || bus.last == Some(epoch) {
             return false;
         }
         bus.last = Some(epoch);
-        let key = self.numbering.take(nanos, epoch, bus.last_key);
+        let key = self.numbering.number_joints(nanos, epoch, bus.last_key);
         let mut occurrence = 1;
         if let Some(count) = bus.occurrences.get_mut(usize::from(epoch.0)) {
             *count += 1;
             occurrence = *count;
         }
-        bus.pending.push_back(Pending { key, epoch, occurrence, index: bus.joints, sums: Vec::new() });
+        bus.pending.push_back(PendingJoints { key, epoch, occurrence, index: bus.joints, sums: Vec::new() });
         bus.joints += 1;
         self.counts.epochs += 1;
         match key {
@@ -189,7 +189,7 @@ impl<'a> Side<'a> {
     }
 
     /// Handles a packet of a cell.
-    fn packet(&mut self, at: usize, nanos: u64, from: CellId, message: &Message) {
+    fn receive_packet(&mut self, at: usize, nanos: u64, from: CellId, message: &Message) {
         let newest = self.numbering.newest().unwrap_or_default();
         let Some(bus) = self.buses.get_mut(at) else { return };
         let Some(cell) = bus.cells.get_mut(from) else { return };
@@ -201,7 +201,7 @@ impl<'a> Side<'a> {
         } else if let Message::Sum { epoch, torque, count, .. } = *message
             && bus.roots.contains(&from)
         {
-            (epoch, Some(Sum { words: torque, count, nanos }))
+            (epoch, Some(RootSum { words: torque, count, nanos }))
         } else {
             return;
         };
@@ -229,7 +229,7 @@ impl<'a> Side<'a> {
         for (at, bus) in self.buses.iter_mut().enumerate() {
             while let Some(first) = bus.pending.front() {
                 // After a gap, or on a bus that is silent while others continue, do not wait for replies.
-                let is_far = newest.zip(first.key).is_some_and(|(newest, key)| is_far(newest, key));
+                let is_far = newest.zip(first.key).is_some_and(|(newest, key)| is_far_behind(newest, key));
                 let Some((epoch, watched)) = self.watch.pop(at, is_end || is_far) else { break };
                 let Some(pending) = bus.pending.pop_front() else { break };
                 let answers = watched.cells.iter().filter_map(|cell| cell.answer.map(|(nanos, _)| nanos));
@@ -241,7 +241,7 @@ impl<'a> Side<'a> {
                 self.counts.sums += pending.sums.len() as u64;
                 let Some(key) = pending.key else { continue };
                 let followed = bus.joints - 1 - pending.index;
-                bus.ready.push_back(Moment {
+                bus.ready.push_back(AnsweredJoints {
                     key,
                     epoch,
                     occurrence: pending.occurrence,
@@ -254,16 +254,16 @@ impl<'a> Side<'a> {
     }
 
     /// Returns the key of the newest joints, if any arrived.
-    pub(super) fn newest(&self) -> Option<Key> {
+    pub(super) fn newest(&self) -> Option<JointsKey> {
         self.numbering.newest()
     }
 
     /// Returns true if the joints at `key` are not ready on a bus and can no longer arrive there.
-    pub(super) fn is_past(&self, bus: usize, key: Key) -> bool {
+    pub(super) fn is_past(&self, bus: usize, key: JointsKey) -> bool {
         let Some(side) = self.buses.get(bus) else { return true };
         let is_pending = side.pending.iter().any(|pending| pending.key.is_some_and(|it| it <= key));
         let is_behind = side.last_key.is_some_and(|last| last >= key);
-        !is_pending && (self.is_ended || is_behind || self.newest().is_some_and(|it| is_far(it, key)))
+        !is_pending && (self.is_ended || is_behind || self.newest().is_some_and(|it| is_far_behind(it, key)))
     }
 
     /// Converts a time in ns to s of the run; `None` if the capture has no times.
@@ -292,7 +292,7 @@ impl<'a> Side<'a> {
 
     /// Returns the reason why the capture has no joints of the skin; `None` if it has some.
     pub(super) fn not_found(&mut self) -> Option<NotFound> {
-        let watch = std::mem::replace(&mut self.watch, Watch::all(self.skin));
+        let watch = std::mem::replace(&mut self.watch, JointsWatcher::all(self.skin));
         if self.first.is_some() { None } else { watch.moments().err() }
     }
 }

@@ -84,15 +84,15 @@ fn run(skin: &Skin, numbers: std::ops::Range<u64>) -> Frames {
 /// Reads two captures in lockstep; also returns the maximum number of joints that were held.
 pub(super) fn read<'a>(
     skin: &'a Skin,
-    (options, starts): (Options, Both<Option<u64>>),
+    (options, starts): (CompareOptions, Both<Option<u64>>),
     a: &Frames,
     b: &Frames,
 ) -> (Comparison<'a>, usize) {
     let mut comparison = Comparison::new(skin, options, starts);
     let mut frames = Both { a: a.iter(), b: b.iter() };
     let mut held = 0;
-    while let Some(which) = comparison.next() {
-        match frames.of_mut(which).next() {
+    while let Some(which) = comparison.next_side() {
+        match frames.get_mut(which).next() {
             Some((nanos, bus, message)) => comparison.receive(which, *nanos, bus, Some(message)),
             None => comparison.end(which, false),
         }
@@ -101,12 +101,12 @@ pub(super) fn read<'a>(
     (comparison, held)
 }
 
-fn compared(skin: &Skin, options: Options, a: &Frames, b: &Frames) -> Report {
+fn compared(skin: &Skin, options: CompareOptions, a: &Frames, b: &Frames) -> CompareReport {
     read(skin, (options, Both::default()), a, b).0.report()
 }
 
-fn equal(skin: &Skin, a: &Frames, b: &Frames) -> Report {
-    compared(skin, Options::default(), a, b)
+fn equal(skin: &Skin, a: &Frames, b: &Frames) -> CompareReport {
+    compared(skin, CompareOptions::default(), a, b)
 }
 
 /// Returns the frames with the first message that satisfies `is` replaced by `to`, or removed.
@@ -140,7 +140,7 @@ fn the_same_run_is_equal_whenever_it_was_and_however_late_it_answered() {
     let report = equal(&skin, &a, &b);
     assert!(report.equal && report.first.is_none(), "{report:?}");
     assert_eq!((report.epochs.compared, report.torques.equal), (600, 595));
-    assert_eq!(report.epochs, Epochs { compared: 600, ..Epochs::default() });
+    assert_eq!(report.epochs, EpochCounts { compared: 600, ..EpochCounts::default() });
     // The last torque arrived after the last joints.
     assert_eq!((report.captures.a.late, report.captures.b.late), (0, 594));
     let [a, b] = [report.captures.a.reply_us.unwrap().p50, report.captures.b.reply_us.unwrap().p50];
@@ -172,7 +172,8 @@ fn a_word_that_is_one_step_off_is_found_and_explained() {
         (Some(2), &[][..], &[][..])
     );
     assert!((first.time_s.a.unwrap() - 4.32).abs() < 1e-9);
-    let tolerant = |tolerance| compared(&skin, Options { tolerance, ..Options::default() }, &a, &late);
+    let tolerant =
+        |tolerance| compared(&skin, CompareOptions { tolerance, ..CompareOptions::default() }, &a, &late);
     assert!(tolerant(2).equal && tolerant(2).torques.tolerated == 1);
     assert!(!tolerant(1).equal);
 }
@@ -210,7 +211,7 @@ fn an_input_that_differs_is_named() {
     assert_eq!((report.differs.as_slice(), report.joints.max_steps), (&["joints"][..], 7));
     let first = report.first.unwrap();
     assert_eq!((first.what, first.number, first.joint, first.unit), ("joints", 9, Some(1), Some("rad")));
-    let options = Options { joints_tolerance: 7, ..Options::default() };
+    let options = CompareOptions { joints_tolerance: 7, ..CompareOptions::default() };
     assert!(compared(&skin, options, &a, &b).equal);
 }
 
@@ -244,7 +245,7 @@ fn missing_replies_count_but_for_those_that_the_end_left_open() {
     assert_eq!(report.cells.iter().map(|row| row.node).collect::<Vec<_>>(), [1]);
     let report = equal(&skin, &b, &a);
     assert_eq!((report.torques.missing_in_a, report.differs.as_slice()), (1, &["torques"][..]));
-    let options = Options { missing: 1, ..Options::default() };
+    let options = CompareOptions { missing: 1, ..CompareOptions::default() };
     assert!(compared(&skin, options, &a, &b).equal);
     // The first difference is one that counts.
     let b = changed(&b, is_torque_of(60), Some(torque(1, 60, 7)));
@@ -269,7 +270,7 @@ fn what_one_has_before_and_after_the_other_is_no_difference_but_a_missing_epoch_
     assert_eq!((first.what, first.how, first.number, first.epoch), ("epoch", "missing in b", 256, 0));
     assert_eq!(first.time_s.b, None);
     // A recording that was cut off lacks joints that the other one has.
-    let mut comparison = Comparison::new(&skin, Options::default(), Both::default());
+    let mut comparison = Comparison::new(&skin, CompareOptions::default(), Both::default());
     for (which, frames) in [(CaptureSide::A, &a), (CaptureSide::B, &run(&skin, 0..300))] {
         frames.iter().for_each(|(nanos, bus, message)| comparison.receive(which, *nanos, bus, Some(message)));
     }
@@ -338,7 +339,7 @@ fn buses_are_compared_each_and_sums_by_their_roots() {
     assert_eq!((first.what, first.bus.as_str(), first.steps), ("sum", "vcan1", Some(1)));
     let values = (first.values.a.unwrap(), first.values.b.unwrap());
     assert!((values.1 - values.0 - 1.0 / 256.0).abs() < 1e-12);
-    assert!(compared(&skin, Options { tolerance: 1, ..Options::default() }, &a, &b).equal);
+    assert!(compared(&skin, CompareOptions { tolerance: 1, ..CompareOptions::default() }, &a, &b).equal);
     // A sum that lacks a cell is different, even with the same words.
     let b = changed(&a, of(30), Some(sum(30, 9, 3)));
     let first = equal(&skin, &a, &b).first.unwrap();
@@ -361,7 +362,7 @@ fn few_joints_are_held_however_long_the_captures_are() {
     b.retain(|(nanos, ..)| !(at(3_000)..at(6_000)).contains(nanos));
     // The cell is touched but does not answer.
     b.retain(|(nanos, _, it)| *nanos < at(8_000) || !matches!(it, Message::Torque { .. }));
-    let (comparison, held) = read(&skin, (Options::default(), Both::default()), &a, &b);
+    let (comparison, held) = read(&skin, (CompareOptions::default(), Both::default()), &a, &b);
     assert!(held <= 80, "{held} joints were held");
     let report = comparison.report();
     assert_eq!((report.epochs.missing_in_b, report.torques.missing_in_b), (3_000, 3_996));
@@ -374,7 +375,7 @@ fn few_joints_are_held_however_long_the_captures_are() {
     for end in [5_000, 9_000] {
         let mut b = a.clone();
         b.retain(|(nanos, bus, _)| *bus == "vcan1" || !(at(1_000)..at(end)).contains(nanos));
-        let (comparison, held) = read(&skin, (Options::default(), Both::default()), &a, &b);
+        let (comparison, held) = read(&skin, (CompareOptions::default(), Both::default()), &a, &b);
         assert!(held <= 300, "{held} joints were held");
         let report = comparison.report();
         assert_eq!((report.epochs.missing_in_b, report.epochs.compared), (end - 1_000, 19_000 - end));
@@ -385,16 +386,16 @@ fn few_joints_are_held_however_long_the_captures_are() {
 fn a_part_is_put_where_its_joints_are() {
     let skin = skin();
     let trace = |frames: &Frames| {
-        let mut trace = Trace::new(&skin);
+        let mut trace = JointTrace::new(&skin);
         frames.iter().for_each(|(nanos, bus, message)| trace.take(*nanos, bus, message));
         trace
     };
     let a = run(&skin, 0..2_000);
     for first in [1, 100, 256, 300, 1_000, 1_900] {
         let b = run(&skin, first..2_000);
-        let starts = starts(&trace(&a), &trace(&b));
+        let starts = start_numbers(&trace(&a), &trace(&b));
         assert_eq!(starts, Both { a: Some(0), b: Some(first) });
-        let report = read(&skin, (Options::default(), starts), &a, &b).0.report();
+        let report = read(&skin, (CompareOptions::default(), starts), &a, &b).0.report();
         assert_eq!((report.equal, report.epochs.before.only_a), (true, first));
         assert_eq!(report.captures.b.first, Some(first));
     }
@@ -409,7 +410,7 @@ fn a_part_is_put_where_its_joints_are() {
         };
         frames.iter().map(|(nanos, bus, message)| (*nanos, *bus, same(message))).collect()
     };
-    let found = starts(&trace(&standing(&a)), &trace(&standing(&run(&skin, 300..900))));
+    let found = start_numbers(&trace(&standing(&a)), &trace(&standing(&run(&skin, 300..900))));
     assert_eq!(found, Both { a: Some(0), b: Some(44) });
 }
 
@@ -417,8 +418,9 @@ fn a_part_is_put_where_its_joints_are() {
 fn a_capture_of_another_skin_is_known_by_its_buses_joints_and_configurations() {
     let skin = skin();
     let a = run(&skin, 0..10);
-    let not_found =
-        |b: &Frames| read(&skin, (Options::default(), Both::default()), &a, b).0.not_found(CaptureSide::B);
+    let not_found = |b: &Frames| {
+        read(&skin, (CompareOptions::default(), Both::default()), &a, b).0.not_found(CaptureSide::B)
+    };
     assert_eq!(not_found(&a), None);
     let elsewhere: Frames = a.iter().map(|(nanos, _, message)| (*nanos, "can9", *message)).collect();
     assert!(matches!(not_found(&elsewhere), Some(NotFound::Buses { .. })));
@@ -437,7 +439,7 @@ fn a_capture_of_another_skin_is_known_by_its_buses_joints_and_configurations() {
         0,
         (at(0) - 5, "vcan0", Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }),
     );
-    let comparison = read(&skin, (Options::default(), Both::default()), &a, &configured).0;
+    let comparison = read(&skin, (CompareOptions::default(), Both::default()), &a, &configured).0;
     assert_eq!(comparison.other_configurations(CaptureSide::A), None);
     assert_eq!(comparison.other_configurations(CaptureSide::B), Some((1, 0)));
 }

@@ -59,16 +59,16 @@ enum DbcNode {
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum SendSchedule {
     /// The message is sent on events.
-    Seldom,
+    OnEvent,
     /// The message is periodic, with the period in ms.
-    Every(u32),
+    Cyclic(u32),
     /// The message is periodic while the cell is in contact, with the period in ms.
     WhileActive(u32),
 }
 
 /// The DBC message of one identifier: its sender, receivers, schedule and signals.
 #[derive(Clone, Debug, PartialEq)]
-struct Message {
+struct DbcMessage {
     id: Id,
     name: String,
     from: DbcNode,
@@ -81,24 +81,24 @@ struct Message {
 }
 
 /// Returns all messages of a bus, by identifier.
-fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
+fn messages(skin: &Skin, bus: usize) -> Vec<DbcMessage> {
     let mut nodes: Vec<_> = skin.cells_on_bus(bus).map(|cell| Node::Cell(cell.node)).collect();
     nodes.sort_unstable_by_key(|node| node.to_byte());
     let (units, rows) = (Units::for_bus(skin, bus), skin.chain(bus).rows.len());
-    let chain = signal::Chain { length: skin.packet_length(bus), units, rows };
+    let chain = signal::BusChain { length: skin.packet_length(bus), units, rows };
     let of = |schema: &'static PacketSchema| {
         let said = |node| message(schema, node, period_ms(skin), &chain);
         let each = nodes.iter().map(|node| said(*node));
         match schema.kind {
             Kind::Command => vec![said(Node::Everyone)],
             Kind::Network => {
-                let (from, to, rhythm) = (DbcNode::Gateway, DbcNode::Unnamed, SendSchedule::Seldom);
+                let (from, to, rhythm) = (DbcNode::Gateway, DbcNode::Unnamed, SendSchedule::OnEvent);
                 let comment = "For several gateways on one bus: sending it is optional; receiving it shows that there is another gateway.";
-                let other = Message { from, to, rhythm, comment, ..said(Node::Gateway) };
+                let other = DbcMessage { from, to, rhythm, comment, ..said(Node::Gateway) };
                 iter::once(other).chain(each).collect()
             }
             Kind::Configure | Kind::Stimulus => {
-                each.chain([Message { to: DbcNode::Cells, ..said(Node::Everyone) }]).collect()
+                each.chain([DbcMessage { to: DbcNode::Cells, ..said(Node::Everyone) }]).collect()
             }
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => each.collect(),
         }
@@ -107,16 +107,21 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
 }
 
 /// Returns the DBC message for a kind of packet that a cell sends or receives, or for a command to all cells.
-fn message(schema: &'static PacketSchema, node: Node, period_ms: u32, chain: &signal::Chain) -> Message {
+fn message(
+    schema: &'static PacketSchema,
+    node: Node,
+    period_ms: u32,
+    chain: &signal::BusChain,
+) -> DbcMessage {
     let PacketSchema { kind, command, meaning, .. } = schema;
     let cell = if command.is_some() { DbcNode::Cells } else { DbcNode::Cell(node.to_byte()) };
     let (from, to) = if kind.is_from_cells() { (cell, DbcNode::Gateway) } else { (DbcNode::Gateway, cell) };
     let rhythm = match kind {
-        Kind::Command if *command == Some(Command::Joints) => SendSchedule::Every(period_ms),
+        Kind::Command if *command == Some(Command::Joints) => SendSchedule::Cyclic(period_ms),
         Kind::Torque => SendSchedule::WhileActive(period_ms),
-        Kind::Network => SendSchedule::Every(HEARTBEAT_MS),
+        Kind::Network => SendSchedule::Cyclic(HEARTBEAT_MS),
         Kind::Command | Kind::Sum | Kind::Sensors | Kind::Configure | Kind::Configured | Kind::Stimulus => {
-            SendSchedule::Seldom
+            SendSchedule::OnEvent
         }
     };
     let (id, name) = match command {
@@ -125,7 +130,7 @@ fn message(schema: &'static PacketSchema, node: Node, period_ms: u32, chain: &si
     };
     let grows = Lengths::for_id(id) == Lengths::ALL;
     let length = if grows { chain.length } else { Length::Six };
-    Message {
+    DbcMessage {
         id,
         name,
         from,
@@ -133,7 +138,7 @@ fn message(schema: &'static PacketSchema, node: Node, period_ms: u32, chain: &si
         rhythm,
         comment: meaning,
         length,
-        signals: signal::all(schema, length, chain),
+        signals: signal::packet_signals(schema, length, chain),
     }
 }
 
@@ -149,7 +154,7 @@ fn period_ms(skin: &Skin) -> u32 {
 
 /// Returns true if the DBC of a bus describes packets that are joined from several frames, false if it describes single
 /// frames.
-const fn are_packets(bus: &SkinBus) -> bool {
+const fn describes_packets(bus: &SkinBus) -> bool {
     matches!(bus.format, Format::Classic)
 }
 

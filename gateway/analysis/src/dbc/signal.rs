@@ -9,11 +9,11 @@ use protocol::parameters::Parameter;
 use protocol::schema::{Field, FieldFormat, FieldRange, Layout, PacketSchema, Units, parameters, reasons};
 
 /// Position after the last word in a packet of six words, in bits.
-const END: usize = WORDS * 16;
+const WORDS_END_BIT: usize = WORDS * 16;
 
 /// The units and lengths of the joints, torques and sums on a bus.
 #[derive(Debug)]
-pub(super) struct Chain {
+pub(super) struct BusChain {
     /// Number of words in a joints, torque or sum packet.
     pub(super) length: Length,
     /// Units of joints, torques and sums.
@@ -22,7 +22,7 @@ pub(super) struct Chain {
     pub(super) rows: usize,
 }
 
-impl Chain {
+impl BusChain {
     /// Returns true if packets of this kind can have the page `layout` on the bus. A page for a row of the chain exists
     /// only up to the number of rows of the chain, or the minimum of a firmware image.
     fn has(&self, kind: Kind, layout: &Layout) -> bool {
@@ -38,7 +38,7 @@ impl Chain {
 
 /// The packets of a message in which a signal is present.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Page {
+pub(super) enum SignalPage {
     /// The signal is in every packet of the message.
     Every,
     /// The signal is in every packet, and is the page number that selects the others.
@@ -51,7 +51,7 @@ pub(super) enum Page {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Signal {
     pub(super) name: String,
-    pub(super) page: Page,
+    pub(super) page: SignalPage,
     /// The first bit of the signal; bit 0 is the least significant bit of byte 0.
     pub(super) start: usize,
     pub(super) bits: u8,
@@ -66,19 +66,19 @@ pub(super) struct Signal {
 }
 
 /// Returns the signals of a kind of packet: the fields of its pages, the fields in bytes 12 and 13, and the CRC.
-pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) -> Vec<Signal> {
+pub(super) fn packet_signals(schema: &'static PacketSchema, length: Length, chain: &BusChain) -> Vec<Signal> {
     let one_page = schema.layouts.len() == 1;
     // The fields after the words are further back in a longer packet.
-    let further = length.words() * 16 - END;
+    let further = length.words() * 16 - WORDS_END_BIT;
     let of_layout = |layout: &'static Layout| {
-        let page = if one_page { Page::Every } else { Page::Only(layout.number) };
+        let page = if one_page { SignalPage::Every } else { SignalPage::Only(layout.number) };
         layout
             .fields
             .iter()
             .flat_map(move |field| {
                 let count = if field.varies_with_chain() { length.words() } else { usize::MAX };
-                let signals = of(field, &layout.prefix, chain.units).into_iter().take(count);
-                let further = if field.first_bit() < END { 0 } else { further };
+                let signals = field_signals(field, &layout.prefix, chain.units).into_iter().take(count);
+                let further = if field.first_bit() < WORDS_END_BIT { 0 } else { further };
                 signals.map(move |signal| Signal { start: signal.start + further, ..signal })
             })
             .map(move |it| Signal { page, ..it })
@@ -87,9 +87,12 @@ pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) 
     let mut signals: Vec<_> = layouts.iter().copied().flat_map(of_layout).collect();
     for field in &schema.end {
         let is_number = matches!(field.format, FieldFormat::Page(_) | FieldFormat::Parameter(_));
-        let numbered =
-            |signal| Signal { page: Page::Number, names: numbers(layouts.iter().copied()), ..signal };
-        let signals_of = of(field, "", chain.units).into_iter();
+        let numbered = |signal| Signal {
+            page: SignalPage::Number,
+            names: layout_names(layouts.iter().copied()),
+            ..signal
+        };
+        let signals_of = field_signals(field, "", chain.units).into_iter();
         let placed = |signal: Signal| Signal { start: signal.start + further, ..signal };
         signals
             .extend(signals_of.map(placed).map(|signal| if is_number { numbered(signal) } else { signal }));
@@ -101,7 +104,7 @@ pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) 
 }
 
 /// Returns the numbers of pages or parameters, each with its name.
-fn numbers(layouts: impl IntoIterator<Item = &'static Layout>) -> Vec<(i64, &'static str)> {
+fn layout_names(layouts: impl IntoIterator<Item = &'static Layout>) -> Vec<(i64, &'static str)> {
     layouts.into_iter().map(|layout| (i64::from(layout.number), layout.name.as_str())).collect()
 }
 
@@ -110,7 +113,7 @@ fn bits(name: String, start: usize, bits: u8) -> Signal {
     let max = f64::from(u32::MAX >> (32 - u32::from(bits.clamp(1, 32))));
     Signal {
         name,
-        page: Page::Every,
+        page: SignalPage::Every,
         start,
         bits,
         signed: false,
@@ -122,7 +125,7 @@ fn bits(name: String, start: usize, bits: u8) -> Signal {
 }
 
 /// Returns the signals of a field: one for each element, or for a field of flags one for each named bit.
-fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
+fn field_signals(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
     let at = field.first_bit();
     let named = |label: &str| field.signal_name(prefix, label);
     if matches!(field.format, FieldFormat::Total(_)) {
@@ -139,14 +142,14 @@ fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
         return (0..usize::from(ports)).map(|port| bits(named(&port.to_string()), at + port, 1)).collect();
     }
     if field.labels.is_empty() {
-        return vec![one(field, 0, units, named(""))];
+        return vec![element_signal(field, 0, units, named(""))];
     }
     let element = |(word, label): (usize, &String)| {
         let parts =
             if let FieldFormat::Group(parts) = &field.format { &parts[..] } else { slice::from_ref(field) };
         let label = label.clone();
         let signal = move |part: &'static Field| {
-            let signal = one(part, word, units, part.signal_name(prefix, &label));
+            let signal = element_signal(part, word, units, part.signal_name(prefix, &label));
             Signal { start: signal.start + word * 16, ..signal }
         };
         parts.iter().map(signal)
@@ -155,7 +158,7 @@ fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
 }
 
 /// Returns the signal of one element of a field.
-fn one(field: &'static Field, element: usize, units: Units, name: String) -> Signal {
+fn element_signal(field: &'static Field, element: usize, units: Units, name: String) -> Signal {
     let unscaled = bits(name, field.first_bit(), field.width());
     let factor = field.step_in(element, units);
     let signed = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
@@ -167,7 +170,7 @@ fn one(field: &'static Field, element: usize, units: Units, name: String) -> Sig
     };
     let named = |(value, name): &'static (i16, String)| (i64::from(*value), name.as_str());
     let names = if let FieldFormat::Parameter(_) = field.format {
-        numbers(parameters())
+        layout_names(parameters())
     } else if field.is_saturating() {
         [i16::MAX, i16::MIN].map(|end| (i64::from(end), "saturated")).to_vec()
     } else if field.format == FieldFormat::Reason {

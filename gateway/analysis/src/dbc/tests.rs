@@ -10,11 +10,11 @@ use protocol::packet::{Epoch, Packet, WORDS, Words};
 mod said;
 
 use super::*;
-use model::generate::{self, Target};
+use model::generate::{self, SkinRequest};
 
 /// Returns a skin with cells 1 to 254 on its only bus.
 fn full() -> Skin {
-    let target = Target { cells: 254, ..Target::default() };
+    let target = SkinRequest { cells: 254, ..SkinRequest::default() };
     Skin::parse("full.toml", &generate::generate(&target).unwrap()).unwrap()
 }
 
@@ -265,7 +265,7 @@ fn what_the_file_and_its_nodes_are_stands_in_comments() {
 
 #[test]
 fn each_bus_has_its_own_cells_and_one_that_is_not_has_no_text() {
-    let target = Target { cells: 20, buses: 2, ..Target::default() };
+    let target = SkinRequest { cells: 20, buses: 2, ..SkinRequest::default() };
     let skin = Skin::parse("two.toml", &generate::generate(&target).unwrap()).unwrap();
     for bus in 0..2 {
         let cells: BTreeSet<_> = skin.cells_on_bus(bus).map(|cell| format!("cell_{}", cell.node)).collect();

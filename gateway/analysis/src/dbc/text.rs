@@ -5,8 +5,8 @@ use core::fmt::{self, Write};
 use protocol::message::VERSION;
 use protocol::skin::{Skin, SkinBus};
 
-use super::signal::{Page, Signal};
-use super::{DbcNode, Message, SendSchedule, are_packets};
+use super::signal::{Signal, SignalPage};
+use super::{DbcMessage, DbcNode, SendSchedule, describes_packets};
 
 /// The format's placeholder for an unnamed sender or receiver.
 const UNNAMED: &str = "Vector__XXX";
@@ -40,7 +40,7 @@ pub(super) fn write(
     skin: &Skin,
     index: usize,
     bus: &SkinBus,
-    messages: &[Message],
+    messages: &[DbcMessage],
 ) -> fmt::Result {
     writeln!(out, "VERSION \"{VERSION}\"\n\nNS_ :")?;
     for section in SECTIONS {
@@ -55,9 +55,9 @@ pub(super) fn write(
     writeln!(out, "\n")?;
     let everyone: Vec<_> = cells.iter().map(|cell| cell.node.get()).collect();
     for message in messages {
-        frame(out, message, &everyone)?;
+        write_message(out, message, &everyone)?;
     }
-    about(out, skin, bus)?;
+    write_file_comment(out, skin, bus)?;
     for cell in &cells {
         let (serial, joint, hash) = (cell.serial, cell.joint, skin.parameters(cell).hash());
         let text = format!("Serial number {serial}, moved by joint {joint}, configuration hash {hash:04X}.");
@@ -66,7 +66,7 @@ pub(super) fn write(
     for message in messages {
         writeln!(out, "CM_ BO_ {} \"{}\";", message.id.to_bits(), message.comment)?;
     }
-    attributes(out, bus, messages)?;
+    write_attributes(out, bus, messages)?;
     for message in messages {
         for signal in message.signals.iter().filter(|signal| !signal.names.is_empty()) {
             write!(out, "VAL_ {} {}", message.id.to_bits(), signal.name)?;
@@ -80,29 +80,29 @@ pub(super) fn write(
 }
 
 /// Writes a message and its signals.
-fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Result {
-    let Message { id, name, from, .. } = message;
+fn write_message(out: &mut impl Write, message: &DbcMessage, everyone: &[u8]) -> fmt::Result {
+    let DbcMessage { id, name, from, .. } = message;
     write!(out, "BO_ {} {name}: {} ", id.to_bits(), message.length.bytes())?;
-    parties(out, *from, everyone)?;
+    write_nodes(out, *from, everyone)?;
     writeln!(out)?;
     for signal in &message.signals {
         let Signal { name, page, start, bits, signed, factor, range: [min, max], unit, names: _ } = signal;
         write!(out, " SG_ {name} ")?;
         match page {
-            Page::Every => {}
-            Page::Number => write!(out, "M ")?,
-            Page::Only(page) => write!(out, "m{page} ")?,
+            SignalPage::Every => {}
+            SignalPage::Number => write!(out, "M ")?,
+            SignalPage::Only(page) => write!(out, "m{page} ")?,
         }
         let sign = if *signed { '-' } else { '+' };
         // `@1` means little-endian.
         write!(out, ": {start}|{bits}@1{sign} ({factor},0) [{min}|{max}] \"{unit}\" ")?;
-        parties(out, message.to, everyone)?;
+        write_nodes(out, message.to, everyone)?;
         writeln!(out)?;
     }
     writeln!(out)
 }
 
-fn parties(out: &mut impl Write, party: DbcNode, everyone: &[u8]) -> fmt::Result {
+fn write_nodes(out: &mut impl Write, party: DbcNode, everyone: &[u8]) -> fmt::Result {
     match party {
         DbcNode::Gateway => write!(out, "gateway"),
         DbcNode::Cell(node) => write!(out, "cell_{node}"),
@@ -118,10 +118,10 @@ fn parties(out: &mut impl Write, party: DbcNode, everyone: &[u8]) -> fmt::Result
 }
 
 /// Writes the comment on the whole file: its skin, bus and limits.
-fn about(out: &mut impl Write, skin: &Skin, bus: &SkinBus) -> fmt::Result {
+fn write_file_comment(out: &mut impl Write, skin: &Skin, bus: &SkinBus) -> fmt::Result {
     // A quotation mark would end the comment.
     let [skin, bus_name] = [&skin.name, &bus.name].map(|name| name.replace('"', "'"));
-    let travels = if are_packets(bus) {
+    let travels = if describes_packets(bus) {
         "Classic: a packet travels in frames of up to 8 bytes under one identifier; this describes their bytes joined, \
          which no frame of the bus has."
     } else {
@@ -134,7 +134,7 @@ fn about(out: &mut impl Write, skin: &Skin, bus: &SkinBus) -> fmt::Result {
     )
 }
 
-fn attributes(out: &mut impl Write, bus: &SkinBus, messages: &[Message]) -> fmt::Result {
+fn write_attributes(out: &mut impl Write, bus: &SkinBus, messages: &[DbcMessage]) -> fmt::Result {
     let choices =
         |names: &[&str]| names.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(",");
     writeln!(out, "BA_DEF_ \"BusType\" STRING ;")?;
@@ -167,8 +167,8 @@ fn attributes(out: &mut impl Write, bus: &SkinBus, messages: &[Message]) -> fmt:
         writeln!(out, "BA_ \"VFrameFormat\" BO_ {id} {STANDARD_CAN_FD};")?;
         writeln!(out, "BA_ \"CANFD_BRS\" BO_ {id} 1;")?;
         let (kind, ms) = match message.rhythm {
-            SendSchedule::Seldom => continue,
-            SendSchedule::Every(ms) => (1, ms),
+            SendSchedule::OnEvent => continue,
+            SendSchedule::Cyclic(ms) => (1, ms),
             SendSchedule::WhileActive(ms) => (2, ms),
         };
         writeln!(out, "BA_ \"GenMsgSendType\" BO_ {id} {kind};")?;

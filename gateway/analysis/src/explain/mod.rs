@@ -7,7 +7,7 @@
 //! ```
 //!
 //! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of its contact state, so a word
-//! that is not the step nearest to the exact product comes from the cell's own J: [`Row::verdict`] looks for a J near
+//! that is not the step nearest to the exact product comes from the cell's own J: [`TorqueRow::verdict`] looks for a J near
 //! the exact one that gives this word. Information that the capture lacks is listed in [`Explanation::missing`].
 
 mod not_found;
@@ -16,10 +16,10 @@ mod row;
 pub mod series;
 mod watch;
 
-pub use not_found::{NotFound, another_robot};
-pub use read::{FoundJoints, find};
-pub use row::{JACOBIAN_STEPS, Row, Verdict};
-pub use watch::{CellMoment, Moment, Origin, RequestedJoints, Watch};
+pub use not_found::{NotFound, other_robot_text};
+pub use read::{FoundJoints, read_to_joints};
+pub use row::{MAX_JACOBIAN_ERROR_STEPS, TorqueRow, WordVerdict};
+pub use watch::{JointsWatcher, ObservedCellState, ObservedJoints, Origin, RequestedJoints};
 
 use protocol::fixed::{Q, is_saturated};
 use protocol::message::{SkinSensors, State};
@@ -27,7 +27,7 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, MAX_ROBOT_JOINTS, Skin, SkinReply};
 use serde::Serialize;
 
-use self::row::{jacobian_steps, number, row};
+use self::row::{joint_number, max_jacobian_error_steps, row};
 use model::central::Central;
 
 /// The derivation of all torques of one epoch.
@@ -38,7 +38,7 @@ pub struct Explanation {
     /// Cells that were in contact or answered, by bus and node id.
     pub cells: Vec<CellExplained>,
     /// The total torque of the skin at each joint.
-    pub total: Vec<Total>,
+    pub total: Vec<JointTotal>,
     /// Missing information, one line each.
     pub missing: Vec<String>,
 }
@@ -74,16 +74,16 @@ pub struct CellExplained {
     /// The robot's joint that moves the cell, from 1.
     pub joint: u8,
     /// The contact state of the cell, and the force computed from it; absent if unknown.
-    pub force: Option<Force>,
+    pub force: Option<ForceSteps>,
     /// Time in ns from the joints to the torque of the cell; absent if none arrived.
     pub answered_after_ns: Option<u64>,
     /// The derivation of the torque on each joint.
-    pub rows: Vec<Row>,
+    pub rows: Vec<TorqueRow>,
 }
 
 /// The steps of Algorithm 1 from a cell's sensor words to the force F_z.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Force {
+pub struct ForceSteps {
     /// The packet from which the cell's contact state is known.
     pub origin: Origin,
     /// The three contact words in N.
@@ -112,7 +112,7 @@ pub struct Force {
 
 /// The torque of the whole skin on one joint, as sent and as computed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Total {
+pub struct JointTotal {
     /// Number of the joint in the robot, from 1.
     pub joint: u8,
     /// Unit of the torques on the joint: Nm, or N for a prismatic joint.
@@ -138,7 +138,7 @@ pub struct Total {
 /// Derives the torques for these joints; `moments` has the joints and answers of each bus of the skin, `None` if
 /// missing.
 #[must_use]
-pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
+pub fn explain(skin: &Skin, moments: &[Option<ObservedJoints>]) -> Explanation {
     Explainer::new(skin).explain(moments)
 }
 
@@ -166,15 +166,19 @@ impl<'a> Explainer<'a> {
     /// Derives the torques for these joints; `moments` has the joints and answers of each bus of the skin, `None` if
     /// missing.
     #[must_use]
-    pub fn explain(&self, moments: &[Option<Moment>]) -> Explanation {
+    pub fn explain(&self, moments: &[Option<ObservedJoints>]) -> Explanation {
         explain_with(self.skin, &self.buses, moments)
     }
 }
 
-fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<Moment>]) -> Explanation {
+fn explain_with(
+    skin: &Skin,
+    parts: &[(Skin, [Central; 2])],
+    moments: &[Option<ObservedJoints>],
+) -> Explanation {
     let mut explanation =
         Explanation { buses: Vec::new(), cells: Vec::new(), total: Vec::new(), missing: Vec::new() };
-    let mut sums = [Sum::default(); MAX_ROBOT_JOINTS];
+    let mut sums = [JointSum::default(); MAX_ROBOT_JOINTS];
     for (index, ((bus, (part, both)), moment)) in skin.buses.iter().zip(parts).zip(moments).enumerate() {
         let name = &bus.name;
         let Some(moment) = moment else {
@@ -197,7 +201,7 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
         explanation.buses.push(BusExplained {
             bus: name.clone(),
             at_ns: moment.at_ns,
-            joints: chain.iter().map(|(joint, _)| number(*joint)).collect(),
+            joints: chain.iter().map(|(joint, _)| joint_number(*joint)).collect(),
             position_words: positions.iter().take(chain.len()).map(|word| word.to_bits()).collect(),
             position_rad: central.positions(&positions).into_iter().take(chain.len()).collect(),
             units: chain.iter().map(|(_, joint)| joint.kind.unit()).collect(),
@@ -209,8 +213,8 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
         here.sort_unstable_by_key(|(_, cell)| cell.node);
         for (place, cell) in here {
             let Some(said) = moment.cells.get(cell.node.index()) else { continue };
-            let known = known(skin, name, cell, said, &mut explanation.missing);
-            let force = known.map(|(sensors, origin)| force(cell, &sensors, origin));
+            let known = usable_contact(skin, name, cell, said, &mut explanation.missing);
+            let force = known.map(|(sensors, origin)| force_steps_of(cell, &sensors, origin));
             let active = force.is_some_and(|force| force.force_steps > 0);
             if said.answer.is_none() && force.is_none() {
                 silent += u32::from(said.contact_state.is_none());
@@ -220,22 +224,22 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
             }
             if active && said.answer.is_none() {
                 let why = match said.too_late {
-                    Some(at) => too_late(at.saturating_sub(moment.at_ns)),
-                    None => silence(moment.halted, said.state).to_owned(),
+                    Some(at) => too_late_text(at.saturating_sub(moment.at_ns)),
+                    None => silence_reason(moment.halted, said.state).to_owned(),
                 };
                 let node = cell.node;
                 explanation.missing.push(format!(
                     "{name} {node}: no torque of this epoch arrived in time: {why}; the sum of words does not contain it"
                 ));
             }
-            let newtons = force.map_or(0.0, |force| force.fused_or_none());
+            let newtons = force.map_or(0.0, |force| force.effective_fused_n());
             let ([in_words, in_numbers], [rounded, real]) = (both, &frames);
             let exact = in_words.torque(place, rounded, newtons);
             let unit = in_words.torque(place, rounded, 1.0);
             let unrounded = in_numbers.torque(place, real, newtons);
             let words = said.answer.map(|(_, words)| words);
             let format = bus.torque_format;
-            let steps = jacobian_steps(part.parameters(cell).chain().len());
+            let steps = max_jacobian_error_steps(part.parameters(cell).chain().len());
             let rows = chain.iter().enumerate().map(|(at, joint)| {
                 let moves = at < usize::from(cell.joint);
                 let steps = moves.then_some(steps);
@@ -257,7 +261,7 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
             explanation.cells.push(CellExplained {
                 bus: name.clone(),
                 node: cell.node.get(),
-                joint: chain.get(usize::from(cell.joint) - 1).map_or(0, |(joint, _)| number(*joint)),
+                joint: chain.get(usize::from(cell.joint) - 1).map_or(0, |(joint, _)| joint_number(*joint)),
                 force,
                 answered_after_ns: said.answer.map(|(at, _)| at.saturating_sub(moment.at_ns)),
                 rows,
@@ -278,7 +282,7 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
 }
 
 #[derive(Clone, Copy, Default)]
-struct Sum {
+struct JointSum {
     words: i64,
     products: f64,
     central: f64,
@@ -287,11 +291,11 @@ struct Sum {
     open: u32,
 }
 
-impl Sum {
+impl JointSum {
     #[expect(clippy::cast_precision_loss, reason = "254 words a bus: exact")]
-    fn total(self, joint: u8, unit: &'static str) -> Total {
+    fn total(self, joint: u8, unit: &'static str) -> JointTotal {
         let words_nm = self.words as f64 / 4_096.0;
-        Total {
+        JointTotal {
             joint,
             unit,
             word_steps: self.words,
@@ -307,13 +311,13 @@ impl Sum {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "for display")]
-fn too_late(nanos: u64) -> String {
+fn too_late_text(nanos: u64) -> String {
     let ms = nanos as f64 / 1e6;
     format!("it came {ms:.3} ms after the joints, after four more joints, and is not used")
 }
 
 /// Returns the likely reason why a cell in contact sent nothing.
-fn silence(halted: bool, state: Option<State>) -> &'static str {
+fn silence_reason(halted: bool, state: Option<State>) -> &'static str {
     let has = |bit| state.is_some_and(|state| state.has(bit));
     if halted || has(State::HALTED) {
         "it was halted"
@@ -328,11 +332,11 @@ fn silence(halted: bool, state: Option<State>) -> &'static str {
 
 /// Returns the contact state of a cell, if its torque can be computed from that state. Otherwise adds the reason to
 /// `missing`, if the cell answered or may be in contact.
-fn known(
+fn usable_contact(
     skin: &Skin,
     bus: &str,
     cell: &Cell,
-    said: &CellMoment,
+    said: &ObservedCellState,
     missing: &mut Vec<String>,
 ) -> Option<(SkinSensors, Origin)> {
     let node = cell.node;
@@ -367,16 +371,16 @@ fn known(
     said.contact_state
 }
 
-impl Force {
+impl ForceSteps {
     /// Returns the fused force in N, exact and before the cell rounds it; 0 below the threshold.
-    const fn fused_or_none(&self) -> f64 {
+    const fn effective_fused_n(&self) -> f64 {
         if self.force_steps > 0 { self.fused_n } else { 0.0 }
     }
 }
 
 /// Computes Algorithm 1 in `f64`, in which every word, sum and product is exact.
 #[expect(clippy::cast_possible_truncation, reason = "at most 2^36 steps of 2^-24: exact")]
-fn force(cell: &Cell, sensors: &SkinSensors, origin: Origin) -> Force {
+fn force_steps_of(cell: &Cell, sensors: &SkinSensors, origin: Origin) -> ForceSteps {
     let rule = &cell.contact;
     let contact_n = sensors.contact.map(Q::to_f64);
     let touch_n = contact_n.iter().sum();
@@ -390,7 +394,7 @@ fn force(cell: &Cell, sensors: &SkinSensors, origin: Origin) -> Force {
         alpha_c * above(touch_n, contact_threshold_n) + alpha_p_n * above(proximity, proximity_threshold);
     let counts = above(fused_n, force_threshold_n).max(0.0);
     let force_steps = ((counts * 16_777_216.0) as i64 + 128) >> 8;
-    Force {
+    ForceSteps {
         origin,
         contact_n,
         proximity,

@@ -21,7 +21,7 @@ pub enum NotFound {
         buses: String,
     },
     /// The joints belong to another robot.
-    #[error("{}", another_robot(bus, *came, *chain))]
+    #[error("{}", other_robot_text(bus, *came, *chain))]
     Robot {
         /// Name of the bus.
         bus: String,
@@ -42,7 +42,7 @@ pub enum NotFound {
 
 /// Returns the text of the error for joints of `came` values, on a bus whose chain has `chain` joints.
 #[must_use]
-pub fn another_robot(bus: &str, came: usize, chain: usize) -> String {
+pub fn other_robot_text(bus: &str, came: usize, chain: usize) -> String {
     format!(
         "{bus} carries {came} joints, but the skin's chain on it has {chain}: the skin is of another robot, name the right one"
     )

@@ -6,18 +6,18 @@ use protocol::time::Micros;
 use trace::capture::{CaptureError, Entry, NoteKind, Reader};
 
 use super::NotFound;
-use super::watch::{Moment, RequestedJoints, Watch};
+use super::watch::{JointsWatcher, ObservedJoints, RequestedJoints};
 
 /// The content of a capture up to the requested joints.
 #[derive(Debug)]
 pub struct FoundJoints {
     /// The joints and answers on each bus of the skin, `None` for a bus without these joints; or the reason why no bus
     /// has them.
-    pub moments: Result<Vec<Option<Moment>>, NotFound>,
+    pub moments: Result<Vec<Option<ObservedJoints>>, NotFound>,
     /// Time that counts as 0 s, in ns since 1970.
     pub zero_ns: u64,
     /// True if `zero_ns` is the first tick of the run, false if it is the first frame.
-    pub is_of_run: bool,
+    pub counts_from_run: bool,
     /// Number of frames before the joints that the recorder of the capture lost.
     pub dropped: u64,
     /// Number of unreadable lines before the joints.
@@ -30,17 +30,17 @@ pub struct FoundJoints {
 ///
 /// # Errors
 /// Returns [`CaptureError`] if the capture cannot be read, or is damaged.
-pub fn find(
+pub fn read_to_joints(
     reader: &mut Reader,
     skin: &Skin,
     requested: RequestedJoints,
 ) -> Result<FoundJoints, CaptureError> {
-    let mut watch = Watch::new(skin, requested);
+    let mut watch = JointsWatcher::new(skin, requested);
     let mut decoder = Decoder::new(None);
     for before in &reader.extras().latched {
         let at = Micros(before.nanos / 1_000);
         if let Decoded::Message(message) = decoder.decode(at, &before.bus, &before.frame) {
-            watch.begin(before.nanos, &before.bus, &message);
+            watch.receive_latched(before.nanos, &before.bus, &message);
         }
     }
     let mut zero = reader.extras().run_began();
@@ -70,7 +70,7 @@ pub fn find(
         moments: watch.moments(),
         is_empty,
         zero_ns: zero.unwrap_or_default(),
-        is_of_run,
+        counts_from_run: is_of_run,
         dropped,
         unreadable,
     })

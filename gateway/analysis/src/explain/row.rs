@@ -6,15 +6,15 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Joint;
 use serde::Serialize;
 
-use super::Force;
+use super::ForceSteps;
 
 /// Maximum error of J in a cell with 16-bit arithmetic, in steps of 2^-14 m: the 5e-4 m that the kernels guarantee for
 /// arms of any shape. Each row of the chain after the sixth, up to the cell's, adds one.
-pub const JACOBIAN_STEPS: i64 = 8;
+pub const MAX_JACOBIAN_ERROR_STEPS: i64 = 8;
 
 /// The torque of one cell on one joint: as sent, and as computed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Row {
+pub struct TorqueRow {
     /// Number of the joint in the robot, from 1.
     pub joint: u8,
     /// Unit of the torques on the joint: Nm, or N for a prismatic joint.
@@ -32,13 +32,13 @@ pub struct Row {
     /// The sent word minus the nearest word, in steps of 2^-12 Nm.
     pub difference_steps: Option<i32>,
     /// The cause of the difference, if there is one.
-    pub verdict: Verdict,
+    pub verdict: WordVerdict,
 }
 
 /// The cause of a difference between a sent word and the exact product.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case", tag = "is")]
-pub enum Verdict {
+pub enum WordVerdict {
     /// The word is the step nearest to the exact product.
     Nearest,
     /// The product is out of the range of a word, and the word is saturated as required.
@@ -57,7 +57,7 @@ pub enum Verdict {
 }
 
 /// Returns a joint's number, from 1, given its index in the robot.
-pub(super) fn number(joint: usize) -> u8 {
+pub(super) fn joint_number(joint: usize) -> u8 {
     u8::try_from(joint + 1).unwrap_or(u8::MAX)
 }
 
@@ -66,12 +66,12 @@ pub(super) fn row(
     &(joint, described): &(usize, &Joint),
     at: usize,
     steps: Option<i64>,
-    force: Option<&Force>,
+    force: Option<&ForceSteps>,
     exact: &[f64; MAX_JOINTS],
     unit: &[f64; MAX_JOINTS],
     format: TorqueFormat,
     words: Option<&Words>,
-) -> Row {
+) -> TorqueRow {
     let of = |values: &[f64; MAX_JOINTS]| force.and_then(|_| values.get(at).copied());
     let (jacobian_m, product_nm) = (of(unit), of(exact));
     let nearest = product_nm.map(|product| format.nearest(product));
@@ -81,24 +81,25 @@ pub(super) fn row(
         (Some(force), Some(jacobian), Some(nearest), Some(word)) => {
             verdict(force.force_steps, jacobian, steps, format, nearest, word)
         }
-        (_, _, _, _) => Verdict::Open,
+        (_, _, _, _) => WordVerdict::Open,
     };
-    Row {
-        joint: number(joint),
+    TorqueRow {
+        joint: joint_number(joint),
         unit: described.kind.torque_unit(),
         jacobian_m,
         product_nm,
         nearest_word: nearest,
         word,
-        word_nm: word.map(|word| format.real(word)),
+        word_nm: word.map(|word| format.to_real(word)),
         difference_steps: difference,
         verdict,
     }
 }
 
 /// Returns the maximum error of J in steps of 2^-14 m, for a cell on the row with this number.
-pub(super) fn jacobian_steps(rows: usize) -> i64 {
-    JACOBIAN_STEPS + i64::try_from(rows.saturating_sub(6)).unwrap_or(i64::MAX - JACOBIAN_STEPS)
+pub(super) fn max_jacobian_error_steps(rows: usize) -> i64 {
+    MAX_JACOBIAN_ERROR_STEPS
+        + i64::try_from(rows.saturating_sub(6)).unwrap_or(i64::MAX - MAX_JACOBIAN_ERROR_STEPS)
 }
 
 /// Returns the cause of the difference between a word and its expected value `nearest`. For a joint that does not move
@@ -115,11 +116,11 @@ fn verdict(
     format: TorqueFormat,
     nearest: i16,
     word: i16,
-) -> Verdict {
+) -> WordVerdict {
     if word == nearest {
-        return if is_saturated(word) { Verdict::Saturated } else { Verdict::Nearest };
+        return if is_saturated(word) { WordVerdict::Saturated } else { WordVerdict::Nearest };
     }
-    let Some(within) = steps else { return Verdict::Unexplained };
+    let Some(within) = steps else { return WordVerdict::Unexplained };
     let exact = jacobian_m * 16_384.0;
     let middle = exact.round() as i64;
     let mut near: Vec<i64> = (middle - within - 1..=middle + within + 1).collect();
@@ -127,7 +128,7 @@ fn verdict(
     near.sort_by(|one, other| off(*one).abs().total_cmp(&off(*other).abs()));
     let gives = |steps: i64| format.round(Acc::<30>::from_steps(steps * force_steps)) == word;
     let found = near.into_iter().find(|&steps| off(steps).abs() <= within as f64 && gives(steps));
-    found.map_or(Verdict::Unexplained, |steps| Verdict::Rounded {
+    found.map_or(WordVerdict::Unexplained, |steps| WordVerdict::Rounded {
         jacobian_m: steps as f64 / 16_384.0,
         jacobian_steps: off(steps),
     })

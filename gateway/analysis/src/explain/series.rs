@@ -12,7 +12,7 @@ use protocol::time::Micros;
 use thiserror::Error;
 use trace::capture::{CaptureError, Entry, Note, Reader};
 
-use super::watch::{Moment, Watch};
+use super::watch::{JointsWatcher, ObservedJoints};
 use super::{Explainer, Explanation, NotFound};
 
 /// Number of epochs that a bus may be behind the others before they no longer wait for it.
@@ -47,7 +47,7 @@ pub enum SeriesError<E> {
     },
     /// The function that receives the epochs has failed.
     #[error("{0}")]
-    Taken(E),
+    Consumer(E),
 }
 
 /// The extent of a capture that was read epoch by epoch.
@@ -71,12 +71,12 @@ pub fn each_epoch<E>(
     mut note: impl FnMut(&Note<'_>),
     mut take: impl FnMut(u64, &EpochTorque) -> Result<(), E>,
 ) -> Result<SeriesTotals, SeriesError<E>> {
-    let mut series = Series::new(skin);
+    let mut series = EpochJoiner::new(skin);
     let mut decoder = Decoder::new(None);
     for before in &reader.extras().latched {
         let at = Micros(before.nanos / 1_000);
         if let Decoded::Message(message) = decoder.decode(at, &before.bus, &before.frame) {
-            series.watch.begin(before.nanos, &before.bus, &message);
+            series.watch.receive_latched(before.nanos, &before.bus, &message);
         }
     }
     let mut counted = SeriesTotals::default();
@@ -97,13 +97,13 @@ pub fn each_epoch<E>(
         series.collect(false);
         while let Some(epoch) = series.next(false) {
             counted.epochs += 1;
-            take(counted.zero_ns, &epoch).map_err(SeriesError::Taken)?;
+            take(counted.zero_ns, &epoch).map_err(SeriesError::Consumer)?;
         }
     }
     series.collect(true);
     while let Some(epoch) = series.next(true) {
         counted.epochs += 1;
-        take(counted.zero_ns, &epoch).map_err(SeriesError::Taken)?;
+        take(counted.zero_ns, &epoch).map_err(SeriesError::Consumer)?;
     }
     if counted.epochs == 0
         && let Err(source) = series.watch.moments()
@@ -123,23 +123,23 @@ pub fn is_summed(skin: &Skin, joint: usize) -> bool {
 }
 
 /// Joins the joints of several buses into epochs.
-struct Series<'a> {
+struct EpochJoiner<'a> {
     skin: &'a Skin,
-    watch: Watch<'a>,
+    watch: JointsWatcher<'a>,
     explainer: Explainer<'a>,
     /// Epochs for which joints of some buses are still missing, by their number and then by bus.
-    waiting: BTreeMap<i64, (Epoch, Vec<Option<Moment>>)>,
+    waiting: BTreeMap<i64, (Epoch, Vec<Option<ObservedJoints>>)>,
     /// The newest epoch number of each bus that has cells.
     last: Vec<(usize, Option<i64>)>,
     newest: Option<(i64, Epoch)>,
 }
 
-impl<'a> Series<'a> {
+impl<'a> EpochJoiner<'a> {
     fn new(skin: &'a Skin) -> Self {
         let with_cells = (0..skin.buses.len()).filter(|bus| skin.cells_on_bus(*bus).next().is_some());
         Self {
             skin,
-            watch: Watch::all(skin),
+            watch: JointsWatcher::all(skin),
             explainer: Explainer::new(skin),
             waiting: BTreeMap::new(),
             last: with_cells.map(|bus| (bus, None)).collect(),

@@ -51,7 +51,7 @@ fn heartbeat(configuration: u16) -> Message {
 
 /// Derives the torques at the requested joints from these messages, which are sent 1 ms apart.
 fn explained(skin: &Skin, messages: &[Message], requested: RequestedJoints) -> Result<Explanation, NotFound> {
-    let mut watch = Watch::new(skin, requested);
+    let mut watch = JointsWatcher::new(skin, requested);
     for (at, message) in (1..).zip(messages) {
         if watch.receive(at * 1_000_000, "vcan0", Some(message)) {
             break;
@@ -82,7 +82,7 @@ fn the_worked_example_of_the_document_is_explained_step_by_step() {
     for row in &cell.rows {
         let off = row.product_nm.unwrap() * 4_096.0 - f64::from(row.nearest_word.unwrap());
         assert!(off.abs() <= 0.5, "{row:?}");
-        assert!(!matches!(row.verdict, Verdict::Unexplained | Verdict::Open), "{row:?}");
+        assert!(!matches!(row.verdict, WordVerdict::Unexplained | WordVerdict::Open), "{row:?}");
     }
     assert_eq!(explanation.total[1].word_steps, 3195);
 }
@@ -96,9 +96,12 @@ fn a_word_that_no_jacobian_near_makes_is_not_explained() {
         [0, 1].map(|at| explanation.cells[0].rows[at].verdict)
     };
     // 3 N times 8 steps of 2^-14 m make 6 steps of 2^-12 Nm.
-    assert!(matches!(verdicts([-1075 + 5, 3195 - 5]), [Verdict::Rounded { .. }, Verdict::Rounded { .. }]));
-    assert_eq!(verdicts([-1075 + 9, 3195 - 9]), [Verdict::Unexplained; 2]);
-    assert_eq!(verdicts([i16::MAX, -3195]), [Verdict::Unexplained; 2]);
+    assert!(matches!(
+        verdicts([-1075 + 5, 3195 - 5]),
+        [WordVerdict::Rounded { .. }, WordVerdict::Rounded { .. }]
+    ));
+    assert_eq!(verdicts([-1075 + 9, 3195 - 9]), [WordVerdict::Unexplained; 2]);
+    assert_eq!(verdicts([i16::MAX, -3195]), [WordVerdict::Unexplained; 2]);
 }
 
 #[test]
@@ -110,7 +113,7 @@ fn a_torque_in_a_joint_that_does_not_move_the_cell_is_not_explained() {
     }
     let said = [heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7), wrong];
     let explanation = explained(&skin, &said, first(7)).unwrap();
-    assert_eq!(explanation.cells[0].rows[2].verdict, Verdict::Unexplained);
+    assert_eq!(explanation.cells[0].rows[2].verdict, WordVerdict::Unexplained);
 }
 
 #[test]
@@ -120,8 +123,8 @@ fn beyond_the_word_saturated_is_right_and_anything_else_is_not() {
         let said = [heartbeat(0x266D), press(AppliesFrom::Next, 30.0), joints(7), torque(7, [-32_250, word])];
         explained(&skin, &said, first(7)).unwrap().cells[0].rows[1].verdict
     };
-    assert_eq!(verdict(i16::MAX), Verdict::Saturated);
-    assert_eq!(verdict(32_000), Verdict::Unexplained);
+    assert_eq!(verdict(i16::MAX), WordVerdict::Saturated);
+    assert_eq!(verdict(32_000), WordVerdict::Unexplained);
 }
 
 #[test]
@@ -196,7 +199,7 @@ fn what_is_not_there_is_named_with_what_is() {
     assert_eq!(error, expected);
     let error = explained(&skin, &[heartbeat(0)], first(5)).unwrap_err().to_string();
     assert_eq!(error, "there are no joints on vcan0, and cells answer only joints");
-    let mut watch = Watch::new(&skin, first(5));
+    let mut watch = JointsWatcher::new(&skin, first(5));
     watch.receive(0, "can7", None);
     let error = watch.moments().unwrap_err().to_string();
     assert_eq!(error, "none of its buses (can7) is one of the skin's (vcan0)");

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use model::tracker::{AddressClaim, Contact, HeartbeatKind, MAX_LATE_EPOCHS, PerCell, is_late};
+use model::tracker::{AddressClaim, ContactState, HeartbeatKind, MAX_LATE_EPOCHS, PerCell, is_late};
 use protocol::id::{CellId, Node};
 use protocol::message::{
     Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
@@ -65,7 +65,7 @@ pub struct RequestedJoints {
 
 /// A joints packet on one bus, and the state and the answer of each cell.
 #[derive(Clone, Debug)]
-pub struct Moment {
+pub struct ObservedJoints {
     /// Time of the joints in ns since 1970.
     pub at_ns: u64,
     /// The joints.
@@ -73,12 +73,12 @@ pub struct Moment {
     /// True if the bus was halted at these joints.
     pub halted: bool,
     /// The cells, by their index on the bus.
-    pub cells: Vec<CellMoment>,
+    pub cells: Vec<ObservedCellState>,
 }
 
 /// The state of one cell at a joints packet.
 #[derive(Clone, Debug, Default)]
-pub struct CellMoment {
+pub struct ObservedCellState {
     /// The contact state of the cell, and the packet from which it is known; `None` if unknown.
     pub contact_state: Option<(SkinSensors, Origin)>,
     /// True if the cell is in test mode and obeys stimuli; `None` if it has not reported its mode.
@@ -97,7 +97,7 @@ pub struct CellMoment {
 
 /// Reads a capture up to the requested joints, and follows the state of each cell.
 #[derive(Debug)]
-pub struct Watch<'a> {
+pub struct JointsWatcher<'a> {
     skin: &'a Skin,
     requested: Option<RequestedJoints>,
     zero: Option<u64>,
@@ -110,14 +110,14 @@ pub struct Watch<'a> {
 struct BusWatch {
     /// True if the capture has frames of the bus.
     is_in_capture: bool,
-    cells_here: bool,
+    has_cells: bool,
     last: Option<Epoch>,
     halted: bool,
     occurrences: u32,
     /// Joints whose answers may still arrive, oldest first.
     open: VecDeque<OpenJoints>,
     cells: PerCell<WatchedCell>,
-    runs: Vec<Run>,
+    runs: Vec<EpochRun>,
     /// The number of values in a joints packet whose length does not fit the chain.
     other_joints: Option<usize>,
     /// Number of runs of epochs that are not kept.
@@ -128,41 +128,41 @@ struct BusWatch {
 #[derive(Debug)]
 struct OpenJoints {
     epoch: Epoch,
-    moment: Moment,
+    moment: ObservedJoints,
     since: u32,
 }
 
 #[derive(Clone, Debug, Default)]
 struct WatchedCell {
     claim: AddressClaim,
-    contact: Contact<Origin>,
+    contact: ContactState<Origin>,
     hash: Option<u16>,
 }
 
 /// A run of joints whose epochs follow each other.
 #[derive(Clone, Copy, Debug)]
-struct Run {
+struct EpochRun {
     first: (Epoch, u64),
     last: (Epoch, u64),
     joints: u64,
 }
 
-impl<'a> Watch<'a> {
+impl<'a> JointsWatcher<'a> {
     /// Creates a watch that finds the requested joints.
     #[must_use]
     pub fn new(skin: &'a Skin, requested: RequestedJoints) -> Self {
-        Self::of(skin, Some(requested))
+        Self::with_request(skin, Some(requested))
     }
 
-    /// Creates a watch that returns all joints, by [`Watch::pop`].
+    /// Creates a watch that returns all joints, by [`JointsWatcher::pop`].
     #[must_use]
     pub fn all(skin: &'a Skin) -> Self {
-        Self::of(skin, None)
+        Self::with_request(skin, None)
     }
 
-    fn of(skin: &'a Skin, requested: Option<RequestedJoints>) -> Self {
+    fn with_request(skin: &'a Skin, requested: Option<RequestedJoints>) -> Self {
         let bus_watch =
-            |bus| BusWatch { cells_here: skin.cells_on_bus(bus).next().is_some(), ..BusWatch::default() };
+            |bus| BusWatch { has_cells: skin.cells_on_bus(bus).next().is_some(), ..BusWatch::default() };
         let bus_watches = (0..skin.buses.len()).map(bus_watch).collect();
         Self { skin, requested, zero: None, bus_watches, others: Vec::new() }
     }
@@ -173,7 +173,7 @@ impl<'a> Watch<'a> {
     }
 
     /// Handles a packet from before the start of the capture, which still has an effect.
-    pub fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
+    pub fn receive_latched(&mut self, nanos: u64, bus: &str, message: &Message) {
         let at = self.skin.bus_named(bus);
         let joints = at.map_or(0, |at| self.skin.joints_on_bus(at).len());
         if let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) {
@@ -213,7 +213,7 @@ impl<'a> Watch<'a> {
 
     /// Removes and returns the oldest joints of a bus, if their answers are complete. At the end of the capture
     /// (`is_end`), all answers count as complete.
-    pub fn pop(&mut self, bus: usize, is_end: bool) -> Option<(Epoch, Moment)> {
+    pub fn pop(&mut self, bus: usize, is_end: bool) -> Option<(Epoch, ObservedJoints)> {
         let moments = &mut self.bus_watches.get_mut(bus)?.open;
         moments.front().filter(|open| is_end || open.is_complete())?;
         moments.pop_front().map(|open| (open.epoch, open.moment))
@@ -221,15 +221,15 @@ impl<'a> Watch<'a> {
 
     /// Returns true if the requested joints and all answers to them are known on all buses.
     fn is_complete(&self) -> bool {
-        self.bus_watches.iter().filter(|bus_watch| bus_watch.cells_here).all(BusWatch::is_complete)
+        self.bus_watches.iter().filter(|bus_watch| bus_watch.has_cells).all(BusWatch::is_complete)
     }
 
     /// Returns the requested joints on each of the skin's buses; `None` for a bus that does not have them. Call it at
-    /// the end of the capture, or once [`Watch::receive`] has returned true.
+    /// the end of the capture, or once [`JointsWatcher::receive`] has returned true.
     ///
     /// # Errors
     /// Returns [`NotFound`] if no bus has these joints.
-    pub fn moments(self) -> Result<Vec<Option<Moment>>, NotFound> {
+    pub fn moments(self) -> Result<Vec<Option<ObservedJoints>>, NotFound> {
         let names = |there: bool| {
             let buses = self
                 .skin
@@ -280,7 +280,7 @@ fn seconds(nanos: u64) -> String {
     format!("{:.3}", nanos as f64 / 1e9)
 }
 
-impl Run {
+impl EpochRun {
     fn text(&self, zero: u64) -> String {
         let Self { first, last, joints } = *self;
         let [from, to] = [first, last].map(|(_, at)| format!("{:.3}", seconds_since(zero, at)));
@@ -295,7 +295,7 @@ impl Run {
 impl OpenJoints {
     fn is_complete(&self) -> bool {
         // A cell that answered has reported its configuration, and a cell in contact has answered.
-        let settled = |cell: &CellMoment| match cell.answer {
+        let settled = |cell: &ObservedCellState| match cell.answer {
             Some(_) => cell.hash.is_some(),
             None => {
                 cell.too_late.is_some()
@@ -341,12 +341,15 @@ impl BusWatch {
             Message::Stimulus { to, from, page } => {
                 let from_epoch = if let AppliesFrom::Epoch(epoch) = from { Some(epoch.0) } else { None };
                 let origin = Origin::Stimulus { at_ns: nanos, from_epoch, late: is_late(from, last) };
-                self.cells.named(to).iter_mut().for_each(|cell| cell.contact.push(from, page, origin, last));
+                self.cells
+                    .addressed_mut(to)
+                    .iter_mut()
+                    .for_each(|cell| cell.contact.push(from, page, origin, last));
             }
             Message::Configure { to, request: Request::Write { number, words }, .. } => {
                 if Parameter::from_number(number) == Some(Parameter::Mode) {
                     let (obeys, origin) = (words.first() == Some(&1), Origin::Mode { at_ns: nanos });
-                    self.cells.named(to).iter_mut().for_each(|cell| cell.mode(obeys, origin));
+                    self.cells.addressed_mut(to).iter_mut().for_each(|cell| cell.set_mode(obeys, origin));
                 }
             }
             Message::Configured { from, answer: Answer::Value { number, written, words }, .. } => {
@@ -368,8 +371,9 @@ impl BusWatch {
             }
             Message::Network { from: Node::Cell(from), page: NetworkPage::Received(heard), .. } => {
                 let cell = self.cells.get_mut(from).filter(|cell| cell.contact.obeys() != Some(false));
-                cell.into_iter()
-                    .for_each(|cell| cell.contact.count(heard.stimuli, Origin::Said { at_ns: nanos }));
+                cell.into_iter().for_each(|cell| {
+                    cell.contact.compare_count(heard.stimuli, Origin::Said { at_ns: nanos })
+                });
             }
             Message::Sensors { from, epoch, page: page @ SensorPage::Skin(skin) } => {
                 let origin = Origin::Said { at_ns: nanos };
@@ -411,7 +415,7 @@ impl BusWatch {
         joints: Joints,
         requested: Option<RequestedJoints>,
     ) {
-        self.run(nanos, epoch);
+        self.record_epoch(nanos, epoch);
         self.latch(epoch);
         for open in &mut self.open {
             open.since += 1;
@@ -422,14 +426,15 @@ impl BusWatch {
             is_one && self.occurrences == requested.occurrence
         });
         if opens {
-            let cells = self.cells.iter().map(|(_, WatchedCell { claim, contact, hash })| CellMoment {
-                contact_state: contact.skin().copied(),
-                test_mode: contact.obeys(),
-                state: claim.heartbeat().map(|heartbeat| heartbeat.state),
-                hash: *hash,
-                ..CellMoment::default()
-            });
-            let moment = Moment { at_ns: nanos, joints, halted: self.halted, cells: cells.collect() };
+            let cells =
+                self.cells.iter().map(|(_, WatchedCell { claim, contact, hash })| ObservedCellState {
+                    contact_state: contact.skin().copied(),
+                    test_mode: contact.obeys(),
+                    state: claim.heartbeat().map(|heartbeat| heartbeat.state),
+                    hash: *hash,
+                    ..ObservedCellState::default()
+                });
+            let moment = ObservedJoints { at_ns: nanos, joints, halted: self.halted, cells: cells.collect() };
             self.open.push_back(OpenJoints { epoch, moment, since: 0 });
         }
     }
@@ -440,12 +445,12 @@ impl BusWatch {
     }
 
     /// Adds the epoch of new joints to the list of runs.
-    fn run(&mut self, nanos: u64, epoch: Epoch) {
+    fn record_epoch(&mut self, nanos: u64, epoch: Epoch) {
         let follows = !self.runs.is_empty() && self.last.is_some_and(|last| last.next() == epoch);
         if !follows && self.runs.len() == MAX_LISTED_RUNS {
             self.further_runs += 1;
         } else if !follows {
-            self.runs.push(Run { first: (epoch, nanos), last: (epoch, nanos), joints: 1 });
+            self.runs.push(EpochRun { first: (epoch, nanos), last: (epoch, nanos), joints: 1 });
         } else if let Some(run) = self.runs.last_mut().filter(|_| self.further_runs == 0) {
             run.last = (epoch, nanos);
             run.joints += 1;
@@ -453,7 +458,7 @@ impl BusWatch {
     }
 
     /// Returns the cell as of the newest joints of this epoch, and true if an answer to them is still in time.
-    fn answering(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut CellMoment, bool)> {
+    fn answering(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut ObservedCellState, bool)> {
         let open = self.open.iter_mut().rev().find(|open| open.epoch == epoch)?;
         let in_time = !open.is_too_late();
         Some((open.moment.cells.get_mut(from.index())?, in_time))
@@ -476,11 +481,11 @@ impl WatchedCell {
         let obeys = heartbeat.state.has(State::TEST_MODE);
         match self.claim.receive(Micros(at_ns / 1_000), heartbeat) {
             HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken => return false,
-            HeartbeatKind::Started { .. } => self.mode(obeys, Origin::Start { at_ns }),
+            HeartbeatKind::Started { .. } => self.set_mode(obeys, Origin::Start { at_ns }),
             // The apparent start was none, and the contact state before it was not kept.
             HeartbeatKind::Shared => self.contact.reset(),
-            HeartbeatKind::First | HeartbeatKind::Known if !obeys => self.contact.reset(),
-            HeartbeatKind::First | HeartbeatKind::Known => {}
+            HeartbeatKind::First | HeartbeatKind::Continued if !obeys => self.contact.reset(),
+            HeartbeatKind::First | HeartbeatKind::Continued => {}
         }
         self.contact.set_obeys(obeys);
         self.hash = Some(heartbeat.configuration);
@@ -489,7 +494,7 @@ impl WatchedCell {
 
     /// Sets the mode of the cell. In test mode it starts without contact; a cell that measures has a contact state that
     /// the bus does not show.
-    fn mode(&mut self, obeys: bool, origin: Origin) {
+    fn set_mode(&mut self, obeys: bool, origin: Origin) {
         if obeys {
             self.contact.start(origin);
         } else {

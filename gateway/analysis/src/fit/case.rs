@@ -18,11 +18,11 @@ const OTHERS_NS: u64 = 4 * HEARTBEAT_NS;
 #[expect(clippy::cast_possible_truncation, reason = "a few pages")]
 const OTHERS: u32 = SensorPage::SIMULATED.len() as u32 - 1;
 /// Share of the period that `skinbus skin generate` gives to slots, in percent.
-const SLOTS_SHARE: u64 = 75;
+const SLOTS_SHARE_PERCENT: u64 = 75;
 
 /// The answers of a bus's cells to joints, if all cells are in contact.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Answers {
+pub enum AnswerPlan {
     /// Each cell sends its own torque.
     Torques {
         /// Number of cells on the bus.
@@ -40,7 +40,7 @@ pub enum Answers {
     },
 }
 
-impl Answers {
+impl AnswerPlan {
     /// Returns the number of cells on the bus, each of which answers.
     #[must_use]
     pub fn cells(&self) -> u32 {
@@ -73,7 +73,7 @@ impl Answers {
 
 /// A bus with its rates and cells, as the input of a timing analysis.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Case {
+pub struct BusCase {
     /// The frame format: one FD frame per packet, or several classic ones.
     pub format: Format,
     /// The length of joints and answers.
@@ -87,7 +87,7 @@ pub struct Case {
     /// The rates at which cells send sensors frames on their own.
     pub sensing: Sensing,
     /// The answers of the cells.
-    pub answers: Answers,
+    pub answers: AnswerPlan,
 }
 
 /// Shares of a bus's time by kind of frame, if each frame has its maximum length.
@@ -113,7 +113,7 @@ impl Load {
 
 /// Upper bounds of times on a bus; `None` if a time is unbounded.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Times {
+pub struct WorstCaseTimes {
     /// From the time at which the joints should be sent to their end on the bus, in ns.
     pub joints_ns: Option<u64>,
     /// From the time at which the joints should be sent to the end of the last answer, in ns: the sum of blocking,
@@ -126,7 +126,7 @@ pub struct Times {
     pub heartbeat_ns: Option<u64>,
 }
 
-impl Times {
+impl WorstCaseTimes {
     /// Returns the smaller of the two bounds of the last answer, in ns.
     #[must_use]
     pub fn last_ns(&self) -> Option<u64> {
@@ -134,7 +134,7 @@ impl Times {
     }
 }
 
-impl Case {
+impl BusCase {
     /// Returns the timing inputs of one bus as the skin describes it, with these rates; `None` if a cell that answers
     /// with sums is unreachable.
     #[must_use]
@@ -148,8 +148,8 @@ impl Case {
         let described = skin.buses.get(bus)?;
         let period_ns = u64::from(skin.timing.ticks_per_broadcast) * skin.timing.tick_nanos();
         let answers = match described.reply {
-            SkinReply::Torque => torques(skin, bus),
-            SkinReply::Sum { slot_us, .. } => sums(skin, bus, period_ns, Some(slot_us), true)?,
+            SkinReply::Torque => torques_of_bus(skin, bus),
+            SkinReply::Sum { slot_us, .. } => sums_of_tree(skin, bus, period_ns, Some(slot_us), true)?,
         };
         Some(Self {
             format,
@@ -173,7 +173,7 @@ impl Case {
             Format::Fd => (Coding::FdSwitched, u8::try_from(length.bytes()).unwrap_or(u8::MAX)),
             Format::Classic => (Coding::Classic, 8),
         };
-        Shape { coding, extended: false, len }.worst().nanoseconds(self.rates)
+        Shape { coding, extended: false, len }.max_bits().nanoseconds(self.rates)
     }
 
     /// Returns the number of frames that a packet of this length takes.
@@ -192,7 +192,7 @@ impl Case {
     }
 
     /// Returns the time that the answers of this number of cells take on the bus, in ns.
-    fn packets_ns(&self, cells: u32) -> u64 {
+    fn answers_ns(&self, cells: u32) -> u64 {
         self.packet_ns().saturating_mul(u64::from(cells))
     }
 
@@ -242,11 +242,11 @@ impl Case {
 
     /// Returns the worst-case times.
     #[must_use]
-    pub fn times(&self) -> Times {
+    pub fn times(&self) -> WorstCaseTimes {
         let joints_ns = self.joints_ns();
         // A heartbeat may be sent a period before it is due; its time counts from then.
         let heartbeat = response(&self.streams(self.jitter_ns(joints_ns)), 4, self.bit_ns());
-        Times {
+        WorstCaseTimes {
             joints_ns,
             chain_ns: joints_ns.and_then(|it| self.chain_ns(it)),
             response_ns: self.response_ns(joints_ns),
@@ -254,7 +254,7 @@ impl Case {
         }
     }
 
-    /// Returns true if one of the bounds proves that the last answer is complete by [`Case::deadline_ns`].
+    /// Returns true if one of the bounds proves that the last answer is complete by [`BusCase::deadline_ns`].
     #[must_use]
     pub fn is_in_time(&self) -> bool {
         let joints_ns = self.joints_ns();
@@ -274,9 +274,11 @@ impl Case {
 
     fn response_ns(&self, joints_ns: Option<u64>) -> Option<Response> {
         match self.answers {
-            Answers::Torques { .. } => response(&self.streams(self.jitter_ns(joints_ns)), 1, self.bit_ns()),
+            AnswerPlan::Torques { .. } => {
+                response(&self.streams(self.jitter_ns(joints_ns)), 1, self.bit_ns())
+            }
             // The releases of sums depend on each other, which response-time analysis does not cover.
-            Answers::Sums { .. } => None,
+            AnswerPlan::Sums { .. } => None,
         }
     }
 
@@ -297,17 +299,17 @@ impl Case {
         let blocking_ns = if self.computation_ns > 0 { self.frame_ns() } else { 0 };
         let step_ns = self.computation_ns.saturating_add(blocking_ns);
         let ready_ns = match &self.answers {
-            Answers::Torques { .. } => step_ns,
-            Answers::Sums { by_depth, shared: true, .. } => {
+            AnswerPlan::Torques { .. } => step_ns,
+            AnswerPlan::Sums { by_depth, shared: true, .. } => {
                 let deep = by_depth.iter().rposition(|&here| here > 0).unwrap_or(0);
                 step_ns.saturating_mul(u64::try_from(deep).unwrap_or(u64::MAX).saturating_add(1))
             }
-            Answers::Sums { by_depth, slot_ns, shared: false } => {
+            AnswerPlan::Sums { by_depth, slot_ns, shared: false } => {
                 let deepest = u64::try_from(by_depth.len().saturating_sub(1)).unwrap_or(u64::MAX);
                 slot_ns.saturating_mul(deepest).saturating_add(step_ns)
             }
         };
-        let last_ns = joints_ns.checked_add(ready_ns)?.checked_add(self.packets_ns(self.answers.cells()))?;
+        let last_ns = joints_ns.checked_add(ready_ns)?.checked_add(self.answers_ns(self.answers.cells()))?;
         (last_ns <= self.period_ns).then_some(last_ns)
     }
 
@@ -316,8 +318,8 @@ impl Case {
     #[must_use]
     pub const fn deadline_ns(&self) -> u64 {
         match self.answers {
-            Answers::Torques { .. } => self.period_ns,
-            Answers::Sums { .. } => self.period_ns / 8 * 7,
+            AnswerPlan::Torques { .. } => self.period_ns,
+            AnswerPlan::Sums { .. } => self.period_ns / 8 * 7,
         }
     }
 
@@ -328,19 +330,19 @@ impl Case {
     }
 }
 
-fn torques(skin: &Skin, bus: usize) -> Answers {
-    Answers::Torques { cells: u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX) }
+fn torques_of_bus(skin: &Skin, bus: usize) -> AnswerPlan {
+    AnswerPlan::Torques { cells: u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX) }
 }
 
 /// Returns the sums for the tree that the wires of a bus allow; `None` if a cell is unreachable. If the skin gives no
 /// slot duration, that of `skinbus skin generate` is used.
-pub(super) fn sums(
+pub(super) fn sums_of_tree(
     skin: &Skin,
     bus: usize,
     period_ns: u64,
     slot_us: Option<u32>,
     shared: bool,
-) -> Option<Answers> {
+) -> Option<AnswerPlan> {
     let depths = skin.wires(bus).depths();
     let mut by_depth = Vec::new();
     for cell in skin.cells_on_bus(bus) {
@@ -351,6 +353,7 @@ pub(super) fn sums(
         *by_depth.get_mut(depth)? += 1;
     }
     let slots = u64::try_from(by_depth.len().max(1)).unwrap_or(u64::MAX);
-    let slot_ns = slot_us.map_or_else(|| period_ns * SLOTS_SHARE / 100 / slots, |us| u64::from(us) * 1_000);
-    Some(Answers::Sums { by_depth, slot_ns, shared })
+    let slot_ns =
+        slot_us.map_or_else(|| period_ns * SLOTS_SHARE_PERCENT / 100 / slots, |us| u64::from(us) * 1_000);
+    Some(AnswerPlan::Sums { by_depth, slot_ns, shared })
 }

@@ -5,9 +5,9 @@ use protocol::skin::Skin;
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 
-use super::case::{Answers, Load};
+use super::case::{AnswerPlan, Load};
 use super::limits::NeededBuses;
-use super::{AssessedBus, BusFit, Row, SkinFit, name};
+use super::{AssessedBus, BusFit, RatesRow, SkinFit, rates_name};
 
 #[derive(Serialize)]
 struct Document<'a> {
@@ -24,7 +24,7 @@ struct Document<'a> {
 /// Returns the results as JSON: for each bus and for all cells together, or at common rates. Times are in µs, loads are
 /// shares of 1, and an unbounded time is null.
 #[must_use]
-pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>, table: &[Row]) -> Value {
+pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>, table: &[RatesRow]) -> Value {
     // The number of buses in a row is that for all cells of the skin.
     let table = table.iter().map(|row| BusFit { need: row.need, ..row.fullest.clone() });
     let cells = skin.cells.len();
@@ -48,13 +48,13 @@ impl Serialize for AssessedBus {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let Self { case, load, times, exceeded } = self;
         let answers = match case.answers {
-            Answers::Torques { .. } => "torques",
-            Answers::Sums { shared: true, .. } => "sums",
-            Answers::Sums { shared: false, .. } => "sums of roots",
+            AnswerPlan::Torques { .. } => "torques",
+            AnswerPlan::Sums { shared: true, .. } => "sums",
+            AnswerPlan::Sums { shared: false, .. } => "sums of roots",
         };
         let Load { joints, answers: of_answers, sensors, heartbeats } = *load;
         json!({
-            "name": name(case.format, case.rates),
+            "name": rates_name(case.format, case.rates),
             "verdict": self.verdict(),
             "format": if case.format == Format::Fd { "fd" } else { "classic" },
             "nominal": case.rates.nominal(),

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::case::Case;
+use super::case::BusCase;
 
 /// The approximate number of nodes that common transceivers can drive on one bus, including the gateway.
 pub const MAX_NODES: u32 = 110;
@@ -47,7 +47,7 @@ pub struct ByLimit<T> {
 
 impl<T> ByLimit<T> {
     /// Returns the limits whose value satisfies a condition, in this order.
-    fn which(self, holds: impl Fn(T) -> bool) -> Vec<Limit> {
+    fn limits_where(self, holds: impl Fn(T) -> bool) -> Vec<Limit> {
         let Self { bandwidth, deadline, nodes } = self;
         let all = [(Limit::Bandwidth, bandwidth), (Limit::Deadline, deadline), (Limit::Nodes, nodes)];
         all.into_iter().filter_map(|(limit, it)| holds(it).then_some(limit)).collect()
@@ -57,8 +57,8 @@ impl<T> ByLimit<T> {
 impl ByLimit<bool> {
     /// Returns the limits whose value is false: the bus does not keep them.
     #[must_use]
-    pub fn broken(self) -> Vec<Limit> {
-        self.which(|holds| !holds)
+    pub fn exceeded(self) -> Vec<Limit> {
+        self.limits_where(|holds| !holds)
     }
 }
 
@@ -68,10 +68,10 @@ pub type MaxCells = ByLimit<u32>;
 impl MaxCells {
     /// Computes the maximum number of cells by each limit, for a bus like this one.
     #[must_use]
-    pub fn for_case(case: &Case) -> Self {
+    pub fn for_case(case: &BusCase) -> Self {
         Self {
-            bandwidth: max(|cells| has_room(&case.with_cells(cells))),
-            deadline: max(|cells| case.with_cells(cells).is_in_time()),
+            bandwidth: largest_holding(|cells| has_room(&case.with_cells(cells))),
+            deadline: largest_holding(|cells| case.with_cells(cells).is_in_time()),
             nodes: MAX_NODES - 1,
         }
     }
@@ -84,23 +84,23 @@ impl MaxCells {
 }
 
 /// Returns true if the load is at most 100 %.
-fn has_room(case: &Case) -> bool {
+fn has_room(case: &BusCase) -> bool {
     case.load().total() <= 1.0
 }
 
 /// Returns the limits that a bus exceeds.
 #[must_use]
-pub fn exceeded(case: &Case) -> Vec<Limit> {
+pub fn exceeded_limits(case: &BusCase) -> Vec<Limit> {
     let holds = ByLimit {
         bandwidth: has_room(case),
         deadline: case.is_in_time(),
         nodes: case.answers.cells() < MAX_NODES,
     };
-    holds.broken()
+    holds.exceeded()
 }
 
 /// Returns the largest number of cells up to which a condition holds; 0 if it does not hold for 1.
-fn max(holds: impl Fn(u32) -> bool) -> u32 {
+fn largest_holding(holds: impl Fn(u32) -> bool) -> u32 {
     let mut beyond = 1;
     while beyond < MAX_SEARCHED_CELLS && holds(beyond) {
         beyond *= 2;
@@ -130,7 +130,7 @@ impl NeededBuses {
 
     /// Adds up the numbers of buses of two chains, which cannot share a bus.
     #[must_use]
-    pub fn with(self, other: Self) -> Self {
+    pub fn plus(self, other: Self) -> Self {
         let sum = |one: Option<u32>, other: Option<u32>| Some(one? + other?);
         let mut both = Self {
             bandwidth: sum(self.bandwidth, other.bandwidth),
@@ -167,7 +167,7 @@ impl NeededBuses {
         // `None` counts as more than any number.
         let key = |buses: Option<u32>| buses.unwrap_or(u32::MAX);
         let most = [self.bandwidth, self.deadline, self.nodes].map(key).into_iter().max();
-        self.which(|buses| Some(key(buses)) == most)
+        self.limits_where(|buses| Some(key(buses)) == most)
     }
 
     /// Returns the number of buses and the limits that require it, as a short text such as `3 nodes`. Bandwidth and
@@ -195,9 +195,9 @@ mod tests {
     #[test]
     fn the_max_is_found_wherever_it_is() {
         for limit in [0, 1, 2, 3, 4, 5, 63, 64, 65, 253, 1_000] {
-            assert_eq!(max(|number| number <= limit), limit);
+            assert_eq!(largest_holding(|number| number <= limit), limit);
         }
-        assert!(max(|_| true) >= MAX_SEARCHED_CELLS / 2);
+        assert!(largest_holding(|_| true) >= MAX_SEARCHED_CELLS / 2);
     }
     #[test]
     fn the_larger_need_binds_and_equal_ones_both() {

@@ -29,30 +29,30 @@ use serde::Serialize;
 
 pub use json::json;
 
-use case::{Case, Load, Times};
+use case::{BusCase, Load, WorstCaseTimes};
 use hint::Hint;
-use limits::{Limit, MaxCells, NeededBuses, exceeded};
-use verdict::Verdict;
+use limits::{Limit, MaxCells, NeededBuses, exceeded_limits};
+use verdict::FitVerdict;
 
 /// Computation time of the paper's cell, 68.5 µs: 1096 instructions at 16 MIPS.
 pub const COMPUTATION_NS: u64 = 68_500;
 
 /// Common bit rates, in bit/s: nominal and data.
-pub const COMMON_RATES: [Common; 7] = [
-    Common(Format::Classic, 500_000, 500_000),
-    Common(Format::Classic, 1_000_000, 1_000_000),
-    Common(Format::Fd, 500_000, 2_000_000),
-    Common(Format::Fd, 500_000, 5_000_000),
-    Common(Format::Fd, 1_000_000, 2_000_000),
-    Common(Format::Fd, 1_000_000, 5_000_000),
-    Common(Format::Fd, 1_000_000, 8_000_000),
+pub const COMMON_RATES: [CommonRates; 7] = [
+    CommonRates(Format::Classic, 500_000, 500_000),
+    CommonRates(Format::Classic, 1_000_000, 1_000_000),
+    CommonRates(Format::Fd, 500_000, 2_000_000),
+    CommonRates(Format::Fd, 500_000, 5_000_000),
+    CommonRates(Format::Fd, 1_000_000, 2_000_000),
+    CommonRates(Format::Fd, 1_000_000, 5_000_000),
+    CommonRates(Format::Fd, 1_000_000, 8_000_000),
 ];
 
 /// A frame format with its nominal and data bit rates in bit/s.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Common(pub Format, pub u32, pub u32);
+pub struct CommonRates(pub Format, pub u32, pub u32);
 
-impl Common {
+impl CommonRates {
     /// Returns the bit rates; `None` if CAN does not allow them.
     #[must_use]
     pub fn rates(&self) -> Option<BitRates> {
@@ -62,7 +62,7 @@ impl Common {
 
 /// Formats the name of a format with its rates: `1M/5M`, `classic 1M`.
 #[must_use]
-pub fn name(format: Format, rates: BitRates) -> String {
+pub fn rates_name(format: Format, rates: BitRates) -> String {
     match format {
         Format::Fd => rates.to_string(),
         Format::Classic => format!("classic {rates}"),
@@ -73,11 +73,11 @@ pub fn name(format: Format, rates: BitRates) -> String {
 #[derive(Clone, Debug, PartialEq)]
 pub struct AssessedBus {
     /// The bus, with its rates and cells.
-    pub case: Case,
+    pub case: BusCase,
     /// Shares of the bus's time, by kind of frame.
     pub load: Load,
     /// Worst-case times on the bus.
-    pub times: Times,
+    pub times: WorstCaseTimes,
     /// The limits that the bus exceeds.
     pub exceeded: Vec<Limit>,
 }
@@ -85,14 +85,14 @@ pub struct AssessedBus {
 impl AssessedBus {
     /// Computes load, times and exceeded limits of a bus.
     #[must_use]
-    pub fn assess(case: &Case) -> Self {
-        Self { case: case.clone(), load: case.load(), times: case.times(), exceeded: exceeded(case) }
+    pub fn assess(case: &BusCase) -> Self {
+        Self { case: case.clone(), load: case.load(), times: case.times(), exceeded: exceeded_limits(case) }
     }
 
     /// Returns the verdict: the bus fits, or the limit that it exceeds.
     #[must_use]
-    pub fn verdict(&self) -> Verdict {
-        Verdict::from_limits(&self.exceeded, self.case.answers.cells())
+    pub fn verdict(&self) -> FitVerdict {
+        FitVerdict::from_limits(&self.exceeded, self.case.answers.cells())
     }
 }
 
@@ -121,7 +121,7 @@ pub struct BusFit {
 
 /// Computes the fit of one bus of a skin, given as an index into [`Skin::buses`]; `None` if the bus does not exist.
 #[must_use]
-pub fn bus(
+pub fn assess_bus(
     skin: &Skin,
     index: usize,
     format: Format,
@@ -129,7 +129,7 @@ pub fn bus(
     computation_ns: u64,
 ) -> Option<BusFit> {
     let name = skin.buses.get(index)?.name.clone();
-    let case = Case::from_skin(skin, index, format, rates, computation_ns)?;
+    let case = BusCase::from_skin(skin, index, format, rates, computation_ns)?;
     let most = MaxCells::for_case(&case);
     Some(BusFit {
         name,
@@ -150,7 +150,7 @@ pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Assessed
         Format::Fd => rates,
         Format::Classic => BitRates::classic(rates.nominal()).ok()?,
     };
-    Some(AssessedBus::assess(&Case::from_skin(skin, index, format, rates, COMPUTATION_NS)?))
+    Some(AssessedBus::assess(&BusCase::from_skin(skin, index, format, rates, COMPUTATION_NS)?))
 }
 
 /// The fit of all cells of a skin, if they are spread evenly over several buses.
@@ -178,11 +178,11 @@ pub struct Spread {
 /// highest load. For a skin with several chains, only the number of buses is computed. Returns `None` for a skin
 /// without buses.
 #[must_use]
-pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<SkinFit> {
+pub fn spread_over_buses(skin: &Skin, buses: &[BusFit]) -> Option<SkinFit> {
     let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
     let fullest = fullest(buses.iter())?;
     let need = need(skin, buses);
-    let most = if carried(skin).count() > 1 { 0 } else { need.buses().unwrap_or(1) };
+    let most = if chains_with_cells(skin).count() > 1 { 0 } else { need.buses().unwrap_or(1) };
     let numbers = 1..=most;
     // Show only informative numbers: all below the required one are too small.
     let is_shown =
@@ -195,7 +195,7 @@ pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<SkinFit> {
 }
 
 /// Returns the chains that carry cells, each with its number of cells.
-fn carried(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
+fn chains_with_cells(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
     let on = |cell: &protocol::skin::Cell| skin.buses.get(cell.bus).map(|bus| bus.chain);
     let count = move |chain: usize| skin.cells.iter().filter(|cell| on(cell) == Some(chain)).count();
     let chains = (0..skin.robot.chains.len()).map(move |chain| (chain, count(chain)));
@@ -216,12 +216,12 @@ fn need(skin: &Skin, buses: &[BusFit]) -> NeededBuses {
         Some(NeededBuses::for_cells(&fullest.most, cells))
     };
     let none = NeededBuses { bandwidth: Some(0), deadline: Some(0), nodes: Some(0) };
-    carried(skin).filter_map(of_chain).reduce(NeededBuses::with).unwrap_or(none)
+    chains_with_cells(skin).filter_map(of_chain).reduce(NeededBuses::plus).unwrap_or(none)
 }
 
 /// The fit of a skin at one pair of common bit rates.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Row {
+pub struct RatesRow {
     /// The bus with the highest load at these rates.
     pub fullest: BusFit,
     /// The number of buses that all cells of the skin need at these rates.
@@ -230,14 +230,15 @@ pub struct Row {
 
 /// Computes the fit of the bus with the highest load at each of the common bit rates, of all formats or of one.
 #[must_use]
-pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Row> {
+pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<RatesRow> {
     let rows = COMMON_RATES.iter().filter(|it| format.is_none_or(|format| format == it.0));
-    let row = |common: &Common| {
+    let row = |common: &CommonRates| {
         let rates = common.rates()?;
-        let buses = (0..skin.buses.len()).map(|index| bus(skin, index, common.0, rates, computation_ns));
+        let buses =
+            (0..skin.buses.len()).map(|index| assess_bus(skin, index, common.0, rates, computation_ns));
         let buses: Vec<_> = buses.flatten().collect();
         let fullest = fullest(buses.iter())?.clone();
-        Some(Row { fullest, need: need(skin, &buses) })
+        Some(RatesRow { fullest, need: need(skin, &buses) })
     };
     rows.filter_map(row).collect()
 }

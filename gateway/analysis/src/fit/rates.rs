@@ -5,9 +5,9 @@ use protocol::skin::SkinBus;
 use protocol::wire_time::{BitRates, BitRatesError};
 
 /// The default nominal bit rate, in bit/s.
-const NOMINAL: u32 = 1_000_000;
+const DEFAULT_NOMINAL: u32 = 1_000_000;
 /// The default data bit rate of FD frames, in bit/s.
-const DATA: u32 = 5_000_000;
+const DEFAULT_DATA: u32 = 5_000_000;
 
 /// Bit rates that the caller requests for all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -33,24 +33,24 @@ impl RequestedRates {
     /// # Errors
     /// Returns [`BitRatesError`] if CAN does not allow these rates.
     pub fn rates(&self) -> Result<BitRates, BitRatesError> {
-        let nominal = self.nominal.unwrap_or(NOMINAL);
-        BitRates::new(nominal, self.data.unwrap_or_else(|| nominal.max(DATA)))
+        let nominal = self.nominal.unwrap_or(DEFAULT_NOMINAL);
+        BitRates::new(nominal, self.data.unwrap_or_else(|| nominal.max(DEFAULT_DATA)))
     }
 
     /// Returns the rates of a bus of a skin.
     ///
     /// # Errors
     /// Returns [`BitRatesError`] if CAN does not allow these rates.
-    pub fn of_bus(&self, bus: &SkinBus) -> Result<ChosenRates, BitRatesError> {
+    pub fn for_bus(&self, bus: &SkinBus) -> Result<ChosenRates, BitRatesError> {
         let is_chosen = self.nominal.is_some() || self.data.is_some() || bus.bitrate.is_some();
-        let rates = match (self.nominal, self.data, described(bus, bus.format)) {
+        let rates = match (self.nominal, self.data, described_rates(bus, bus.format)) {
             (None, None, Some(described)) => described?,
             (nominal, data, _) => {
                 let nominal = nominal.or(bus.bitrate);
                 let data = data.or(bus.data_bitrate);
                 match bus.format {
                     Format::Fd => Self { nominal, data }.rates()?,
-                    Format::Classic => BitRates::classic(nominal.unwrap_or(NOMINAL))?,
+                    Format::Classic => BitRates::classic(nominal.unwrap_or(DEFAULT_NOMINAL))?,
                 }
             }
         };
@@ -61,7 +61,7 @@ impl RequestedRates {
 /// Returns the rates that the skin describes for a bus; the data bit rate defaults to the nominal one. Returns `None`
 /// if the skin gives no rate.
 #[must_use]
-pub fn described(bus: &SkinBus, format: Format) -> Option<Result<BitRates, BitRatesError>> {
+pub fn described_rates(bus: &SkinBus, format: Format) -> Option<Result<BitRates, BitRatesError>> {
     let nominal = bus.bitrate?;
     Some(match format {
         Format::Fd => BitRates::new(nominal, bus.data_bitrate.unwrap_or(nominal)),
@@ -75,10 +75,10 @@ mod tests {
     use protocol::skin::Skin;
 
     fn rates(nominal: Option<u32>, data: Option<u32>, described: &str) -> (String, bool) {
-        let text = model::generate::generate(&model::generate::Target::default()).unwrap();
+        let text = model::generate::generate(&model::generate::SkinRequest::default()).unwrap();
         let text = text.replace("format = \"fd\"", described);
         let skin = Skin::parse("skin.toml", &text).unwrap();
-        let chosen = RequestedRates { nominal, data }.of_bus(&skin.buses[0]).unwrap();
+        let chosen = RequestedRates { nominal, data }.for_bus(&skin.buses[0]).unwrap();
         (chosen.rates.to_string(), chosen.is_chosen)
     }
 

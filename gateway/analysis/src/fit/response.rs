@@ -75,7 +75,7 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
         let sum = before.iter().map(|it| it.demand_ns(it.count, window_ns)).fold(0, u64::saturating_add);
         sum.saturating_add(own.demand_ns(others, window_ns))
     };
-    let busy_ns = settle(own.frame_ns, |busy_ns| {
+    let busy_ns = fixed_point(own.frame_ns, |busy_ns| {
         blocking_ns.saturating_add(higher_ns(busy_ns)).saturating_add(own.demand_ns(1, busy_ns))
     })?;
     let instances = busy_ns.saturating_add(own.jitter_ns).div_ceil(own.period_ns);
@@ -83,7 +83,7 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
     let mut wait_ns = blocking_ns;
     for instance in 0..instances {
         let own_ns = instance.saturating_mul(own.frame_ns);
-        wait_ns = settle(wait_ns.max(blocking_ns.saturating_add(own_ns)), |wait_ns| {
+        wait_ns = fixed_point(wait_ns.max(blocking_ns.saturating_add(own_ns)), |wait_ns| {
             let higher_ns = higher_ns(wait_ns.saturating_add(bit_ns));
             blocking_ns.saturating_add(own_ns).saturating_add(higher_ns)
         })?;
@@ -98,7 +98,7 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
 
 /// Returns the lowest fixed point of an increasing function, found by iterating from below; `None` if it exceeds
 /// [`HORIZON_NS`].
-fn settle(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
+fn fixed_point(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
     let mut at_ns = from_ns;
     while at_ns <= HORIZON_NS {
         let next_ns = next_ns(at_ns);

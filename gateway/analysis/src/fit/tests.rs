@@ -6,13 +6,13 @@ use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::wire_time::BitRates;
 
-use super::case::{Answers, Case};
+use super::case::{AnswerPlan, BusCase};
 use super::limits::{Limit, MaxCells};
-use super::verdict::Verdict;
-use super::{BusFit, COMPUTATION_NS, bus, fullest, json, table, whole};
-use model::generate::{Reply, Target, generate};
+use super::verdict::FitVerdict;
+use super::{BusFit, COMPUTATION_NS, assess_bus, fullest, json, spread_over_buses, table};
+use model::generate::{Reply, SkinRequest, generate};
 
-fn text(target: &Target) -> String {
+fn text(target: &SkinRequest) -> String {
     generate(target).unwrap()
 }
 
@@ -25,12 +25,12 @@ fn fit(skin: &Skin, rates: &str) -> BusFit {
         Some(rates) => (Format::Classic, rates),
         None => (Format::Fd, rates),
     };
-    bus(skin, 0, format, rates.parse().unwrap(), COMPUTATION_NS).unwrap()
+    assess_bus(skin, 0, format, rates.parse().unwrap(), COMPUTATION_NS).unwrap()
 }
 
 #[test]
 fn packets_take_what_is_known_of_them() {
-    let skin = skin(&text(&Target { cells: 1, ..Target::default() }));
+    let skin = skin(&text(&SkinRequest { cells: 1, ..SkinRequest::default() }));
     for (rates, us) in [
         ("500k/2M", 160.0),
         ("500k/5M", 102.4),
@@ -48,7 +48,7 @@ fn packets_take_what_is_known_of_them() {
 
 #[test]
 fn the_whole_arm_is_too_much_for_one_bus_at_1m_5m_and_three_are_needed_electrically() {
-    let fit = fit(&skin(&text(&Target::default())), "1M/5M");
+    let fit = fit(&skin(&text(&SkinRequest::default())), "1M/5M");
     let load = fit.rated.load;
     let share = |packets: f64| packets * 70.4 / 16_000.0;
     assert!((load.joints + load.answers - share(254.0)).abs() < 1e-12, "111.76 %: {load:?}");
@@ -65,9 +65,9 @@ fn the_whole_arm_is_too_much_for_one_bus_at_1m_5m_and_three_are_needed_electrica
 
 #[test]
 fn at_1m_8m_it_is_in_time_and_the_chain_is_the_smaller_bound() {
-    let fit = fit(&skin(&text(&Target::default())), "1M/8M");
+    let fit = fit(&skin(&text(&SkinRequest::default())), "1M/8M");
     assert_eq!(fit.rated.exceeded, [Limit::Nodes]);
-    assert_eq!(fit.rated.verdict(), Verdict::Nodes(254));
+    assert_eq!(fit.rated.verdict(), FitVerdict::Nodes(254));
     // Blocking, joints, computation, blocking, 253 torques.
     assert_eq!(fit.rated.times.chain_ns, Some(56_000 * (3 + 253) + 68_500));
     let response = fit.rated.times.response_ns.unwrap();
@@ -79,24 +79,24 @@ fn at_1m_8m_it_is_in_time_and_the_chain_is_the_smaller_bound() {
 
 #[test]
 fn a_single_cell_waits_for_joints_and_one_heartbeat_at_most() {
-    let case = fit(&skin(&text(&Target { cells: 1, ..Target::default() })), "1M/5M").rated.case;
+    let case = fit(&skin(&text(&SkinRequest { cells: 1, ..SkinRequest::default() })), "1M/5M").rated.case;
     // Its own heartbeat: once before the joints, once while it computes.
     assert_eq!(case.times().chain_ns, Some(4 * 70_400 + 68_500));
     // A cell that needs no time to compute answers before other frames start.
-    let at_once = Case { computation_ns: 0, ..case };
+    let at_once = BusCase { computation_ns: 0, ..case };
     assert_eq!(at_once.times().chain_ns, Some(3 * 70_400));
 }
 
 #[test]
 fn the_most_cells_fit_and_one_more_does_not_at_all_rates_and_with_sensors() {
-    let text = text(&Target { cells: 40, ..Target::default() });
+    let text = text(&SkinRequest { cells: 40, ..SkinRequest::default() });
     let format = "format = \"fd\"";
     for sensing in ["", "\nsensing = \"event\"", "\nsensing = \"continuous\"\nsensing_hz = 62.5"] {
         let skin = skin(&text.replace(format, &format!("{format}{sensing}")));
         for row in table(&skin, None, COMPUTATION_NS) {
             let (case, most) = (&row.fullest.rated.case, row.fullest.most);
             for (limit, cells) in [(Limit::Bandwidth, most.bandwidth), (Limit::Deadline, most.deadline)] {
-                let exceeded = |cells| super::exceeded(&case.with_cells(cells)).contains(&limit);
+                let exceeded = |cells| super::exceeded_limits(&case.with_cells(cells)).contains(&limit);
                 assert!(cells > 0 && !exceeded(cells) && exceeded(cells + 1), "{limit:?} {cells} {case:?}");
             }
         }
@@ -105,7 +105,7 @@ fn the_most_cells_fit_and_one_more_does_not_at_all_rates_and_with_sensors() {
 
 #[test]
 fn sensors_are_loaded_with_what_they_say() {
-    let text = text(&Target { cells: 40, ..Target::default() });
+    let text = text(&SkinRequest { cells: 40, ..SkinRequest::default() });
     let format = "format = \"fd\"";
     let sensors = |sensing: &str| {
         let skin = skin(&text.replace(format, &format!("{format}\n{sensing}")));
@@ -119,7 +119,7 @@ fn sensors_are_loaded_with_what_they_say() {
 
 #[test]
 fn every_hint_does_in_a_description_what_it_says() {
-    let target = Target { cells: 200, ..Target::default() };
+    let target = SkinRequest { cells: 200, ..SkinRequest::default() };
     let format = "format = \"fd\"";
     let sensing = "sensing = \"continuous\"\nsensing_hz = 20.0";
     let text = text(&target).replace(format, &format!("{format}\n{sensing}"));
@@ -136,14 +136,14 @@ fn every_hint_does_in_a_description_what_it_says() {
         } else if hint.change.starts_with("sensing") {
             text.replace(sensing, "sensing = \"event\"")
         } else if hint.change.contains("buses") {
-            let two = generate(&Target { buses: 2, ..target.clone() }).unwrap();
+            let two = generate(&SkinRequest { buses: 2, ..target.clone() }).unwrap();
             two.replace(format, &format!("{format}\n{sensing}"))
         } else {
             text.clone()
         };
         let skin = skin(&other);
-        let buses =
-            (0..skin.buses.len()).filter_map(|index| bus(&skin, index, Format::Fd, rates, COMPUTATION_NS));
+        let buses = (0..skin.buses.len())
+            .filter_map(|index| assess_bus(&skin, index, Format::Fd, rates, COMPUTATION_NS));
         let buses: Vec<_> = buses.collect();
         let after = fullest(buses.iter()).unwrap().rated.clone();
         assert_eq!(after, hint.after, "{}", hint.change);
@@ -152,7 +152,7 @@ fn every_hint_does_in_a_description_what_it_says() {
 
 #[test]
 fn sums_of_all_cells_save_no_frame_and_those_of_roots_all_others() {
-    let skin = skin(&text(&Target { buses: 3, ..Target::default() }));
+    let skin = skin(&text(&SkinRequest { buses: 3, ..SkinRequest::default() }));
     let fit = fit(&skin, "1M/5M");
     let [shared, roots] = &fit.answers[..] else { panic!("{:?}", fit.answers) };
     assert_eq!(shared.after.load, fit.rated.load);
@@ -165,9 +165,9 @@ fn sums_of_all_cells_save_no_frame_and_those_of_roots_all_others() {
 
 #[test]
 fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
-    let skin = skin(&text(&Target { cells: 60, reply: Reply::Sum, ..Target::default() }));
+    let skin = skin(&text(&SkinRequest { cells: 60, reply: Reply::Sum, ..SkinRequest::default() }));
     let fit = fit(&skin, "1M/5M");
-    let Answers::Sums { by_depth, slot_ns, shared } = &fit.rated.case.answers else { panic!("{fit:?}") };
+    let AnswerPlan::Sums { by_depth, slot_ns, shared } = &fit.rated.case.answers else { panic!("{fit:?}") };
     let depths = skin.wires(0).depths();
     let deepest = depths.iter().flatten().max().copied().unwrap();
     assert_eq!((by_depth.iter().sum::<u32>(), by_depth.len()), (60, usize::from(deepest) + 1));
@@ -187,9 +187,9 @@ fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
 
 #[test]
 fn json_has_the_same_figures_and_null_where_there_is_no_bound() {
-    let skin = skin(&text(&Target::default()));
+    let skin = skin(&text(&SkinRequest::default()));
     let fits = [fit(&skin, "1M/5M")];
-    let json = json(&skin, &fits, whole(&skin, &fits).as_ref(), &[]);
+    let json = json(&skin, &fits, spread_over_buses(&skin, &fits).as_ref(), &[]);
     let bus = &json["buses"][0];
     assert_eq!((bus["bus"].as_str(), bus["name"].as_str()), (Some("vcan0"), Some("1M/5M")));
     assert_eq!((bus["nominal"].as_u64(), bus["data"].as_u64()), (Some(1_000_000), Some(5_000_000)));

@@ -10,7 +10,7 @@ use protocol::packet::Epoch;
 use protocol::time::Micros;
 use serde::Serialize;
 
-use model::decode::wired;
+use model::decode::wire_message;
 use model::packets::{NoPacket, PacketReader};
 
 /// The kinds of frames that only a bench sends, and a real robot does not.
@@ -94,7 +94,7 @@ impl ClassifiedFrame {
 
 /// Classifies the frames of one bus in order, with bounded memory.
 #[derive(Debug, Default)]
-pub struct Traffic {
+pub struct TrafficClassifier {
     /// Number of frames in valid packets, and of 11-bit data frames that are not packets.
     ours: u64,
     others: u64,
@@ -112,7 +112,7 @@ struct PendingReplies {
     sensors: u8,
 }
 
-impl Traffic {
+impl TrafficClassifier {
     /// Returns true if most of the frames that may be packets are packets of this protocol; a random frame is one with
     /// probability 1/65 536.
     #[must_use]
@@ -121,12 +121,12 @@ impl Traffic {
     }
 
     /// Classifies the next frame. On a bus of another protocol no frame counts as the bench's. Never panics.
-    pub fn sort(&mut self, nanos: u64, frame: &Frame) -> ClassifiedFrame {
+    pub fn classify(&mut self, nanos: u64, frame: &Frame) -> ClassifiedFrame {
         let received = self.packets.read(Micros(nanos / 1_000), frame);
         let packet = match received.packet {
             Ok((packet, _)) => packet,
             Err(NoPacket::NotData) => {
-                let bench = wired(frame).map(|_| BenchFrame::Wire);
+                let bench = wire_message(frame).map(|_| BenchFrame::Wire);
                 return ClassifiedFrame { bench, ..ClassifiedFrame::OTHER };
             }
             Err(NoPacket::Segment(_)) => return ClassifiedFrame::OTHER,
@@ -170,7 +170,7 @@ impl Traffic {
             Message::Network { from, page, .. } => {
                 let Node::Cell(from) = *from else { return ClassifiedFrame::OTHER };
                 if let NetworkPage::Heartbeat(heartbeat) = page {
-                    let owed = self.take(from);
+                    let owed = self.take_pending(from);
                     // A starting cell leaves sync and report unanswered.
                     if heartbeat.state.has(State::CLAIMING) {
                         says(RunEvent::Preparation)
@@ -201,7 +201,7 @@ impl Traffic {
     }
 
     /// Returns the answers that a cell still owes, and clears them.
-    fn take(&mut self, from: CellId) -> PendingReplies {
+    fn take_pending(&mut self, from: CellId) -> PendingReplies {
         self.cells().get_mut(from.index()).map(std::mem::take).unwrap_or_default()
     }
 
@@ -217,8 +217,8 @@ mod tests {
     use proptest::prelude::*;
     use protocol::message::{Heartbeat, ReceivedCounts, RejectedCounts, SensorPage, SkinSensors, Tree};
 
-    fn said(traffic: &mut Traffic, format: Format, message: &Message) -> Vec<Option<BenchFrame>> {
-        message.encode().frames(format).map(|frame| traffic.sort(0, &frame).bench).collect()
+    fn said(traffic: &mut TrafficClassifier, format: Format, message: &Message) -> Vec<Option<BenchFrame>> {
+        message.encode().frames(format).map(|frame| traffic.classify(0, &frame).bench).collect()
     }
 
     fn page(from: i64, page: NetworkPage) -> Message {
@@ -237,7 +237,7 @@ mod tests {
     #[test]
     fn what_answers_a_sync_or_a_report_is_the_benchs_once_and_what_comes_by_itself_is_not() {
         for format in [Format::Fd, Format::Classic] {
-            let mut traffic = Traffic::default();
+            let mut traffic = TrafficClassifier::default();
             let mut last = |message: &Message| *said(&mut traffic, format, message).last().unwrap();
             let (alive, tree) =
                 (heartbeat(1, State::CONFIGURED), page(1, NetworkPage::Tree(Tree::default())));
@@ -267,7 +267,7 @@ mod tests {
 
     #[test]
     fn a_first_segment_says_nothing_and_the_second_one_all_of_it() {
-        let mut traffic = Traffic::default();
+        let mut traffic = TrafficClassifier::default();
         let stimulus = Message::Stimulus {
             to: Node::Everyone,
             from: protocol::message::AppliesFrom::Next,
@@ -275,7 +275,8 @@ mod tests {
         };
         assert_eq!(said(&mut traffic, Format::Classic, &stimulus), [None, Some(BenchFrame::Stimulus)]);
         let torque = skin(9).encode();
-        let sorted: Vec<_> = torque.frames(Format::Classic).map(|frame| traffic.sort(0, &frame)).collect();
+        let sorted: Vec<_> =
+            torque.frames(Format::Classic).map(|frame| traffic.classify(0, &frame)).collect();
         assert_eq!((sorted[0].from, sorted[0].ends_pair), (None, false));
         assert_eq!((sorted[1].from, sorted[1].ends_pair), (CellId::new(9).ok(), true));
     }
@@ -283,17 +284,17 @@ mod tests {
     proptest! {
         #[test]
         fn chance_makes_no_bench(frames in proptest::collection::vec((0..0x800_u32, any::<[u8; 16]>(), any::<bool>()), 0..400)) {
-            let mut traffic = Traffic::default();
+            let mut traffic = TrafficClassifier::default();
             // The first frame alone would be accepted with probability 1/65 536.
             let unknown_node = Frame::classic(0x700, &[1]).unwrap();
-            (0..4).for_each(|_| assert_eq!(traffic.sort(0, &unknown_node), ClassifiedFrame::OTHER));
+            (0..4).for_each(|_| assert_eq!(traffic.classify(0, &unknown_node), ClassifiedFrame::OTHER));
             for (id, data, is_fd) in frames {
                 let frame = if is_fd {
                     Frame::with_data(id, Format::Fd, protocol::can::FD_FORMAT, &data)
                 } else {
                     Frame::classic(id, data.get(..8).unwrap())
                 };
-                prop_assert_eq!(traffic.sort(0, &frame.unwrap()).bench, None);
+                prop_assert_eq!(traffic.classify(0, &frame.unwrap()).bench, None);
             }
         }
     }

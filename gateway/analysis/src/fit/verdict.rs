@@ -9,7 +9,7 @@ use super::limits::{ByLimit, Limit, MAX_NODES};
 
 /// The verdict on a bus: it fits, or the limit that it exceeds.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Verdict {
+pub enum FitVerdict {
     /// Bandwidth, deadline and number of nodes fit.
     Fits,
     /// Bandwidth and deadline fit, but the bus has this number of nodes, more than transceivers can drive.
@@ -20,8 +20,8 @@ pub enum Verdict {
     Deadline,
 }
 
-impl Verdict {
-    /// Returns the verdict for a bus with this number of cells that exceeds these limits, see [`ByLimit::broken`].
+impl FitVerdict {
+    /// Returns the verdict for a bus with this number of cells that exceeds these limits, see [`ByLimit::exceeded`].
     #[must_use]
     pub fn from_limits(exceeded: &[Limit], cells: u32) -> Self {
         match exceeded.first() {
@@ -39,7 +39,7 @@ impl Verdict {
     }
 }
 
-impl Display for Verdict {
+impl Display for FitVerdict {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match self {
             Self::Fits => f.pad("fits"),
@@ -50,7 +50,7 @@ impl Display for Verdict {
     }
 }
 
-impl Serialize for Verdict {
+impl Serialize for FitVerdict {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_str(self)
     }
@@ -59,7 +59,7 @@ impl Serialize for Verdict {
 /// The cells whose answers a verdict includes.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(tag = "answering", rename_all = "lowercase")]
-pub enum Cells {
+pub enum AnsweringCells {
     /// All cells of the bus.
     All {
         /// Number of cells.
@@ -78,7 +78,7 @@ pub enum Cells {
     Foreign,
 }
 
-impl Cells {
+impl AnsweringCells {
     /// Returns the number of cells on the bus.
     #[must_use]
     pub const fn on_the_bus(self) -> u32 {
@@ -89,7 +89,7 @@ impl Cells {
     }
 }
 
-impl Display for Cells {
+impl Display for AnsweringCells {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match *self {
             Self::All { cells: 1 } => f.write_str("the only cell answers"),
@@ -118,25 +118,25 @@ impl Display for Cells {
 /// );
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Answer {
+pub struct FitSummary {
     /// The load of the bus; for a run, in the second with the highest load.
     pub load: f64,
     /// The format and the bit rates of the bus, as text.
     pub rates: String,
     /// The cells whose answers the load includes.
-    pub cells: Cells,
+    pub cells: AnsweringCells,
     /// The verdict on the bus.
-    pub verdict: Verdict,
+    pub verdict: FitVerdict,
 }
 
-impl Answer {
+impl FitSummary {
     /// Returns the load and the verdict of a bus if all cells answer.
     #[must_use]
     pub fn worst_case(rated: &AssessedBus) -> Self {
         Self {
             load: rated.load.total(),
-            rates: super::name(rated.case.format, rated.case.rates),
-            cells: Cells::All { cells: rated.case.answers.cells() },
+            rates: super::rates_name(rated.case.format, rated.case.rates),
+            cells: AnsweringCells::All { cells: rated.case.answers.cells() },
             verdict: rated.verdict(),
         }
     }
@@ -144,33 +144,33 @@ impl Answer {
     /// Returns the load and the verdict of a run. `load` is that of its busiest second, and `late` is the number of
     /// answers that ended after the next joints.
     #[must_use]
-    pub fn this_run(load: f64, late: u64, rates: String, cells: Cells) -> Self {
+    pub fn this_run(load: f64, late: u64, rates: String, cells: AnsweringCells) -> Self {
         let on_the_bus = cells.on_the_bus();
         let holds = ByLimit { bandwidth: load <= 1.0, deadline: late == 0, nodes: on_the_bus < MAX_NODES };
-        Self { load, rates, cells, verdict: Verdict::from_limits(&holds.broken(), on_the_bus) }
+        Self { load, rates, cells, verdict: FitVerdict::from_limits(&holds.exceeded(), on_the_bus) }
     }
 
     /// Returns the name of the case: the worst case, or this run.
     #[must_use]
-    pub const fn case(&self) -> &'static str {
+    pub const fn case_name(&self) -> &'static str {
         match self.cells {
-            Cells::All { .. } => "worst case",
-            Cells::Some { .. } => "this run",
-            Cells::Foreign => "this capture",
+            AnsweringCells::All { .. } => "worst case",
+            AnsweringCells::Some { .. } => "this run",
+            AnsweringCells::Foreign => "this capture",
         }
     }
 
     /// Formats load and verdict for a row of a table.
     #[must_use]
-    pub fn value(&self) -> String {
+    pub fn table_value(&self) -> String {
         format!("{}: {}", percent(self.load), self.verdict)
     }
 }
 
-impl Display for Answer {
+impl Display for FitSummary {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let (load, rates) = (percent(self.load), &self.rates);
-        write!(f, "{}: {load} of {rates}: {} ({})", self.case(), self.verdict, self.cells)
+        write!(f, "{}: {load} of {rates}: {} ({})", self.case_name(), self.verdict, self.cells)
     }
 }
 
@@ -185,8 +185,8 @@ mod tests {
     use super::*;
 
     fn this_run(load: f64, late: u64, cells: u32) -> String {
-        let cells = Cells::Some { most: 120, cells, described: true };
-        Answer::this_run(load, late, "1M/5M".to_owned(), cells).to_string()
+        let cells = AnsweringCells::Some { most: 120, cells, described: true };
+        FitSummary::this_run(load, late, "1M/5M".to_owned(), cells).to_string()
     }
 
     #[test]

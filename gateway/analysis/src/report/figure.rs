@@ -4,9 +4,9 @@ use std::fmt;
 
 use serde::Serialize;
 
-pub use super::finding::{Finding, Quantity, Verdict};
+pub use super::finding::{Finding, FindingVerdict, Quantity};
 pub use super::number::{number, quantity};
-pub use super::skin::{Drawing, Legend, Map, Panel, Spot, Strip, StripGroup, StripRow};
+pub use super::skin::{Drawing, Legend, Map, MapCell, Panel, Strip, StripGroup, StripRow};
 
 /// The contents of an HTML page: a title, facts, and sections with figures and tables.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -93,7 +93,7 @@ pub struct Figure {
     /// Caption of the figure.
     pub title: String,
     /// Width of the figure on the page.
-    pub size: Size,
+    pub size: FigureWidth,
     /// The horizontal axis.
     pub x: Axis,
     /// The vertical axis.
@@ -130,7 +130,7 @@ impl Figure {
     /// Makes the figure half as wide as the page.
     #[must_use]
     pub const fn half(mut self) -> Self {
-        self.size = Size::Half;
+        self.size = FigureWidth::Half;
         self
     }
 
@@ -165,7 +165,7 @@ impl Figure {
 
 /// The width of a figure on a page.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub enum Size {
+pub enum FigureWidth {
     /// The full width.
     #[default]
     Wide,
@@ -196,7 +196,7 @@ impl Axis {
 
     /// Sets the first and the last value of the axis.
     #[must_use]
-    pub const fn between(mut self, from: f64, to: f64) -> Self {
+    pub const fn with_ends(mut self, from: f64, to: f64) -> Self {
         self.range = Some((from, to));
         self
     }
@@ -314,7 +314,7 @@ pub struct Table {
 impl Table {
     /// Marks the last column as commands.
     #[must_use]
-    pub const fn of_commands(mut self) -> Self {
+    pub const fn with_commands(mut self) -> Self {
         self.commands = true;
         self
     }

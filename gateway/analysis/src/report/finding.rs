@@ -25,7 +25,7 @@ pub struct Finding {
     /// A command that shows the details.
     pub command: Option<String>,
     /// The result of comparing the measured value.
-    pub verdict: Verdict,
+    pub verdict: FindingVerdict,
 }
 
 impl Finding {
@@ -33,16 +33,16 @@ impl Finding {
     /// the same.
     #[must_use]
     pub fn less_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
-        let finding = Self::stated(what, ours).beside(paper).against("below the paper's");
-        Self { verdict: Verdict::less_is_better(paper, finding.ours.value), ..finding }
+        let finding = Self::stated(what, ours).with_paper_value(paper).with_reference("below the paper's");
+        Self { verdict: FindingVerdict::less_is_better(paper, finding.ours.value), ..finding }
     }
 
     /// Creates a finding that is rated against the paper's value: more is better, and within 5 % of it the two count as
     /// the same.
     #[must_use]
     pub fn more_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
-        let finding = Self::stated(what, ours).beside(paper).against("above the paper's");
-        Self { verdict: Verdict::less_is_better(finding.ours.value, paper), ..finding }
+        let finding = Self::stated(what, ours).with_paper_value(paper).with_reference("above the paper's");
+        Self { verdict: FindingVerdict::less_is_better(finding.ours.value, paper), ..finding }
     }
 
     /// Creates a finding for information, without a rating.
@@ -56,27 +56,27 @@ impl Finding {
             against: None,
             origin: None,
             command: None,
-            verdict: Verdict::Stated,
+            verdict: FindingVerdict::Stated,
         }
     }
 
     /// Adds the paper's value in the same unit, for comparison without a rating.
     #[must_use]
-    pub fn beside(mut self, paper: f64) -> Self {
+    pub fn with_paper_value(mut self, paper: f64) -> Self {
         self.paper = Some(Quantity::new(paper, self.ours.unit.clone()));
         self
     }
 
     /// Sets the text shown without a requirement: the reference of the rating, or why there is no rating.
     #[must_use]
-    pub fn against(mut self, what: impl Into<String>) -> Self {
+    pub fn with_reference(mut self, what: impl Into<String>) -> Self {
         self.against = Some(what.into());
         self
     }
 
     /// Sets where the requirement comes from.
     #[must_use]
-    pub fn from(mut self, origin: impl Into<String>) -> Self {
+    pub fn with_origin(mut self, origin: impl Into<String>) -> Self {
         self.origin = Some(origin.into());
         self
     }
@@ -93,21 +93,21 @@ impl Finding {
     pub fn at_most(self, limit: f64) -> Self {
         let kept = self.ours.value <= limit;
         let bar = format!("at most {}", quantity(limit, &self.ours.unit));
-        self.must(bar, kept)
+        self.with_requirement(bar, kept)
     }
 
     /// Rates the value by a requirement, given as text; `kept` is true if the value meets it.
     #[must_use]
-    pub fn must(mut self, bar: impl Into<String>, kept: bool) -> Self {
+    pub fn with_requirement(mut self, bar: impl Into<String>, kept: bool) -> Self {
         self.bar = Some(bar.into());
-        self.verdict = if kept { Verdict::Better } else { Verdict::Worse };
+        self.verdict = if kept { FindingVerdict::Better } else { FindingVerdict::Worse };
         self
     }
 }
 
 /// The result of a comparison with the paper or with a requirement.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub enum Verdict {
+pub enum FindingVerdict {
     /// The value is better than the paper's, or meets the requirement.
     Better,
     /// The value is within 5 % of the paper's.
@@ -119,7 +119,7 @@ pub enum Verdict {
     Stated,
 }
 
-impl Verdict {
+impl FindingVerdict {
     /// Compares two values for which less is better; within 5 % of `paper` they count as the same.
     #[must_use]
     pub fn less_is_better(paper: f64, ours: f64) -> Self {
@@ -135,7 +135,7 @@ impl Verdict {
     }
 }
 
-impl fmt::Display for Verdict {
+impl fmt::Display for FindingVerdict {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Better => "better",
@@ -202,13 +202,16 @@ mod tests {
         let more = |ours| Finding::more_is_better("", 2.0, quantity(ours)).verdict;
         assert_eq!(
             [1.0, 1.91, 2.09, 2.2].map(less),
-            [Verdict::Better, Verdict::Same, Verdict::Same, Verdict::Worse]
+            [FindingVerdict::Better, FindingVerdict::Same, FindingVerdict::Same, FindingVerdict::Worse]
         );
         assert_eq!(
             [1.0, 1.95, 2.05, 3.0].map(more),
-            [Verdict::Worse, Verdict::Same, Verdict::Same, Verdict::Better]
+            [FindingVerdict::Worse, FindingVerdict::Same, FindingVerdict::Same, FindingVerdict::Better]
         );
-        assert_eq!(less(f64::NAN), Verdict::Stated);
-        assert_eq!(Finding::stated("", quantity(0.0)).must("none", true).verdict, Verdict::Better);
+        assert_eq!(less(f64::NAN), FindingVerdict::Stated);
+        assert_eq!(
+            Finding::stated("", quantity(0.0)).with_requirement("none", true).verdict,
+            FindingVerdict::Better
+        );
     }
 }

@@ -19,7 +19,7 @@ const UNITS: [(&str, f64, &str, i32); 8] = [
 
 /// A unit with an SI prefix, and the factor to convert to it.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Fitted {
+pub(super) struct PrefixedUnit {
     /// The factor that converts a value from the original unit to this one.
     pub(super) factor: f64,
     /// The unit with its prefix.
@@ -27,25 +27,25 @@ pub(super) struct Fitted {
 }
 
 /// Returns the unit as a static text if it takes prefixes.
-pub(super) fn known(unit: &str) -> Option<&'static str> {
+pub(super) fn prefixable_unit(unit: &str) -> Option<&'static str> {
     UNITS.iter().find(|(name, ..)| *name == unit).map(|(name, ..)| *name)
 }
 
 /// Returns the unit with the prefix by which a value of this size becomes 1 to 999; `None` for a unit without prefixes.
-pub(super) fn fitted(size: f64, unit: &str) -> Option<Fitted> {
+pub(super) fn prefixed(size: f64, unit: &str) -> Option<PrefixedUnit> {
     let (_, scale, base, most) = *UNITS.iter().find(|(name, ..)| *name == unit)?;
-    let size = rounded(size.abs() * scale);
+    let size = to_three_digits(size.abs() * scale);
     let prefixes = PREFIXES.iter().filter(|(power, _)| *power <= most);
     let fits = |(power, _): &&(i32, &str)| size >= 1_000_f64.powi(*power) * 0.999_999;
     let (power, prefix) = match size {
         0.0 => (0, ""),
         _ => *prefixes.rev().find(fits).or(PREFIXES.first())?,
     };
-    Some(Fitted { factor: scale / 1_000_f64.powi(power), unit: format!("{prefix}{base}") })
+    Some(PrefixedUnit { factor: scale / 1_000_f64.powi(power), unit: format!("{prefix}{base}") })
 }
 
 /// Rounds a value to three significant digits, as its text shows it.
-fn rounded(value: f64) -> f64 {
+fn to_three_digits(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
 
@@ -71,12 +71,12 @@ pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
     if !value.is_finite() || unit.is_empty() && half.is_none() {
         return fraction(value);
     }
-    let Fitted { factor, unit } =
-        fitted(size, unit).unwrap_or_else(|| Fitted { factor: 1.0, unit: unit.to_owned() });
+    let PrefixedUnit { factor, unit } =
+        prefixed(size, unit).unwrap_or_else(|| PrefixedUnit { factor: 1.0, unit: unit.to_owned() });
     let value = value * factor;
     let of_half = half.map(|half| half * factor).and_then(|half| Some((half, second_digit(half)?)));
     let (value, half) = match of_half {
-        Some((half, digits)) => (trimmed(value, digits), format!(" ± {}", trimmed(half, digits))),
+        Some((half, digits)) => (with_decimals(value, digits), format!(" ± {}", with_decimals(half, digits))),
         None => {
             let half = half.map_or_else(String::new, |half| format!(" ± {}", number(half * factor)));
             (number(value), half)
@@ -95,7 +95,7 @@ fn second_digit(value: f64) -> Option<usize> {
 }
 
 /// Formats a number with at most this number of decimals, without trailing zeros.
-fn trimmed(value: f64, digits: usize) -> String {
+fn with_decimals(value: f64, digits: usize) -> String {
     let text = format!("{:.digits$}", value + 0.0);
     if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
 }
@@ -105,7 +105,7 @@ fn trimmed(value: f64, digits: usize) -> String {
 fn fraction(value: f64) -> String {
     let digits = (4..=6).find(|digits| 1.0 - value >= 10_f64.powi(-digits));
     match digits.and_then(|digits| usize::try_from(digits).ok()) {
-        Some(digits) if value > 0.999 && value < 1.0 => trimmed(value, digits),
+        Some(digits) if value > 0.999 && value < 1.0 => with_decimals(value, digits),
         _ => number(value),
     }
 }
@@ -136,7 +136,7 @@ pub fn number(value: f64) -> String {
     }
     let digits = [(100.0, 0), (10.0, 1), (1.0, 2), (0.1, 3), (0.01, 4), (0.001, 5)];
     let digits = digits.iter().find(|(from, _)| size >= *from).map_or(6, |(_, digits)| *digits);
-    trimmed(value, digits)
+    with_decimals(value, digits)
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use protocol::xml::escaped;
 
-use super::figure::{Figure, Finding, Page, Section, Size, Table, Verdict};
+use super::figure::{Figure, FigureWidth, Finding, FindingVerdict, Page, Section, Table};
 use super::svg;
 
 /// The style of all pages: light, dark on dark screens, and black on white for paper.
@@ -21,7 +21,7 @@ pub fn html(page: &Page) -> String {
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
          <meta name=\"color-scheme\" content=\"light dark\"/>\n<title>{title}</title>\n\
          <style>\n{STYLE}{}\n</style>\n</head>\n<body>\n<header>\n<h1>{title}</h1>\n",
-        svg::dark()
+        svg::dark_rules()
     );
     paragraph(&mut out, &page.intro);
     out.push_str("</header>\n");
@@ -67,8 +67,8 @@ fn section(out: &mut String, section: &Section) {
     for drawing in &section.drawings {
         let (name, title) = (escaped(drawing.name()), escaped(drawing.title()));
         let _ = writeln!(out, "<figure class=\"wide\" id=\"{name}\">");
-        out.push_str(&svg::inline_cells(drawing, svg::natural(Size::Wide).0, "desk"));
-        out.push_str(&svg::inline_cells(drawing, svg::natural(Size::Half).0, "hand"));
+        out.push_str(&svg::inline_cells(drawing, svg::natural_size(FigureWidth::Wide).0, "desk"));
+        out.push_str(&svg::inline_cells(drawing, svg::natural_size(FigureWidth::Half).0, "hand"));
         let _ = writeln!(out, "<figcaption>{title}</figcaption>\n</figure>");
     }
     if !section.figures.is_empty() {
@@ -85,13 +85,13 @@ fn section(out: &mut String, section: &Section) {
 }
 
 fn figure(out: &mut String, figure: &Figure) {
-    let class = if figure.size == Size::Wide { "wide" } else { "half" };
+    let class = if figure.size == FigureWidth::Wide { "wide" } else { "half" };
     let _ = writeln!(out, "<figure class=\"{class}\" id=\"{}\">", escaped(&figure.name));
     let natural = svg::height(figure, figure.size);
-    if figure.size == Size::Wide {
+    if figure.size == FigureWidth::Wide {
         // Letters that are readable on a desktop are too small on a phone, which gets its own drawing.
         out.push_str(&svg::inline(figure, natural, "desk"));
-        out.push_str(&svg::inline(figure, svg::height(figure, Size::Half), "hand"));
+        out.push_str(&svg::inline(figure, svg::height(figure, FigureWidth::Half), "hand"));
     } else {
         out.push_str(&svg::inline(figure, natural, "both"));
     }
@@ -99,24 +99,24 @@ fn figure(out: &mut String, figure: &Figure) {
 }
 
 /// The attribute of right-aligned cells.
-const NUMBER: &str = " class=\"n\"";
+const NUMBER_CLASS: &str = " class=\"n\"";
 
 fn findings(out: &mut String, findings: &[Finding]) {
     let paper = findings.iter().any(|finding| finding.paper.is_some());
     let limit = findings.iter().any(|finding| finding.bar.is_some() || finding.against.is_some());
     let shown = [true, paper, true, limit, paper || limit];
     out.push_str("<div class=\"scroll\"><table class=\"findings\">\n<thead>");
-    let head = [("figure", ""), ("paper", NUMBER), ("here", NUMBER), ("limit", ""), ("", "")];
-    row(out, "th", some(head, shown));
+    let head = [("figure", ""), ("paper", NUMBER_CLASS), ("here", NUMBER_CLASS), ("limit", ""), ("", "")];
+    row(out, "th", shown_cells(head, shown));
     out.push_str("</thead>\n<tbody>\n");
     for finding in findings {
         let (class, verdict) = match (finding.verdict, &finding.bar) {
-            (Verdict::Better, None) => ("better", "✓ better"),
-            (Verdict::Better, Some(_)) => ("better", "✓ holds"),
-            (Verdict::Same, _) => ("same", "= the same"),
-            (Verdict::Worse, None) => ("worse", "✗ worse"),
-            (Verdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
-            (Verdict::Stated, _) => ("stated", ""),
+            (FindingVerdict::Better, None) => ("better", "✓ better"),
+            (FindingVerdict::Better, Some(_)) => ("better", "✓ holds"),
+            (FindingVerdict::Same, _) => ("same", "= the same"),
+            (FindingVerdict::Worse, None) => ("worse", "✗ worse"),
+            (FindingVerdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
+            (FindingVerdict::Stated, _) => ("stated", ""),
         };
         let origin = finding.origin.as_ref().map(|origin| format!(" ({origin})")).unwrap_or_default();
         let limit = finding.bar.as_ref().or(finding.against.as_ref());
@@ -132,7 +132,7 @@ fn findings(out: &mut String, findings: &[Finding]) {
             (verdict, &format!(" class=\"verdict {class}\"")),
         ];
         let [_, paper, ours, limit, verdict] = shown;
-        self::cells(out, "td", some(cells, [paper, ours, limit, verdict]));
+        self::cells(out, "td", shown_cells(cells, [paper, ours, limit, verdict]));
         out.push_str("</tr>\n");
     }
     out.push_str("</tbody>\n</table></div>\n");
@@ -145,7 +145,8 @@ fn table(out: &mut String, table: &Table) {
     }
     out.push_str("<div class=\"scroll\"><table>\n");
     let columns = 0..table.head.len();
-    let classes: Vec<_> = columns.map(|column| if numbers(table, column) { NUMBER } else { "" }).collect();
+    let classes: Vec<_> =
+        columns.map(|column| if is_number_column(table, column) { NUMBER_CLASS } else { "" }).collect();
     let classes = || classes.iter().copied().chain(std::iter::repeat(""));
     out.push_str("<thead>");
     row(out, "th", table.head.iter().map(String::as_str).zip(classes()));
@@ -174,7 +175,7 @@ fn command(text: &str) -> String {
 }
 
 /// Returns those of the cells whose column is shown.
-fn some<T, const N: usize>(cells: [T; N], shown: [bool; N]) -> impl Iterator<Item = T> {
+fn shown_cells<T, const N: usize>(cells: [T; N], shown: [bool; N]) -> impl Iterator<Item = T> {
     cells.into_iter().zip(shown).filter(|(_, shown)| *shown).map(|(cell, _)| cell)
 }
 
@@ -192,7 +193,7 @@ fn cells<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, 
 }
 
 /// Returns true if a column contains numbers, so that it is right-aligned.
-fn numbers(table: &Table, column: usize) -> bool {
+fn is_number_column(table: &Table, column: usize) -> bool {
     let mut cells =
         table.rows.iter().filter_map(|row| row.get(column)).filter(|cell| !cell.is_empty()).peekable();
     cells.peek().is_some()
@@ -222,13 +223,15 @@ mod tests {
             title: "One & two".to_owned(),
             text: vec!["a < b".to_owned()],
             figures: vec![
-                figure(&format!("{name}-wide"), Size::Wide),
-                figure(&format!("{name}-half"), Size::Half),
+                figure(&format!("{name}-wide"), FigureWidth::Wide),
+                figure(&format!("{name}-half"), FigureWidth::Half),
             ],
             findings: vec![
                 Finding::less_is_better("error", 0.0054, nm(6.3e-5))
                     .with_command(Some("look <here>".to_owned())),
-                Finding::stated("slope", nm(0.25).plus_minus(0.5)).must("below 1 Nm", false).from("--limit"),
+                Finding::stated("slope", nm(0.25).plus_minus(0.5))
+                    .with_requirement("below 1 Nm", false)
+                    .with_origin("--limit"),
             ],
             tables: vec![
                 Table {
@@ -245,7 +248,7 @@ mod tests {
                     ["at", "look"],
                     [["2 s".to_owned(), "skinbus view 'a b' --at 2".to_owned()]],
                 )
-                .of_commands(),
+                .with_commands(),
             ],
             ..Section::default()
         };

@@ -5,11 +5,11 @@ use std::ops::Range;
 use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 
 use super::figure::{Axis, Scale, quantity};
-use super::number::{Fitted, fitted, known};
+use super::number::{PrefixedUnit, prefixable_unit, prefixed};
 
 /// The range of an axis, with its mapping and unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Span {
+pub(crate) struct AxisSpan {
     from: f64,
     to: f64,
     scale: Scale,
@@ -17,7 +17,7 @@ pub(crate) struct Span {
     unit: Option<&'static str>,
 }
 
-impl Span {
+impl AxisSpan {
     /// Creates the range of an axis: the given one, or that of the data plus a margin of the share `room`.
     pub(crate) fn new(axis: &Axis, values: impl Iterator<Item = f64>, room: f64) -> Self {
         let scale = axis.scale;
@@ -26,17 +26,17 @@ impl Span {
             let ends = values.filter(usable).fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), value| {
                 (from.min(value), to.max(value))
             });
-            wider(ends, scale, room)
+            with_margin(ends, scale, room)
         });
         let is_fit = usable(&from) && usable(&to) && from < to;
-        let (from, to) = if is_fit { (from, to) } else { wider((from, to), scale, room) };
-        Self { from, to, scale, unit: known(&axis.unit) }
+        let (from, to) = if is_fit { (from, to) } else { with_margin((from, to), scale, room) };
+        Self { from, to, scale, unit: prefixable_unit(&axis.unit) }
     }
 
     /// Returns the unit of a linear axis with the SI prefix that fits its ends.
-    fn fitted(&self) -> Option<Fitted> {
+    fn fitted(&self) -> Option<PrefixedUnit> {
         let unit = self.unit.filter(|_| self.scale == Scale::Linear)?;
-        fitted(self.from.abs().max(self.to.abs()), unit)
+        prefixed(self.from.abs().max(self.to.abs()), unit)
     }
 
     /// Returns the axis title: the quantity and its unit, unless each tick shows the unit.
@@ -50,7 +50,7 @@ impl Span {
     }
 
     /// Returns the position of a value: 0 at the start of the axis, 1 at its end, NaN for a value that has no position.
-    pub(crate) fn place(&self, value: f64) -> f64 {
+    pub(crate) fn position(&self, value: f64) -> f64 {
         match self.scale {
             Scale::Linear => (value - self.from) / (self.to - self.from),
             Scale::Log if value > 0.0 => (value / self.from).ln() / (self.to / self.from).ln(),
@@ -80,8 +80,8 @@ impl Span {
         let size = self.from.abs().max(self.to.abs()) * factor;
         match self.scale {
             Scale::Log if (0.01..1e5).contains(&tick) && self.unit.is_none() => format!("{}", round(tick)),
-            Scale::Log => self.unit.map_or_else(|| power(tick), |unit| quantity(tick, unit)),
-            Scale::Linear if !(1e-3..1e6).contains(&size) => power(tick * factor),
+            Scale::Log => self.unit.map_or_else(|| power_of_ten_text(tick), |unit| quantity(tick, unit)),
+            Scale::Linear if !(1e-3..1e6).contains(&size) => power_of_ten_text(tick * factor),
             Scale::Linear => {
                 let step = step(self.from, self.to, most) * factor;
                 let digits = (0..9).find(|digits| step * 10_f64.powi(*digits) > 0.999).unwrap_or(9);
@@ -91,7 +91,7 @@ impl Span {
     }
 }
 
-impl Ranged for Span {
+impl Ranged for AxisSpan {
     type FormatOption = DefaultFormatting;
     type ValueType = f64;
 
@@ -100,7 +100,7 @@ impl Ranged for Span {
         reason = "a position in a picture; saturating at its edge is right"
     )]
     fn map(&self, value: &f64, (from, to): (i32, i32)) -> i32 {
-        let place = f64::from(from) + self.place(*value) * f64::from(to - from);
+        let place = f64::from(from) + self.position(*value) * f64::from(to - from);
         place.round() as i32
     }
 
@@ -114,7 +114,7 @@ impl Ranged for Span {
 }
 
 /// Returns the ends of the data with a margin; a default range if there are no data.
-fn wider((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
+fn with_margin((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
     let nothing = !(from.is_finite() && to.is_finite() && from <= to);
     match scale {
         Scale::Linear if nothing => (0.0, 1.0),
@@ -182,18 +182,18 @@ fn round(tick: f64) -> f64 {
 }
 
 /// Formats a number with a power of ten: `2·10⁻⁵`.
-fn power(tick: f64) -> String {
+fn power_of_ten_text(tick: f64) -> String {
     if tick == 0.0 {
         return "0".to_owned();
     }
     let text = format!("{tick:.3e}");
     let Some((digits, exponent)) = text.split_once('e') else { return text };
     let digits = digits.trim_end_matches('0').trim_end_matches('.');
-    let exponent: String = exponent.chars().map(raised).collect();
+    let exponent: String = exponent.chars().map(superscript).collect();
     if digits == "1" { format!("10{exponent}") } else { format!("{digits}·10{exponent}") }
 }
 
-fn raised(digit: char) -> char {
+fn superscript(digit: char) -> char {
     let place = digit.to_digit(10).and_then(|digit| usize::try_from(digit).ok());
     place.and_then(|place| "⁰¹²³⁴⁵⁶⁷⁸⁹".chars().nth(place)).unwrap_or(if digit == '-' {
         '⁻'
@@ -209,22 +209,22 @@ mod tests {
 
     #[test]
     fn an_axis_has_the_prefix_that_fits_its_ends_or_the_unit_at_each_tick() {
-        let axis = Axis::new("error", "Nm").between(-2e-4, 3e-4);
-        let span = Span::new(&axis, [].into_iter(), 0.0);
+        let axis = Axis::new("error", "Nm").with_ends(-2e-4, 3e-4);
+        let span = AxisSpan::new(&axis, [].into_iter(), 0.0);
         assert_eq!((span.title(&axis), span.caption(1e-4, 5)), ("error (µNm)".to_owned(), "100".to_owned()));
-        let axis = Axis::new("time", "µs").between(5.0, 2_000.0).log();
-        let span = Span::new(&axis, [].into_iter(), 0.0);
+        let axis = Axis::new("time", "µs").with_ends(5.0, 2_000.0).log();
+        let span = AxisSpan::new(&axis, [].into_iter(), 0.0);
         let words = [5.0, 1_000.0].map(|tick| span.caption(tick, 5));
         assert_eq!(
             (span.title(&axis), words),
             ("time".to_owned(), ["5\u{a0}µs", "1\u{a0}ms"].map(str::to_owned))
         );
-        let axis = Axis::new("position", "rad").between(0.0, 2.0);
-        assert_eq!(Span::new(&axis, [].into_iter(), 0.0).title(&axis), "position (rad)");
+        let axis = Axis::new("position", "rad").with_ends(0.0, 2.0);
+        assert_eq!(AxisSpan::new(&axis, [].into_iter(), 0.0).title(&axis), "position (rad)");
     }
 
-    fn span(from: f64, to: f64, scale: Scale) -> Span {
-        Span::new(&Axis { scale, ..Axis::default() }.between(from, to), [].into_iter(), 0.0)
+    fn span(from: f64, to: f64, scale: Scale) -> AxisSpan {
+        AxisSpan::new(&Axis { scale, ..Axis::default() }.with_ends(from, to), [].into_iter(), 0.0)
     }
 
     #[test]
@@ -243,7 +243,7 @@ mod tests {
     #[test]
     fn an_axis_fits_what_is_drawn_and_begins_at_0_where_all_is_above() {
         let ends = |scale, values: &[f64]| {
-            let span = Span::new(&Axis { scale, ..Axis::default() }, values.iter().copied(), 0.05);
+            let span = AxisSpan::new(&Axis { scale, ..Axis::default() }, values.iter().copied(), 0.05);
             (span.from, span.to)
         };
         assert_eq!(ends(Scale::Linear, &[0.2, 10.0, f64::NAN]), (0.0, 10.0 + 0.05 * 9.8));
@@ -270,7 +270,7 @@ mod tests {
         #[test]
         fn a_place_comes_back_as_its_value(from in 1e-3..1e3_f64, width in 1e-2..1e3_f64, place in 0.0..1.0_f64, log: bool) {
             let span = span(from, from + width, if log { Scale::Log } else { Scale::Linear });
-            prop_assert!((span.place(span.value(place)) - place).abs() < 1e-9);
+            prop_assert!((span.position(span.value(place)) - place).abs() < 1e-9);
         }
     }
 }

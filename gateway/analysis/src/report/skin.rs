@@ -85,12 +85,12 @@ pub struct Panel {
     /// The radius in m of the unrolled cylinder; `None` for a plate.
     pub radius: Option<f64>,
     /// The cells on the link.
-    pub cells: Vec<Spot>,
+    pub cells: Vec<MapCell>,
 }
 
 /// A cell on a map.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Spot {
+pub struct MapCell {
     /// Position to the right and down, in m.
     pub at: [f64; 2],
     /// Value of the cell; 0 is drawn without colour, and `None` stands for unknown.

@@ -1,7 +1,7 @@
 //! Draws a figure as SVG.
 //!
 //! The drawing contains the colours for paper, so that every program can show it. Each colour also has a class, with
-//! which [`dark()`] replaces it on a dark screen.
+//! which [`dark_rules()`] replaces it on a dark_rules screen.
 
 mod cells;
 mod colour;
@@ -20,22 +20,22 @@ use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use plotters_svg::SVGBackend;
 use protocol::xml::escaped;
 
-use super::figure::{Axis, Figure, Mark, MarkAxis, Series, Shape, Size};
-use super::scale::Span;
-use super::thin::thinned;
+use super::figure::{Axis, Figure, FigureWidth, Mark, MarkAxis, Series, Shape};
+use super::scale::AxisSpan;
+use super::thin::thin_points;
 
 /// Number of drawing units per pixel, so that positions are whole numbers.
-const UNIT: i32 = 8;
+const UNITS_PER_PIXEL: i32 = 8;
 /// Height of a diagram below another one, in pixels.
-const BELOW: u32 = 170;
+const LOWER_DIAGRAM_HEIGHT: u32 = 170;
 /// Size of letters, in pixels.
-const LETTERS: f64 = 13.0;
+const LETTER_SIZE: f64 = 13.0;
 /// Widths of lines in drawing units. The plotting library would draw each dash as a line of its own, of which a noisy
 /// curve has thousands. So dashed lines have unique widths, by which they are found and given a dash attribute.
-const LINE: u32 = 13;
-const DASHED: u32 = 14;
-const DOTTED: u32 = 9;
-const DASHES: [(u32, &str); 2] = [(DASHED, "56 36"), (DOTTED, "16 24")];
+const LINE_WIDTH: u32 = 13;
+const DASHED_WIDTH: u32 = 14;
+const DOTTED_WIDTH: u32 = 9;
+const DASHES: [(u32, &str); 2] = [(DASHED_WIDTH, "56 36"), (DOTTED_WIDTH, "16 24")];
 
 /// Colour on paper, CSS class, and colour on a dark screen: for text, faint text, the grid, and each series. The series
 /// have Okabe and Ito's colours, which colour-blind readers can distinguish; their yellow is omitted because it is
@@ -63,42 +63,42 @@ fn colours() -> impl Iterator<Item = RGBColor> {
 
 /// Returns the CSS rules with the colours for dark screens.
 #[must_use]
-pub fn dark() -> String {
+pub fn dark_rules() -> String {
     let mut rules = "@media screen and (prefers-color-scheme:dark){".to_owned();
     for (_, class, colour) in CLASSES {
         let _ = write!(rules, ".{class}-f{{fill:{colour}}}.{class}-s{{stroke:{colour}}}");
     }
-    colour::dark(&mut rules);
+    colour::add_dark_rules(&mut rules);
     rules.push('}');
     rules
 }
 
 /// Returns the width and the height of a figure in pixels, before scaling.
 #[must_use]
-pub const fn natural(size: Size) -> (u32, u32) {
+pub const fn natural_size(size: FigureWidth) -> (u32, u32) {
     match size {
-        Size::Wide => (960, 320),
-        Size::Half => (470, 270),
+        FigureWidth::Wide => (960, 320),
+        FigureWidth::Half => (470, 270),
     }
 }
 
 /// Returns the width and the height of a figure in pixels, including a diagram below it.
 #[must_use]
-pub(crate) const fn height(figure: &Figure, size: Size) -> (u32, u32) {
-    let (width, height) = natural(size);
-    (width, if figure.below.is_some() { height + BELOW } else { height })
+pub(crate) const fn height(figure: &Figure, size: FigureWidth) -> (u32, u32) {
+    let (width, height) = natural_size(size);
+    (width, if figure.below.is_some() { height + LOWER_DIAGRAM_HEIGHT } else { height })
 }
 
 /// Draws a standalone SVG file, for a paper or a document.
 #[must_use]
 pub fn draw(figure: &Figure) -> String {
     let (width, height) = height(figure, figure.size);
-    let style = format!("<style>{}</style>\n", dark());
+    let style = format!("<style>{}</style>\n", dark_rules());
     let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
     document(figure, (width, height), &attributes, &style)
 }
 
-/// Draws a figure as an element of a page that contains the CSS rules of [`dark()`]; `size` is the size in pixels
+/// Draws a figure as an element of a page that contains the CSS rules of [`dark_rules()`]; `size` is the size in pixels
 /// before scaling.
 #[must_use]
 pub fn inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
@@ -106,14 +106,14 @@ pub fn inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
 }
 
 fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, style: &str) -> String {
-    let unit = UNIT.unsigned_abs();
+    let unit = UNITS_PER_PIXEL.unsigned_abs();
     let mut drawing = String::new();
     let area = SVGBackend::with_string(&mut drawing, (width * unit, height * unit)).into_drawing_area();
     // A drawing in memory can only fail if the area is too small.
     let drawn = drawing_of(figure, &area).and_then(|()| area.present());
     drop(area);
     let body = drawing.split_once(">\n").map_or("", |(_, body)| body);
-    let body = if drawn.is_ok() { classed(body) } else { "</svg>\n".to_owned() };
+    let body = if drawn.is_ok() { with_classes(body) } else { "</svg>\n".to_owned() };
     let title = escaped(&figure.title);
     format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {} {}\" role=\"img\" {attributes} \
@@ -124,7 +124,7 @@ fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, styl
 }
 
 /// Adds the CSS class to every colour of an SVG text.
-fn classed(body: &str) -> String {
+fn with_classes(body: &str) -> String {
     let mut body = body.replace(" opacity=\"1\"", "").replace(" font-family=\"sans-serif\"", "");
     for (RGBColor(r, g, b), class, _) in CLASSES {
         for (attribute, kind) in [("fill", 'f'), ("stroke", 's')] {
@@ -140,16 +140,16 @@ fn classed(body: &str) -> String {
 }
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-type Chart<'a, 'b> = ChartContext<'b, SVGBackend<'a>, Cartesian2d<Span, Span>>;
-type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
+type Chart<'a, 'b> = ChartContext<'b, SVGBackend<'a>, Cartesian2d<AxisSpan, AxisSpan>>;
+type DrawResult = Result<(), DrawingAreaErrorKind<std::io::Error>>;
 
 /// One of the diagrams of a figure.
 #[derive(Clone, Copy)]
 struct Diagram<'a> {
     axes: (&'a Axis, &'a Axis),
     /// The axes, fitted to the data.
-    x: Span,
-    y: Span,
+    x: AxisSpan,
+    y: AxisSpan,
     series: &'a [Series],
     marks: &'a [Mark],
     /// True if the labels of the horizontal axis belong below this diagram.
@@ -157,7 +157,7 @@ struct Diagram<'a> {
 }
 
 impl<'a> Diagram<'a> {
-    fn of(figure: &'a Figure) -> Vec<Self> {
+    fn from_figure(figure: &'a Figure) -> Vec<Self> {
         let upper = (&figure.y, figure.series.as_slice(), figure.marks.as_slice());
         let lower = figure.below.as_ref().map(|it| (&it.y, it.series.as_slice(), it.marks.as_slice()));
         let drawn = || std::iter::once(upper).chain(lower);
@@ -165,11 +165,11 @@ impl<'a> Diagram<'a> {
         let marks =
             |marks: &'a [Mark], on| marks.iter().filter(move |mark| mark.on == on).map(|mark| mark.at);
         let across = points().filter(|point| point.1.is_finite()).map(|point| point.0);
-        let x = Span::new(&figure.x, across.chain(marks(&figure.marks, MarkAxis::X)), 0.0);
+        let x = AxisSpan::new(&figure.x, across.chain(marks(&figure.marks, MarkAxis::X)), 0.0);
         let count = drawn().count();
         let diagrams = drawn().enumerate().map(|(at, (axis, series, of_marks))| {
             let up = series.iter().flat_map(|series| &series.points).map(|point| point.1);
-            let y = Span::new(axis, up.chain(marks(of_marks, MarkAxis::Y)), 0.06);
+            let y = AxisSpan::new(axis, up.chain(marks(of_marks, MarkAxis::Y)), 0.06);
             Self { axes: (&figure.x, axis), x, y, series, marks: of_marks, is_lowest: at + 1 == count }
         });
         diagrams.collect()
@@ -178,7 +178,7 @@ impl<'a> Diagram<'a> {
     /// Returns the maximum number of ticks of the vertical axis, for a height in drawing units.
     const fn ticks(height: u32) -> usize {
         // A low diagram needs closer ticks.
-        let distance = if height > pixels(BELOW) { 42 } else { 32 };
+        let distance = if height > pixels(LOWER_DIAGRAM_HEIGHT) { 42 } else { 32 };
         (height / pixels(distance)) as usize
     }
 
@@ -190,21 +190,21 @@ impl<'a> Diagram<'a> {
     }
 }
 
-fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
-    let diagrams = Diagram::of(figure);
+fn drawing_of(figure: &Figure, area: &Area<'_>) -> DrawResult {
+    let diagrams = Diagram::from_figure(figure);
     let (_, height) = area.dim_in_pixel();
     let (upper, lower) = match figure.below {
-        Some(_) => area.split_vertically(height.saturating_sub(pixels(BELOW))),
+        Some(_) => area.split_vertically(height.saturating_sub(pixels(LOWER_DIAGRAM_HEIGHT))),
         None => area.split_vertically(height),
     };
     let areas = [upper, lower];
     let digits = diagrams.iter().zip(&areas).map(|(diagram, area)| diagram.letters(area.dim_in_pixel().1));
     // Both diagrams have the same left edge.
-    let left = pixels(34) + in_pixels(0.62 * LETTERS * digits.max().unwrap_or(1) as f64).unsigned_abs();
+    let left = pixels(34) + in_pixels(0.62 * LETTER_SIZE * digits.max().unwrap_or(1) as f64).unsigned_abs();
     diagrams.iter().zip(&areas).try_for_each(|(diagram, area)| diagram_of(diagram, area, left))
 }
 
-fn diagram_of(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> Drawn {
+fn diagram_of(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> DrawResult {
     let Diagram { axes, x, y, series, marks, is_lowest } = *diagram;
     let (width, height) = area.dim_in_pixel();
     let (x_most, y_most) = ((width / pixels(80)) as usize, Diagram::ticks(height));
@@ -225,8 +225,8 @@ fn diagram_of(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> Drawn {
         .light_line_style(GRID.mix(0.0))
         .bold_line_style(GRID.stroke_width(pixels(1)))
         .axis_style(FAINT.stroke_width(pixels(1)))
-        .label_style(letters(&INK, LETTERS))
-        .axis_desc_style(letters(&INK, LETTERS))
+        .label_style(letters(&INK, LETTER_SIZE))
+        .axis_desc_style(letters(&INK, LETTER_SIZE))
         .set_all_tick_mark_size(pixels(5))
         .x_label_formatter(&|tick| if is_lowest { x.caption(*tick, x_most) } else { String::new() })
         .y_label_formatter(&|tick| y.caption(*tick, y_most))
@@ -234,7 +234,7 @@ fn diagram_of(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> Drawn {
         .y_desc(y.title(axes.1))
         .draw()?;
     let (columns, lines) = chart.plotting_area().dim_in_pixel();
-    let grain = (columns / UNIT.unsigned_abs(), lines / UNIT.unsigned_abs());
+    let grain = (columns / UNITS_PER_PIXEL.unsigned_abs(), lines / UNITS_PER_PIXEL.unsigned_abs());
     for (series, colour) in series.iter().zip(colours()) {
         series_of(&mut chart, series, colour, (&x, &y), grain)?;
     }
@@ -253,18 +253,18 @@ fn series_of(
     chart: &mut Chart<'_, '_>,
     series: &Series,
     colour: RGBColor,
-    (x, y): (&Span, &Span),
+    (x, y): (&AxisSpan, &AxisSpan),
     (columns, lines): (u32, u32),
-) -> Drawn {
-    let placed = series.points.iter().map(|point| (x.place(point.0), y.place(point.1)));
-    let style = colour.stroke_width(if series.shape == Shape::Dashed { DASHED } else { LINE });
+) -> DrawResult {
+    let placed = series.points.iter().map(|point| (x.position(point.0), y.position(point.1)));
+    let style = colour.stroke_width(if series.shape == Shape::Dashed { DASHED_WIDTH } else { LINE_WIDTH });
     let back = |points: Vec<(f64, f64)>| -> Vec<(f64, f64)> {
         points.into_iter().map(|(across, up)| (x.value(across), y.value(up))).collect()
     };
     match series.shape {
         Shape::Line | Shape::Dashed | Shape::Steps => {
-            for run in runs(&placed.collect::<Vec<_>>()) {
-                let run = thinned(run, columns);
+            for run in line_pieces(&placed.collect::<Vec<_>>()) {
+                let run = thin_points(run, columns);
                 let run = if series.shape == Shape::Steps { stairs(&run) } else { run };
                 for piece in clipped(&run) {
                     let points = back(piece);
@@ -308,7 +308,7 @@ fn is_finite(point: &(f64, f64)) -> bool {
 }
 
 /// Returns the pieces of a line between gaps, which are points with values that are not finite.
-fn runs(points: &[(f64, f64)]) -> impl Iterator<Item = &[(f64, f64)]> {
+fn line_pieces(points: &[(f64, f64)]) -> impl Iterator<Item = &[(f64, f64)]> {
     points.split(|point| !is_finite(point)).filter(|run| !run.is_empty())
 }
 
@@ -359,15 +359,15 @@ fn clipped(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
     pieces
 }
 
-fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Drawn {
-    let place = if mark.on == MarkAxis::X { x.place(mark.at) } else { y.place(mark.at) };
+fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&AxisSpan, &AxisSpan)) -> DrawResult {
+    let place = if mark.on == MarkAxis::X { x.position(mark.at) } else { y.position(mark.at) };
     if !(0.0..=1.0).contains(&place) {
         return Ok(());
     }
     let ends =
         if mark.on == MarkAxis::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
     let line = ends.map(|(across, up)| (x.value(across), y.value(up)));
-    chart.draw_series([PathElement::new(line.to_vec(), FAINT.stroke_width(DOTTED))])?;
+    chart.draw_series([PathElement::new(line.to_vec(), FAINT.stroke_width(DOTTED_WIDTH))])?;
     // Put the text on the side with room.
     let (across, up, side, end) = match mark.on {
         MarkAxis::X if place > 0.6 => (place, 1.0, HPos::Right, VPos::Top),
@@ -376,7 +376,7 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
         MarkAxis::Y => (1.0, place, HPos::Right, VPos::Bottom),
     };
     let gap = if matches!(side, HPos::Left) { 0.006 } else { -0.006 };
-    let style = letters(&FAINT, LETTERS - 1.0).pos(Pos::new(side, end));
+    let style = letters(&FAINT, LETTER_SIZE - 1.0).pos(Pos::new(side, end));
     let at = (x.value(across + gap), y.value(up - if mark.on == MarkAxis::X { 0.02 } else { 0.0 }));
     chart.draw_series([Text::new(mark.caption.clone(), at, style)])?;
     Ok(())
@@ -388,7 +388,7 @@ fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
     let mut rows: Vec<Vec<_>> = Vec::new();
     let mut at = i32::MAX;
     for (series, colour) in named {
-        let room = in_pixels(48.0 + 0.56 * LETTERS * series.caption.chars().count() as f64);
+        let room = in_pixels(48.0 + 0.56 * LETTER_SIZE * series.caption.chars().count() as f64);
         if at.saturating_add(room) > i32::try_from(width).unwrap_or(i32::MAX) {
             rows.push(Vec::new());
             at = in_pixels(12.0);
@@ -401,7 +401,7 @@ fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
     rows
 }
 
-fn entry_of(area: &Area<'_>, series: &Series, colour: RGBColor, (at, row): (i32, i32)) -> Drawn {
+fn entry_of(area: &Area<'_>, series: &Series, colour: RGBColor, (at, row): (i32, i32)) -> DrawResult {
     let middle = in_pixels(15.0) + row * in_pixels(20.0);
     let end = at + in_pixels(22.0);
     let style: ShapeStyle = colour.stroke_width(pixels(2));
@@ -421,23 +421,23 @@ fn entry_of(area: &Area<'_>, series: &Series, colour: RGBColor, (at, row): (i32,
             area.draw(&Rectangle::new(corners, colour.mix(0.25).filled()))?;
         }
     }
-    let style = letters(&INK, LETTERS).pos(Pos::new(HPos::Left, VPos::Center));
+    let style = letters(&INK, LETTER_SIZE).pos(Pos::new(HPos::Left, VPos::Center));
     area.draw(&Text::new(series.caption.clone(), (end + in_pixels(6.0), middle), style))
 }
 
 /// Returns the text style for letters of a size in pixels. The plotting library draws them smaller by a factor of 1.24,
 /// which is corrected here.
 fn letters<'a>(colour: &RGBColor, size: f64) -> TextStyle<'a> {
-    ("sans-serif", size * 1.24 * f64::from(UNIT)).into_font().color(colour)
+    ("sans-serif", size * 1.24 * f64::from(UNITS_PER_PIXEL)).into_font().color(colour)
 }
 
 const fn pixels(count: u32) -> u32 {
-    count * UNIT.unsigned_abs()
+    count * UNITS_PER_PIXEL.unsigned_abs()
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "a length in a picture")]
 fn in_pixels(count: f64) -> i32 {
-    (count * f64::from(UNIT)).round() as i32
+    (count * f64::from(UNITS_PER_PIXEL)).round() as i32
 }
 
 #[cfg(test)]

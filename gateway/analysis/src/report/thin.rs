@@ -138,7 +138,7 @@ fn join(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, C
 
 /// Reduces a list of points: at most four are kept for each of `columns` equal parts of the range 0 to 1 in x.
 #[must_use]
-pub fn thinned(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
+pub fn thin_points(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
     if points.len() <= 4 * columns as usize {
         return points.to_vec();
     }
@@ -283,7 +283,7 @@ mod tests {
         ) {
             let count = ys.len() as f64;
             let points: Vec<_> = ys.iter().enumerate().map(|(n, y)| (n as f64 / count, f64::from(*y))).collect();
-            let thin = thinned(&points, columns);
+            let thin = thin_points(&points, columns);
             prop_assert!(thin.len() <= points.len() && (points.len() <= 4 * columns as usize || thin.len() <= 4 * columns as usize));
             prop_assert!(thin.iter().all(|point| points.contains(point)));
             for column in 0..columns {

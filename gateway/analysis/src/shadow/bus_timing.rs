@@ -12,8 +12,8 @@ use super::report::{BusShadow, Counts, Delays, Loads, Peak, Stretches};
 use super::reported::FrameTimings;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
 use crate::fit;
-use crate::fit::traffic::{ClassifiedFrame, RunEvent, Traffic};
-use crate::fit::verdict::{Answer, Cells};
+use crate::fit::traffic::{ClassifiedFrame, RunEvent, TrafficClassifier};
+use crate::fit::verdict::{AnsweringCells, FitSummary};
 use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 
 /// Maximum number of frames that wait to be sent on a bus: some minutes of a bus at full load. Further frames are
@@ -24,7 +24,7 @@ const IDENTIFIER_COUNT: usize = 0x800;
 
 /// The data that the model keeps with a frame until it is sent.
 #[derive(Clone, Copy, Debug)]
-struct Tag {
+struct FrameTag {
     /// Index of the frame in the capture.
     place: u64,
     /// Identifier of the frame; `None` for one of 29 bits.
@@ -53,7 +53,7 @@ pub(super) struct BusProperties {
     /// Number of the skin's cells on the bus; `None` without a skin.
     pub(super) cells: Option<u32>,
     /// The worst case of the bus, with all these cells answering.
-    pub(super) worst_case: Option<Answer>,
+    pub(super) worst_case: Option<FitSummary>,
     /// True to include frames that only a bench sends.
     pub(super) bench_traffic: bool,
 }
@@ -64,7 +64,7 @@ pub(super) struct BusTiming {
     pub(super) name: String,
     pub(super) counts: Counts,
     known: BusProperties,
-    model: BusModel<Tag>,
+    model: BusModel<FrameTag>,
     pending: VecDeque<Pending>,
     frames: u64,
     /// Earliest and latest time of a frame in the capture, in ns.
@@ -73,7 +73,7 @@ pub(super) struct BusTiming {
     released: u64,
     /// The end of the last transmission, in ns.
     wire_end: u64,
-    traffic: Traffic,
+    traffic: TrafficClassifier,
     has_fd: bool,
     phases: Phases,
     figures: ByPhase<Figures>,
@@ -94,7 +94,7 @@ impl BusTiming {
             span: None,
             released: 0,
             wire_end: 0,
-            traffic: Traffic::default(),
+            traffic: TrafficClassifier::default(),
             has_fd: false,
             phases: Phases::default(),
             figures: ByPhase::default(),
@@ -105,22 +105,22 @@ impl BusTiming {
 
     /// Handles a packet from before the start of the capture, which still has an effect.
     pub(super) fn latched(&mut self, nanos: u64, frame: &Frame) {
-        match self.traffic.sort(nanos, frame).says {
-            RunEvent::Joints(_) => self.phases.beginning.in_the_middle = true,
+        match self.traffic.classify(nanos, frame).says {
+            RunEvent::Joints(_) => self.phases.beginning.is_mid_run = true,
             says @ (RunEvent::Halt | RunEvent::Resume) => _ = self.epochs.receive(nanos, says, None),
             RunEvent::Answer(_) | RunEvent::Preparation | RunEvent::Other => {}
         }
     }
 
     /// Counts a frame of any kind and its time.
-    pub(super) fn count(&mut self, nanos: u64) {
+    pub(super) fn count_frame(&mut self, nanos: u64) {
         self.frames += 1;
         let (first, last) = self.span.unwrap_or((nanos, nanos));
         self.span = Some((first.min(nanos), last.max(nanos)));
     }
 
     /// Handles a frame that a real CAN bus could carry.
-    pub(super) fn take(
+    pub(super) fn receive(
         &mut self,
         nanos: u64,
         frame: &Frame,
@@ -129,7 +129,7 @@ impl BusTiming {
         reported: Option<&mut FrameTimings>,
     ) {
         let id = (!frame.is_extended()).then(|| u16::try_from(frame.id()).unwrap_or(0));
-        let sorted = self.traffic.sort(nanos, frame);
+        let sorted = self.traffic.classify(nanos, frame);
         self.has_fd |= frame.format() == Format::Fd;
         if sorted.bench.is_some() && sorted.ends_pair {
             // The previous frame with its identifier, which is near the end of the queue.
@@ -156,21 +156,21 @@ impl BusTiming {
             self.pending.front().filter(|first| !waits(first, self.pending.len())).copied()
         {
             self.pending.pop_front();
-            self.enter(first, reported.as_deref_mut());
+            self.request_frame(first, reported.as_deref_mut());
         }
     }
 
     /// Ends the input: all waiting frames are sent.
     pub(super) fn finish(&mut self, mut reported: Option<&mut FrameTimings>) {
         while let Some(first) = self.pending.pop_front() {
-            self.enter(first, reported.as_deref_mut());
+            self.request_frame(first, reported.as_deref_mut());
         }
         self.model.finish();
-        self.drain(reported);
+        self.collect_sent(reported);
     }
 
     /// Passes the next frame in order of time to the model, which requests its transmission.
-    fn enter(&mut self, pending: Pending, mut reported: Option<&mut FrameTimings>) {
+    fn request_frame(&mut self, pending: Pending, mut reported: Option<&mut FrameTimings>) {
         let Pending { at, priority, bits, place, id, sorted } = pending;
         let ClassifiedFrame { says, bench, from, .. } = sorted;
         if let Some(bench) = bench {
@@ -184,7 +184,7 @@ impl BusTiming {
         let at = at.max(self.released);
         self.released = at;
         self.model.run_until(at);
-        self.drain(reported.as_deref_mut());
+        self.collect_sent(reported.as_deref_mut());
         let phase = self.phases.at(at, says, self.traffic.is_ours());
         let answer = self.epochs.receive(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
@@ -200,15 +200,15 @@ impl BusTiming {
             *queued += 1;
             (*queued, id)
         });
-        let tag = Tag { place, id, phase, answer };
+        let tag = FrameTag { place, id, phase, answer };
         self.model.request(Request { at, priority, bits, queue: None, tag });
         figures.queue(at, self.model.waiting(), of_one);
     }
 
     /// Takes completed transmissions from the model and records them.
-    fn drain(&mut self, mut reported: Option<&mut FrameTimings>) {
+    fn collect_sent(&mut self, mut reported: Option<&mut FrameTimings>) {
         while let Some(attempt) = self.model.poll() {
-            let Attempt { tag: Tag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
+            let Attempt { tag: FrameTag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
             self.wire_end = end;
             self.figures.of(self.phases.now()).busy.record(start, end, SATURATED_NS);
             if is_damaged {
@@ -235,8 +235,8 @@ impl BusTiming {
         }
         let rates = self.known.rates;
         match BitRates::classic(rates.nominal()) {
-            Ok(classic) if !self.has_fd => fit::name(Format::Classic, classic),
-            _ => fit::name(Format::Fd, rates),
+            Ok(classic) if !self.has_fd => fit::rates_name(Format::Classic, classic),
+            _ => fit::rates_name(Format::Fd, rates),
         }
     }
 
@@ -271,9 +271,9 @@ impl BusTiming {
         let answering = self.epochs.answering(self.known.cells);
         let replies = self.epochs.replies();
         let this_run = (operation.frames > 0).then(|| {
-            let who = if is_ours { answering.cells() } else { Cells::Foreign };
+            let who = if is_ours { answering.cells() } else { AnsweringCells::Foreign };
             let late = replies.late - replies.late_when_ready;
-            Answer::this_run(load.worst_1_s.value, late, self.named_rates(), who)
+            FitSummary::this_run(load.worst_1_s.value, late, self.named_rates(), who)
         });
         BusShadow {
             bus: self.name.clone(),

@@ -9,9 +9,9 @@ use crate::fit::traffic::RunEvent;
 
 /// A set of cells of a bus.
 #[derive(Clone, Copy, Debug, Default)]
-struct Set([u64; 4]);
+struct CellSet([u64; 4]);
 
-impl Set {
+impl CellSet {
     fn insert(&mut self, cell: CellId) {
         let (word, bit) = (cell.index() / 64, cell.index() % 64);
         self.0.get_mut(word).into_iter().for_each(|word| *word |= 1 << bit);
@@ -28,18 +28,18 @@ struct EpochAnswers {
     /// Time in ns at which the joints should be sent, by the capture.
     at: u64,
     /// The cells that answered; `None` if cells were halted when the joints were sent.
-    answered: Option<Set>,
+    answered: Option<CellSet>,
 }
 
 /// Follows joints and the answers to them, in bounded memory.
 #[derive(Debug, Default)]
 pub(super) struct Epochs {
-    senders: Set,
+    senders: CellSet,
     /// The newest joints of each epoch number.
     numbered: Vec<EpochAnswers>,
     newest: Option<Epoch>,
     halted: bool,
-    closed: Counts,
+    closed: EpochTotals,
     epochs_halted: u64,
     replies: Replies,
     after_joints: Times,
@@ -47,14 +47,14 @@ pub(super) struct Epochs {
 
 /// Counts over all epochs.
 #[derive(Clone, Copy, Debug, Default)]
-struct Counts {
+struct EpochTotals {
     epochs: u64,
     answers: u64,
     most: u32,
 }
 
-impl Counts {
-    fn close(&mut self, answered: Set) {
+impl EpochTotals {
+    fn close(&mut self, answered: CellSet) {
         self.epochs += 1;
         self.answers += u64::from(answered.len());
         self.most = self.most.max(answered.len());
@@ -67,7 +67,7 @@ impl Epochs {
     pub(super) fn receive(&mut self, at: u64, says: RunEvent, from: Option<CellId>) -> Option<(Epoch, bool)> {
         from.into_iter().for_each(|cell| self.senders.insert(cell));
         match says {
-            RunEvent::Joints(epoch) => self.joints(at, epoch),
+            RunEvent::Joints(epoch) => self.receive_joints(at, epoch),
             RunEvent::Answer(epoch) => {
                 let answered = &mut self.numbered(epoch).answered;
                 from.into_iter().zip(answered).for_each(|(cell, answered)| answered.insert(cell));
@@ -81,7 +81,7 @@ impl Epochs {
     }
 
     /// Records joints at the time `at` in ns; joints that repeat an epoch count once.
-    fn joints(&mut self, at: u64, epoch: Epoch) {
+    fn receive_joints(&mut self, at: u64, epoch: Epoch) {
         let halted = self.halted;
         let numbered = self.numbered(epoch);
         numbered.at = at;
@@ -89,7 +89,7 @@ impl Epochs {
             return;
         }
         let numbered = self.numbered(epoch);
-        let before = std::mem::replace(&mut numbered.answered, (!halted).then(Set::default));
+        let before = std::mem::replace(&mut numbered.answered, (!halted).then(CellSet::default));
         before.into_iter().for_each(|answered| self.closed.close(answered));
         self.epochs_halted += u64::from(halted);
     }

@@ -38,7 +38,7 @@ impl<const SPAN: u64> Window<SPAN> {
 
 /// Stretches of time in which the bus carries frames without a pause.
 #[derive(Debug, Default)]
-pub(super) struct Busy {
+pub(super) struct BusyTime {
     /// Time in which the bus was busy, in ns.
     pub(super) total: u64,
     begin: u64,
@@ -46,7 +46,7 @@ pub(super) struct Busy {
     stretches: Stretches,
 }
 
-impl Busy {
+impl BusyTime {
     /// Records a transmission from `start` to `end`, in order of time. A stretch of at least `saturated` ns counts as
     /// saturated.
     pub(super) fn record(&mut self, start: u64, end: u64, saturated: u64) {
@@ -96,7 +96,7 @@ mod tests {
 
     #[test]
     fn stretches_end_where_the_wire_is_free() {
-        let mut busy = Busy::default();
+        let mut busy = BusyTime::default();
         for (start, end) in [(10, 20), (20, 45), (50, 55), (60, 90), (90, 100)] {
             busy.record(start, end, 30);
         }

@@ -26,7 +26,7 @@ use protocol::skin::Skin;
 use protocol::wire_time::{BitRates, Bits};
 
 use crate::fit;
-use crate::fit::verdict::Answer;
+use crate::fit::verdict::FitSummary;
 use bus_model::{BitErrors, BitErrorsError};
 use bus_timing::{BusProperties, BusTiming};
 use reported::FrameTimings;
@@ -34,7 +34,7 @@ use reported::FrameTimings;
 pub use bus_timing::MAX_QUEUE;
 pub use phase::PAUSE_NS;
 pub use report::{
-    Answering, BusShadow, Counts, Delays, KindDelays, Loads, Peak, Replies, Report, StartUp, Stretches,
+    Answering, BusShadow, Counts, Delays, KindDelays, Loads, Peak, Replies, ShadowReport, StartUp, Stretches,
 };
 pub use reported::FrameTiming;
 pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
@@ -49,11 +49,11 @@ pub const MAX_BUSES: usize = 64;
 
 /// Properties of the modelled buses.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct ShadowOptions {
     /// Bit rates of the buses that `of_bus` does not name.
     pub rates: BitRates,
     /// Bit rates of single buses, by name.
-    pub of_bus: Vec<(String, BitRates)>,
+    pub rates_by_bus: Vec<(String, BitRates)>,
     /// Share of bits that the model damages, in [0, [`BitErrors::MAX`]].
     pub bit_errors: f64,
     /// Seed of the random bit errors; each bus derives its own.
@@ -66,13 +66,13 @@ pub struct Options {
     pub skin: Option<Skin>,
 }
 
-impl Options {
+impl ShadowOptions {
     /// Returns options with these bit rates for all buses, and defaults for everything else.
     #[must_use]
     pub const fn new(rates: BitRates) -> Self {
         Self {
             rates,
-            of_bus: Vec::new(),
+            rates_by_bus: Vec::new(),
             bit_errors: 0.0,
             seed: 1,
             each_frame: false,
@@ -82,14 +82,14 @@ impl Options {
     }
 
     /// Returns the given properties of a bus.
-    fn of(&self, bus: &str) -> BusProperties {
-        let named = self.of_bus.iter().find(|(name, _)| name == bus);
+    fn bus_properties(&self, bus: &str) -> BusProperties {
+        let named = self.rates_by_bus.iter().find(|(name, _)| name == bus);
         let rates = named.map_or(self.rates, |(_, rates)| *rates);
         let described = self.skin.as_ref().and_then(|skin| Some((skin, skin.bus_named(bus)?)));
         let cells =
             described.map(|(skin, bus)| u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX));
         let worst_case = described.and_then(|(skin, bus)| fit::worst_case(skin, bus, rates));
-        let worst_case = worst_case.as_ref().map(Answer::worst_case);
+        let worst_case = worst_case.as_ref().map(FitSummary::worst_case);
         BusProperties { rates, cells, worst_case, bench_traffic: self.bench_traffic }
     }
 }
@@ -100,7 +100,7 @@ const MAX_TIME_NS: u64 = u64::MAX / 2;
 /// The model of all buses of a capture.
 #[derive(Debug)]
 pub struct Shadow {
-    options: Options,
+    options: ShadowOptions,
     bus_timings: Vec<BusTiming>,
     reported: Option<FrameTimings>,
     frames: u64,
@@ -113,7 +113,7 @@ impl Shadow {
     ///
     /// # Errors
     /// Returns [`BitErrorsError`] if the bit-error rate is outside its range.
-    pub fn new(options: Options) -> Result<Self, BitErrorsError> {
+    pub fn new(options: ShadowOptions) -> Result<Self, BitErrorsError> {
         BitErrors::new(options.bit_errors, options.seed)?;
         let reported = options.each_frame.then(FrameTimings::default);
         Ok(Self { options, bus_timings: Vec::new(), reported, frames: 0, further: 0, has_times: true })
@@ -121,7 +121,7 @@ impl Shadow {
 
     /// Handles the next frame of a bus, at a time in ns since 1970. A time after the year 2262 is set to the end of
     /// that year, so that the later time of its transmission can still be represented.
-    pub fn frame(&mut self, bus: &str, nanos: u64, frame: &Frame) {
+    pub fn receive(&mut self, bus: &str, nanos: u64, frame: &Frame) {
         let nanos = nanos.min(MAX_TIME_NS);
         let place = self.frames;
         self.frames += 1;
@@ -130,27 +130,27 @@ impl Shadow {
         if let Some(reported) = &mut self.reported {
             let (id, extended) =
                 (frame.id() | frame.raw_id() & ERROR, frame.is_extended() || frame.is_error());
-            reported.enter(FrameTiming { nanos, bus: bus_timing, id, extended, bits, sent: None });
+            reported.add(FrameTiming { nanos, bus: bus_timing, id, extended, bits, sent: None });
         }
         let Some(bus_timing) = bus_timing.and_then(|bus_timing| self.bus_timings.get_mut(bus_timing)) else {
             self.further += 1;
             return;
         };
-        bus_timing.count(nanos);
+        bus_timing.count_frame(nanos);
         match bits {
-            Some(bits) => bus_timing.take(nanos, frame, bits, place, self.reported.as_mut()),
+            Some(bits) => bus_timing.receive(nanos, frame, bits, place, self.reported.as_mut()),
             None => bus_timing.counts.error_frames += 1,
         }
     }
 
     /// Handles a packet from before the start of the capture, which still has an effect.
-    pub fn latched(&mut self, bus: &str, nanos: u64, frame: &Frame) {
+    pub fn receive_latched(&mut self, bus: &str, nanos: u64, frame: &Frame) {
         let bus_timing = self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing));
         bus_timing.into_iter().for_each(|bus_timing| bus_timing.latched(nanos, frame));
     }
 
     /// Records a number of frames that the recorder lost on a bus.
-    pub fn missing(&mut self, bus: &str, frames: u64) {
+    pub fn record_missing(&mut self, bus: &str, frames: u64) {
         if let Some(bus_timing) =
             self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing))
         {
@@ -182,8 +182,8 @@ impl Shadow {
 
     /// Returns the figures of all buses.
     #[must_use]
-    pub fn report(&self) -> Report {
-        Report {
+    pub fn report(&self) -> ShadowReport {
+        ShadowReport {
             frames: self.frames,
             frames_of_other_buses: self.further,
             bit_error_rate: self.options.bit_errors,
@@ -202,7 +202,7 @@ impl Shadow {
         let seed = self.options.seed.wrapping_add(u64::try_from(index).unwrap_or(0));
         let errors = BitErrors::new(self.options.bit_errors, seed).ok();
         let errors = errors.filter(|_| self.options.bit_errors > 0.0);
-        self.bus_timings.push(BusTiming::new(bus, self.options.of(bus), errors));
+        self.bus_timings.push(BusTiming::new(bus, self.options.bus_properties(bus), errors));
         Some(index)
     }
 }

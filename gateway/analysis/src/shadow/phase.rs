@@ -3,7 +3,7 @@
 use model::quantiles::Times;
 use protocol::id::{Id, Kind};
 
-use super::load::{Busy, Window};
+use super::load::{BusyTime, Window};
 use super::report::{Delays, KindDelays, Loads, Peak, StartUp};
 use super::{SATURATED_NS, SECOND_NS};
 use crate::fit::traffic::RunEvent;
@@ -48,7 +48,7 @@ pub(super) struct CaptureStart {
     is_prepared: bool,
     is_answered: bool,
     /// True if joints were sent before the capture.
-    pub(super) in_the_middle: bool,
+    pub(super) is_mid_run: bool,
 }
 
 impl CaptureStart {
@@ -69,7 +69,7 @@ impl CaptureStart {
     fn phase(&self, is_ours: bool) -> Phase {
         let soon =
             self.joints.zip(self.first).is_some_and(|(joints, first)| joints - first < MAX_FIRST_JOINTS_NS);
-        let in_the_middle = self.in_the_middle || self.is_answered || soon && !self.is_prepared;
+        let in_the_middle = self.is_mid_run || self.is_answered || soon && !self.is_prepared;
         if in_the_middle || !is_ours { Phase::Operation } else { Phase::StartUp }
     }
 }
@@ -124,7 +124,7 @@ pub(super) struct Figures {
     requested: u64,
     in_16_ms: Window<SATURATED_NS>,
     in_1_s: Window<SECOND_NS>,
-    pub(super) busy: Busy,
+    pub(super) busy: BusyTime,
     pub(super) all: Times,
     kinds: [Times; 8],
     /// The largest number of waiting frames in all; in the next field, of one identifier.

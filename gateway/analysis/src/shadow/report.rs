@@ -5,11 +5,11 @@ use protocol::wire_time::BitRates;
 use serde::{Serialize, Serializer};
 
 use crate::fit::traffic::BenchFrames;
-use crate::fit::verdict::{Answer, Cells};
+use crate::fit::verdict::{AnsweringCells, FitSummary};
 
 /// The figures of all buses of a capture.
 #[derive(Clone, Debug, Serialize)]
-pub struct Report {
+pub struct ShadowReport {
     /// Frames of any kind, on all buses.
     pub frames: u64,
     /// Frames of buses beyond the first 64. These buses are not modelled.
@@ -44,9 +44,9 @@ pub struct BusShadow {
     /// The duration of operation in s. Load, stretches, delays and queues are computed for this phase.
     pub operation_s: f64,
     /// Load and verdict of the worst case, with all cells of the skin answering; `None` without a skin.
-    pub worst_case: Option<Answer>,
+    pub worst_case: Option<FitSummary>,
     /// Load and verdict of the captured traffic; `None` without operation.
-    pub this_run: Option<Answer>,
+    pub this_run: Option<FitSummary>,
     /// The numbers of cells that answered, if the bus carries this project's protocol.
     pub answering: Option<Answering>,
     /// The figures of the start-up: the traffic before the first joints, and after a second without joints.
@@ -195,8 +195,8 @@ pub struct Answering {
 impl Answering {
     /// Returns the numbers in the form that a verdict uses.
     #[must_use]
-    pub const fn cells(&self) -> Cells {
-        Cells::Some { most: self.most, cells: self.cells, described: self.described }
+    pub const fn cells(&self) -> AnsweringCells {
+        AnsweringCells::Some { most: self.most, cells: self.cells, described: self.described }
     }
 }
 

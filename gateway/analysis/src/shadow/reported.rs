@@ -39,7 +39,7 @@ pub(super) struct FrameTimings {
 
 impl FrameTimings {
     /// Adds a frame. If it has bits, its transmission is still unknown.
-    pub(super) fn enter(&mut self, shaded: FrameTiming) {
+    pub(super) fn add(&mut self, shaded: FrameTiming) {
         self.entries.push_back(Entry { shaded, is_open: shaded.bits.is_some() });
     }
 

@@ -10,15 +10,15 @@ use protocol::packet::{Epoch, WORDS};
 
 const MS: u64 = 1_000_000;
 
-fn options() -> Options {
-    Options { each_frame: true, ..Options::new("1M/5M".parse().unwrap()) }
+fn options() -> ShadowOptions {
+    ShadowOptions { each_frame: true, ..ShadowOptions::new("1M/5M".parse().unwrap()) }
 }
 
 fn shadow() -> Shadow {
     Shadow::new(options()).unwrap()
 }
 
-fn ended(mut shadow: Shadow) -> (Vec<FrameTiming>, Report) {
+fn ended(mut shadow: Shadow) -> (Vec<FrameTiming>, ShadowReport) {
     shadow.finish();
     let frames: Vec<_> = std::iter::from_fn(|| shadow.poll()).collect();
     (frames, shadow.report())
@@ -43,17 +43,17 @@ fn torque(cell: i64, epoch: u8) -> Message {
 }
 
 fn say(shadow: &mut Shadow, format: Format, nanos: u64, message: &Message) {
-    message.encode().frames(format).for_each(|frame| shadow.frame("vcan0", nanos, &frame));
+    message.encode().frames(format).for_each(|frame| shadow.receive("vcan0", nanos, &frame));
 }
 
 #[test]
 fn frames_come_back_in_the_files_order_with_the_times_of_the_wire() {
     let mut shadow = shadow();
     let (slow, urgent) = (classic(0x700, &[1; 8]), classic(0x100, &[2; 8]));
-    shadow.frame("can0", 5, &slow);
-    shadow.frame("can0", 10, &slow);
-    shadow.frame("can1", 10, &slow);
-    shadow.frame("can0", 11, &urgent);
+    shadow.receive("can0", 5, &slow);
+    shadow.receive("can0", 10, &slow);
+    shadow.receive("can1", 10, &slow);
+    shadow.receive("can0", 11, &urgent);
     let (frames, report) = ended(shadow);
     let sent: Vec<_> = frames.iter().map(|frame| frame.sent.unwrap()).collect();
     let (a, b) = (took(&slow), took(&urgent));
@@ -75,9 +75,9 @@ fn frames_come_back_in_the_files_order_with_the_times_of_the_wire() {
 #[test]
 fn each_bus_has_its_own_bit_rates() {
     let of_bus = vec![("can1".to_owned(), "500k".parse().unwrap())];
-    let mut shadow = Shadow::new(Options { of_bus, ..options() }).unwrap();
+    let mut shadow = Shadow::new(ShadowOptions { rates_by_bus: of_bus, ..options() }).unwrap();
     let frame = classic(1, &[]);
-    ["can0", "can1"].into_iter().for_each(|bus| shadow.frame(bus, 0, &frame));
+    ["can0", "can1"].into_iter().for_each(|bus| shadow.receive(bus, 0, &frame));
     let (frames, _) = ended(shadow);
     let ends: Vec<_> = frames.iter().map(|frame| frame.sent.unwrap().1).collect();
     assert_eq!(ends, [took(&frame), 2 * took(&frame)]);
@@ -87,7 +87,7 @@ fn each_bus_has_its_own_bit_rates() {
 fn a_recording_out_of_order_is_sorted_and_told_in_the_files_order() {
     let times = [9, 3, 6, 1, 12].map(|time| time * MS);
     let mut shadow = shadow();
-    times.into_iter().for_each(|time| shadow.frame("can0", time, &classic(1, &[])));
+    times.into_iter().for_each(|time| shadow.receive("can0", time, &classic(1, &[])));
     let (frames, report) = ended(shadow);
     assert_eq!(frames.iter().map(|frame| frame.sent.unwrap().0).collect::<Vec<_>>(), times);
     assert_eq!((report.buses[0].counts.out_of_order, report.buses[0].counts.too_late_to_sort), (3, 0));
@@ -97,14 +97,16 @@ fn a_recording_out_of_order_is_sorted_and_told_in_the_files_order() {
 #[test]
 fn what_is_too_far_out_of_order_counts_at_a_later_time() {
     let mut shadow = shadow();
-    [0, 5_000, 100].into_iter().for_each(|time| shadow.frame("can0", time * MS, &classic(1, &[])));
+    [0, 5_000, 100].into_iter().for_each(|time| shadow.receive("can0", time * MS, &classic(1, &[])));
     let (frames, report) = ended(shadow);
     let starts: Vec<_> = frames.iter().map(|frame| frame.sent.unwrap().0 / MS).collect();
     // Frame 0 had been sent before, so 100 ms could still be sorted in; but not before released frames.
     assert_eq!(starts, [0, 5_000, 100]);
     assert_eq!(report.buses[0].counts.too_late_to_sort, 0);
     let mut shadow = Shadow::new(options()).unwrap();
-    [1_000, 3_000, 5_000, 100].into_iter().for_each(|time| shadow.frame("can0", time * MS, &classic(1, &[])));
+    [1_000, 3_000, 5_000, 100]
+        .into_iter()
+        .for_each(|time| shadow.receive("can0", time * MS, &classic(1, &[])));
     let (frames, report) = ended(shadow);
     assert_eq!(frames[3].sent.unwrap().0 / MS, 3_000);
     assert_eq!(report.buses[0].counts.too_late_to_sort, 1);
@@ -115,11 +117,11 @@ fn what_is_on_no_real_bus_takes_no_time() {
     let bus_timing = protocol::port::LinkId { wire: 3, back: false };
     let wire = bus_timing.encode_frame(protocol::port::PortMessage::Join);
     let mut shadow = shadow();
-    shadow.frame("vcan0", 0, &wire);
-    shadow.frame("vcan0", 0, &classic(ERROR | 4, &[0; 8]));
+    shadow.receive("vcan0", 0, &wire);
+    shadow.receive("vcan0", 0, &classic(ERROR | 4, &[0; 8]));
     // A frame of another protocol with the bit of a wire set, as in J1939.
     let other = classic(EXTENDED | 0x18FE_F100, &[7; 8]);
-    shadow.frame("vcan0", 0, &other);
+    shadow.receive("vcan0", 0, &other);
     let (frames, report) = ended(shadow);
     let sent: Vec<_> = frames.iter().map(|frame| (frame.bits.is_some(), frame.sent)).collect();
     assert_eq!(sent, [(false, None), (false, None), (true, Some((0, took(&other))))]);
@@ -158,7 +160,7 @@ fn load_is_what_is_requested_for_even_if_it_does_not_fit() {
     let mut shadow = shadow();
     let frame = classic(0x2AA, &[0x55; 8]);
     // Every 100 us for 1.1 s: frames of more than 110 us.
-    (0..=11_000).for_each(|step| shadow.frame("can0", step * 100_000, &frame));
+    (0..=11_000).for_each(|step| shadow.receive("can0", step * 100_000, &frame));
     let (frames, report) = ended(shadow);
     let bus = &report.buses[0];
     let load = took(&frame) as f64 / 100_000.0;
@@ -175,9 +177,9 @@ fn load_is_what_is_requested_for_even_if_it_does_not_fit() {
 #[test]
 fn bit_errors_cost_time_and_are_the_same_for_the_same_seed() {
     let run = |bit_errors, seed| {
-        let mut shadow = Shadow::new(Options { bit_errors, seed, ..options() }).unwrap();
+        let mut shadow = Shadow::new(ShadowOptions { bit_errors, seed, ..options() }).unwrap();
         let frame = Frame::with_data(0x201, Format::Fd, BIT_RATE_SWITCH | FD_FORMAT, &[9; 16]).unwrap();
-        (0..2_000).for_each(|step| shadow.frame("can0", step * 200_000, &frame));
+        (0..2_000).for_each(|step| shadow.receive("can0", step * 200_000, &frame));
         ended(shadow)
     };
     let (clean, _) = run(0.0, 1);
@@ -187,14 +189,14 @@ fn bit_errors_cost_time_and_are_the_same_for_the_same_seed() {
     // About one in six; the standard deviation for 2000 is 17.
     assert!((200..600).contains(&report.buses[0].counts.damaged), "{}", report.buses[0].counts.damaged);
     assert!(clean.iter().zip(&noisy).all(|(clean, noisy)| noisy.sent.unwrap().1 >= clean.sent.unwrap().1));
-    assert!(Shadow::new(Options { bit_errors: 0.5, ..options() }).is_err());
+    assert!(Shadow::new(ShadowOptions { bit_errors: 0.5, ..options() }).is_err());
 }
 
 #[test]
 fn of_one_time_or_none_there_is_no_verdict() {
     let of = |step: u64, has_times: bool| {
         let mut shadow = shadow();
-        (0..9).for_each(|at| shadow.frame("can0", 5 * MS + at * step, &classic(0x123, &[1; 8])));
+        (0..9).for_each(|at| shadow.receive("can0", 5 * MS + at * step, &classic(0x123, &[1; 8])));
         if !has_times {
             shadow.without_times();
         }
@@ -212,7 +214,7 @@ fn nothing_is_nothing() {
     let (frames, report) = ended(shadow());
     assert!(frames.is_empty() && report.buses.is_empty());
     let mut shadow = shadow();
-    shadow.missing("can0", 7);
+    shadow.record_missing("can0", 7);
     let (_, report) = ended(shadow);
     assert_eq!((report.buses[0].counts.missing, report.buses[0].load.mean), (7, None));
 }

@@ -6,12 +6,12 @@ use std::collections::BTreeMap;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
 use serde::Serialize;
 
-use super::{Count, seconds};
+use super::{TimedCount, seconds};
 use model::decode::Foreign;
 use protocol::packet::{Length, Lengths, PacketError, data_id};
 
 /// Maximum number of identifiers of a bus that are counted separately. Frames with further identifiers share one count.
-const IDENTIFIERS: usize = 4096;
+const MAX_IDENTIFIERS: usize = 4096;
 
 /// The type of a foreign frame.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
@@ -33,12 +33,12 @@ pub(super) struct ForeignCounter {
     others: u64,
     /// Number of frames, or groups of frames, whose CRC was checked: a frame by itself, or together with the frames
     /// before it that could be segments of the same packet.
-    tried: u64,
+    checked_groups: u64,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct IdentifierCounts {
-    count: Count,
+    count: TimedCount,
     bytes: (u8, u8),
     wrong_crc: u64,
 }
@@ -98,23 +98,23 @@ impl ForeignCounter {
             Foreign::Extended | Foreign::Data(_) => FrameType::Data,
         };
         let wrong_crc = u64::from(matches!(why, Foreign::Data(PacketError::Crc { .. })));
-        self.tried += match why {
+        self.checked_groups += match why {
             Foreign::Data(PacketError::Crc { .. }) => 1,
-            Foreign::Data(PacketError::Incomplete) => groups(frame),
+            Foreign::Data(PacketError::Incomplete) => completed_lengths(frame),
             Foreign::Data(_) | Foreign::Extended | Foreign::Remote | Foreign::Error(_) => 0,
         };
         let key = (of, frame.raw_id());
-        if self.identifiers.len() == IDENTIFIERS && !self.identifiers.contains_key(&key) {
+        if self.identifiers.len() == MAX_IDENTIFIERS && !self.identifiers.contains_key(&key) {
             self.others += 1;
             return;
         }
         let len = frame.len();
         let seen = self.identifiers.entry(key).or_insert_with(|| IdentifierCounts {
-            count: Count::default(),
+            count: TimedCount::default(),
             bytes: (len, len),
             wrong_crc: 0,
         });
-        seen.count.take(nanos);
+        seen.count.record(nanos);
         seen.bytes = (seen.bytes.0.min(len), seen.bytes.1.max(len));
         seen.wrong_crc += wrong_crc;
     }
@@ -123,7 +123,7 @@ impl ForeignCounter {
     pub(super) fn report(&self, earliest: u64) -> ForeignFrames {
         let mut foreign = ForeignFrames {
             frames: self.others,
-            packets_by_chance: self.tried as f64 / 65_536.0,
+            packets_by_chance: self.checked_groups as f64 / 65_536.0,
             frames_of_other_identifiers: self.others,
             ..ForeignFrames::default()
         };
@@ -145,7 +145,7 @@ impl ForeignCounter {
 }
 
 /// Returns the number of different packet lengths that a classic frame can be the last segment of.
-fn groups(frame: &Frame) -> u64 {
+fn completed_lengths(frame: &Frame) -> u64 {
     let ends = |length: &Length| length.last_segment() == frame.data().len();
     data_id(frame).map_or(0, |id| Lengths::for_id(id).iter().filter(ends).count() as u64)
 }

@@ -160,8 +160,8 @@ fn what_is_refused_is_counted_by_reason_and_bus() {
             tape.frame(bus, frame);
         }
     }
-    tape.stats.dropped("can1", 5);
-    tape.stats.dropped("", 7);
+    tape.stats.record_dropped("can1", 5);
+    tape.stats.record_dropped("", 7);
     let report = tape.stats.report();
     let expected = RefusedFrames { length: 1, crc: 1, meaning: 0, incomplete: 1 };
     for bus in &report.buses {

@@ -105,7 +105,7 @@ pub struct Follower {
     /// Number of frames dropped on earlier sockets of this bus.
     dropped_before: u64,
     /// Last reported reason why the bus does not open.
-    refused: String,
+    last_refusal: String,
 }
 
 /// Waits up to `wait` for frames and reads one batch into `inbox`, whose former frames are discarded. Returns the
@@ -113,7 +113,7 @@ pub struct Follower {
 ///
 /// # Errors
 /// Returns [`BusError`] if the bus is down, gone or closed.
-pub fn fill(bus: &Bus, inbox: &mut Inbox, wait: Duration) -> Result<usize, BusError> {
+pub fn receive_batch(bus: &Bus, inbox: &mut Inbox, wait: Duration) -> Result<usize, BusError> {
     inbox.clear();
     if bus.wait(Some(wait))? { bus.receive(inbox) } else { Ok(0) }
 }
@@ -145,12 +145,12 @@ impl Follower {
         if (1..BATCH).contains(&self.inbox.frames().len()) {
             thread::sleep(self.gather);
         }
-        self.receive(|inbox| fill(bus, inbox, timeout))
+        self.receive(|inbox| receive_batch(bus, inbox, timeout))
     }
 
     /// Passes each item of the last step to `each`, in order of arrival. Frames on the wires to the roots are not
     /// passed on: the follower handles them.
-    pub fn parts(&mut self, mut each: impl FnMut(FollowedItem)) {
+    pub fn for_each_item(&mut self, mut each: impl FnMut(FollowedItem)) {
         for received in self.inbox.frames() {
             if let Some(roots) = &mut self.roots
                 && roots.handle_frame(&received.frame)
@@ -179,14 +179,14 @@ impl Follower {
         !matches!(self.state, FollowState::Working)
     }
 
-    fn receive(&mut self, fill: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> FollowStep {
-        match fill(&mut self.inbox) {
+    fn receive(&mut self, receive_batch: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> FollowStep {
+        match receive_batch(&mut self.inbox) {
             Ok(0) => FollowStep::Nothing,
             Ok(count) => {
                 self.state = FollowState::Working;
                 FollowStep::Frames(count)
             }
-            Err(error) if !error.is_temporary() => self.gone(error),
+            Err(error) if !error.is_temporary() => self.enter_gone(error),
             Err(_) if matches!(self.state, FollowState::Lost) => {
                 thread::sleep(DOWN_PAUSE);
                 FollowStep::Nothing
@@ -209,7 +209,7 @@ impl Follower {
         match receive(&mut self.inbox) {
             Ok(count @ 1..) => FollowStep::Leftover(count),
             // An interface goes down before it is removed; both events are reported once.
-            Err(error) if !error.is_temporary() => self.gone(error),
+            Err(error) if !error.is_temporary() => self.enter_gone(error),
             Ok(0) | Err(_) => {
                 self.state = FollowState::Lost;
                 FollowStep::Drained
@@ -217,9 +217,9 @@ impl Follower {
         }
     }
 
-    fn gone(&mut self, error: BusError) -> FollowStep {
+    fn enter_gone(&mut self, error: BusError) -> FollowStep {
         self.inbox.clear();
-        self.refused.clear();
+        self.last_refusal.clear();
         self.state = FollowState::Gone { retry: None };
         FollowStep::Gone(error)
     }
@@ -243,8 +243,8 @@ impl Follower {
             Err(error) => {
                 self.state = FollowState::Gone { retry: Some(now + REOPEN_INTERVAL) };
                 let why = error.to_string();
-                let is_new = !is_absent(&error) && self.refused != why;
-                self.refused = why;
+                let is_new = !is_absent(&error) && self.last_refusal != why;
+                self.last_refusal = why;
                 if is_new { FollowStep::Refused(error) } else { FollowStep::Nothing }
             }
         }

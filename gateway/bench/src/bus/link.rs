@@ -33,7 +33,7 @@ pub struct SharedBus {
 }
 
 /// The control loop's end of the triple buffer that holds the open bus.
-pub type Slot = triple_buffer::Output<Arc<Bus>>;
+pub type BusSlot = triple_buffer::Output<Arc<Bus>>;
 
 /// The end of a [`SharedBus`] that the receiver's thread holds.
 #[derive(Debug)]
@@ -48,7 +48,7 @@ pub struct ReceiveEnd {
 impl SharedBus {
     /// Creates the link of a bus that was opened with these options.
     #[must_use]
-    pub fn new(bus: Bus, target: BusOptions) -> (Arc<Self>, ReceiveEnd, Slot) {
+    pub fn new(bus: Bus, target: BusOptions) -> (Arc<Self>, ReceiveEnd, BusSlot) {
         let bus = Arc::new(bus);
         let link = Arc::new(Self {
             name: bus.name().to_owned(),
@@ -73,7 +73,7 @@ impl SharedBus {
     ///
     /// # Errors
     /// Returns [`io::Error`] if no such process runs.
-    pub fn reports(&self) -> io::Result<ReportReader> {
+    pub fn connect_reports(&self) -> io::Result<ReportReader> {
         ReportReader::connect(&self.name, self.kind, self.target.directory.as_deref())
     }
 
@@ -89,19 +89,19 @@ impl SharedBus {
 
 /// Returns true if a bus with this error may work again, after a wait or a reopening.
 #[must_use]
-pub const fn may_return(error: &BusError) -> bool {
+pub const fn is_recoverable(error: &BusError) -> bool {
     error.is_temporary() || error.is_closed()
 }
 
 impl ReceiveEnd {
     /// Marks the bus as not working, and as `gone` if it must be reopened. Returns true if the state changed.
-    pub fn lose(&self, gone: bool) -> bool {
-        let bus_event = gone && !self.link.gone.swap(true, Ordering::Relaxed);
-        self.link.state.works.swap(false, Ordering::Relaxed) || bus_event
+    pub fn mark_lost(&self, gone: bool) -> bool {
+        let became_gone = gone && !self.link.gone.swap(true, Ordering::Relaxed);
+        self.link.state.works.swap(false, Ordering::Relaxed) || became_gone
     }
 
     /// Marks the bus as working. Returns true if the state changed.
-    pub fn regain(&self) -> bool {
+    pub fn mark_working(&self) -> bool {
         !self.link.state.works.swap(true, Ordering::Relaxed)
     }
 }
@@ -126,39 +126,40 @@ impl Source for ReceiveEnd {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Outages {
     /// Number of losses.
-    pub times: u64,
+    pub count: u64,
     /// Total duration of the outages that have ended.
-    lost: Duration,
+    past_losses: Duration,
     /// Start of the present outage, if the bus is lost.
-    since: Option<Instant>,
+    lost_since: Option<Instant>,
 }
 
 impl Outages {
     /// Starts an outage at `now`, unless one has started already.
     pub fn begin(&mut self, now: Instant) {
-        if self.since.is_none() {
-            self.times += 1;
-            self.since = Some(now);
+        if self.lost_since.is_none() {
+            self.count += 1;
+            self.lost_since = Some(now);
         }
     }
 
     /// Ends the present outage at `now`.
     pub fn end(&mut self, now: Instant) {
-        self.lost += self.since.take().map_or(Duration::ZERO, |since| now.saturating_duration_since(since));
+        self.past_losses +=
+            self.lost_since.take().map_or(Duration::ZERO, |since| now.saturating_duration_since(since));
     }
 
     /// Total lost time up to `now`, including the present outage.
     #[must_use]
-    pub fn lost(&self, now: Instant) -> Duration {
+    pub fn total_lost(&self, now: Instant) -> Duration {
         let mut until_now = *self;
         until_now.end(now);
-        until_now.lost
+        until_now.past_losses
     }
 
     /// Returns true while the bus is lost.
     #[must_use]
-    pub const fn lasts(&self) -> bool {
-        self.since.is_some()
+    pub const fn is_ongoing(&self) -> bool {
+        self.lost_since.is_some()
     }
 }
 
@@ -176,8 +177,11 @@ mod tests {
         outages.begin(start + second);
         outages.end(start + 2 * second);
         outages.begin(start + 5 * second);
-        assert_eq!((outages.times, outages.lost(start + 6 * second), outages.lasts()), (2, 3 * second, true));
+        assert_eq!(
+            (outages.count, outages.total_lost(start + 6 * second), outages.is_ongoing()),
+            (2, 3 * second, true)
+        );
         outages.end(start + 9 * second);
-        assert_eq!((outages.lost(start + 99 * second), outages.lasts()), (6 * second, false));
+        assert_eq!((outages.total_lost(start + 99 * second), outages.is_ongoing()), (6 * second, false));
     }
 }

@@ -8,7 +8,7 @@ use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::time::Micros;
 
-use super::follow::fill;
+use super::follow::receive_batch;
 use super::realtime::wall;
 
 /// Opens a bus for frames of this format. `None` means FD frames, or classic frames if the interface carries only
@@ -78,7 +78,7 @@ impl Listener {
     /// # Errors
     /// Returns [`BusError`] if the bus is down, gone or closed.
     pub fn receive(&mut self, wait: Duration) -> Result<bool, BusError> {
-        fill(&self.bus, &mut self.inbox, wait).map(|count| count > 0)
+        receive_batch(&self.bus, &mut self.inbox, wait).map(|count| count > 0)
     }
 
     /// The frames received last.
@@ -101,7 +101,7 @@ impl Listener {
 ///
 /// # Errors
 /// Returns all other errors.
-pub fn passing<T>(done: Result<T, BusError>, pause: Duration) -> Result<Option<T>, BusError> {
+pub fn tolerate_transient<T>(done: Result<T, BusError>, pause: Duration) -> Result<Option<T>, BusError> {
     match done {
         Ok(done) => Ok(Some(done)),
         Err(error) if error.is_temporary() => {

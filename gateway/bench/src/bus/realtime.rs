@@ -108,7 +108,7 @@ pub fn run(
         number += skipped;
         due += skipped * period_ns;
         let tick = Tick { number, time: Micros((due - start) / 1_000) };
-        turn.turn(tick, skipped, due, now, &mut send);
+        turn.run_tick(tick, skipped, due, now, &mut send);
         number += 1;
     }
 }

@@ -21,7 +21,7 @@ pub struct RootWires {
     began: Instant,
     /// True once the gateway sends on the wires. If it sends before all cells are present, the first cells build a tree
     /// that is deeper than necessary.
-    explores: bool,
+    is_sending: bool,
 }
 
 /// Returns the roots of a bus and the links on which the gateway sends to them. The list is empty if cells answer with
@@ -81,7 +81,7 @@ impl RootWires {
             uplinks: Uplinks::new(roots.len(), walk, Micros(0)),
             roots,
             began: Instant::now(),
-            explores: false,
+            is_sending: false,
         })
     }
 
@@ -91,8 +91,8 @@ impl RootWires {
     }
 
     /// Starts sending on the wires.
-    pub const fn explore(&mut self) {
-        self.explores = true;
+    pub const fn start_sending(&mut self) {
+        self.is_sending = true;
     }
 
     /// Roots that started (true) or stopped (false) feeding the gateway since the last call.
@@ -114,23 +114,23 @@ impl RootWires {
             if let Ok(Id { kind: Kind::Network, node }) = packet::data_id(frame)
                 && let Node::Cell(cell) = Node::from_byte(node)
             {
-                self.uplinks.claimed(cell);
+                self.uplinks.mark_used(cell);
             }
             return false;
         };
         let root = self.roots.iter().position(|(_, own, _)| own.reversed() == link_id);
         if let Some((root, message)) =
-            root.filter(|_| self.explores).and_then(|root| Some((root, link_id.decode_frame(frame)?)))
+            root.filter(|_| self.is_sending).and_then(|root| Some((root, link_id.decode_frame(frame)?)))
         {
             let now = self.now();
-            self.uplinks.handle(now, root, message);
+            self.uplinks.handle_message(now, root, message);
         }
         true
     }
 
     /// Sends the messages that are due on the wires to the roots.
     pub fn send_due(&mut self, bus: &Bus) {
-        if !self.explores {
+        if !self.is_sending {
             return;
         }
         let now = self.now();
@@ -146,7 +146,7 @@ impl RootWires {
     /// Returns the time in which the next message on the wires becomes due, if no frame arrives before.
     #[must_use]
     pub fn timeout(&self) -> Duration {
-        if !self.explores {
+        if !self.is_sending {
             return Duration::MAX;
         }
         Duration::from_micros(self.uplinks.poll_timeout().elapsed_since(self.now()).0)
@@ -221,7 +221,7 @@ mod tests {
         let leave = LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Leave);
         assert!(roots.handle_frame(&leave));
         assert_eq!(roots.uplinks.poll_transmit(), None, "it does not send yet");
-        roots.explore();
+        roots.start_sending();
         assert!(
             roots.handle_frame(
                 &LinkId { wire: 0, back: false }.encode_frame(protocol::port::PortMessage::Join)

@@ -7,7 +7,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use protocol::bus::{Bus, BusError, BusOptions, KindChoice};
 use thiserror::Error;
 
-use crate::processes::{LaunchError, apart, program, spawn, wait_or_kill};
+use crate::processes::{LaunchError, isolate, program_path, spawn, wait_or_kill};
 
 /// An embedded bus in a process of its own, which removes its socket even if the gateway is killed.
 #[derive(Debug)]
@@ -22,21 +22,21 @@ impl ServedBus {
     /// # Errors
     /// Returns [`LaunchError`] if the program does not start or does not report that it serves the bus.
     pub fn start(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
-        let mut served = Self::begin(program, bus, directory)?;
-        served.wait(program)?;
+        let mut served = Self::spawn_server(program, bus, directory)?;
+        served.wait_until_serving(program)?;
         Ok(served)
     }
 
     /// Starts the program, which will serve the bus.
-    fn begin(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
+    fn spawn_server(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
         let mut command = Command::new(program);
         command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
-        apart(&mut command, directory);
+        isolate(&mut command, directory);
         Ok(Self { bus: bus.to_owned(), child: spawn(&mut command)? })
     }
 
     /// Waits until clients can connect.
-    fn wait(&mut self, program: &Path) -> Result<(), LaunchError> {
+    fn wait_until_serving(&mut self, program: &Path) -> Result<(), LaunchError> {
         let start = |source| LaunchError::Start { path: program.to_owned(), source };
         let mut line = String::new();
         if let Some(out) = self.child.stdout.take() {
@@ -92,9 +92,9 @@ pub type BusTarget<'a> = (&'a str, KindChoice, BusOptions);
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum IfAbsent {
     /// Serve a new embedded bus, because this program starts all its cells.
-    Made,
+    Create,
     /// Return an error, because the cells are expected on a bus that exists already.
-    Refused,
+    Fail,
 }
 
 /// Opens a bus. Serves an embedded bus that has no server.
@@ -124,12 +124,12 @@ pub fn open_or_serve_all(
     for (name, kind, target) in buses {
         let opened = Bus::open(name, *kind, target);
         let is_served = matches!(opened, Err(BusError::NotServed { .. }))
-            || (absent == IfAbsent::Made && matches!(opened, Err(BusError::Absent { .. })));
+            || (absent == IfAbsent::Create && matches!(opened, Err(BusError::Absent { .. })));
         begun.push(match opened {
             Err(_) if is_served => {
-                let program = program("vcan-setup")?;
+                let program = program_path("vcan-setup")?;
                 let name = kind.served().served_as(name);
-                Err(ServedBus::begin(&program, &name, target.directory.as_deref())
+                Err(ServedBus::spawn_server(&program, &name, target.directory.as_deref())
                     .map(|served| (program, served))?)
             }
             opened => Ok(opened?),
@@ -140,7 +140,7 @@ pub fn open_or_serve_all(
         opened.push(match begun {
             Ok(bus) => bus,
             Err((program, mut served)) => {
-                served.wait(&program)?;
+                served.wait_until_serving(&program)?;
                 all_served.push(served);
                 // Not by the user's choice: an interface of this name may have appeared meanwhile.
                 Bus::open(name, KindChoice::Only(kind.served()), target)?

@@ -26,7 +26,7 @@ use thiserror::Error;
 use vcan_setup::slcan::BridgeError;
 
 use crate::commission;
-use crate::processes::{LaunchError, Processes, STARTING};
+use crate::processes::{LaunchError, Processes, START_TIMEOUT};
 use crate::setup::Timeout;
 
 pub use firmware::{Firmware, FirmwareError};
@@ -173,7 +173,7 @@ impl<'a> Emulator<'a> {
     ) -> Result<Emulation, EmulateError> {
         let files =
             tempfile::Builder::new().prefix("skinbus-cells-").tempdir().map_err(EmulateError::Files)?;
-        let _flash = bench.flash.map(hold).transpose()?;
+        let _flash = bench.flash.map(lock_directory).transpose()?;
         let mut planned = PlannedLines::default();
         for cell in self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell)) {
             let place = CellFiles::of(bench, files.path(), cell)?;
@@ -222,7 +222,7 @@ impl<'a> Emulator<'a> {
         let benches = buses.into_iter().map(|bus| commission::open(&skin, bus, bench.kinds));
         let benches = benches.collect::<Result<Vec<_>, _>>()?;
         let stop = AtomicBool::new(false);
-        let (mut ended, mut timeout, mut is_over) = (None, Timeout::new(STARTING), false);
+        let (mut ended, mut timeout, mut is_over) = (None, Timeout::new(START_TIMEOUT), false);
         let wish = CommissionOptions { dry_run: false, verify: false };
         let done = commission::commission(benches, &skin, wish, &stop, |far| {
             ended = ended.take().or_else(|| processes.ended().into_iter().next());
@@ -271,9 +271,12 @@ impl CellFiles {
         let bus = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
         let name = format!("{bus}-{}", cell.node);
         let flash = bench.flash.unwrap_or(files);
-        let too = || EmulateError::Path(flash.to_owned());
+        let invalid_path = || EmulateError::Path(flash.to_owned());
         let flash = fs::canonicalize(flash).map_err(EmulateError::Files)?.join(format!("{name}.flash"));
-        let flash = flash.to_str().filter(|path| path.len() <= 240 && !path.contains(' ')).ok_or_else(too)?;
+        let flash = flash
+            .to_str()
+            .filter(|path| path.len() <= 240 && !path.contains(' '))
+            .ok_or_else(invalid_path)?;
         Ok(Self {
             program: files.join(format!("{name}.elf")),
             socket: files.join(format!("{name}.sock")),
@@ -284,7 +287,7 @@ impl CellFiles {
 }
 
 /// Opens a directory of flash files and locks it. On a file system without locks, the directory stays unlocked.
-fn hold(directory: &Path) -> Result<File, EmulateError> {
+fn lock_directory(directory: &Path) -> Result<File, EmulateError> {
     let opened = File::open(directory).map_err(EmulateError::Files)?;
     match flock(&opened, FlockOperation::NonBlockingLockExclusive) {
         Err(Errno::WOULDBLOCK) => Err(EmulateError::FlashInUse(directory.to_owned())),
@@ -324,11 +327,11 @@ mod tests {
     #[test]
     fn a_directory_of_flash_files_is_of_one_run() {
         let folder = tempfile::tempdir().unwrap();
-        let held = hold(folder.path()).unwrap();
-        let error = hold(folder.path()).unwrap_err();
+        let held = lock_directory(folder.path()).unwrap();
+        let error = lock_directory(folder.path()).unwrap_err();
         assert!(error.to_string().contains("emulated cells of another run use it"), "{error}");
         assert_eq!(error.exit_code(), 2);
         drop(held);
-        hold(folder.path()).unwrap();
+        lock_directory(folder.path()).unwrap();
     }
 }

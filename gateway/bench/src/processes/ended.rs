@@ -8,17 +8,17 @@ use super::Ended;
 use crate::summary::{CellError, ErrorCells};
 
 /// Time within which processes must end to be reported in the same note.
-const TOGETHER: Duration = Duration::from_millis(50);
+const GROUPING_TIME: Duration = Duration::from_millis(50);
 /// Maximum number of processes named in one note.
-const NAMED: usize = 6;
+const MAX_NAMED: usize = 6;
 
 /// The processes that ended so far.
 #[derive(Debug, Default)]
 pub(crate) struct EndedProcesses {
     /// Ended processes that no note has reported yet.
-    new: Vec<Ended>,
+    pending: Vec<Ended>,
     /// Time at which the last end of a process was found.
-    found: Option<Instant>,
+    last_found_at: Option<Instant>,
     /// Cells whose processes failed, by reason and by bus.
     errors: BTreeMap<String, BTreeMap<String, BTreeSet<u8>>>,
 }
@@ -28,14 +28,16 @@ impl EndedProcesses {
     /// have not been reported.
     pub(crate) fn add_ended(&mut self, ended: Vec<Ended>, last: bool) -> Vec<String> {
         if !ended.is_empty() {
-            self.found = Some(Instant::now());
-            self.new.extend(ended);
+            self.last_found_at = Some(Instant::now());
+            self.pending.extend(ended);
         }
-        if self.new.is_empty() || (!last && self.found.is_some_and(|found| found.elapsed() < TOGETHER)) {
+        if self.pending.is_empty()
+            || (!last && self.last_found_at.is_some_and(|found| found.elapsed() < GROUPING_TIME))
+        {
             return Vec::new();
         }
         let mut groups = BTreeMap::<(String, String), Vec<Ended>>::new();
-        for ended in self.new.drain(..) {
+        for ended in self.pending.drain(..) {
             groups.entry((ended.bus.clone(), ended.how())).or_default().push(ended);
         }
         groups.into_iter().map(|((bus, how), group)| self.note((&bus, &how), &group)).collect()
@@ -57,8 +59,9 @@ impl EndedProcesses {
         match group {
             [one] => format!("the process of {one} ended ({how})"),
             many => {
-                let named: Vec<_> = many.iter().take(NAMED).map(|ended| ended.cells().to_string()).collect();
-                let more = if many.len() > NAMED { ", ..." } else { "" };
+                let named: Vec<_> =
+                    many.iter().take(MAX_NAMED).map(|ended| ended.cells().to_string()).collect();
+                let more = if many.len() > MAX_NAMED { ", ..." } else { "" };
                 let named = named.join(", ");
                 format!("{} processes of cells on {bus} ended ({how}): {named}{more}", many.len())
             }

@@ -31,13 +31,13 @@ use model::scenario::ProcessAction;
 /// Time that two gateways on one bus need to detect each other.
 pub const GATEWAY_DETECTION_TIME: Duration = Duration::from_millis(500);
 /// Maximum time without progress while started cells become ready.
-pub const STARTING: Duration = Duration::from_secs(15);
+pub const START_TIMEOUT: Duration = Duration::from_secs(15);
 /// Number of files that a gateway or a bus server opens besides its buses and clients.
 const OTHER_FILES: usize = 26;
 /// Number of files that a gateway opens for each bus.
 const FILES_OF_A_BUS: usize = 4;
 /// Time that processes have to end after SIGTERM.
-const TIMEOUT: Duration = Duration::from_secs(2);
+const TERM_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// An error that keeps a process from starting.
 #[derive(Debug, Error)]
@@ -46,7 +46,7 @@ pub enum LaunchError {
     /// The program does not exist.
     #[error(
         "{name} is not at {path}: build it with `cargo build --release`, or name its path in {}",
-        variable(name)
+        path_variable(name)
     )]
     Missing {
         /// Name of the program.
@@ -107,7 +107,7 @@ pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
 }
 
 /// Returns the name of the environment variable that overrides the path of a program of this project.
-fn variable(name: &str) -> String {
+fn path_variable(name: &str) -> String {
     format!("SKINBUS_{}", name.to_ascii_uppercase().replace('-', "_"))
 }
 
@@ -116,9 +116,10 @@ fn variable(name: &str) -> String {
 ///
 /// # Errors
 /// Returns [`LaunchError::Missing`] if the file does not exist.
-pub fn program(name: &'static str) -> Result<PathBuf, LaunchError> {
+pub fn program_path(name: &'static str) -> Result<PathBuf, LaunchError> {
     let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
-    let path = path_from_env(&variable(name)).or_else(beside).unwrap_or_else(|| Path::new(".").join(name));
+    let path =
+        path_from_env(&path_variable(name)).or_else(beside).unwrap_or_else(|| Path::new(".").join(name));
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
 }
 
@@ -127,7 +128,7 @@ pub fn program(name: &'static str) -> Result<PathBuf, LaunchError> {
 ///
 /// # Errors
 /// Returns [`MemoryError`] if the system grants no file in memory.
-pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), MemoryError> {
+pub fn memory_file(bytes: &[u8]) -> Result<(File, PathBuf), MemoryError> {
     let memory = || {
         let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
         file.write_all(bytes).map(|()| file)
@@ -201,7 +202,7 @@ pub struct Processes {
     /// Standard error of the processes; `None` before the first start.
     error: Option<StandardError>,
     /// Processes that had already ended by themselves when they were to be restarted.
-    found: Vec<Ended>,
+    ended_at_restart: Vec<Ended>,
 }
 
 /// Settings for starting cells.
@@ -243,11 +244,11 @@ impl Processes {
     pub fn start(&mut self, plan: &CellLaunch<'_>) -> Result<(), LaunchError> {
         for (bus, described) in plan.skin.buses.iter().enumerate() {
             let mut nodes: Vec<u8> = plan.skin.cells_on_bus(bus).map(|cell| cell.node.get()).collect();
-            nodes.retain(|&node| !self.runs(bus, node));
+            nodes.retain(|&node| !self.has_process(bus, node));
             nodes.sort_unstable();
             for nodes in groups(&nodes, plan.per_process) {
-                let mut command = plan.of(&described.name, nodes);
-                let child = start(&mut command, self.error.as_ref())?;
+                let mut command = plan.command(&described.name, nodes);
+                let child = spawn_cells(&mut command, self.error.as_ref())?;
                 let (phase, bus_name) = (Phase::Running, described.name.clone());
                 self.all.push(Process { command, bus, bus_name, nodes, child, phase, log: None });
             }
@@ -278,13 +279,13 @@ impl Processes {
 
     /// Returns true if a process of this cell runs.
     #[must_use]
-    pub fn runs(&self, bus: usize, node: u8) -> bool {
-        self.all.iter().any(|process| process.state().runs(bus, node))
+    pub fn has_process(&self, bus: usize, node: u8) -> bool {
+        self.all.iter().any(|process| process.state().runs_cell(bus, node))
     }
 
     /// Ids of the running processes.
     pub fn pids(&self) -> impl Iterator<Item = u32> {
-        self.all.iter().filter(|process| process.lives()).map(|process| process.child.id())
+        self.all.iter().filter(|process| process.is_running()).map(|process| process.child.id())
     }
 
     /// Returns the state of each process.
@@ -296,14 +297,14 @@ impl Processes {
     /// standard error.
     pub fn ended(&mut self) -> Vec<Ended> {
         self.error.iter_mut().for_each(StandardError::read);
-        let mut ended = std::mem::take(&mut self.found);
+        let mut ended = std::mem::take(&mut self.ended_at_restart);
         if !self.changed.swap(false, Ordering::Relaxed) {
             return ended;
         }
-        for process in self.all.iter_mut().filter(|process| process.lives()) {
+        for process in self.all.iter_mut().filter(|process| process.is_running()) {
             if let Ok(Some(status)) = process.child.try_wait() {
                 process.phase = Phase::Ended;
-                ended.push(process.ended(status, self.error.as_mut()));
+                ended.push(process.end_record(status, self.error.as_mut()));
             }
         }
         ended
@@ -313,22 +314,23 @@ impl Processes {
     ///
     /// # Errors
     /// Returns [`LaunchError`] if a restarted process does not start.
-    pub fn act(&mut self, bus: usize, node: u8, action: ProcessAction) -> Result<bool, LaunchError> {
-        let holds = |process: &&mut Process| process.state().runs(bus, node);
+    pub fn apply(&mut self, bus: usize, node: u8, action: ProcessAction) -> Result<bool, LaunchError> {
+        let holds = |process: &&mut Process| process.state().runs_cell(bus, node);
         let Some(process) = self.all.iter_mut().find(holds) else { return Ok(false) };
         match action {
             ProcessAction::Kill => process.signal(Signal::KILL, Phase::Running),
             ProcessAction::Stop => process.signal(Signal::STOP, Phase::Stopped),
             ProcessAction::Continue => process.signal(Signal::CONT, Phase::Running),
             ProcessAction::Restart => {
-                let lived = process.lives();
+                let lived = process.is_running();
                 process.signal(Signal::KILL, Phase::Ended);
                 // A process with an exit code had ended by itself before; a killed one has a signal status.
                 let status = process.child.wait().ok().filter(|status| lived && status.signal().is_none());
-                self.found.extend(status.map(|status| process.ended(status, self.error.as_mut())));
+                self.ended_at_restart
+                    .extend(status.map(|status| process.end_record(status, self.error.as_mut())));
                 process.child = match &process.log {
                     Some(_) => spawn(&mut process.command)?,
-                    None => start(&mut process.command, self.error.as_ref())?,
+                    None => spawn_cells(&mut process.command, self.error.as_ref())?,
                 };
                 process.phase = Phase::Running;
             }
@@ -342,12 +344,12 @@ impl Process {
         ProcessState { bus: self.bus, nodes: self.nodes, phase: self.phase }
     }
 
-    fn lives(&self) -> bool {
+    fn is_running(&self) -> bool {
         self.phase != Phase::Ended
     }
 
     /// Creates the record of a process that ended with `status`.
-    fn ended(&self, status: ExitStatus, error: Option<&mut StandardError>) -> Ended {
+    fn end_record(&self, status: ExitStatus, error: Option<&mut StandardError>) -> Ended {
         let said = match (&self.log, error) {
             (Some(log), _) => last_line(log),
             (None, Some(error)) => {
@@ -362,7 +364,7 @@ impl Process {
 
     /// Sends a signal and enters `phase`. Ended processes are left alone.
     fn signal(&mut self, signal: Signal, phase: Phase) {
-        if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()).filter(|_| self.lives()) {
+        if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()).filter(|_| self.is_running()) {
             let _ = kill_process(pid, signal);
             self.phase = phase;
         }
@@ -376,14 +378,18 @@ impl Drop for Processes {
             process.signal(Signal::CONT, Phase::Running);
             process.signal(Signal::TERM, Phase::Running);
         }
-        let mut children: Vec<_> =
-            self.all.iter_mut().filter(|process| process.lives()).map(|process| &mut process.child).collect();
+        let mut children: Vec<_> = self
+            .all
+            .iter_mut()
+            .filter(|process| process.is_running())
+            .map(|process| &mut process.child)
+            .collect();
         wait_or_kill(&mut children);
     }
 }
 
 impl CellLaunch<'_> {
-    fn of(&self, bus: &str, (first, last): (u8, u8)) -> Command {
+    fn command(&self, bus: &str, (first, last): (u8, u8)) -> Command {
         let mut command = Command::new(self.program);
         command.args(["--bus", bus]);
         if first == last {
@@ -399,7 +405,7 @@ impl CellLaunch<'_> {
             command.arg("--flash").arg(flash);
         }
         command.stdin(Stdio::null()).stdout(Stdio::null());
-        apart(&mut command, self.directory);
+        isolate(&mut command, self.directory);
         command
     }
 }
@@ -409,9 +415,9 @@ pub(crate) fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
 }
 
 /// Starts a process of cells with its standard error connected to the pipe.
-fn start(command: &mut Command, error: Option<&StandardError>) -> Result<Child, LaunchError> {
+fn spawn_cells(command: &mut Command, error: Option<&StandardError>) -> Result<Child, LaunchError> {
     if let Some(error) = error {
-        error.give(command).map_err(LaunchError::Pipe)?;
+        error.attach_to(command).map_err(LaunchError::Pipe)?;
     }
     let child = spawn(command);
     // The command is kept for a restart, and would keep the pipe's end open.
@@ -429,7 +435,7 @@ fn last_line(log: &Path) -> Option<String> {
 
 /// Puts a process into its own group: Ctrl-C on a terminal signals the whole group but is meant for the gateway alone,
 /// because cells and buses must live until the final reports. `directory` is where the process finds embedded buses.
-pub(crate) fn apart(command: &mut Command, directory: Option<&Path>) {
+pub(crate) fn isolate(command: &mut Command, directory: Option<&Path>) {
     command.process_group(0);
     if let Some(directory) = directory {
         command.env("SKINBUS_DIR", directory);
@@ -451,7 +457,7 @@ pub fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
 
 /// Waits for processes that were asked to end, and kills those that do not.
 pub(crate) fn wait_or_kill(children: &mut [&mut Child]) {
-    let give_up = Instant::now() + TIMEOUT;
+    let give_up = Instant::now() + TERM_TIMEOUT;
     loop {
         let running = children
             .iter_mut()
@@ -483,7 +489,7 @@ mod tests {
 
     #[test]
     fn a_missing_program_is_named_with_the_hint() {
-        let error = program("no-such-program").unwrap_err().to_string();
+        let error = program_path("no-such-program").unwrap_err().to_string();
         assert!(error.starts_with("no-such-program is not at /"), "{error}");
         assert!(error.ends_with("or name its path in SKINBUS_NO_SUCH_PROGRAM"), "{error}");
     }

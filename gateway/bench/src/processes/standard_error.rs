@@ -11,7 +11,7 @@ use protocol::usage::eprint_line;
 use rustix::io::ioctl_fionbio;
 
 /// Prefix of each line from a cell's process.
-const PROGRAM: &str = "cell-node: ";
+const LINE_PREFIX: &str = "cell-node: ";
 
 /// Maximum length in bytes of an incomplete line.
 const MAX_LINE_BYTES: usize = 1 << 16;
@@ -42,17 +42,17 @@ impl StandardError {
     ///
     /// # Errors
     /// Returns [`io::Error`] if too many files are open.
-    pub(super) fn give(&self, command: &mut Command) -> io::Result<()> {
+    pub(super) fn attach_to(&self, command: &mut Command) -> io::Result<()> {
         command.stderr(self.write.try_clone()?);
         Ok(())
     }
 
     /// Reads all that has arrived. Keeps reasons; passes other lines on to the standard error of this program.
     pub(super) fn read(&mut self) {
-        let mut piece = [0; 4_096];
+        let mut chunk = [0; 4_096];
         loop {
-            match self.read.read(&mut piece) {
-                Ok(count @ 1..) => self.unread.extend(piece.iter().take(count)),
+            match self.read.read(&mut chunk) {
+                Ok(count @ 1..) => self.unread.extend(chunk.iter().take(count)),
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 // The pipe is empty.
                 Ok(0) | Err(_) => break,
@@ -60,15 +60,15 @@ impl StandardError {
         }
         while let Some(end) = self.unread.iter().position(|&byte| byte == b'\n') {
             let line: Vec<_> = self.unread.drain(..=end).collect();
-            self.take(&String::from_utf8_lossy(line.strip_suffix(b"\n").unwrap_or(&line)));
+            self.handle_line(&String::from_utf8_lossy(line.strip_suffix(b"\n").unwrap_or(&line)));
         }
         if self.unread.len() > MAX_LINE_BYTES {
             eprint_line(&String::from_utf8_lossy(&core::mem::take(&mut self.unread)));
         }
     }
 
-    fn take(&mut self, line: &str) {
-        match line.strip_prefix(PROGRAM).and_then(ExitReason::parse) {
+    fn handle_line(&mut self, line: &str) {
+        match line.strip_prefix(LINE_PREFIX).and_then(ExitReason::parse) {
             Some(words) => self.words.push(words),
             None => eprint_line(line),
         }

@@ -18,7 +18,7 @@ pub type Metadata = BTreeMap<String, String>;
 /// Metadata of the program and its command line.
 #[must_use]
 pub fn program(command_line: &[String], began_nanos: u64) -> Metadata {
-    facts([
+    metadata([
         ("program", format!("skinbus {}", env!("CARGO_PKG_VERSION"))),
         ("git_revision", env!("SKINBUS_GIT_REVISION").to_owned()),
         ("command_line", command_line.join(" ")),
@@ -35,7 +35,7 @@ pub fn machine(idle: &Quantiles) -> Metadata {
     let read = |name: &str| {
         fs::read_to_string(name).map_or_else(|_| "unknown".to_owned(), |text| text.trim().to_owned())
     };
-    facts([
+    metadata([
         ("sysname", text(about.sysname())),
         ("release", text(about.release())),
         ("version", text(about.version())),
@@ -70,7 +70,7 @@ pub fn realtime_minus_monotonic() -> i64 {
 /// Metadata of the skin and its effective timing, together with the metadata in `run`.
 #[must_use]
 pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Metadata {
-    let mut all = facts([
+    let mut all = metadata([
         ("skin", skin.name.clone()),
         ("robot", skin.robot.name.clone()),
         ("joints", skin.robot.joints.len().to_string()),
@@ -101,6 +101,6 @@ pub fn hashes(skin: &Skin) -> Metadata {
     skin.cells.iter().map(of_cell).collect()
 }
 
-fn facts<const N: usize>(facts: [(&str, String); N]) -> Metadata {
+fn metadata<const N: usize>(facts: [(&str, String); N]) -> Metadata {
     facts.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }

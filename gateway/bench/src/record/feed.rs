@@ -5,28 +5,28 @@ use std::sync::{Arc, Mutex};
 
 use protocol::message::SkinSensors;
 
-use crate::view::View;
+use crate::view::BusView;
 use control::cycle::turn::{BusState, TimedRecord};
 use model::latched::ReceivedFrame;
-use model::table::Status;
+use model::table::CellStatus;
 use trace::capture::BusNote;
 
 /// Queue length in frames for a bus. The queues of many buses together have at most four times this length, which
 /// limits memory. The queue of each bus has at least [`FRAMES_OF_MANY`] frames, more than a second of a full bus.
-const FRAMES: usize = 65_536;
+const FRAME_QUEUE: usize = 65_536;
 /// Minimum queue length in frames for a bus, if there are many buses.
-const FRAMES_OF_MANY: usize = 16_384;
+const MIN_FRAME_QUEUE: usize = 16_384;
 
 /// Returns the queue length in frames for each of `buses` buses.
 #[must_use]
-pub fn frames(buses: usize) -> usize {
-    (4 * FRAMES / buses.max(1)).clamp(FRAMES_OF_MANY, FRAMES)
+pub fn frame_queue_length(buses: usize) -> usize {
+    (4 * FRAME_QUEUE / buses.max(1)).clamp(MIN_FRAME_QUEUE, FRAME_QUEUE)
 }
 
 /// Queue length in ticks: more than a second of the control loop.
-pub const TICKS: usize = 1_024;
+pub const TICK_QUEUE: usize = 1_024;
 /// Queue length in epochs for a bus: more than a second of broadcasts.
-pub const EPOCHS: usize = 128;
+pub const EPOCH_QUEUE: usize = 128;
 
 /// An item from the receiver of a bus, in order of arrival.
 #[derive(Clone, Copy, Debug)]
@@ -64,7 +64,7 @@ pub struct EpochContacts {
     /// Epoch of the joints.
     pub epoch: u8,
     /// Sensor values and status of each cell, in the order of the bus.
-    pub cells: Box<[(Option<SkinSensors>, Status)]>,
+    pub cells: Box<[(Option<SkinSensors>, CellStatus)]>,
 }
 
 /// The receiver's end of the queues to the recorder.
@@ -77,7 +77,7 @@ pub struct Outlet {
     /// Number of frames that did not fit and have not been reported to the recorder.
     unreported: u64,
     /// Number of epochs whose contact states did not fit into the queue.
-    untouched: u64,
+    unrecorded_epochs: u64,
 }
 
 /// Items that did not fit into queues.
@@ -121,16 +121,16 @@ impl Outlet {
 
     /// Returns true if contact states are recorded.
     #[must_use]
-    pub const fn wants_touched(&self) -> bool {
+    pub const fn records_contacts(&self) -> bool {
         self.touched.is_some()
     }
 
     /// Queues contact states.
-    pub fn touched(&mut self, touched: EpochContacts) {
+    pub fn push_contacts(&mut self, touched: EpochContacts) {
         if let Some(queue) = &mut self.touched
             && queue.push(touched).is_err()
         {
-            self.untouched += 1;
+            self.unrecorded_epochs += 1;
         }
     }
 
@@ -147,7 +147,7 @@ impl Outlet {
     /// Returns the numbers of items that did not fit into the queues.
     #[must_use]
     pub const fn unrecorded(&self) -> Unrecorded {
-        Unrecorded { frames: self.unrecorded, epochs: self.untouched }
+        Unrecorded { frames: self.unrecorded, epochs: self.unrecorded_epochs }
     }
 }
 
@@ -157,7 +157,7 @@ pub struct BusFeed {
     pub(super) frames: rtrb::Consumer<Captured>,
     pub(super) touched: Option<rtrb::Consumer<EpochContacts>>,
     /// State of the bus's cells.
-    pub(super) view: Arc<Mutex<View>>,
+    pub(super) view: Arc<Mutex<BusView>>,
     /// State of the bus.
     pub(super) state: Arc<BusState>,
 }
@@ -165,10 +165,15 @@ pub struct BusFeed {
 /// Creates the queues for one bus out of `buses`, and returns both ends. `all` is true if contact states are recorded,
 /// not only frames.
 #[must_use]
-pub fn bus_feed(buses: usize, all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, BusFeed) {
-    let (frames, taken) = rtrb::RingBuffer::new(frames(buses));
-    let (touched, states) = all.then(|| rtrb::RingBuffer::new(EPOCHS)).unzip();
-    let outlet = Outlet { frames, touched, unrecorded: 0, unreported: 0, untouched: 0 };
+pub fn bus_feed(
+    buses: usize,
+    all: bool,
+    view: Arc<Mutex<BusView>>,
+    state: Arc<BusState>,
+) -> (Outlet, BusFeed) {
+    let (frames, taken) = rtrb::RingBuffer::new(frame_queue_length(buses));
+    let (touched, states) = all.then(|| rtrb::RingBuffer::new(EPOCH_QUEUE)).unzip();
+    let outlet = Outlet { frames, touched, unrecorded: 0, unreported: 0, unrecorded_epochs: 0 };
     (outlet, BusFeed { frames: taken, touched: states, view, state })
 }
 
@@ -188,14 +193,17 @@ mod tests {
 
     #[test]
     fn forty_buses_take_ten_times_the_memory_of_one() {
-        assert_eq!([0, 1, 4, 8, 16, 40].map(frames), [65_536, 65_536, 65_536, 32_768, 16_384, 16_384]);
+        assert_eq!(
+            [0, 1, 4, 8, 16, 40].map(frame_queue_length),
+            [65_536, 65_536, 65_536, 32_768, 16_384, 16_384]
+        );
     }
 
     #[test]
     fn what_does_not_fit_is_reported_where_it_is_missing() {
         let (mut outlet, mut bus_feed) = bus_feed(1, false, Arc::default(), Arc::default());
         let frame = |at_nanos| ReceivedFrame { at_nanos, from_gateway: false, frame: Frame::EMPTY };
-        let all = FRAMES as u64;
+        let all = FRAME_QUEUE as u64;
         (0..all + 7).for_each(|at| outlet.frame(frame(at)));
         assert_eq!(outlet.unrecorded(), Unrecorded { frames: 7, epochs: 0 });
         let mut taken = 0;

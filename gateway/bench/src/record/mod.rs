@@ -23,7 +23,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 
 use feed::{Feed, Unrecorded};
-use text::Text;
+use text::CandumpWriter;
 use thiserror::Error;
 use topics::Topics;
 use trace::recording::account::RecordingAccount;
@@ -99,7 +99,7 @@ pub enum OutputError {
 /// Output files that are open but contain no data yet.
 #[derive(Debug)]
 pub struct Outputs {
-    text: Option<Text>,
+    text: Option<CandumpWriter>,
     series: Option<SplitRecording<Topics>>,
 }
 
@@ -116,7 +116,7 @@ impl Outputs {
     ) -> Result<Self, OutputError> {
         let text = options.candump.as_ref().map(|candump| {
             let failed = |source| OutputError::Candump { path: candump.path.clone(), source };
-            Text::create(candump, options.force, stopped).map_err(failed)
+            CandumpWriter::create(candump, options.force, stopped).map_err(failed)
         });
         let text = text.transpose()?;
         let series = options.mcap.as_ref().map(|Mcap { path, split, .. }| {
@@ -125,7 +125,7 @@ impl Outputs {
                 return Err(OutputError::Name(path.clone()));
             }
             check_regular(path, options.force).map_err(failed)?;
-            repair::orphans(path, say);
+            repair::repair_orphans(path, say);
             SplitRecording::claim(path, options.force, *split).map_err(failed)
         });
         Ok(Self { text, series: series.transpose()? })
@@ -139,13 +139,13 @@ impl Outputs {
 
     /// Path of the candump log, if any.
     #[must_use]
-    pub fn log(&self) -> Option<&Path> {
-        self.text.as_ref().map(Text::path)
+    pub fn candump_path(&self) -> Option<&Path> {
+        self.text.as_ref().map(CandumpWriter::path)
     }
 
     /// Returns true if more than frames is recorded.
     #[must_use]
-    pub const fn wants_all(&self) -> bool {
+    pub const fn records_all(&self) -> bool {
         self.series.is_some()
     }
 
@@ -154,19 +154,19 @@ impl Outputs {
     /// # Errors
     /// Returns [`ThreadError`] if the system grants no thread.
     pub fn start(self, feed: Feed, layout: Layout, head: FileHead) -> Result<Recorder, ThreadError> {
-        let stop = Arc::new(Stop::default());
+        let stop = Arc::new(StopRequest::default());
         let (tell, said) = mpsc::channel();
         let (notes, noted) = mpsc::channel();
         let work = thread::RecorderThread::new(self, feed, layout, (noted, tell));
         let ended = Arc::clone(&stop);
         let thread = spawn("recorder", move || work.run(head, &ended))?;
-        Ok(Recorder { thread, stop, notes, said })
+        Ok(Recorder { thread, stop, notes, messages: said })
     }
 }
 
 /// Requests to end a recording.
 #[derive(Debug, Default)]
-struct Stop {
+struct StopRequest {
     /// Ends the recording.
     now: AtomicBool,
     /// Removes the recording, as if the run had not happened.
@@ -177,15 +177,15 @@ struct Stop {
 #[derive(Debug)]
 pub struct Recorder {
     thread: std::thread::JoinHandle<RecordingAccount>,
-    stop: Arc<Stop>,
+    stop: Arc<StopRequest>,
     notes: mpsc::Sender<(u64, String)>,
-    said: mpsc::Receiver<String>,
+    messages: mpsc::Receiver<String>,
 }
 
 impl Recorder {
     /// Returns the messages for the user that have arrived since the last call.
     pub fn messages(&self) -> impl Iterator<Item = String> + '_ {
-        self.said.try_iter()
+        self.messages.try_iter()
     }
 
     /// Adds a note about an intervention to the recording; a candump log holds frames only.

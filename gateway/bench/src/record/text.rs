@@ -21,13 +21,13 @@ const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A log that is being written. The first write error ends it after its last whole line.
 #[derive(Debug)]
-pub struct Text {
+pub struct CandumpWriter {
     log: LogFile,
     failed: bool,
     /// True if another program moved or changed the file.
     moved: bool,
     /// Time of the last check that the log still has its name.
-    looked: Instant,
+    checked_at: Instant,
     /// Lines not yet written.
     lines: String,
     /// Number of frames in `lines`.
@@ -38,7 +38,7 @@ pub struct Text {
     lost: u64,
 }
 
-impl Text {
+impl CandumpWriter {
     /// Starts a log. Waits for a FIFO's reader, or until `stopped`.
     ///
     /// # Errors
@@ -51,7 +51,7 @@ impl Text {
         };
         let lines = String::with_capacity(WRITE_BYTES + 256);
         let (failed, moved, looked) = (false, false, Instant::now());
-        Ok(Self { log, failed, moved, looked, lines, waiting: 0, frames: 0, lost: 0 })
+        Ok(Self { log, failed, moved, checked_at: looked, lines, waiting: 0, frames: 0, lost: 0 })
     }
 
     /// Path of the log.
@@ -106,10 +106,10 @@ impl Text {
     /// Returns [`io::Error`] once if the log cannot be written or was moved or changed.
     pub fn flush(&mut self) -> io::Result<()> {
         self.write()?;
-        if self.looked.elapsed() < CHECK_INTERVAL {
+        if self.checked_at.elapsed() < CHECK_INTERVAL {
             return Ok(());
         }
-        self.looked = Instant::now();
+        self.checked_at = Instant::now();
         self.check_name()
     }
 
@@ -169,9 +169,9 @@ mod tests {
     use super::*;
     use protocol::can::Frame;
 
-    fn text(path: &Path) -> Text {
+    fn text(path: &Path) -> CandumpWriter {
         let target = Candump { path: path.to_owned(), numbered: false };
-        Text::create(&target, false, &AtomicBool::new(false)).unwrap()
+        CandumpWriter::create(&target, false, &AtomicBool::new(false)).unwrap()
     }
 
     fn seen(at: u64) -> ReceivedFrame {
@@ -212,10 +212,10 @@ mod tests {
         let path = folder.path().join("run.log");
         let mut log = text(&path);
         let mut said = Vec::new();
-        let mut frames = |log: &mut Text, count| {
+        let mut frames = |log: &mut CandumpWriter, count| {
             for at in 0..count {
                 log.frame("vcan0", &seen(at)).unwrap();
-                log.looked = Instant::now().checked_sub(CHECK_INTERVAL).unwrap();
+                log.checked_at = Instant::now().checked_sub(CHECK_INTERVAL).unwrap();
                 said.extend(log.flush().err());
             }
         };

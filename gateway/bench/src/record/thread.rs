@@ -12,13 +12,13 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::backlog;
 use super::facts::realtime_minus_monotonic;
-use super::feed::{BusFeed, Captured, Feed, frames};
-use super::text::Text;
-use super::topics::{OF_ROBOT, Topics};
-use super::{Outputs, Stop};
+use super::feed::{BusFeed, Captured, Feed, frame_queue_length};
+use super::text::CandumpWriter;
+use super::topics::{ROBOT_MESSAGES, Topics};
+use super::{Outputs, StopRequest};
 use crate::bus::realtime::wall;
 use model::latched::LatchedPackets;
-use trace::capture::{Note, NoteKind, RUN_METADATA, facts_of_run};
+use trace::capture::{Note, NoteKind, RUN_METADATA, run_metadata};
 use trace::recording::account::{MessageCount, RecordingAccount};
 use trace::recording::layout::Layout;
 use trace::recording::series::{FileHead, RecordingEvent, SplitRecording};
@@ -29,15 +29,15 @@ use trace::ros2::standard::{Diagnosis, Level, Point};
 /// Pause between rounds of the thread.
 const ROUND_PAUSE: Duration = Duration::from_millis(10);
 /// Interval between flushes: a killed run may lose the data of this time plus one [`LOOK`].
-const FLUSH: Duration = Duration::from_millis(40);
+const FLUSH_INTERVAL: Duration = Duration::from_millis(40);
 /// Interval between readings of the kernel's backlog drops.
 const BACKLOG_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval between diagnostics messages.
-const DIAGNOSE: Duration = Duration::from_millis(500);
+const DIAGNOSTICS_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Figures that the recorder keeps for one bus.
 #[derive(Default)]
-struct Seen {
+struct BusRecord {
     latched: LatchedPackets,
     /// Number of frames recorded or counted as lost.
     frames: u64,
@@ -52,28 +52,28 @@ struct Seen {
 }
 
 /// The output files and their errors.
-struct Files {
-    text: Option<Text>,
+struct OutputFiles {
+    text: Option<CandumpWriter>,
     series: Option<SplitRecording<Topics>>,
     errors: Vec<RecordingEvent>,
 }
 
 /// State of the recorder's thread.
 pub(super) struct RecorderThread {
-    files: Files,
+    files: OutputFiles,
     feed: Feed,
     layout: Layout,
     /// Notes about interventions, with their times.
-    noted: Receiver<(u64, String)>,
-    tell: Sender<String>,
+    notes: Receiver<(u64, String)>,
+    messages: Sender<String>,
     /// Number of errors already reported.
     reported: usize,
-    buses: Vec<Seen>,
+    buses: Vec<BusRecord>,
     /// Joint positions at the last tick.
     q: Option<[f64; MAX_ROBOT_JOINTS]>,
     backlog: Option<u64>,
     /// True once the files contain the start time of the loop.
-    has_began: bool,
+    start_is_written: bool,
     ticks: u64,
     ticks_skipped: u64,
     max_late_ns: u64,
@@ -81,9 +81,9 @@ pub(super) struct RecorderThread {
 }
 
 /// A period, and the time at which it was over the last time.
-struct Every(Duration, Instant);
+struct Interval(Duration, Instant);
 
-impl Every {
+impl Interval {
     fn new(period: Duration) -> Self {
         Self(period, Instant::now())
     }
@@ -105,18 +105,18 @@ impl RecorderThread {
         (noted, tell): (Receiver<(u64, String)>, Sender<String>),
     ) -> Self {
         let Outputs { text, series } = outputs;
-        let buses = feed.bus_feeds.iter().map(|_| Seen::default()).collect();
+        let buses = feed.bus_feeds.iter().map(|_| BusRecord::default()).collect();
         Self {
-            files: Files { text, series, errors: Vec::new() },
+            files: OutputFiles { text, series, errors: Vec::new() },
             feed,
             layout,
-            noted,
-            tell,
+            notes: noted,
+            messages: tell,
             reported: 0,
             buses,
             q: None,
             backlog: backlog::dropped(),
-            has_began: false,
+            start_is_written: false,
             ticks: 0,
             ticks_skipped: 0,
             max_late_ns: 0,
@@ -125,23 +125,26 @@ impl RecorderThread {
     }
 
     /// Records until stopped, including all items queued by then.
-    pub(super) fn run(mut self, head: FileHead, stop: &Stop) -> RecordingAccount {
+    pub(super) fn run(mut self, head: FileHead, stop: &StopRequest) -> RecordingAccount {
         if let Some(series) = &mut self.files.series {
             let nanos = head.nanos;
             series.begin(head, |writer| Topics::new(writer, &self.layout));
-            robot(series, &self.layout, nanos);
+            write_robot(series, &self.layout, nanos);
         }
-        let (mut flush, mut request, mut diagnose) =
-            (Every::new(FLUSH), Every::new(BACKLOG_INTERVAL), Every::new(DIAGNOSE));
-        let many = frames(self.feed.bus_feeds.len()) / 8;
+        let (mut flush, mut request, mut diagnose) = (
+            Interval::new(FLUSH_INTERVAL),
+            Interval::new(BACKLOG_INTERVAL),
+            Interval::new(DIAGNOSTICS_INTERVAL),
+        );
+        let many = frame_queue_length(self.feed.bus_feeds.len()) / 8;
         loop {
             let ended = stop.now.load(Ordering::Acquire);
-            let taken = self.take();
+            let taken = self.drain_queues();
             if ended && stop.discard.load(Ordering::Relaxed) {
                 return self.discard();
             }
             if request.is_due() || ended {
-                self.request_kernel();
+                self.record_backlog();
             }
             if diagnose.is_due() || ended {
                 self.diagnose();
@@ -161,24 +164,24 @@ impl RecorderThread {
     }
 
     /// Writes the items that are queued now. Returns the length of the longest queue.
-    fn take(&mut self) -> usize {
+    fn drain_queues(&mut self) -> usize {
         let offset = realtime_minus_monotonic();
         if let Some(series) = &mut self.files.series {
             series.set_time(wall());
         }
         let mut most = 0;
-        self.take_ticks(offset);
+        self.drain_ticks(offset);
         for bus in 0..self.feed.bus_feeds.len() {
-            most = most.max(self.take_frames(bus));
-            self.take_touched(bus);
+            most = most.max(self.drain_frames(bus));
+            self.drain_contacts(bus);
         }
-        for (nanos, text) in self.noted.try_iter() {
+        for (nanos, text) in self.notes.try_iter() {
             self.files.note(nanos, None, NoteKind::Text, &text);
         }
         most
     }
 
-    fn take_frames(&mut self, bus: usize) -> usize {
+    fn drain_frames(&mut self, bus: usize) -> usize {
         let (Some(bus_feed), Some(seen), Some(name)) =
             (self.feed.bus_feeds.get_mut(bus), self.buses.get_mut(bus), self.layout.buses.get(bus))
         else {
@@ -218,7 +221,7 @@ impl RecorderThread {
         taken
     }
 
-    fn take_ticks(&mut self, offset: i64) {
+    fn drain_ticks(&mut self, offset: i64) {
         let Some(ticks) = &mut self.feed.ticks else { return };
         while let Ok(timed) = ticks.pop() {
             self.q = Some(timed.record.q);
@@ -227,20 +230,20 @@ impl RecorderThread {
             self.max_late_ns = self.max_late_ns.max(timed.late_ns);
             let nanos = timed.due_ns.saturating_add_signed(offset);
             let layout = &self.layout;
-            if !mem::replace(&mut self.has_began, true)
+            if !mem::replace(&mut self.start_is_written, true)
                 && let Some(series) = &mut self.files.series
             {
                 let since = timed.record.tick.number.saturating_mul(layout.tick_ns);
-                series.add(RUN_METADATA, facts_of_run(nanos.saturating_sub(since)));
+                series.add_metadata(RUN_METADATA, run_metadata(nanos.saturating_sub(since)));
             }
-            let messages = 4 + u64::from(layout.poses_at(timed.record.tick.number));
+            let messages = 4 + u64::from(layout.records_poses_at(timed.record.tick.number));
             self.files.put(MessageCount::others(messages), |window, topics| {
                 topics.tick(window, layout, nanos, &timed)
             });
         }
     }
 
-    fn take_touched(&mut self, bus: usize) {
+    fn drain_contacts(&mut self, bus: usize) {
         let (Some(bus_feed), Some(seen)) = (self.feed.bus_feeds.get_mut(bus), self.buses.get_mut(bus)) else {
             return;
         };
@@ -260,7 +263,7 @@ impl RecorderThread {
     }
 
     /// Records new drops in the kernel's backlog; their bus is unknown.
-    fn request_kernel(&mut self) {
+    fn record_backlog(&mut self) {
         let (Some(total), Some(before)) = (backlog::dropped(), self.backlog) else { return };
         let frames = total.saturating_sub(before);
         self.backlog = Some(total);
@@ -283,7 +286,7 @@ impl RecorderThread {
             ],
         }];
         let buses = self.feed.bus_feeds.iter().zip(&self.layout.buses).zip(&self.buses);
-        parts.extend(buses.map(|((bus_feed, name), seen)| bus(bus_feed, name, seen)));
+        parts.extend(buses.map(|((bus_feed, name), seen)| diagnose_bus(bus_feed, name, seen)));
         let lost = series.lost();
         let unrecorded: u64 = self.buses.iter().map(|bus| bus.unrecorded).sum();
         let all_well = lost.frames + lost.others + unrecorded == 0;
@@ -304,18 +307,18 @@ impl RecorderThread {
     }
 
     fn flush(&mut self) {
-        self.files.text(Text::flush);
+        self.files.text(CandumpWriter::flush);
         let Some(series) = &mut self.files.series else { return };
         // Both segments of a packet to the cells must be in one file.
         let now = wall();
         let holds = self.buses.iter().any(|bus| bus.latched.is_within_a_packet(now));
-        if !series.flush(holds) || !series.next(|writer| Topics::new(writer, &self.layout)) {
+        if !series.flush(holds) || !series.begin_next(|writer| Topics::new(writer, &self.layout)) {
             return;
         }
         // Each file must be readable without the one before it, so it begins with these frames. Items queued before
         // went into the former file.
         let began = now.saturating_sub(WINDOW_NS);
-        robot(series, &self.layout, began);
+        write_robot(series, &self.layout, began);
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.latched.frames() {
                 series.put(MessageCount::others(1), |window, topics| {
@@ -323,7 +326,7 @@ impl RecorderThread {
                 });
             }
         }
-        series.settle();
+        series.write_waiting();
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&mut self.buses).enumerate() {
             let frames = mem::take(&mut seen.missing);
             if frames > 0 {
@@ -337,11 +340,11 @@ impl RecorderThread {
 
     /// Sends new errors to the user.
     fn send_messages(&mut self) {
-        let Files { series, errors, .. } = &mut self.files;
+        let OutputFiles { series, errors, .. } = &mut self.files;
         errors.extend(series.iter_mut().flat_map(SplitRecording::drain_events));
         for line in errors.get(self.reported..).unwrap_or_default() {
             // At the end of the run the receiver is gone.
-            let _ = self.tell.send(line.to_string());
+            let _ = self.messages.send(line.to_string());
         }
         self.reported = errors.len();
     }
@@ -351,7 +354,7 @@ impl RecorderThread {
         if let Some(series) = &mut self.files.series {
             series.discard();
         }
-        let files: Vec<_> = self.files.text.and_then(Text::discard).into_iter().collect();
+        let files: Vec<_> = self.files.text.and_then(CandumpWriter::discard).into_iter().collect();
         RecordingAccount {
             frames: files.iter().map(|file| file.frames).sum(),
             files,
@@ -379,7 +382,7 @@ impl RecorderThread {
             lost = lost.max(unwritten);
             // Earlier errors have been reported during the run.
             if let Err(error) = finished {
-                self.files.errors.push(RecordingEvent::Else(format!("{path}: {error}")));
+                self.files.errors.push(RecordingEvent::Other(format!("{path}: {error}")));
             }
         }
         self.send_messages();
@@ -389,19 +392,19 @@ impl RecorderThread {
         recording.lost = lost;
         let spent = Duration::try_from(clock_gettime(ClockId::ThreadCPUTime)).unwrap_or_default();
         recording.processor_s = spent.as_secs_f64();
-        recording.errors = self.files.errors.iter().map(|said| said.what().to_owned()).collect();
+        recording.errors = self.files.errors.iter().map(|said| said.description().to_owned()).collect();
         recording
     }
 }
 
-impl Files {
+impl OutputFiles {
     /// Returns true between the end of one file of a recording and the start of the next.
     fn is_between(&self) -> bool {
         self.series.as_ref().is_some_and(|series| !series.is_open())
     }
 
     /// Writes to the candump log, if there is one.
-    fn text(&mut self, write: impl FnOnce(&mut Text) -> io::Result<()>) {
+    fn text(&mut self, write: impl FnOnce(&mut CandumpWriter) -> io::Result<()>) {
         if let Some(text) = &mut self.text
             && let Err(error) = write(text)
         {
@@ -409,7 +412,7 @@ impl Files {
             self.errors.push(if text.is_over() {
                 RecordingEvent::BrokeOff(what)
             } else {
-                RecordingEvent::Else(what)
+                RecordingEvent::Other(what)
             });
         }
     }
@@ -439,9 +442,10 @@ impl Files {
 }
 
 /// Writes the robot's description, once per file.
-fn robot(series: &mut SplitRecording<Topics>, layout: &Layout, nanos: u64) {
+fn write_robot(series: &mut SplitRecording<Topics>, layout: &Layout, nanos: u64) {
     if layout.robot.is_some() {
-        series.put(MessageCount::others(OF_ROBOT), |window, topics| topics.robot(window, layout, nanos));
+        series
+            .put(MessageCount::others(ROBOT_MESSAGES), |window, topics| topics.robot(window, layout, nanos));
     }
 }
 
@@ -450,7 +454,7 @@ fn dropped(frames: u64, place: &str, total: u64) -> String {
 }
 
 /// Returns the diagnosis of a bus for the diagnostics topic.
-fn bus(bus_feed: &BusFeed, name: &str, seen: &Seen) -> Diagnosis {
+fn diagnose_bus(bus_feed: &BusFeed, name: &str, seen: &BusRecord) -> Diagnosis {
     let works = bus_feed.state.is_there();
     let (mut cells, mut silent) = (0, 0);
     if let Ok(view) = bus_feed.view.lock() {

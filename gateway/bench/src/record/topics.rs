@@ -10,7 +10,7 @@ use control::controller::BadCycle;
 use control::cycle::Halt;
 use control::cycle::turn::TimedRecord;
 use model::latched::ReceivedFrame;
-use model::table::Status;
+use model::table::CellStatus;
 use trace::capture::Note;
 use trace::recording::NOTES_TOPIC;
 use trace::recording::file::Channel;
@@ -22,7 +22,7 @@ use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
 
 /// QoS profile that bag tools store for latched topics: readers that join later get the last message.
-const LATCHED: (&str, &str) = (
+const LATCHED_QOS: (&str, &str) = (
     "offered_qos_profiles",
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    \
      nsec: 854775807\n  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  \
@@ -36,7 +36,7 @@ const TF_STATIC: &str = "/tf_static";
 const DESCRIPTION: &str = "/robot_description";
 
 /// Number of messages that [`Topics::robot`] writes.
-pub const OF_ROBOT: u64 = 2;
+pub const ROBOT_MESSAGES: u64 = 2;
 
 /// Channels of one file.
 #[derive(Debug)]
@@ -78,8 +78,8 @@ impl Topics {
         let [states, commands, torques] = &of_arm;
         let robot = layout.robot.is_some().then(|| {
             let moving = writer.channel::<Transforms<'_>>(TF, &[])?;
-            let still = writer.channel::<Transforms<'_>>(TF_STATIC, &[LATCHED])?;
-            Ok::<_, io::Error>([moving, still, writer.channel::<Text<'_>>(DESCRIPTION, &[LATCHED])?])
+            let still = writer.channel::<Transforms<'_>>(TF_STATIC, &[LATCHED_QOS])?;
+            Ok::<_, io::Error>([moving, still, writer.channel::<Text<'_>>(DESCRIPTION, &[LATCHED_QOS])?])
         });
         Ok(Self {
             can,
@@ -98,7 +98,7 @@ impl Topics {
     /// Writes the robot's fixed transforms and description, if known.
     pub fn robot(&mut self, window: &mut ReorderWindow, layout: &Layout, nanos: u64) {
         let (Some(robot), Some([_, still, description])) = (&layout.robot, &mut self.robot) else { return };
-        window.write(still, nanos, &Transforms { nanos, transforms: &robot.still() });
+        window.write(still, nanos, &Transforms { nanos, transforms: &robot.fixed_transforms() });
         window.write(description, nanos, &Text(&robot.description));
     }
 
@@ -149,10 +149,14 @@ impl Topics {
         };
         window.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active });
         window.write(&mut self.timing, nanos, &timing(nanos, timed));
-        if layout.poses_at(record.tick.number)
+        if layout.records_poses_at(record.tick.number)
             && let (Some(robot), Some([moving, ..])) = (&layout.robot, &mut self.robot)
         {
-            window.write(moving, nanos, &Transforms { nanos, transforms: &robot.moving(position) });
+            window.write(
+                moving,
+                nanos,
+                &Transforms { nanos, transforms: &robot.moving_transforms(position) },
+            );
         }
     }
 
@@ -174,7 +178,7 @@ impl Topics {
         let (cells, cloud) = scratch;
         cells.clear();
         cells.extend(patch.cells.iter().map(|&(cell, node)| {
-            let (sensors, status) = touched.cells.get(cell).copied().unwrap_or((None, Status::Unknown));
+            let (sensors, status) = touched.cells.get(cell).copied().unwrap_or((None, CellStatus::Unknown));
             #[expect(clippy::cast_possible_truncation, reason = "words of 16 bits")]
             let (force, proximity) = sensors.map_or((f32::NAN, f32::NAN), |sensors| {
                 (central.force(cell, &sensors) as f32, sensors.proximity.to_f64() as f32)
@@ -185,7 +189,7 @@ impl Topics {
         let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells };
         window.write(state, nanos, &message);
         let Some(q) = q else { return };
-        let frames = central.frames_at(&layout.chain_positions(patch.bus, q));
+        let frames = central.frames_at_positions(&layout.chain_positions(patch.bus, q));
         cloud.clear();
         cloud.extend(cells.iter().zip(&patch.cells).map(|(state, &(cell, _))| {
             #[expect(clippy::cast_possible_truncation, reason = "metres with 7 digits")]

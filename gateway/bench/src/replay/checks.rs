@@ -24,12 +24,12 @@ pub(super) struct Checks {
 
 impl Checks {
     /// Returns the name that a bus has in this replay.
-    pub(super) fn bus_link(&self, bus_link: usize) -> &str {
+    pub(super) fn bus_name(&self, bus_link: usize) -> &str {
         self.routes.names.get(bus_link).map_or("", |(_, name)| name)
     }
 
     /// Returns the name that each bus has in this replay, and the survey of the recorded bus.
-    pub(super) fn bus_links(&self) -> impl Iterator<Item = (&str, &SurveyedBus)> {
+    pub(super) fn named_buses(&self) -> impl Iterator<Item = (&str, &SurveyedBus)> {
         let buses = &self.survey.buses;
         self.routes.names.iter().filter_map(|(bus, name)| Some((name.as_str(), buses.get(*bus)?)))
     }
@@ -40,35 +40,35 @@ impl Checks {
     }
 
     /// Returns the cells that sent on each bus in the replayed part of the recording.
-    pub(super) fn recorded(&self) -> Vec<BTreeSet<CellId>> {
-        self.bus_links().map(|(_, bus)| self.cells(bus).map(|(cell, _)| cell).collect()).collect()
+    pub(super) fn recorded_cells(&self) -> Vec<BTreeSet<CellId>> {
+        self.named_buses().map(|(_, bus)| self.cells(bus).map(|(cell, _)| cell).collect()).collect()
     }
 
     /// Returns true if the replay begins with a state that includes parameters. The cells then have their recorded
     /// configuration only after that state is restored.
-    pub(super) fn configures(&self) -> bool {
-        self.bus_links().any(|(_, bus)| bus.state.configures())
+    pub(super) fn needs_parameters(&self) -> bool {
+        self.named_buses().any(|(_, bus)| bus.state.has_commit())
     }
 
     /// Returns true if newly started cells are already in the state in which the replay begins.
     pub(super) fn are_fresh(&self) -> bool {
-        self.options.spawn.is_some() && self.bus_links().all(|(_, bus)| bus.state.is_fresh())
+        self.options.spawn.is_some() && self.named_buses().all(|(_, bus)| bus.state.is_fresh())
     }
 
     /// Returns the number of cells whose recorded configuration is unknown.
-    pub(super) fn unchecked(&self) -> u64 {
+    pub(super) fn unknown_hashes(&self) -> u64 {
         let unknown = |bus| self.cells(bus).filter(|(_, cell)| hash(cell).is_none()).count() as u64;
-        self.bus_links().map(|(_, bus)| unknown(bus)).sum()
+        self.named_buses().map(|(_, bus)| unknown(bus)).sum()
     }
 
     /// Checks that the cells are present with their recorded configuration.
-    pub(super) fn hashes(&self, comparator: &Comparator) -> Result<(), Mismatch> {
+    pub(super) fn check_hashes(&self, comparator: &Comparator) -> Result<(), Mismatch> {
         if self.options.expect.is_none() {
             return Ok(());
         }
         let (mut absent, mut other) = (Vec::new(), Vec::new());
         let (mut equal, mut others, mut count) = (0_usize, 0_usize, 0_usize);
-        for (bus_link, (name, bus)) in self.bus_links().enumerate() {
+        for (bus_link, (name, bus)) in self.named_buses().enumerate() {
             let there: BTreeMap<_, _> = comparator
                 .settled_cells(bus_link)
                 .filter_map(|(cell, present)| Some((cell, present.claim.heartbeat()?.configuration)))
@@ -108,7 +108,7 @@ impl Checks {
     }
 
     /// Returns the cells of each bus that measure now, although they obeyed stimuli in the recording.
-    pub(super) fn measuring(&self, comparator: &Comparator) -> Vec<Vec<CellId>> {
+    pub(super) fn measuring_cells(&self, comparator: &Comparator) -> Vec<Vec<CellId>> {
         let measures = |(bus_link, (_, bus)): (usize, (&str, &SurveyedBus))| {
             let obeyed = |cell: &CellId| bus.cells.get(cell).is_some_and(|cell| !cell.measured);
             let now = comparator
@@ -116,11 +116,11 @@ impl Checks {
                 .filter(|(_, present)| !present.claim.has_state(State::TEST_MODE));
             now.map(|(cell, _)| cell).filter(obeyed).collect()
         };
-        self.bus_links().enumerate().map(measures).collect()
+        self.named_buses().enumerate().map(measures).collect()
     }
 }
 
 /// Returns the hash of a cell's recorded configuration, if known.
 const fn hash(cell: &SurveyedCell) -> Option<u16> {
-    if let KnownValue::Yes(hash) = cell.hash { Some(hash) } else { None }
+    if let KnownValue::Value(hash) = cell.hash { Some(hash) } else { None }
 }

@@ -104,7 +104,7 @@ impl Difference {
         if let Some(((recorded, format), (now, _))) =
             recorded.and_then(|said| said.steps(units)).zip(now.and_then(|said| said.steps(units)))
         {
-            text += &format!("\n  {}", Steps { recorded, now, format, units });
+            text += &format!("\n  {}", StepDifferences { recorded, now, format, units });
         }
         Self { how, bus: bus.to_owned(), cell: cell.get(), when, text }
     }
@@ -121,10 +121,12 @@ impl SentValue {
                 };
                 let packet = Packet { id: Id::new(kind, Node::Cell(cell)), words, epoch, count };
                 Message::decode(&packet)
-                    .map_or_else(|error| error.to_string(), |message| meaning(message, units))
+                    .map_or_else(|error| error.to_string(), |message| message_text(message, units))
             }
-            Self::Sum(own) => summed(cell, epoch, own, units),
-            &Self::Answer(tag, answer) => meaning(Message::Configured { from: cell, tag, answer }, units),
+            Self::Sum(own) => sum_text(cell, epoch, own, units),
+            &Self::Answer(tag, answer) => {
+                message_text(Message::Configured { from: cell, tag, answer }, units)
+            }
         }
     }
 
@@ -141,7 +143,7 @@ impl SentValue {
 }
 
 /// Formats a sum, the children whose sums it contains, and the cell's own contribution.
-fn summed(cell: CellId, epoch: Epoch, own: &OwnTerm, units: Units) -> String {
+fn sum_text(cell: CellId, epoch: Epoch, own: &OwnTerm, units: Units) -> String {
     let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
     let less = match children.as_slice() {
@@ -161,24 +163,24 @@ fn summed(cell: CellId, epoch: Epoch, own: &OwnTerm, units: Units) -> String {
         }
     };
     let words: String = own.steps.iter().take(own.sum.length().words()).enumerate().map(word).collect();
-    format!("{}; {less}:{words} Nm", meaning(sum, units))
+    format!("{}; {less}:{words} Nm", message_text(sum, units))
 }
 
 /// Formats a message as text, without the verdict on its frame.
-fn meaning(message: Message, units: Units) -> String {
+fn message_text(message: Message, units: Units) -> String {
     let text = Decoded::Message(message).in_units(units).to_string();
     text.split_once(' ').map_or(String::new(), |(_, text)| text.trim_start().to_owned())
 }
 
 /// Formats the differences between torques: `joint 1: 2 steps more (0.0005 Nm), joint 3: ...`.
-struct Steps {
+struct StepDifferences {
     recorded: [Option<i32>; MAX_JOINTS],
     now: [Option<i32>; MAX_JOINTS],
     format: TorqueFormat,
     units: Units,
 }
 
-impl Display for Steps {
+impl Display for StepDifferences {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let mut comma = "";
         for (index, (&recorded, &now)) in self.recorded.iter().zip(&self.now).enumerate() {

@@ -6,7 +6,7 @@ use std::process::ExitStatus;
 use protocol::bus::{BusError, KindsError};
 use thiserror::Error;
 
-use crate::error::{RunError, why};
+use crate::error::{RunError, reason_suffix};
 use model::decode::MAX_BUSES;
 use trace::capture::CaptureError;
 
@@ -88,7 +88,7 @@ pub enum ReplayError {
     Empty(String),
     /// The bus does not exist, so no cell on it can answer.
     #[error("{0}; or start fresh cells on an embedded bus with --spawn")]
-    NotThere(BusError),
+    BusAbsent(BusError),
     /// The requested part has nothing to send.
     #[error("nothing remains to be sent: {name} ends at {ends_s:.3} s, and --from and --to leave none of it")]
     NothingLeft {
@@ -135,14 +135,14 @@ pub enum ReplayError {
     },
     /// Other cells are on a bus on which cells were to be started.
     #[error("cells are on {bus} already: {cells}; leave out --spawn to use them, or stop them")]
-    CellsThere {
+    CellsPresent {
         /// Name of the bus.
         bus: String,
         /// The cells found.
         cells: String,
     },
     /// A process of cells ended too early.
-    #[error("the process of {cells} ended while starting ({status}){}", why(.said.as_deref()))]
+    #[error("the process of {cells} ended while starting ({status}){}", reason_suffix(.said.as_deref()))]
     Ended {
         /// The cells of the process.
         cells: String,
@@ -188,7 +188,7 @@ impl ReplayError {
         match self {
             Self::Run(error) => error.exit_code(),
             Self::Kinds(_)
-            | Self::NotThere(_)
+            | Self::BusAbsent(_)
             | Self::StandardInput
             | Self::Pipe(_)
             | Self::Open(_)
@@ -202,7 +202,7 @@ impl ReplayError {
             Self::Read(_)
             | Self::Line(_)
             | Self::Empty(_)
-            | Self::CellsThere { .. }
+            | Self::CellsPresent { .. }
             | Self::Ended { .. }
             | Self::OtherGateway(_)
             | Self::NoCell(_)

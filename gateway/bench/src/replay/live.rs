@@ -15,25 +15,25 @@ use super::player::{Pace, Stage};
 use super::replay_plan::OpenJoints;
 use super::report::Lockstep;
 use super::shared_state::SharedState;
-use super::start::{ReplayBus, mode};
+use super::start::{ReplayBus, mode_message};
 use super::{ReplayError, ReplayOptions};
 use crate::bus::realtime;
 use crate::setup::names;
 
 /// Interval in ns between checks of the stop flag.
-const LOOK_NS: u64 = 100_000_000;
+const STOP_POLL_NS: u64 = 100_000_000;
 /// Pause while the queue of steps is empty.
 const STEP_PAUSE: Duration = Duration::from_micros(100);
 const DOWN_PAUSE: Duration = Duration::from_millis(50);
 /// Time without any answer after which cells are queried again, because a frame may have been lost. After [`TIMEOUT`]
 /// they are given up.
-const REMIND: Duration = Duration::from_millis(500);
-const TIMEOUT: Duration = Duration::from_secs(3);
+const RESYNC_INTERVAL: Duration = Duration::from_millis(500);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Maximum number of times that joints are resent when cells processed them too late to answer.
-const REQUEST_AGAIN: u32 = 16;
+const MAX_RESENDS: u32 = 16;
 /// Maximum number of times that joints are resent on a bus on which resending did not help the last time. The cells are
 /// then probably not late but absent.
-const REQUEST_AGAIN_IN_VAIN: u32 = 2;
+const MAX_RESENDS_AFTER_FAILURE: u32 = 2;
 /// Time to wait for answers to resent joints, before cells must also send a heartbeat.
 const FIRST_ANSWER_WAIT: Duration = Duration::from_millis(100);
 /// Maximum factor by which the wait for answers is extended from try to try.
@@ -49,7 +49,7 @@ pub(super) struct LiveStage {
     /// Counts of cells that did not answer, and of joints that were resent.
     pub(super) lockstep: Lockstep,
     /// Buses on which resending did not help the last time.
-    pub(super) in_vain: BTreeSet<usize>,
+    pub(super) resend_failed: BTreeSet<usize>,
     pub(super) down: BTreeSet<usize>,
 }
 
@@ -67,7 +67,7 @@ impl Stage for LiveStage {
             if now >= asleep {
                 break;
             }
-            realtime::sleep_until(asleep.min(now + LOOK_NS));
+            realtime::sleep_until(asleep.min(now + STOP_POLL_NS));
         }
         while realtime::now() < at && !self.shared_state.is_over() {
             core::hint::spin_loop();
@@ -120,19 +120,20 @@ impl Stage for LiveStage {
         // On a slow machine, a cell skips joints that it processes more than one period late, and does not answer them.
         // Such joints are resent under the epoch before, and then under their own epoch. The sync follows later,
         // because on such a machine the heartbeats of some cells delay others.
-        let tries = if self.in_vain.contains(&bus_index) { REQUEST_AGAIN_IN_VAIN } else { REQUEST_AGAIN };
+        let tries =
+            if self.resend_failed.contains(&bus_index) { MAX_RESENDS_AFTER_FAILURE } else { MAX_RESENDS };
         for again in 0.. {
             if self.shared_state.is_over() {
                 return;
             }
             if self.shared_state.comparator().unanswered(bus_index, round) == 0 {
                 if again > 0 {
-                    self.in_vain.remove(&bus_index);
+                    self.resend_failed.remove(&bus_index);
                 }
                 return;
             }
             if again == tries {
-                self.in_vain.insert(bus_index);
+                self.resend_failed.insert(bus_index);
                 return;
             }
             let epoch = if again % 2 == 0 { open.epoch.advanced_by(u8::MAX) } else { open.epoch };
@@ -162,7 +163,7 @@ impl Stage for LiveStage {
         for (bus_link, messages) in states {
             self.finish(*bus_link, &[Message::Sync])?;
             self.shared_state.comparator().mute(true);
-            let mut all = self.forgetting(*bus_link);
+            let mut all = self.contact_resets(*bus_link);
             all.extend_from_slice(messages);
             for message in &all {
                 if let Message::Joints { epoch, .. } = *message {
@@ -173,7 +174,7 @@ impl Stage for LiveStage {
             self.finish(*bus_link, &[Message::Sync])?;
             self.shared_state.comparator().mute(false);
         }
-        Ok(self.shared_state.checks.hashes(&self.shared_state.comparator())?)
+        Ok(self.shared_state.checks.check_hashes(&self.shared_state.comparator())?)
     }
 
     fn show(&mut self, at: u64) {
@@ -183,11 +184,11 @@ impl Stage for LiveStage {
 
 impl LiveStage {
     /// Returns the messages that reset the contact state of those cells on a bus that are in test mode.
-    fn forgetting(&self, bus_index: usize) -> Vec<Message> {
+    fn contact_resets(&self, bus_index: usize) -> Vec<Message> {
         let comparator = self.shared_state.comparator();
         let obeying =
             comparator.settled_cells(bus_index).filter(|(_, cell)| cell.claim.has_state(Flags::TEST_MODE));
-        obeying.map(|(cell, _)| mode(cell, true)).collect()
+        obeying.map(|(cell, _)| mode_message(cell, true)).collect()
     }
 
     fn send_messages(&self, bus_index: usize, messages: &[Message]) -> Result<(), BusError> {
@@ -216,24 +217,24 @@ impl LiveStage {
         let (mut done, mut progress, mut reminded) = (0, Instant::now(), Instant::now());
         let mut comparator = self.shared_state.comparator();
         while !comparator.is_done(bus_index) && !self.shared_state.is_over() {
-            let now = comparator.done(bus_index);
+            let now = comparator.done_count(bus_index);
             if now != done {
                 (done, progress, reminded) = (now, Instant::now(), Instant::now());
             }
-            if reminded.elapsed() > REMIND {
+            if reminded.elapsed() > RESYNC_INTERVAL {
                 reminded = Instant::now();
                 // If the bus refuses messages, the next frame reports it.
                 let _ = self.send_messages(bus_index, &[Message::Sync]);
             }
-            if progress.elapsed() > TIMEOUT {
+            if progress.elapsed() > ANSWER_TIMEOUT {
                 let late = comparator.give_up(bus_index);
-                let name = self.shared_state.checks.bus_link(bus_index);
+                let name = self.shared_state.checks.bus_name(bus_index);
                 self.lockstep.silent_cells.extend(late.iter().map(|cell| format!("{cell} on {name}")));
                 let (plural, verb) = if late.len() == 1 { ("", "does") } else { ("s", "do") };
                 self.notify(format!(
                     "cell{plural} {} on {name} {verb} not answer within {} s: the replay goes on without",
                     names(&late, ""),
-                    TIMEOUT.as_secs()
+                    ANSWER_TIMEOUT.as_secs()
                 ));
                 return;
             }

@@ -12,51 +12,51 @@ use protocol::message::{Message, State};
 use super::ReplayError;
 use super::comparator::Comparator;
 use super::session::Session;
-use super::start::{SkinOverride, mode};
+use super::start::{SpawnSkin, mode_message};
 use crate::error::RunError;
-use crate::processes::STARTING;
+use crate::processes::START_TIMEOUT;
 use crate::setup::{Timeout, names};
 
 /// Time within which each running cell sends at least one heartbeat.
 const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time after which the remaining cells count as unreachable if no other cell has become reachable: two hellos and a
 /// search.
-const ORGANISING: Duration = Duration::from_secs(2);
+const ROUTE_TIMEOUT: Duration = Duration::from_secs(2);
 /// Interval between polls.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 impl Session {
     /// Queries the cells and checks that they fit the recording.
-    pub(super) fn check_cells(&mut self, skin_override: Option<&SkinOverride>) -> Result<(), ReplayError> {
+    pub(super) fn check_cells(&mut self, skin_override: Option<&SpawnSkin>) -> Result<(), ReplayError> {
         let shared_state = Arc::clone(&self.shared_state);
         let (checks, options) = (&shared_state.checks, &shared_state.checks.options);
-        if !options.hears() {
+        if !options.receives() {
             return Ok(());
         }
-        let spawned_skin = |skin: &protocol::skin::Skin, name: &str| -> BTreeSet<CellId> {
+        let cells_of_bus = |skin: &protocol::skin::Skin, name: &str| -> BTreeSet<CellId> {
             let bus = skin.bus_named(name);
             bus.into_iter().flat_map(|bus| skin.cells_on_bus(bus)).map(|cell| cell.node).collect()
         };
-        let target = match skin_override {
-            None => checks.recorded(),
+        let required = match skin_override {
+            None => checks.recorded_cells(),
             Some(skin_override) => {
-                shared_state.comparator().describe(&skin_override.skin);
-                checks.bus_links().map(|(name, _)| spawned_skin(&skin_override.skin, name)).collect()
+                shared_state.comparator().set_units(&skin_override.skin);
+                checks.named_buses().map(|(name, _)| cells_of_bus(&skin_override.skin, name)).collect()
             }
         };
-        self.wait_for_cells(&target)?;
+        self.wait_for_cells(&required)?;
         self.wait_for_tree()?;
         let comparator = shared_state.comparator();
-        let nobody = (0..self.buses.bus_links.len())
+        let has_no_cells = (0..self.buses.bus_links.len())
             .all(|bus_link| comparator.settled_cells(bus_link).next().is_none());
-        if nobody && (options.expect.is_some() || options.lockstep || skin_override.is_some()) {
-            let names: Vec<_> = checks.bus_links().map(|(name, _)| name).collect();
+        if has_no_cells && (options.expect.is_some() || options.lockstep || skin_override.is_some()) {
+            let names: Vec<_> = checks.named_buses().map(|(name, _)| name).collect();
             return Err(ReplayError::NoCell(names.join(", ")));
         }
-        if !checks.configures() {
-            checks.hashes(&comparator)?;
+        if !checks.needs_parameters() {
+            checks.check_hashes(&comparator)?;
         }
-        let measuring = checks.measuring(&comparator);
+        let measuring = checks.measuring_cells(&comparator);
         drop(comparator);
         let all = measuring.concat();
         if all.is_empty() {
@@ -76,7 +76,7 @@ impl Session {
     }
 
     /// Polls until the check returns true.
-    fn wait(
+    fn poll_until(
         &mut self,
         mut is_last: impl FnMut(&mut Self, &Comparator) -> Result<bool, ReplayError>,
     ) -> Result<(), ReplayError> {
@@ -92,16 +92,16 @@ impl Session {
     }
 
     /// Waits until the required cells have answered, or until no further cell answers.
-    fn wait_for_cells(&mut self, target: &[BTreeSet<CellId>]) -> Result<(), ReplayError> {
+    fn wait_for_cells(&mut self, required: &[BTreeSet<CellId>]) -> Result<(), ReplayError> {
         let spawned = self.buses.processes.pids().next().is_some();
         for bus_link in self.buses.bus_links.iter() {
             bus_link.send(&[Message::Sync])?;
         }
         // Cells answer at once, so that after the first pause they are known even if none is required.
         thread::sleep(POLL_INTERVAL);
-        let all = target.iter().map(BTreeSet::len).sum::<usize>();
-        let mut timeout = Timeout::new(if spawned { STARTING } else { DISCOVERY_TIMEOUT });
-        self.wait(|session, comparator| {
+        let all = required.iter().map(BTreeSet::len).sum::<usize>();
+        let mut timeout = Timeout::new(if spawned { START_TIMEOUT } else { DISCOVERY_TIMEOUT });
+        self.poll_until(|session, comparator| {
             if session.is_interrupted() {
                 return Err(RunError::Interrupted.into());
             }
@@ -111,13 +111,13 @@ impl Session {
             }
             if let Some(bus_link) = comparator.other_gateway() {
                 return Err(ReplayError::OtherGateway(
-                    session.shared_state.checks.bus_link(bus_link).to_owned(),
+                    session.shared_state.checks.bus_name(bus_link).to_owned(),
                 ));
             }
             let there = |(bus_link, cells): (usize, &BTreeSet<CellId>)| {
                 comparator.settled_cells(bus_link).filter(|(cell, _)| cells.contains(cell)).count()
             };
-            let there = target.iter().enumerate().map(there).sum();
+            let there = required.iter().enumerate().map(there).sum();
             Ok(there == all || timeout.is_over(there))
         })
     }
@@ -127,8 +127,8 @@ impl Session {
         for bus_link in self.buses.bus_links.iter().filter(|bus_link| bus_link.wired) {
             bus_link.send(&[Message::Report])?;
         }
-        let mut timeout = Timeout::new(ORGANISING);
-        self.wait(|session, comparator| {
+        let mut timeout = Timeout::new(ROUTE_TIMEOUT);
+        self.poll_until(|session, comparator| {
             let wired = session.buses.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.wired);
             let without: Vec<_> =
                 wired.map(|(index, bus_link)| (bus_link, comparator.unreachable(index))).collect();
@@ -149,9 +149,9 @@ impl Session {
 
     /// Puts measuring cells into test mode.
     fn set_test_mode(&mut self, measuring: &[Vec<CellId>]) -> Result<(), ReplayError> {
-        self.tell_mode(measuring, true)?;
+        self.send_mode(measuring, true)?;
         let give_up = Instant::now() + DISCOVERY_TIMEOUT;
-        self.wait(|_, comparator| {
+        self.poll_until(|_, comparator| {
             let obeys = |(bus_link, cells): (usize, &Vec<CellId>)| {
                 let obeying =
                     comparator.present_cells(bus_link).filter(|(_, it)| it.claim.has_state(State::TEST_MODE));
@@ -166,15 +166,15 @@ impl Session {
     }
 
     /// Restores the former mode of the cells.
-    pub(super) fn leave(&self) -> Result<(), ReplayError> {
-        self.tell_mode(&self.measuring, false)
+    pub(super) fn restore_mode(&self) -> Result<(), ReplayError> {
+        self.send_mode(&self.measuring, false)
     }
 
     /// Switches cells to test mode and reports it at once, or switches them to measuring.
-    fn tell_mode(&self, cells: &[Vec<CellId>], obey: bool) -> Result<(), ReplayError> {
+    fn send_mode(&self, cells: &[Vec<CellId>], obey: bool) -> Result<(), ReplayError> {
         for (bus_link, cells) in self.buses.bus_links.iter().zip(cells).filter(|(_, cells)| !cells.is_empty())
         {
-            let modes = cells.iter().map(|cell| mode(*cell, obey));
+            let modes = cells.iter().map(|cell| mode_message(*cell, obey));
             bus_link.send(&modes.chain(obey.then_some(Message::Sync)).collect::<Vec<_>>())?;
         }
         Ok(())

@@ -53,14 +53,14 @@ use crate::bus::realtime::idle_lateness;
 use crate::processes::ended::EndedProcesses;
 use crate::progress::Progress;
 use crate::setup::names;
-use crate::signals::caught;
+use crate::signals::catch_signals;
 use model::decode::MAX_BUSES;
 use trace::capture::{CaptureError, Entry, NoteKind, Reader, RecordingExtras, seconds_since};
 
 /// Period in ns of the wake-ups whose lateness is measured.
 const GRID_NS: u64 = 2_000_000;
 /// Maximum number of unreadable lines that are named.
-const NAMED_LINES: u64 = 5;
+const MAX_NAMED_LINES: u64 = 5;
 
 /// Cells to start for a replay.
 #[derive(Clone, Debug)]
@@ -115,13 +115,12 @@ pub struct ReplayOptions {
 /// and in the comparison are in the summary.
 pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     let progress = Progress::lines(options.quiet);
-    let (survey, extras, name) = look_through(options, &progress)?;
+    let (survey, extras, name) = survey_capture(options, &progress)?;
     let routes = Routes::new(options, &survey, &name)?;
-    let skin_override =
-        options.spawn.as_ref().map(|spawn| start::skin_override(spawn, &routes, &extras, &name));
+    let skin_override = options.spawn.as_ref().map(|spawn| start::spawn_skin(spawn, &routes, &extras, &name));
     let skin_override = skin_override.transpose()?;
     // Until here, a signal may end the program, because there is nothing to clean up.
-    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
+    let signalled = catch_signals(&[SIGHUP, SIGINT, SIGTERM])?;
     // In lockstep, frames are sent when cells have answered, not at a time.
     let timed = matches!(options.pace, Pace::Timed(_)) && !options.lockstep;
     let idle = timed.then(|| idle_lateness(GRID_NS));
@@ -130,13 +129,13 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     for bus_link in buses.bus_links.iter() {
         progress.note(&format!("{} is {}", bus_link.bus.name(), bus_link.bus.kind()));
     }
-    let speaks = options.only != SenderFilter::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
-    let heard = if speaks { buses.listen()? } else { Vec::new() };
+    let sends_joints = options.only != SenderFilter::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
+    let present = if sends_joints { buses.find_cells()? } else { Vec::new() };
     let checks = Checks { options: options.clone(), survey, routes, name };
     if let (Some(spawn), Some(skin_override)) = (&options.spawn, &skin_override) {
-        buses.start_cells(spawn, skin_override, &heard)?;
+        buses.start_cells(spawn, skin_override, &present)?;
     } else if options.only == SenderFilter::All {
-        warn_of_doubles(&checks, &heard, &progress);
+        warn_of_doubles(&checks, &present, &progress);
     }
     let shared_state = Arc::new(SharedState::new(checks));
     let (measuring, ended) = (Vec::new(), EndedProcesses::default());
@@ -145,7 +144,7 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
 }
 
 /// Reads the whole capture once. Returns its survey, its contents other than frames, and its display name.
-fn look_through(
+fn survey_capture(
     options: &ReplayOptions,
     progress: &Progress,
 ) -> Result<(Survey, RecordingExtras, String), ReplayError> {
@@ -159,12 +158,13 @@ fn look_through(
     let mut reader = Reader::open_all(&options.files).map_err(ReplayError::Open)?;
     let name = reader.name().to_owned();
     let mut survey = Survey::new(options.part);
-    let few = |buses| if buses > MAX_BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
+    let check_bus_count =
+        |buses| if buses > MAX_BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
     let note = |text: String| progress.note(&format!("{name}: {text}"));
     // Latched frames are stored before the first frame, and are known once the capture is open.
     let latched = &reader.extras().latched;
     let buses: BTreeSet<_> = latched.iter().map(|frame| frame.bus.as_str()).collect();
-    few(buses.len())?;
+    check_bus_count(buses.len())?;
     survey.add_latched(latched);
     survey.run_began = reader.extras().run_began();
     let (mut unreadable, mut backwards) = (0_u64, None);
@@ -175,18 +175,18 @@ fn look_through(
                     backwards = Some((survey.frames + 1, survey.last - record.time.nanos));
                 }
                 survey.add_frame(&record);
-                few(survey.buses.len())?;
+                check_bus_count(survey.buses.len())?;
             }
             Entry::Note(note) => match note.kind {
                 NoteKind::Dropped(frames) => survey.dropped = survey.dropped.saturating_add(frames),
                 NoteKind::Unreadable(why) => {
                     let line = format!("{name}:{}: {why}", note.line);
                     unreadable += 1;
-                    if unreadable <= NAMED_LINES {
+                    if unreadable <= MAX_NAMED_LINES {
                         progress.note(&line);
                     }
                 }
-                NoteKind::Text => survey.note(&note),
+                NoteKind::Text => survey.add_note(&note),
                 NoteKind::CanXl => {}
             },
         }
@@ -201,7 +201,7 @@ fn look_through(
     if let Some(what) = &reader.extras().unfinished {
         note(what.to_string());
     }
-    for remark in reader.remarks_beside_order() {
+    for remark in reader.remarks_except_order() {
         note(remark);
     }
     if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::WINDOW_NS) {
@@ -213,13 +213,13 @@ fn look_through(
     }
     if survey.frames == 0 {
         return Err(match reader.text_kind() {
-            Some((what, hint)) => ReplayError::Open(CaptureError::Other { name, what, hint }),
+            Some((what, hint)) => ReplayError::Open(CaptureError::OtherFormat { name, what, hint }),
             None => ReplayError::Empty(name),
         });
     }
     let (from, to) = survey.bounds();
     if from > survey.last || from >= to {
-        let ends_s = seconds_since(survey.zero(), survey.last);
+        let ends_s = seconds_since(survey.time_origin(), survey.last);
         return Err(ReplayError::NothingLeft { name, ends_s });
     }
     Ok((survey, reader.extras().clone(), name))
@@ -227,7 +227,7 @@ fn look_through(
 
 /// Warns that cells which are already on the bus will receive copies of the messages that they sent in the recording.
 fn warn_of_doubles(checks: &Checks, heard: &[BTreeSet<CellId>], progress: &Progress) {
-    for ((name, bus), heard) in checks.bus_links().zip(heard) {
+    for ((name, bus), heard) in checks.named_buses().zip(heard) {
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
             progress.note(&format!(

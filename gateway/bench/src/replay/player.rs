@@ -62,7 +62,7 @@ pub enum Pace {
 
 /// Counts of the frames that were to be sent on one bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct BusLinkTally {
+pub struct BusTally {
     /// Frames that the bus accepted.
     pub sent: u64,
     /// Frames refused because the bus stayed full.
@@ -77,7 +77,7 @@ pub struct BusLinkTally {
 #[derive(Debug)]
 pub struct PlayerResult {
     /// Counts of each bus.
-    pub bus_links: Vec<BusLinkTally>,
+    pub bus_links: Vec<BusTally>,
     /// Lateness of the frames in ns. Frames that were to be sent at once are not included.
     pub late: Histogram<u64>,
     /// True if the replay was stopped before its end.
@@ -115,7 +115,7 @@ impl Player {
             down: vec![false; bus_links],
             origin: None,
             played: PlayerResult {
-                bus_links: vec![BusLinkTally::default(); bus_links],
+                bus_links: vec![BusTally::default(); bus_links],
                 late: histogram(),
                 was_stopped: false,
                 failure: None,
@@ -196,13 +196,13 @@ impl Player {
         self.rounds.clear();
         let deadline = self.deadline(first, stage.now());
         // Announce the joints before they are sent, because the answers may arrive before the send call returns.
-        let mut open = self.push(first, stage);
+        let mut open = self.add_to_batch(first, stage);
         let _ = steps.pop();
         if let Some(deadline) = deadline {
             stage.wait_until(deadline);
         }
         let now = stage.now();
-        self.was_late(deadline, now);
+        self.record_lateness(deadline, now);
         stage.show(first.at);
         // In lockstep, joints end a batch: the next frame must wait, or belongs to the next joints.
         while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
@@ -214,22 +214,22 @@ impl Player {
             if next.bus_index != bus_link || waits || deadline.is_some_and(|deadline| deadline > now) {
                 break;
             }
-            self.was_late(deadline, now);
-            open = self.push(&next, stage).or(open);
+            self.record_lateness(deadline, now);
+            open = self.add_to_batch(&next, stage).or(open);
             let _ = steps.pop();
         }
         let frames = self.batch.len();
         let sync = self.syncs.as_ref().and_then(|syncs| syncs.get(bus_link)).filter(|_| open.is_some());
         self.batch.extend(sync.into_iter().flatten());
         let sent = stage.send(bus_link, &self.batch);
-        self.account(bus_link, frames, sent, stage);
+        self.count_sent(bus_link, frames, sent, stage);
         let is_down = self.down.get(bus_link).copied().unwrap_or(false);
         if let Some(place) = self.open.get_mut(bus_link).filter(|_| self.syncs.is_some() && !is_down) {
             *place = open.or(*place);
         }
     }
 
-    fn push(&mut self, due: &DueFrame, stage: &mut impl Stage) -> Option<OpenJoints> {
+    fn add_to_batch(&mut self, due: &DueFrame, stage: &mut impl Stage) -> Option<OpenJoints> {
         self.batch.push(due.frame);
         let FrameRole::Joints(open) = due.role else { return None };
         stage.announce(due.bus_index, open.round, open.epoch);
@@ -237,14 +237,14 @@ impl Player {
         Some(open)
     }
 
-    fn was_late(&mut self, deadline: Option<u64>, now: u64) {
+    fn record_lateness(&mut self, deadline: Option<u64>, now: u64) {
         if let Some(deadline) = deadline {
             // The histogram resizes itself, so recording cannot fail.
             let _ = self.played.late.record(now.saturating_sub(deadline));
         }
     }
 
-    fn account(
+    fn count_sent(
         &mut self,
         bus_index: usize,
         frames: usize,

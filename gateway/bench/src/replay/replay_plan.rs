@@ -170,7 +170,7 @@ impl<'a> ReplayPlan<'a> {
     /// Plans all frames whose order and meaning are settled.
     fn place_settled(&mut self, comparator: &mut Comparator) -> ControlFlow<()> {
         while let Some((next, decoded)) = self.settler.pop() {
-            self.place(&next, &decoded, comparator)?;
+            self.plan_frame(&next, &decoded, comparator)?;
         }
         ControlFlow::Continue(())
     }
@@ -195,11 +195,11 @@ impl<'a> ReplayPlan<'a> {
 
     /// Returns the step that restores the state at the start of the replayed part.
     #[must_use]
-    pub fn restoring(&self) -> PlayerStep {
+    pub fn restore_step(&self) -> PlayerStep {
         let bounds = self.survey.bounds();
         let of = |(bus, bus_link): (&super::survey::SurveyedBus, &Option<usize>)| {
             let there: Vec<_> = bus.cells_in(bounds).map(|(cell, _)| cell).collect();
-            Some(((*bus_link)?, bus.state.restoring(|cell| there.contains(&cell), bus.first_joints)))
+            Some(((*bus_link)?, bus.state.restoring_messages(|cell| there.contains(&cell), bus.first_joints)))
         };
         PlayerStep::Restore(
             self.survey.buses.iter().zip(&self.selection.destinations).filter_map(of).collect(),
@@ -218,7 +218,7 @@ impl<'a> ReplayPlan<'a> {
     }
 
     /// Plans one frame: sends it, or counts it as skipped.
-    fn place(
+    fn plan_frame(
         &mut self,
         next: &ReleasedFrame<(usize, Frame)>,
         decoded: &Decoded,
@@ -234,9 +234,9 @@ impl<'a> ReplayPlan<'a> {
         } else if next.nanos >= to {
             Some(reason::AFTER)
         } else {
-            self.unwanted(bus, &frame, decoded)
+            self.skip_reason(bus, &frame, decoded)
         };
-        let bus_link = self.bus_link(bus);
+        let bus_link = self.destination(bus);
         let role = bus_link.filter(|_| self.selection.reads).map_or(FrameRole::Plain, |bus_link| {
             let is_in_part = (from..to).contains(&next.nanos);
             classify(bus_link, next.nanos, decoded, unwanted.is_none(), is_in_part, comparator)
@@ -263,13 +263,13 @@ impl<'a> ReplayPlan<'a> {
     }
 
     /// Returns the index of the bus that receives the frames of a bus of the capture, if any.
-    fn bus_link(&self, bus: usize) -> Option<usize> {
+    fn destination(&self, bus: usize) -> Option<usize> {
         self.selection.destinations.get(bus).copied().flatten()
     }
 
     /// Returns the reason why a frame in the replayed part is not sent, or `None` if it is sent.
-    fn unwanted(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
-        let picked = self.bus_link(bus).is_some();
+    fn skip_reason(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
+        let picked = self.destination(bus).is_some();
         if frame.is_error() {
             return Some(reason::ERROR);
         }

@@ -8,8 +8,8 @@ use serde::Serialize;
 
 use super::comparator::{Tally, Uncompared};
 use super::difference::Difference;
-use super::player::BusLinkTally;
-use crate::summary::{CellError, cells_in_error, many};
+use super::player::BusTally;
+use crate::summary::{CellError, cells_in_error, count_noun};
 use model::quantiles::Quantiles;
 
 /// Summary of a replay.
@@ -64,7 +64,7 @@ pub struct BusSummary {
     pub kind: String,
     /// Counts of sent and refused frames.
     #[serde(flatten)]
-    pub frames: BusLinkTally,
+    pub frames: BusTally,
     /// Number of replies lost because they arrived faster than this program read them.
     pub unheard: u64,
 }
@@ -160,7 +160,7 @@ impl Summary {
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
                 wrong.push(format!(
                     "cells came too late for joints {}: --lockstep waits for them",
-                    many(expect.joints_skipped, "time", "times")
+                    count_noun(expect.joints_skipped, "time", "times")
                 ));
             }
         }
@@ -169,12 +169,12 @@ impl Summary {
         }
         if self.lost > 0 {
             let were = if self.lost == 1 { "was" } else { "were" };
-            let frames = many(self.lost, "frame", "frames");
+            let frames = count_noun(self.lost, "frame", "frames");
             wrong.push(format!("{frames} {were} lost while a bus was down"));
         }
         if self.refused > 0 {
             let were = if self.refused == 1 { "was" } else { "were" };
-            let frames = many(self.refused, "frame", "frames");
+            let frames = count_noun(self.refused, "frame", "frames");
             wrong.push(format!("{frames} {were} refused: a bus stayed full"));
         }
         (!wrong.is_empty()).then(|| wrong.join("; "))
@@ -185,7 +185,7 @@ impl Summary {
     #[must_use]
     pub fn first_line(&self) -> (bool, String) {
         let until = if self.interrupted { " until it was interrupted" } else { "" };
-        let sent = format!("{} sent", many(self.sent, "frame", "frames"));
+        let sent = format!("{} sent", count_noun(self.sent, "frame", "frames"));
         match (self.verdict(true), &self.expect) {
             (Some(why), _) => (false, format!("look at: {why}")),
             (None, None) => {
@@ -195,15 +195,15 @@ impl Summary {
                 (false, format!("look at: no reply was compared, {sent}"))
             }
             (None, Some(expect)) => {
-                let equal = format!("{} as recorded", many(expect.tally.equal, "reply", "replies"));
+                let equal = format!("{} as recorded", count_noun(expect.tally.equal, "reply", "replies"));
                 let lacking = expect.tally.lacking.reasons().iter().map(|(_, count)| count).sum::<u64>();
                 let unread = self.buses.iter().map(|bus| bus.unheard).sum();
                 let unchecked = [
-                    (lacking, many(lacking, "reply not compared", "replies not compared")),
-                    (unread, many(unread, "reply not read in time", "replies not read in time")),
+                    (lacking, count_noun(lacking, "reply not compared", "replies not compared")),
+                    (unread, count_noun(unread, "reply not read in time", "replies not read in time")),
                     (
                         expect.recording_dropped,
-                        many(
+                        count_noun(
                             expect.recording_dropped,
                             "frame not in the recording",
                             "frames not in the recording",
@@ -211,7 +211,11 @@ impl Summary {
                     ),
                     (
                         expect.unchecked_cells,
-                        many(expect.unchecked_cells, "configuration not known", "configurations not known"),
+                        count_noun(
+                            expect.unchecked_cells,
+                            "configuration not known",
+                            "configurations not known",
+                        ),
                     ),
                 ];
                 let unchecked = unchecked.into_iter().filter(|(count, _)| *count > 0).map(|(_, text)| text);

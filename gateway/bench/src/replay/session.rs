@@ -14,12 +14,12 @@ use protocol::message::Message;
 use super::ReplayError;
 use super::checks::Checks;
 use super::live::LiveStage;
-use super::player::{BusLinkTally, Player, PlayerResult};
+use super::player::{BusTally, Player, PlayerResult};
 use super::replay_plan::PlanSummary;
 use super::report::{BusSummary, Expect, Lockstep, Summary};
 use super::shared_state::SharedState;
-use super::source::{self, AHEAD};
-use super::start::{Buses, SkinOverride};
+use super::source::{self, STEP_QUEUE};
+use super::start::{Buses, SpawnSkin};
 use super::survey::SurveyedBus;
 use crate::bus::realtime::{self, Granted};
 use crate::error::RunError;
@@ -49,25 +49,25 @@ impl Session {
     pub(super) fn run(
         mut self,
         idle: Option<&Histogram<u64>>,
-        skin_override: Option<&SkinOverride>,
+        skin_override: Option<&SpawnSkin>,
     ) -> Result<Summary, ReplayError> {
         let mut receivers = Vec::new();
-        if self.shared_state.checks.options.hears() {
+        if self.shared_state.checks.options.receives() {
             let roots = std::mem::take(&mut self.buses.roots);
             for ((index, bus_link), roots) in self.buses.bus_links.iter().enumerate().zip(roots) {
                 let (bus_links, shared_state) =
                     (Arc::clone(&self.buses.bus_links), Arc::clone(&self.shared_state));
-                let hear = move || {
+                let receive = move || {
                     bus_links.get(index).map_or(0, |bus_link| shared_state.receive(index, bus_link, roots))
                 };
-                receivers.push(spawn(&format!("rx {}", bus_link.bus.name()), hear)?);
+                receivers.push(spawn(&format!("rx {}", bus_link.bus.name()), receive)?);
             }
         }
         let mut outcome = self.check_cells(skin_override).and_then(|()| self.play(idle));
-        if let Err(error) = self.leave() {
+        if let Err(error) = self.restore_mode() {
             self.progress.note(&error.to_string());
         }
-        self.shared_state.deaf.store(true, Ordering::Relaxed);
+        self.shared_state.stop_receiving.store(true, Ordering::Relaxed);
         for (bus_link, receiver) in receivers.into_iter().enumerate() {
             let unheard = receiver.join().unwrap_or(0);
             if let Some(bus) = outcome.as_mut().ok().and_then(|summary| summary.buses.get_mut(bus_link)) {
@@ -80,7 +80,7 @@ impl Session {
 
     /// Sends all steps. The returned summary lacks the number of unread frames, which the receivers report later.
     fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
-        let (queue, mut steps) = rtrb::RingBuffer::new(AHEAD);
+        let (queue, mut steps) = rtrb::RingBuffer::new(STEP_QUEUE);
         let shared_state = Arc::clone(&self.shared_state);
         let reader = spawn("reader", move || source::read_capture(&shared_state, queue))?;
         while !self.shared_state.ready.load(Ordering::Relaxed) && !reader.is_finished() {
@@ -88,7 +88,7 @@ impl Session {
         }
 
         let options = &self.shared_state.checks.options;
-        let hears = options.hears();
+        let hears = options.receives();
         let (log_sender, said) = mpsc::channel();
         let bus_links = Arc::clone(&self.buses.bus_links);
         let sync = || bus_links.iter().map(|bus_link| bus_link.frames(&Message::Sync).collect()).collect();
@@ -97,7 +97,7 @@ impl Session {
             shared_state: Arc::clone(&self.shared_state),
             log_sender,
             lockstep: Lockstep::default(),
-            in_vain: BTreeSet::new(),
+            resend_failed: BTreeSet::new(),
             down: BTreeSet::new(),
             bus_links,
         };
@@ -114,14 +114,14 @@ impl Session {
             let played = player.play(&mut steps, &mut live);
             (played, live, granted)
         })?;
-        let other_gateway = self.watch(&said, || player.is_finished());
+        let other_gateway = self.show_progress(&said, || player.is_finished());
         let (mut played, mut live, granted) = player.join().map_err(|_| RunError::Panicked("player"))?;
         let duration_s = began.elapsed().as_secs_f64();
         let plan_summary = reader.join().map_err(|_| RunError::Panicked("reader"))?;
         played.failure = other_gateway.or(played.failure);
         // A replay ended by a signal is compared up to that point.
-        self.shared_state.over.store(false, Ordering::Relaxed);
-        let bus_links = self.shared_state.checks.bus_links().enumerate();
+        self.shared_state.stop_sending.store(false, Ordering::Relaxed);
+        let bus_links = self.shared_state.checks.named_buses().enumerate();
         for (bus_link, (name, _)) in bus_links.filter(|_| hears && played.failure.is_none()) {
             if let Err(why) = live.report(bus_link) {
                 self.progress.note(&format!("{name}: its cells were not asked for a final report: {why}"));
@@ -131,7 +131,7 @@ impl Session {
         for line in said.try_iter() {
             self.progress.note(&line);
         }
-        self.look_at_processes(true);
+        self.note_ended_processes(true);
         let plan_summary = plan_summary.unwrap_or_else(|error| {
             played.failure.get_or_insert(ReplayError::Read(error));
             PlanSummary::default()
@@ -140,7 +140,7 @@ impl Session {
     }
 
     /// Shows notes about processes that have ended; with `last`, all pending notes.
-    fn look_at_processes(&mut self, last: bool) {
+    fn note_ended_processes(&mut self, last: bool) {
         let ended = self.buses.processes.ended();
         for note in self.ended.add_ended(ended, last) {
             self.progress.note(&note);
@@ -148,8 +148,12 @@ impl Session {
     }
 
     /// Shows the progress until the replay is over. Returns an error if another gateway appears.
-    fn watch(&mut self, said: &mpsc::Receiver<String>, is_over: impl Fn() -> bool) -> Option<ReplayError> {
-        let bar = self.progress.bar(self.length());
+    fn show_progress(
+        &mut self,
+        said: &mpsc::Receiver<String>,
+        is_over: impl Fn() -> bool,
+    ) -> Option<ReplayError> {
+        let bar = self.progress.bar(self.length_ms());
         let mut other_gateway = None;
         while !is_over() {
             thread::sleep(ROUND_PAUSE);
@@ -158,16 +162,16 @@ impl Session {
             for line in said.try_iter() {
                 self.progress.note(&line);
             }
-            self.look_at_processes(false);
-            if self.shared_state.checks.options.hears() && other_gateway.is_none() {
+            self.note_ended_processes(false);
+            if self.shared_state.checks.options.receives() && other_gateway.is_none() {
                 let bus_link = self.shared_state.comparator().other_gateway();
                 other_gateway = bus_link.map(|bus_link| {
-                    ReplayError::OtherGateway(self.shared_state.checks.bus_link(bus_link).to_owned())
+                    ReplayError::OtherGateway(self.shared_state.checks.bus_name(bus_link).to_owned())
                 });
             }
             if other_gateway.is_some() || self.signalled.load(Ordering::Relaxed) {
-                self.shared_state.over.store(true, Ordering::Relaxed);
-                self.shared_state.has_heard();
+                self.shared_state.stop_sending.store(true, Ordering::Relaxed);
+                self.shared_state.notify_waiting();
             }
         }
         bar.finish_and_clear();
@@ -175,7 +179,7 @@ impl Session {
     }
 
     /// Returns the length of the capture in ms, or `None` if the replay has no end.
-    fn length(&self) -> Option<u64> {
+    fn length_ms(&self) -> Option<u64> {
         let Checks { survey, options, .. } = &self.shared_state.checks;
         let (from, to) = survey.bounds();
         let from = from.max(survey.first.unwrap_or(0));
@@ -194,7 +198,7 @@ impl Session {
     ) -> Summary {
         let checks = &self.shared_state.checks;
         let options = &checks.options;
-        let total = |of: fn(&BusLinkTally) -> u64| played.bus_links.iter().map(of).sum();
+        let total = |of: fn(&BusTally) -> u64| played.bus_links.iter().map(of).sum();
         let bus = |(index, (name, bus)): (usize, (&str, &SurveyedBus))| {
             Some(BusSummary {
                 capture: bus.name.clone(),
@@ -215,20 +219,20 @@ impl Session {
             lost: total(|bus_link| bus_link.lost),
             skipped: plan_summary.skipped,
             sent_at_once: plan_summary.late,
-            buses: checks.bus_links().enumerate().filter_map(bus).collect(),
+            buses: checks.named_buses().enumerate().filter_map(bus).collect(),
             late_us: idle.map(|_| Quantiles::from_histogram(&played.late, 1e-3)),
             idle_late_us: idle.map(|idle| Quantiles::from_histogram(idle, 1e-3)),
             spin_us: options.spin.as_secs_f64() * 1e6,
             fifo: granted.fifo,
             memory_locked: granted.locked,
             lockstep: options.lockstep.then_some(lockstep),
-            expect: options.expect.map(|tolerance| self.expectation(tolerance)),
+            expect: options.expect.map(|tolerance| self.comparison_result(tolerance)),
             cell_errors: self.ended.errors(),
             failure: played.failure.map(|failure| failure.to_string()),
         }
     }
 
-    fn expectation(&self, tolerance: u16) -> Expect {
+    fn comparison_result(&self, tolerance: u16) -> Expect {
         let (comparator, checks) = (self.shared_state.comparator(), &self.shared_state.checks);
         let present = (0..self.buses.bus_links.len()).flat_map(|bus_link| comparator.present_cells(bus_link));
         let late = present.filter_map(|(_, cell)| {
@@ -240,7 +244,7 @@ impl Session {
             tally: *comparator.tally(),
             joints_skipped: late.sum(),
             recording_dropped: checks.survey.dropped,
-            unchecked_cells: checks.unchecked(),
+            unchecked_cells: checks.unknown_hashes(),
             first: comparator.first().cloned(),
         }
     }

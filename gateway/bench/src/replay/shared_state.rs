@@ -21,13 +21,13 @@ const POLL_INTERVAL: Duration = Duration::from_millis(50);
 pub(super) struct SharedState {
     pub(super) checks: Checks,
     comparator: Mutex<Comparator>,
-    heard: Condvar,
+    message_arrived: Condvar,
     /// Set once, to stop sending.
-    pub(super) over: AtomicBool,
+    pub(super) stop_sending: AtomicBool,
     /// Set when the queue of steps is full for the first time, or when the whole capture has been read.
     pub(super) ready: AtomicBool,
     /// Set once at the end, to stop receiving.
-    pub(super) deaf: AtomicBool,
+    pub(super) stop_receiving: AtomicBool,
     /// Number of frames sent, for the progress line.
     pub(super) sent: AtomicU64,
     /// Position of the replay in ns after its first frame.
@@ -36,16 +36,16 @@ pub(super) struct SharedState {
 
 impl SharedState {
     pub(super) fn new(checks: Checks) -> Self {
-        let named_cells = checks.bus_links().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
+        let named_cells = checks.named_buses().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
         let comparator =
             Comparator::new(named_cells, checks.survey.first.unwrap_or(0), checks.options.expect);
         Self {
             checks,
             comparator: Mutex::new(comparator),
-            heard: Condvar::new(),
-            over: AtomicBool::new(false),
+            message_arrived: Condvar::new(),
+            stop_sending: AtomicBool::new(false),
             ready: AtomicBool::new(false),
-            deaf: AtomicBool::new(false),
+            stop_receiving: AtomicBool::new(false),
             sent: AtomicU64::new(0),
             at: AtomicU64::new(0),
         }
@@ -57,8 +57,8 @@ impl SharedState {
     }
 
     /// Wakes the threads that wait for an answer.
-    pub(super) fn has_heard(&self) {
-        self.heard.notify_all();
+    pub(super) fn notify_waiting(&self) {
+        self.message_arrived.notify_all();
     }
 
     /// Waits until a message arrives, at most for `time`.
@@ -67,18 +67,18 @@ impl SharedState {
         comparator: MutexGuard<'a, Comparator>,
         time: Duration,
     ) -> MutexGuard<'a, Comparator> {
-        let waited = self.heard.wait_timeout(comparator, time);
+        let waited = self.message_arrived.wait_timeout(comparator, time);
         waited.unwrap_or_else(PoisonError::into_inner).0
     }
 
     pub(super) fn is_over(&self) -> bool {
-        self.over.load(Ordering::Relaxed)
+        self.stop_sending.load(Ordering::Relaxed)
     }
 
     /// Marks a bus as down and wakes waiting threads.
     pub(super) fn mark_down(&self, bus_index: usize) {
         self.comparator().mark_down(bus_index);
-        self.has_heard();
+        self.notify_waiting();
     }
 
     /// Receives on a bus until the end of the replay, and acts as the gateway's side of the wires to the roots. Returns
@@ -87,9 +87,9 @@ impl SharedState {
         realtime::prepare_receiver();
         let mut decoder = Decoder::new(Some(bus_link.format));
         // Start the wires at once: the cells may be present already, and cells that start build their tree at once.
-        roots.iter_mut().for_each(RootWires::explore);
+        roots.iter_mut().for_each(RootWires::start_sending);
         let (mut follower, mut end) = (Follower::new(roots, Duration::ZERO), OpenedOnce(&bus_link.bus));
-        while !self.deaf.load(Ordering::Relaxed) {
+        while !self.stop_receiving.load(Ordering::Relaxed) {
             match follower.step(&mut end, POLL_INTERVAL) {
                 FollowStep::Nothing | FollowStep::Drained | FollowStep::Refused(_) => continue,
                 FollowStep::Frames(_) | FollowStep::Leftover(_) => {}
@@ -104,7 +104,7 @@ impl SharedState {
                 }
             }
             let mut comparator = self.comparator();
-            follower.parts(|part| {
+            follower.for_each_item(|part| {
                 let FollowedItem::Frame(received) = part else { return };
                 let at = Micros(received.at_nanos / 1_000);
                 if !received.own
@@ -115,7 +115,7 @@ impl SharedState {
                 }
             });
             drop(comparator);
-            self.has_heard();
+            self.notify_waiting();
         }
         follower.dropped()
     }

@@ -9,12 +9,12 @@ use super::shared_state::SharedState;
 use trace::capture::{CaptureError, Entry, Reader};
 
 /// Number of steps read ahead: some tenths of a second of traffic on a full bus.
-pub(super) const AHEAD: usize = 16_384;
+pub(super) const STEP_QUEUE: usize = 16_384;
 /// Pause while the queue is full. The steps in the queue last much longer than the pause.
 const FULL_QUEUE_PAUSE: Duration = Duration::from_millis(2);
 
 /// Reads a capture once per pass and queues the steps.
-struct Source<'a> {
+struct CaptureReader<'a> {
     shared_state: &'a SharedState,
     replay_plan: ReplayPlan<'a>,
     queue: rtrb::Producer<PlayerStep>,
@@ -26,22 +26,22 @@ pub(super) fn read_capture(
     queue: rtrb::Producer<PlayerStep>,
 ) -> Result<PlanSummary, CaptureError> {
     let Checks { options, survey, routes, .. } = &shared_state.checks;
-    let (bus_links, hears) = (routes.bus_links.clone(), options.hears());
+    let (bus_links, hears) = (routes.destinations.clone(), options.receives());
     let selection = Selection { only: options.only, destinations: bus_links, reads: hears };
-    let mut source = Source { shared_state, replay_plan: ReplayPlan::new(survey, &selection), queue };
+    let mut source = CaptureReader { shared_state, replay_plan: ReplayPlan::new(survey, &selection), queue };
     let mut pass = 0_u32;
     while options.passes.is_none_or(|passes| pass < passes) && !source.is_over() {
         if hears && (pass > 0 || !shared_state.checks.are_fresh()) {
-            source.push(source.replay_plan.restoring());
+            source.push(source.replay_plan.restore_step());
         }
         let mut comparator = shared_state.comparator();
         comparator.expect_restart();
-        for (bus, bus_link) in survey.buses.iter().zip(&routes.bus_links) {
+        for (bus, bus_link) in survey.buses.iter().zip(&routes.destinations) {
             let Some(bus_link) = *bus_link else { continue };
             bus.latched.iter().for_each(|message| comparator.expect(bus_link, message, false));
         }
         drop(comparator);
-        source.pass()?;
+        source.read_pass()?;
         pass = pass.saturating_add(1);
     }
     shared_state.comparator().expect_end();
@@ -49,8 +49,8 @@ pub(super) fn read_capture(
     Ok(source.replay_plan.into_summary())
 }
 
-impl Source<'_> {
-    fn pass(&mut self) -> Result<(), CaptureError> {
+impl CaptureReader<'_> {
+    fn read_pass(&mut self) -> Result<(), CaptureError> {
         let mut reader = Reader::open_all(&self.shared_state.checks.options.files)?;
         while let Some(entry) = reader.next()? {
             let Entry::Frame(record) = entry else {

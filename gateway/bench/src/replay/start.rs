@@ -19,7 +19,7 @@ use super::{ReplayError, ReplayOptions, SpawnOptions};
 use crate::bus::listen::{self, Listener};
 use crate::bus::roots::{ReceiveFilter, RootWires};
 use crate::bus::served::{IfAbsent, ServedBus, open_or_serve};
-use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, Processes, in_memory, program};
+use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, Processes, memory_file, program_path};
 use crate::setup::names;
 use model::decode::Decoded;
 use trace::capture::{RecordingExtras, SKIN_ATTACHMENT};
@@ -31,7 +31,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(5);
 #[derive(Clone, Debug)]
 pub(super) struct Routes {
     /// Destination index of each bus of the capture; `None` if it is not replayed.
-    pub(super) bus_links: Vec<Option<usize>>,
+    pub(super) destinations: Vec<Option<usize>>,
     /// Index of each destination's bus in the capture, and name of the destination in this replay.
     pub(super) names: Vec<(usize, String)>,
 }
@@ -59,18 +59,18 @@ impl Routes {
                 target.clone_from(to);
             }
         }
-        let mut routes = Self { bus_links: Vec::new(), names: Vec::new() };
+        let mut routes = Self { destinations: Vec::new(), names: Vec::new() };
         for (bus, target) in targets.into_iter().enumerate() {
-            let goes = selected.is_empty() || selected.contains(&bus);
-            routes.bus_links.push(goes.then_some(routes.names.len()));
-            if goes {
+            let is_replayed = selected.is_empty() || selected.contains(&bus);
+            routes.destinations.push(is_replayed.then_some(routes.names.len()));
+            if is_replayed {
                 routes.names.push((bus, target));
             }
         }
         let names = routes.names.iter().map(|(_, name)| name.as_str());
         options.kinds.clone().restrict_to(names)?;
         let distinct: BTreeSet<_> = routes.names.iter().map(|(_, name)| name).collect();
-        if options.hears() && distinct.len() < routes.names.len() {
+        if options.receives() && distinct.len() < routes.names.len() {
             return Err(ReplayError::Merged);
         }
         Ok(routes)
@@ -113,7 +113,7 @@ pub(super) struct Buses {
 
 /// Skin of the cells to start.
 #[derive(Debug)]
-pub(super) struct SkinOverride {
+pub(super) struct SpawnSkin {
     pub(super) skin: Skin,
     pub(super) file: PathBuf,
     /// Memory file of an attached skin, from which cells read it.
@@ -121,14 +121,14 @@ pub(super) struct SkinOverride {
 }
 
 /// Returns the skin of the cells to start: the skin of the options, or else that of the recording.
-pub(super) fn skin_override(
+pub(super) fn spawn_skin(
     spawn: &SpawnOptions,
     routes: &Routes,
     extras: &RecordingExtras,
     file: &str,
-) -> Result<SkinOverride, ReplayError> {
+) -> Result<SpawnSkin, ReplayError> {
     let mut skin_override = if let Some(path) = &spawn.skin {
-        SkinOverride { skin: Skin::read(path)?, file: path.clone(), _memory: None }
+        SpawnSkin { skin: Skin::read(path)?, file: path.clone(), _memory: None }
     } else {
         let attached = extras.attachments.iter().find(|(name, _)| name == SKIN_ATTACHMENT);
         let Some((_, bytes)) = attached else {
@@ -136,8 +136,8 @@ pub(super) fn skin_override(
         };
         let text = String::from_utf8_lossy(bytes);
         let skin = Skin::parse_recorded(&format!("the skin in {file}"), &text)?;
-        let (memory, file) = in_memory(bytes)?;
-        SkinOverride { skin, file, _memory: Some(memory) }
+        let (memory, file) = memory_file(bytes)?;
+        SpawnSkin { skin, file, _memory: Some(memory) }
     };
     for (_, name) in &routes.names {
         if skin_override.skin.bus_named(name).is_none() {
@@ -165,7 +165,7 @@ pub(super) fn open(
     options: &ReplayOptions,
     survey: &Survey,
     routes: &Routes,
-    skin_override: Option<&SkinOverride>,
+    skin_override: Option<&SpawnSkin>,
     recorded: Option<&Skin>,
 ) -> Result<Buses, ReplayError> {
     let (mut bus_links, mut roots, mut served) = (Vec::new(), Vec::new(), Vec::new());
@@ -182,26 +182,26 @@ pub(super) fn open(
             .map_or_else(|| vec![Filter::ALL], |(skin, bus)| ReceiveFilter::for_bus(skin, bus, true).filters);
         let bus_options = BusOptions {
             fd: surveyed.has_fd || format == Some(Format::Fd),
-            filters: if options.hears() { receive_filter } else { Vec::new() },
+            filters: if options.receives() { receive_filter } else { Vec::new() },
             receive_buffer: options.receive_buffer,
             send_timeout: options.timeout,
             ..BusOptions::default()
         };
-        let (bus, of_ours) = match skin_override {
-            Some(_) => open_or_serve(name, options.kinds.kind_of(name), &bus_options, IfAbsent::Made)?,
+        let (bus, served_here) = match skin_override {
+            Some(_) => open_or_serve(name, options.kinds.kind_of(name), &bus_options, IfAbsent::Create)?,
             None => match Bus::open(name, options.kinds.kind_of(name), &bus_options) {
                 Err(error) if options.expect.is_some() && error.may_open_later() => {
-                    return Err(ReplayError::NotThere(error));
+                    return Err(ReplayError::BusAbsent(error));
                 }
                 opened => (opened?, None),
             },
         };
         // Real buses have real wires.
-        let has_wires = options.hears() && (!bus.kind().is_interface() || bus.is_virtual()?);
+        let has_wires = options.receives() && (!bus.kind().is_interface() || bus.is_virtual()?);
         let root = spawned_skin.filter(|_| has_wires).and_then(|(skin, bus)| RootWires::for_bus(skin, bus));
-        let (own, wired) = (of_ours.is_some(), root.is_some());
+        let (own, wired) = (served_here.is_some(), root.is_some());
         roots.push(root);
-        served.extend(of_ours);
+        served.extend(served_here);
         bus_links.push(ReplayBus { bus, format: format.unwrap_or(Format::Fd), own, wired });
     }
     Ok(Buses { bus_links: Arc::new(bus_links), roots, processes: Processes::default(), _served: served })
@@ -210,8 +210,8 @@ pub(super) fn open(
 impl Buses {
     /// Receives on the buses that existed before this replay, for as long as two gateways need to detect each other.
     /// Returns the cells found, by bus.
-    pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, ReplayError> {
-        let mut heard = vec![BTreeSet::new(); self.bus_links.len()];
+    pub(super) fn find_cells(&self) -> Result<Vec<BTreeSet<CellId>>, ReplayError> {
+        let mut found = vec![BTreeSet::new(); self.bus_links.len()];
         let filters = vec![Filter::exact(Id::command(Command::Joints)), Filter::for_kind(Kind::Network)];
         let again = |(index, bus_link): (usize, &ReplayBus)| {
             let options = BusOptions { filters: filters.clone(), ..BusOptions::default() };
@@ -227,9 +227,9 @@ impl Buses {
             for (index, listener) in &mut open {
                 listener.receive(Duration::ZERO)?;
                 let speakers: Vec<_> =
-                    listener.decoded().filter_map(|(_, decoded)| speaker(&decoded)).collect();
+                    listener.decoded().filter_map(|(_, decoded)| sender(&decoded)).collect();
                 for speaker in speakers {
-                    match (speaker, heard.get_mut(*index)) {
+                    match (speaker, found.get_mut(*index)) {
                         (Node::Gateway, _) => {
                             return Err(ReplayError::OtherGateway(listener.bus().name().to_owned()));
                         }
@@ -239,28 +239,28 @@ impl Buses {
                 }
             }
         }
-        Ok(heard)
+        Ok(found)
     }
 
     /// Starts the cells of a skin, on buses without cells.
     pub(super) fn start_cells(
         &mut self,
         spawn: &SpawnOptions,
-        skin_override: &SkinOverride,
+        skin_override: &SpawnSkin,
         heard: &[BTreeSet<CellId>],
     ) -> Result<(), ReplayError> {
         let there = self.bus_links.iter().zip(heard).find(|(_, cells)| !cells.is_empty());
         if let Some((bus_link, cells)) = there {
             let cells = names(&cells.iter().copied().collect::<Vec<_>>(), "");
-            return Err(ReplayError::CellsThere { bus: bus_link.bus.name().to_owned(), cells });
+            return Err(ReplayError::CellsPresent { bus: bus_link.bus.name().to_owned(), cells });
         }
-        let kinds = KindChoices::exactly(
+        let kinds = KindChoices::from_kinds(
             self.bus_links.iter().map(|bus_link| (bus_link.bus.name(), bus_link.bus.kind())),
         );
         self.processes = Processes::new()?;
         self.processes.start(&CellLaunch {
             directory: None,
-            program: &program("cell-node")?,
+            program: &program_path("cell-node")?,
             skin_file: &skin_override.file,
             skin: &skin_override.skin,
             kinds: &kinds,
@@ -272,7 +272,7 @@ impl Buses {
 }
 
 /// Returns the sender if it is a gateway or a cell.
-const fn speaker(decoded: &Decoded) -> Option<Node> {
+const fn sender(decoded: &Decoded) -> Option<Node> {
     if let Decoded::Message(Message::Network { from, .. }) = decoded {
         Some(*from)
     } else if let Decoded::Message(Message::Joints { .. }) = decoded {
@@ -284,13 +284,13 @@ const fn speaker(decoded: &Decoded) -> Option<Node> {
 
 impl ReplayOptions {
     /// Returns true if the replay receives messages of cells.
-    pub(super) fn hears(&self) -> bool {
+    pub(super) fn receives(&self) -> bool {
         self.expect.is_some() || self.lockstep || self.only == SenderFilter::Inputs
     }
 }
 
 /// Returns the message that makes a cell obey stimuli, or measure. In both cases, the cell then drops all stimuli.
-pub(super) fn mode(cell: CellId, obeys: bool) -> Message {
+pub(super) fn mode_message(cell: CellId, obeys: bool) -> Message {
     let words = core::array::from_fn(|place| i16::from(obeys && place == 0));
     let request = Request::Write { number: Parameter::Mode.number(), words };
     Message::Configure { to: Node::Cell(cell), tag: 0, request }

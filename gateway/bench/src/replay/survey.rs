@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use model::tracker::{Account, CellTracker, DEAD_AFTER, HeartbeatKind, MAX_LATE_EPOCHS};
+use model::tracker::{CellTracker, DEAD_AFTER, HeartbeatKind, MAX_LATE_EPOCHS, UplinkAccount};
 use protocol::can::Format;
 use protocol::candump::Record;
 use protocol::id::{CellId, Command, Id, Node};
@@ -15,17 +15,17 @@ use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use model::decode::{Decoded, Decoder};
-use model::latched::State;
+use model::latched::LatchedState;
 use trace::capture::{BusNote, LatchedFrame, Note};
 
 /// Silence in ns after which a cell counts as absent.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
 /// Maximum time in ns from the first joints after a cell's start to the cell's first heartbeat.
-const STARTS_NS: u64 = 100_000_000;
+const MAX_START_NS: u64 = 100_000_000;
 
 /// Maximum number of joint broadcasts between the sending and the recording of a page of counters.
-const PASSED: usize = 64;
+const MAX_COUNTER_DELAY: usize = 64;
 
 /// A part of a capture. Bounds are in ns since the start of the run or, if the capture has no run, since its first
 /// frame.
@@ -77,7 +77,7 @@ pub struct SurveyedBus {
     /// Messages from before the capture. The capture holds them as latched at its start.
     pub latched: Vec<Message>,
     /// State where the replayed part begins.
-    pub state: State,
+    pub state: LatchedState,
     /// First joints in the replayed part.
     pub first_joints: Option<(Epoch, Joints)>,
     /// Number of sums that cells sent.
@@ -85,7 +85,7 @@ pub struct SurveyedBus {
     /// Cells of the bus.
     pub cells: BTreeMap<CellId, SurveyedCell>,
     /// State of cells according to messages from before the capture.
-    before: BTreeMap<CellId, Before>,
+    before: BTreeMap<CellId, EarlierCell>,
 }
 
 /// A broadcast of joints.
@@ -100,10 +100,10 @@ struct Broadcast {
 
 /// State of a cell from before the capture.
 #[derive(Clone, Debug, Default)]
-struct Before {
+struct EarlierCell {
     tracked: CellTracker,
     /// Time of the cell's last message in ns since 1970.
-    heard: u64,
+    last_seen: u64,
     hash: KnownValue<u16>,
     measures: bool,
 }
@@ -157,7 +157,7 @@ pub enum KnownValue<T> {
     /// The value had changed before a cell reported it.
     TooLate,
     /// The value.
-    Yes(T),
+    Value(T),
 }
 
 impl Survey {
@@ -185,7 +185,7 @@ impl Survey {
                 let bus = self.bus(bus);
                 bus.is_accounted = true;
                 bus.state.apply(&message);
-                bus.take_before(&message, *nanos);
+                bus.add_latched(&message, *nanos);
                 bus.latched.push(message);
             }
         }
@@ -215,7 +215,7 @@ impl Survey {
             } else {
                 PartPosition::After
             };
-            bus.take(&message, from, nanos, place);
+            bus.add_message(&message, from, nanos, place);
         }
     }
 
@@ -226,14 +226,14 @@ impl Survey {
         // the capture may lack those of the other buses.
         let is_accounted = self.buses.iter().any(|bus| bus.is_accounted);
         for cell in self.buses.iter_mut().flat_map(|bus| bus.cells.values_mut()) {
-            cell.end(last);
+            cell.finish(last);
             cell.is_accounted = is_accounted;
         }
     }
 
     /// Handles a note: the cells of a lost bus are away until they send again. Their last answers may have been lost
     /// with the bus.
-    pub fn note(&mut self, note: &Note<'_>) {
+    pub fn add_note(&mut self, note: &Note<'_>) {
         let Some((name, BusNote::Lost)) = BusNote::parse(note) else { return };
         let Some(bus) = self.bus_named(name).and_then(|at| self.buses.get_mut(at)) else { return };
         // These joints may still be answered.
@@ -246,7 +246,7 @@ impl Survey {
 
     /// Returns the time in ns since 1970 from which seconds count: the start of the run, or the first frame.
     #[must_use]
-    pub fn zero(&self) -> u64 {
+    pub fn time_origin(&self) -> u64 {
         self.run_began.or(self.first).unwrap_or(0)
     }
 
@@ -254,8 +254,8 @@ impl Survey {
     /// frames older than the first one.
     #[must_use]
     pub fn bounds(&self) -> (u64, u64) {
-        let end = self.part.to.map_or(u64::MAX, |to| self.zero().saturating_add(to));
-        (self.part.from.map_or(0, |from| self.zero().saturating_add(from)), end)
+        let end = self.part.to.map_or(u64::MAX, |to| self.time_origin().saturating_add(to));
+        (self.part.from.map_or(0, |from| self.time_origin().saturating_add(from)), end)
     }
 
     /// Returns the index of a bus, by its name in the capture.
@@ -281,7 +281,7 @@ impl Survey {
 
 impl SurveyedBus {
     /// Handles a message from before the capture that is latched at its start.
-    fn take_before(&mut self, message: &Message, nanos: u64) {
+    fn add_latched(&mut self, message: &Message, nanos: u64) {
         if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =
             *message
         {
@@ -290,10 +290,10 @@ impl SurveyedBus {
             if before.tracked.receive(Micros(nanos / 1_000), message, None).word
                 != Some(HeartbeatKind::Claimant)
             {
-                before.heard = nanos;
+                before.last_seen = nanos;
                 before.measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
                 before.hash =
-                    if is_settled { KnownValue::Yes(heartbeat.configuration) } else { KnownValue::No };
+                    if is_settled { KnownValue::Value(heartbeat.configuration) } else { KnownValue::No };
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.addresses(**cell)) {
@@ -311,18 +311,18 @@ impl SurveyedBus {
         self.cells.entry(cell).or_insert_with(|| SurveyedCell::new(nanos, before)).mark_seen(nanos);
     }
 
-    fn take(&mut self, message: &Message, from: Option<CellId>, nanos: u64, place: PartPosition) {
+    fn add_message(&mut self, message: &Message, from: Option<CellId>, nanos: u64, place: PartPosition) {
         if place == PartPosition::Before {
             self.state.apply(message);
         }
         self.is_accounted |= matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
         self.sums += u64::from(matches!(message, Message::Sum { .. }));
         if let Some(cell) = from.and_then(|from| self.cells.get_mut(&from)) {
-            cell.take(message, nanos, place, &self.recent_joints);
+            cell.add_message(message, nanos, place, &self.recent_joints);
         } else if let Message::Joints { epoch, joints } = *message {
             self.joints += 1;
             self.recent_joints.push_back(Broadcast { epoch, number: self.joints, nanos });
-            if self.recent_joints.len() > PASSED {
+            if self.recent_joints.len() > MAX_COUNTER_DELAY {
                 self.recent_joints.pop_front();
             }
             if place == PartPosition::In {
@@ -339,13 +339,13 @@ impl SurveyedBus {
 }
 
 impl SurveyedCell {
-    fn new(nanos: u64, before: Option<&Before>) -> Self {
+    fn new(nanos: u64, before: Option<&EarlierCell>) -> Self {
         // A cell that sent just before the capture was present when it began.
         let first =
-            before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
+            before.map(|before| before.last_seen).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
         let mut tracked = before.map(|before| before.tracked.clone()).unwrap_or_default();
         // It is not known that messages of the cell between the two times are lost.
-        tracked.account = Account::default();
+        tracked.account = UplinkAccount::default();
         Self {
             hash: before.map_or(KnownValue::No, |before| before.hash),
             measured: before.is_some_and(|before| before.measures),
@@ -374,7 +374,7 @@ impl SurveyedCell {
     }
 
     /// Ends the survey of the cell at the end of the capture, `nanos` in ns since 1970.
-    fn end(&mut self, nanos: u64) {
+    fn finish(&mut self, nanos: u64) {
         self.unrecorded = self.tracked.account.uplink().lost;
         if let Some(away) = self.away {
             self.silences.push((away, u64::MAX));
@@ -386,7 +386,13 @@ impl SurveyedCell {
     }
 
     /// Handles a message that the cell sent after these joints.
-    fn take(&mut self, message: &Message, nanos: u64, place: PartPosition, joints: &VecDeque<Broadcast>) {
+    fn add_message(
+        &mut self,
+        message: &Message,
+        nanos: u64,
+        place: PartPosition,
+        joints: &VecDeque<Broadcast>,
+    ) {
         let word = self.tracked.receive(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
@@ -396,17 +402,17 @@ impl SurveyedCell {
                 // A restart sets the counters to 0. They then count joints from before this heartbeat.
                 Some(HeartbeatKind::Started { .. }) => {
                     let last = joints.back().map(|last| (last.number, last.nanos)).unwrap_or_default();
-                    let may_count = |joints: &&Broadcast| nanos <= joints.nanos.saturating_add(STARTS_NS);
+                    let may_count = |joints: &&Broadcast| nanos <= joints.nanos.saturating_add(MAX_START_NS);
                     let early = joints.iter().rev().take_while(may_count).count() as u64;
                     self.report = Some((ReceivedCounts::default(), last.0.saturating_sub(early), last.1));
                 }
-                Some(HeartbeatKind::First | HeartbeatKind::Known | HeartbeatKind::Shared) => {}
+                Some(HeartbeatKind::First | HeartbeatKind::Continued | HeartbeatKind::Shared) => {}
             }
-            self.heartbeat(heartbeat, nanos, place);
+            self.add_heartbeat(heartbeat, nanos, place);
         } else if let Message::Network { page: NetworkPage::Received(heard), epoch, .. } = *message {
             // The page carries the epoch of the last joints that its counters include.
             let at = joints.iter().rev().find(|joints| joints.epoch == epoch);
-            self.report(heard, at.map(|joints| (joints.number, joints.nanos)));
+            self.add_counters(heard, at.map(|joints| (joints.number, joints.nanos)));
         } else if let Message::Configured { answer: Answer::Value { number, written: true, .. }, .. } =
             *message
             && number == Parameter::Commit.number()
@@ -415,12 +421,12 @@ impl SurveyedCell {
             self.hash = match self.hash {
                 _ if place == PartPosition::Before => KnownValue::No,
                 KnownValue::No => KnownValue::TooLate,
-                known @ (KnownValue::TooLate | KnownValue::Yes(_)) => known,
+                known @ (KnownValue::TooLate | KnownValue::Value(_)) => known,
             };
         }
     }
 
-    fn heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: PartPosition) {
+    fn add_heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: PartPosition) {
         // A cell that claims its node id answers nothing.
         if heartbeat.state.has(Flags::CLAIMING) {
             self.claims.get_or_insert(nanos);
@@ -430,14 +436,14 @@ impl SurveyedCell {
             self.silences.push((since, nanos));
         }
         if place == PartPosition::Before || self.hash == KnownValue::No {
-            self.hash = KnownValue::Yes(heartbeat.configuration);
+            self.hash = KnownValue::Value(heartbeat.configuration);
         }
         self.measured |= place == PartPosition::In && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
     /// Handles a report of counters. `at` is the number and time of the last joints that they cover; it is `None` if
     /// those joints came before the capture, so that it is unknown which joints the counters cover.
-    fn report(&mut self, heard: ReceivedCounts, at: Option<(u64, u64)>) {
+    fn add_counters(&mut self, heard: ReceivedCounts, at: Option<(u64, u64)>) {
         let Some((joints, last)) = at else { return };
         if let Some((before, joints_before, from)) = self.report {
             let taken = heard.joints.wrapping_sub(before.joints);
@@ -445,7 +451,7 @@ impl SurveyedCell {
             let known = u64::from(taken) + u64::from(repeated);
             let between = joints.saturating_sub(joints_before);
             // A cell cannot receive more joints than were broadcast since its start, so it had not restarted.
-            if known <= between + PASSED as u64 {
+            if known <= between + MAX_COUNTER_DELAY as u64 {
                 self.untaken += between.saturating_sub(known);
                 match self.accounted.last_mut() {
                     Some((_, until)) if *until == from => *until = last,

@@ -4,7 +4,7 @@
 //! while the robot is halted, they hold the motion of the last tick, and cells latch them with the next joints: one
 //! broadcast late.
 
-use model::accelerometer::kinematics::UPRIGHT;
+use model::accelerometer::kinematics::UPRIGHT_GRAVITY;
 use model::accelerometer::{Accelerometers, RobotState};
 use protocol::fixed::Q3_12;
 use protocol::id::Node;
@@ -25,7 +25,7 @@ pub(super) struct Moved {
 
 impl Moved {
     /// Returns the state of the robot `seconds` before the tick (at most 0.1 s), at constant acceleration.
-    fn before(&self, seconds: f64) -> RobotState {
+    fn state_before(&self, seconds: f64) -> RobotState {
         let mut state = self.state;
         let dt = (seconds - self.at_s).clamp(-0.1, 0.0);
         let joints = state.position.iter_mut().zip(&mut state.speed).zip(&state.acceleration);
@@ -49,13 +49,13 @@ impl Accelerations {
     /// Creates the accelerometers of the scenario, if it has any.
     pub(super) fn new(options: &RunOptions) -> Option<Self> {
         let sheet = options.scenario.sensors.acceleration?;
-        let sensors = Accelerometers::new(&options.skin, &sheet, options.scenario.seed, UPRIGHT);
+        let sensors = Accelerometers::new(&options.skin, &sheet, options.scenario.seed, UPRIGHT_GRAVITY);
         Some(Self { sensors, broadcasts: 0 })
     }
 
     /// Returns the stimuli of a future epoch for each bus, or an empty list if the motion is not known in advance.
     /// `now` is the time in s since the start of the loop.
-    pub(super) fn ahead(
+    pub(super) fn stimuli_ahead(
         &self,
         options: &RunOptions,
         moved: Option<Moved>,
@@ -66,7 +66,7 @@ impl Accelerations {
         }
         match (&options.planned, options.scenario.motion) {
             (Some(planned), _) => {
-                self.stimuli(options, |seconds| planned.at(seconds), now, AppliesFrom::Epoch(epoch))
+                self.stimuli(options, |seconds| planned.state_at(seconds), now, AppliesFrom::Epoch(epoch))
             }
             (None, motion) if motion.state_at(now).is_some() => {
                 let state = |seconds| motion.state_at(seconds).unwrap_or_default();
@@ -78,7 +78,7 @@ impl Accelerations {
 
     /// Returns the stimuli that follow the latest broadcast, once per broadcast, or an empty list if they were sent
     /// ahead.
-    pub(super) fn latest(
+    pub(super) fn latest_stimuli(
         &mut self,
         options: &RunOptions,
         moved: Option<Moved>,
@@ -88,7 +88,7 @@ impl Accelerations {
         match moved {
             Some(moved) if self.broadcasts != broadcasts && (moved.is_halted || !is_known) => {
                 self.broadcasts = broadcasts;
-                self.stimuli(options, |seconds| moved.before(seconds), now, AppliesFrom::Next)
+                self.stimuli(options, |seconds| moved.state_before(seconds), now, AppliesFrom::Next)
             }
             _ => Vec::new(),
         }
@@ -122,10 +122,10 @@ mod tests {
         let mut state = RobotState::default();
         (state.position[1], state.speed[1], state.acceleration[1]) = (0.5, 1.0, -10.0);
         let moved = Moved { at_s: 2.0, state, is_halted: false };
-        let before = moved.before(1.99);
+        let before = moved.state_before(1.99);
         // q - v t + a t^2 / 2, v - a t.
         assert!((before.position[1] - (0.5 - 0.01 - 0.000_5)).abs() < 1e-12, "{before:?}");
         assert!((before.speed[1] - 1.1).abs() < 1e-12);
-        assert_eq!(moved.before(2.5), state);
+        assert_eq!(moved.state_before(2.5), state);
     }
 }

@@ -16,16 +16,16 @@ use protocol::usage::eprint_line;
 use super::bench::{Bench, POLL_INTERVAL};
 use super::receiver::BusEvent;
 use crate::error::RunError;
-use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, STARTING, program};
+use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, START_TIMEOUT, program_path};
 use crate::setup::{Timeout, names};
-use crate::view::View;
+use crate::view::BusView;
 use model::repeat::Repeats;
 use model::table::{Notice, Switch};
 
 /// Time within which running cells must send a heartbeat, and all cells must confirm their switches.
 pub(super) const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Interval after which switches are sent again to a cell that does not confirm them.
-pub(super) const SWITCH_AGAIN: Span = Span::from_millis(250);
+pub(super) const SWITCH_RETRY_INTERVAL: Span = Span::from_millis(250);
 
 /// Cells, by bus and node id, to which switches were sent, with the times.
 pub(super) type Announced = Repeats<(usize, CellId)>;
@@ -37,14 +37,14 @@ impl Bench<'_> {
         let listened = Instant::now() + GATEWAY_DETECTION_TIME;
         if options.spawn {
             if self.served.len() < self.bus_links.len() {
-                self.find_alone(listened)?;
+                self.check_for_others(listened)?;
             }
-            let program = program("cell-node")?;
+            let program = program_path("cell-node")?;
             self.processes.start(&CellLaunch {
                 program: &program,
                 skin_file: &options.skin_file,
                 skin: &options.skin,
-                kinds: &KindChoices::exactly(
+                kinds: &KindChoices::from_kinds(
                     self.bus_links.iter().map(|bus_link| (bus_link.link.name.as_str(), bus_link.link.kind)),
                 ),
                 directory: options.directory.as_deref(),
@@ -53,7 +53,7 @@ impl Bench<'_> {
             })?;
         }
         let cells = options.skin.cells.len();
-        self.wait(self.timeout(), |bench, timeout| {
+        self.poll_until(self.timeout(), |bench, timeout| {
             // Cells without parameters will not become ready.
             let ready = bench.count(|cell| cell.ready || cell.unconfigured);
             let is_over = timeout.is_over(ready);
@@ -61,8 +61,8 @@ impl Bench<'_> {
             Ok(Instant::now() >= listened && (ready == cells || is_over))
         })?;
         self.check_cells()?;
-        self.wake_up()?;
-        self.go_on_after_others();
+        self.resume_halted_cells()?;
+        self.continue_epochs();
         self.switch_cells()?;
         // Requests the counters, contact states and network positions of the cells.
         self.send_to_all(&Message::Report)?;
@@ -74,7 +74,7 @@ impl Bench<'_> {
     }
 
     /// Prints the lines that the options give for the start of the loop.
-    pub(super) fn announce(&self) {
+    pub(super) fn print_announcements(&self) {
         if self.options.quiet {
             return;
         }
@@ -86,11 +86,11 @@ impl Bench<'_> {
 
     /// Returns the maximum time without progress of the cells.
     pub(super) const fn timeout(&self) -> Duration {
-        if self.options.spawn { STARTING } else { DISCOVERY_TIMEOUT }
+        if self.options.spawn { START_TIMEOUT } else { DISCOVERY_TIMEOUT }
     }
 
     /// Polls until the check returns true.
-    pub(super) fn wait(
+    pub(super) fn poll_until(
         &mut self,
         timeout: Duration,
         mut is_last: impl FnMut(&mut Self, &mut Timeout) -> Result<bool, RunError>,
@@ -98,13 +98,13 @@ impl Bench<'_> {
         let mut timeout = Timeout::new(timeout);
         while !is_last(self, &mut timeout)? {
             thread::sleep(POLL_INTERVAL);
-            self.hear_while_starting()?;
+            self.check_for_failures()?;
         }
         Ok(())
     }
 
     /// Resumes cells that an earlier gateway has halted.
-    fn wake_up(&mut self) -> Result<(), RunError> {
+    fn resume_halted_cells(&mut self) -> Result<(), RunError> {
         self.send_to_all(&Message::Resume)?;
         let halted = |bench: &Self| bench.count(|cell| cell.halted);
         if halted(self) == 0 {
@@ -112,18 +112,18 @@ impl Bench<'_> {
         }
         // The next heartbeats show the state of the cells.
         self.send_to_all(&Message::Sync)?;
-        self.wait(DISCOVERY_TIMEOUT, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
+        self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
     }
 
     /// Checks that a bus that existed before has neither a gateway nor cells with the same node ids. Listening disturbs
     /// neither of them.
-    fn find_alone(&mut self, until: Instant) -> Result<(), RunError> {
-        self.wait(GATEWAY_DETECTION_TIME, |_, _| Ok(Instant::now() >= until))?;
+    fn check_for_others(&mut self, until: Instant) -> Result<(), RunError> {
+        self.poll_until(GATEWAY_DETECTION_TIME, |_, _| Ok(Instant::now() >= until))?;
         // Emulated cells are present already, and belong to this run.
         let others = self.bus_links.iter().enumerate().filter_map(|(bus, bus_link)| {
             let view = bus_link.view.lock().ok()?;
             let heard = view.cells.iter().filter(|cell| cell.seen).map(|cell| cell.node);
-            let others: Vec<_> = heard.filter(|node| !self.processes.runs(bus, node.get())).collect();
+            let others: Vec<_> = heard.filter(|node| !self.processes.has_process(bus, node.get())).collect();
             (!others.is_empty()).then(|| names(&others, &format!(" on {}", bus_link.link.name)))
         });
         let cells = others.collect::<Vec<_>>().join("; ");
@@ -131,19 +131,19 @@ impl Bench<'_> {
             return Ok(());
         }
         let embedded = self.bus_links.iter().any(|bus_link| !bus_link.link.kind.is_interface());
-        Err(RunError::CellsThere { cells, embedded })
+        Err(RunError::CellsPresent { cells, embedded })
     }
 
     /// Sets the first epoch to follow those of a former gateway, because cells that were running before have received
     /// its joints.
-    fn go_on_after_others(&mut self) {
+    fn continue_epochs(&mut self) {
         if self.options.spawn {
             return;
         }
-        let heard = |view: &View| -> Vec<_> {
+        let heard = |view: &BusView| -> Vec<_> {
             view.cells.iter().filter(|cell| cell.ready).map(|cell| cell.last_joints).collect()
         };
-        let last = after(&self.views().flat_map(|(_, view)| heard(&view)).collect::<Vec<_>>());
+        let last = last_epoch(&self.views().flat_map(|(_, view)| heard(&view)).collect::<Vec<_>>());
         self.first_epoch = last.next();
         if let Some(cycle) = &mut self.cycle {
             cycle.start_after(last);
@@ -161,7 +161,7 @@ impl Bench<'_> {
         if none || (spawned && !silent.is_empty()) {
             return Err(RunError::NotReady { cells: silent, spawned });
         }
-        let cells = self.names(|cell| cell.ready && cell.other);
+        let cells = self.names(|cell| cell.ready && cell.other_configuration);
         if !cells.is_empty() {
             return Err(RunError::OtherSkin { skin: self.options.skin_file.clone(), cells });
         }
@@ -184,11 +184,11 @@ impl Bench<'_> {
 
     /// Handles events while the bench starts. Returns an error if another gateway is found, a process ended, or a bus
     /// was lost.
-    fn hear_while_starting(&mut self) -> Result<(), RunError> {
+    fn check_for_failures(&mut self) -> Result<(), RunError> {
         if self.signalled.load(Ordering::Relaxed) {
             return Err(RunError::Interrupted);
         }
-        for (bus, bus_event) in self.bus_event.try_iter() {
+        for (bus, bus_event) in self.events.try_iter() {
             match bus_event {
                 BusEvent::Notice(Notice::OtherGateway) => return Err(self.other_gateway(bus)),
                 BusEvent::Down(why) | BusEvent::Lost(why) | BusEvent::Refused(why) => {
@@ -223,8 +223,8 @@ impl Bench<'_> {
 
     /// Sends all cells, before the first joints, the switches that a cell loses when it restarts.
     fn switch_cells(&mut self) -> Result<(), RunError> {
-        let mut announced = Announced::new(SWITCH_AGAIN);
-        let lacking = self.lacking();
+        let mut announced = Announced::new(SWITCH_RETRY_INTERVAL);
+        let lacking = self.unconfirmed_switches();
         for (bus, (bus_link, described)) in self.bus_links.iter().zip(&self.options.skin.buses).enumerate() {
             // Cells that ran before may be in any mode; newly started cells are in the default mode.
             let off = (!self.options.spawn && described.sensing == Sensing::Off)
@@ -235,17 +235,17 @@ impl Bench<'_> {
             }
         }
         announced.mark_all_sent(self.now());
-        self.wait(DISCOVERY_TIMEOUT, |bench, timeout| {
-            bench.switch_again(&mut announced)?;
+        self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| {
+            bench.repeat_switches(&mut announced)?;
             // Cells that have not confirmed by then get their switches again while the loop runs.
-            Ok(bench.lacking().is_empty() || timeout.is_over(0))
+            Ok(bench.unconfirmed_switches().is_empty() || timeout.is_over(0))
         })
     }
 
     /// Sends switches again to cells that have not confirmed them in time, because the cell restarted or a message was
     /// lost.
-    pub(super) fn switch_again(&self, announced: &mut Announced) -> Result<(), RunError> {
-        let lacking = self.lacking();
+    pub(super) fn repeat_switches(&self, announced: &mut Announced) -> Result<(), RunError> {
+        let lacking = self.unconfirmed_switches();
         let due = announced.due(self.now(), lacking.iter().map(|(cell, _)| *cell));
         for ((bus, cell), switches) in lacking.into_iter().filter(|(cell, _)| due.contains(cell)) {
             let Some(bus_link) = self.bus_links.get(bus) else { continue };
@@ -257,7 +257,7 @@ impl Bench<'_> {
     }
 
     /// Returns the reachable cells with unconfirmed switches, and those switches.
-    fn lacking(&self) -> Vec<((usize, CellId), Vec<Switch>)> {
+    fn unconfirmed_switches(&self) -> Vec<((usize, CellId), Vec<Switch>)> {
         let mut lacking = Vec::new();
         for (bus, bus_link) in
             self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())
@@ -265,8 +265,9 @@ impl Bench<'_> {
             let Ok(view) = bus_link.view.lock() else { continue };
             // Check the flag first: cells rarely lack a switch, and this would visit thousands of cells a hundred times
             // a second.
-            for cell in view.cells.iter().filter(|cell| view.lacking && cell.is_lacking()) {
-                lacking.push(((bus, cell.node), cell.lacks.into_iter().flatten().collect()));
+            for cell in view.cells.iter().filter(|cell| view.has_unconfirmed && cell.has_unconfirmed_switch())
+            {
+                lacking.push(((bus, cell.node), cell.unconfirmed_switches.into_iter().flatten().collect()));
             }
         }
         lacking
@@ -276,7 +277,7 @@ impl Bench<'_> {
 /// Returns the epoch after which this run starts its own, such that no cell takes the first joints as repeated: the
 /// next epoch must not be one of `taken`, the last epochs that the cells received. The search starts at the first
 /// cell's epoch, because buses may have had different ones.
-fn after(taken: &[Epoch]) -> Epoch {
+fn last_epoch(taken: &[Epoch]) -> Epoch {
     let mut last = taken.first().copied().unwrap_or_default();
     for _ in 0..u8::MAX {
         if !taken.contains(&last.next()) {
@@ -293,7 +294,7 @@ mod tests {
 
     #[test]
     fn the_first_epoch_is_new_to_the_cells_of_all_buses() {
-        let first = |taken: &[u8]| after(&taken.iter().map(|&epoch| Epoch(epoch)).collect::<Vec<_>>()).0;
+        let first = |taken: &[u8]| last_epoch(&taken.iter().map(|&epoch| Epoch(epoch)).collect::<Vec<_>>()).0;
         assert_eq!(first(&[]), 0);
         assert_eq!(first(&[7, 7, 7]), 7);
         assert_eq!(first(&[7, 7, 200, 200]), 7);

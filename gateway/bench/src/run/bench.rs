@@ -21,14 +21,14 @@ use super::commander::{RemoteControl, SwitchedBuses};
 use super::hosts::Hosts;
 use super::network::Network;
 use super::receiver::{BusEvent, ReceiverResult};
-use crate::bus::link::{SharedBus, Slot, may_return};
+use crate::bus::link::{BusSlot, SharedBus, is_recoverable};
 use crate::bus::served::ServedBus;
 use crate::emulate::Emulation;
 use crate::processes::Processes;
 use crate::processes::ended::EndedProcesses;
 use crate::record::Recorder;
 use crate::setup::names;
-use crate::view::{CellView, View};
+use crate::view::{BusView, CellView};
 use control::cycle::Cycle;
 use control::cycle::turn::{BusPort, Shared, TimedRecord};
 use model::table::Switch;
@@ -37,7 +37,7 @@ use model::table::Switch;
 pub(super) const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Tag of `configure` requests that set switches of cells.
-const SWITCH: u8 = 0x5E;
+const SWITCH_TAG: u8 = 0x5E;
 
 /// One bus of a bench.
 #[derive(Debug)]
@@ -45,11 +45,11 @@ pub(super) struct RunBus {
     pub(super) link: Arc<SharedBus>,
     pub(super) format: Format,
     /// The control loop's end of the bus; `None` once the loop has started.
-    pub(super) line: Option<(BusPort, Slot)>,
-    pub(super) view: Arc<Mutex<View>>,
+    pub(super) port: Option<(BusPort, BusSlot)>,
+    pub(super) view: Arc<Mutex<BusView>>,
     pub(super) receiver: Option<JoinHandle<ReceiverResult>>,
     /// Sends the receiver the cells that may have missed a message.
-    pub(super) in_doubt: Sender<BTreeSet<CellId>>,
+    pub(super) possibly_missed: Sender<BTreeSet<CellId>>,
     /// Other hosts connected to the bus.
     pub(super) hosts: Hosts,
     /// Network of its cells, if they answer with sums.
@@ -62,7 +62,7 @@ impl RunBus {
     pub(super) fn send(&self, message: &Message) -> Result<bool, BusError> {
         let frames: Vec<Frame> = message.encode().frames(self.format).collect();
         match self.link.send(&frames).map_err(BusError::from) {
-            Err(error) if may_return(&error) => {
+            Err(error) if is_recoverable(&error) => {
                 self.shared.unsent.fetch_add(frames.len() as u64, Ordering::Relaxed);
                 Ok(false)
             }
@@ -72,7 +72,7 @@ impl RunBus {
 
     /// Sends a switch to one cell or to all cells. The caller repeats it for cells that do not confirm.
     pub(super) fn switch(&self, to: Node, (number, words): Switch) -> Result<bool, BusError> {
-        self.send(&Message::Configure { to, tag: SWITCH, request: Request::Write { number, words } })
+        self.send(&Message::Configure { to, tag: SWITCH_TAG, request: Request::Write { number, words } })
     }
 }
 
@@ -86,7 +86,7 @@ pub(super) struct Bench<'a> {
     pub(super) backlog_dropped: Option<u64>,
     pub(super) shared: Arc<Shared>,
     pub(super) bus_links: Vec<RunBus>,
-    pub(super) bus_event: Inlet<(usize, BusEvent)>,
+    pub(super) events: Inlet<(usize, BusEvent)>,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) cycle: Option<Cycle>,
     /// Epoch of the first broadcast.
@@ -121,12 +121,12 @@ impl Bench<'_> {
     }
 
     /// Returns each bus with the view that its receiver maintains.
-    pub(super) fn views(&self) -> impl Iterator<Item = (&RunBus, MutexGuard<'_, View>)> {
+    pub(super) fn views(&self) -> impl Iterator<Item = (&RunBus, MutexGuard<'_, BusView>)> {
         self.bus_links.iter().filter_map(|bus_link| Some((bus_link, bus_link.view.lock().ok()?)))
     }
 
     /// Returns the networks of cells that answer with sums, with the views of their receivers.
-    pub(super) fn networks(&mut self) -> impl Iterator<Item = (&mut Network, MutexGuard<'_, View>)> {
+    pub(super) fn networks(&mut self) -> impl Iterator<Item = (&mut Network, MutexGuard<'_, BusView>)> {
         self.bus_links
             .iter_mut()
             .filter_map(|RunBus { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
@@ -138,9 +138,10 @@ impl Bench<'_> {
     }
 
     /// Returns the selected cells as text: `1, 2, 5 on vcan0`.
-    pub(super) fn names(&self, target: impl Fn(&CellView) -> bool) -> String {
+    pub(super) fn names(&self, selects: impl Fn(&CellView) -> bool) -> String {
         let names = self.views().filter_map(|(bus_link, view)| {
-            let nodes: Vec<_> = view.cells.iter().filter(|cell| target(cell)).map(|cell| cell.node).collect();
+            let nodes: Vec<_> =
+                view.cells.iter().filter(|cell| selects(cell)).map(|cell| cell.node).collect();
             (!nodes.is_empty()).then(|| names(&nodes, &format!(" on {}", bus_link.link.name)))
         });
         names.collect::<Vec<_>>().join("; ")

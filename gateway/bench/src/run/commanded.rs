@@ -12,9 +12,9 @@ use super::bench::{Bench, RunBus};
 use super::commander::{CommandError, RemoteControl};
 use super::measured::LoopTotals;
 use crate::bus::served::ServedBus;
-use crate::processes::{LaunchError, program};
+use crate::processes::{LaunchError, program_path};
 use crate::progress::Progress;
-use crate::remote::{BenchCommand, BenchState, BusState, LinkDown, Phase, ProcessState};
+use crate::remote::{BenchCommand, BenchState, BusStatus, LinkDown, Phase, ProcessState};
 use model::scenario::ProcessAction;
 
 /// Maximum number of commands carried out in one round, so that stimuli are not delayed.
@@ -25,15 +25,15 @@ const STATE_INTERVAL: Duration = Duration::from_millis(200);
 impl Bench<'_> {
     /// Carries out received commands, and sends the state if the interval is over. If the other side has ended, ends
     /// the remote control and brings back the buses that it has taken down.
-    pub(super) fn obey(&mut self, measured: &LoopTotals, progress: &Progress) {
+    pub(super) fn handle_remote(&mut self, measured: &LoopTotals, progress: &Progress) {
         let links = &self.bus_links;
-        self.commanded.settle(|bus| {
+        self.commanded.forget_working(|bus| {
             let link = &links.get(bus)?.link;
             (!link.is_gone()).then(|| link.state.commands.load(Ordering::Relaxed))
         });
         let Some(mut remote) = self.remote.take() else { return };
         if remote.lines.has_ended() {
-            self.commanded.release(|bus| commands(links, bus));
+            self.commanded.release(|bus| commands_sent(links, bus));
             // At the end of the run the other side may end first.
             if !self.signalled.load(Ordering::Relaxed) {
                 progress.error(
@@ -50,9 +50,9 @@ impl Bench<'_> {
                     let note = format!("view: {what}");
                     progress.note(&note);
                     self.recorder.iter().for_each(|recorder| recorder.note(&note));
-                    remote.answer(true, what);
+                    remote.add_reply(true, what);
                 }
-                Err(why) => remote.answer(false, format!("{what}: {why}")),
+                Err(why) => remote.add_reply(false, format!("{what}: {why}")),
             }
         }
         let now = Instant::now();
@@ -86,12 +86,12 @@ impl Bench<'_> {
 
     fn carry_out(&mut self, command: BenchCommand) -> Result<(), CommandError> {
         match command {
-            BenchCommand::Process { action, bus, node } => self.act(action, bus, node),
+            BenchCommand::Process { action, bus, node } => self.control_process(action, bus, node),
             BenchCommand::Link { down, bus, nodes } => self.command_link(down, bus, nodes),
             BenchCommand::Bus { down, bus } => {
                 self.commanded.check(down, bus)?;
                 self.switch_bus(down, bus)?;
-                self.commanded.switched(down, bus, commands(&self.bus_links, bus));
+                self.commanded.note_switched(down, bus, commands_sent(&self.bus_links, bus));
                 Ok(())
             }
         }
@@ -99,11 +99,11 @@ impl Bench<'_> {
 
     /// Returns the process of a cell, if it has one.
     fn process(&self, bus: usize, node: u8) -> Option<ProcessState> {
-        self.processes.states().find(|process| process.runs(bus, node))
+        self.processes.states().find(|process| process.runs_cell(bus, node))
     }
 
-    fn act(&mut self, action: ProcessAction, bus: usize, node: u8) -> Result<(), CommandError> {
-        cell(&self.options.skin, bus, node)?;
+    fn control_process(&mut self, action: ProcessAction, bus: usize, node: u8) -> Result<(), CommandError> {
+        find_cell(&self.options.skin, bus, node)?;
         let phase = self.process(bus, node).ok_or(CommandError::NoProcess)?.phase;
         match (action, phase) {
             (ProcessAction::Restart, _)
@@ -112,13 +112,13 @@ impl Bench<'_> {
             | (ProcessAction::Continue, Phase::Stopped) => {}
             (_, phase) => return Err(CommandError::Phase(phase)),
         }
-        self.processes.act(bus, node, action)?;
+        self.processes.apply(bus, node, action)?;
         Ok(())
     }
 
     fn command_link(&mut self, down: bool, bus: usize, [one, other]: [u8; 2]) -> Result<(), CommandError> {
         let skin = &self.options.skin;
-        let (one, other) = (cell(skin, bus, one)?, cell(skin, bus, other)?);
+        let (one, other) = (find_cell(skin, bus, one)?, find_cell(skin, bus, other)?);
         if !one.neighbors.contains(&Some(other.node)) {
             return Err(CommandError::NoWire);
         }
@@ -152,7 +152,7 @@ impl Bench<'_> {
             let pairs = network.links_down().into_iter();
             pairs.map(move |[one, other]| LinkDown { bus, nodes: [one.get(), other.get()] })
         });
-        let buses = self.bus_links.iter().enumerate().map(|(bus, bus_link)| BusState {
+        let buses = self.bus_links.iter().enumerate().map(|(bus, bus_link)| BusStatus {
             down: self.commanded.is_expected(bus),
             links: bus_link.network.is_some(),
         });
@@ -161,25 +161,25 @@ impl Bench<'_> {
             links_down: links_down.collect(),
             buses: buses.collect(),
             lateness: measured.lateness,
-            halted: measured.halts.why().map(str::to_owned),
+            halted: measured.halts.present_reason().map(str::to_owned),
             answers: remote.answers.clone(),
         }
     }
 }
 
 /// Returns the number of commands that this run has sent on a bus.
-fn commands(links: &[RunBus], bus: usize) -> u64 {
+fn commands_sent(links: &[RunBus], bus: usize) -> u64 {
     links.get(bus).map_or(0, |bus_link| bus_link.link.state.commands.load(Ordering::Relaxed))
 }
 
 /// Starts a server for an embedded bus.
 pub(super) fn serve(options: &RunOptions, bus: &str) -> Result<ServedBus, LaunchError> {
-    let program = program("vcan-setup")?;
+    let program = program_path("vcan-setup")?;
     ServedBus::start(&program, bus, options.directory.as_deref())
 }
 
 /// Finds a cell of the skin.
-fn cell(skin: &Skin, bus: usize, node: u8) -> Result<&Cell, CommandError> {
+fn find_cell(skin: &Skin, bus: usize, node: u8) -> Result<&Cell, CommandError> {
     if bus >= skin.buses.len() {
         return Err(CommandError::NoBus);
     }
@@ -215,8 +215,8 @@ mod tests {
     #[test]
     fn cells_are_those_of_the_skin() {
         let skin = Skin::parse("skin.toml", model::testing::SKIN).unwrap();
-        assert_eq!(cell(&skin, 0, 1).unwrap().node.get(), 1);
-        assert!(matches!(cell(&skin, 0, 200), Err(CommandError::NoCell)));
-        assert!(matches!(cell(&skin, usize::MAX, 1), Err(CommandError::NoBus)));
+        assert_eq!(find_cell(&skin, 0, 1).unwrap().node.get(), 1);
+        assert!(matches!(find_cell(&skin, 0, 200), Err(CommandError::NoCell)));
+        assert!(matches!(find_cell(&skin, usize::MAX, 1), Err(CommandError::NoBus)));
     }
 }

@@ -63,7 +63,7 @@ impl SwitchedBuses {
     }
 
     /// Notes that a bus was taken down or brought up after it had accepted this number of commands.
-    pub(super) fn switched(&mut self, down: bool, bus: usize, commands: u64) {
+    pub(super) fn note_switched(&mut self, down: bool, bus: usize, commands: u64) {
         self.0.insert(bus, if down { Switched::Down } else { Switched::Up { commands } });
     }
 
@@ -78,7 +78,7 @@ impl SwitchedBuses {
     /// Forgets the buses that work again, which have accepted a command since they were brought up. A bus accepts none
     /// until its receiver has noticed the loss and reopened it. `taken` returns the number of accepted commands, or
     /// `None` for a bus that is lost.
-    pub(super) fn settle(&mut self, taken: impl Fn(usize) -> Option<u64>) {
+    pub(super) fn forget_working(&mut self, taken: impl Fn(usize) -> Option<u64>) {
         self.0.retain(|bus, switched| match switched {
             Switched::Down => true,
             Switched::Up { commands } => taken(*bus).is_none_or(|taken| taken <= *commands),
@@ -124,7 +124,7 @@ impl RemoteControl {
         Self { lines, answers: Vec::new(), count: 0, due: Instant::now() }
     }
 
-    pub(super) fn answer(&mut self, done: bool, text: String) {
+    pub(super) fn add_reply(&mut self, done: bool, text: String) {
         self.count += 1;
         if self.answers.len() >= MAX_REPLIES {
             self.answers.remove(0);
@@ -152,38 +152,38 @@ mod tests {
         let mut buses = SwitchedBuses::default();
         assert!(matches!(buses.check(false, 0), Err(CommandError::Already("down"))));
         buses.check(true, 0).unwrap();
-        buses.switched(true, 0, 100);
+        buses.note_switched(true, 0, 100);
         assert!(matches!(buses.check(true, 0), Err(CommandError::Already("up"))));
-        buses.settle(|_| Some(105));
+        buses.forget_working(|_| Some(105));
         assert!(buses.is_down(0) && buses.is_expected(0), "what works there is of before");
         // The bus was taken down and up at once, so that its receiver has not noticed the change.
         buses.check(false, 0).unwrap();
-        buses.switched(false, 0, 105);
-        buses.settle(|_| Some(105));
+        buses.note_switched(false, 0, 105);
+        buses.forget_working(|_| Some(105));
         assert!(!buses.is_down(0) && buses.is_expected(0));
         assert!(matches!(buses.check(false, 0), Err(CommandError::ComesUp)));
-        buses.settle(|_| None);
+        buses.forget_working(|_| None);
         assert!(buses.is_expected(0), "the receiver has noticed it");
         // The bus was taken down again before it worked.
         buses.check(true, 0).unwrap();
-        buses.switched(true, 0, 105);
-        buses.switched(false, 0, 105);
-        buses.settle(|_| Some(105));
+        buses.note_switched(true, 0, 105);
+        buses.note_switched(false, 0, 105);
+        buses.forget_working(|_| Some(105));
         assert!(buses.is_expected(0) && !buses.is_expected(1));
-        buses.settle(|_| Some(106));
+        buses.forget_working(|_| Some(106));
         assert!(!buses.is_expected(0), "it works: its next loss is one");
     }
 
     #[test]
     fn buses_that_a_remote_had_down_come_back_without_it() {
         let mut buses = SwitchedBuses::default();
-        buses.switched(true, 0, 7);
-        buses.switched(false, 1, 7);
+        buses.note_switched(true, 0, 7);
+        buses.note_switched(false, 1, 7);
         buses.release(|_| 9);
         assert!(!buses.is_down(0) && buses.is_expected(0) && buses.is_expected(1));
-        buses.settle(|_| Some(9));
+        buses.forget_working(|_| Some(9));
         assert!(buses.is_expected(0) && !buses.is_expected(1));
-        buses.settle(|_| Some(10));
+        buses.forget_working(|_| Some(10));
         assert!(!buses.is_expected(0));
     }
 }

@@ -14,18 +14,20 @@ use crate::error::RunError;
 use crate::view::CellView;
 
 /// Time that cells have to report their counters and to clear their contact state; they need some milliseconds.
-const ANSWERING: Duration = Duration::from_millis(500);
+const REPORT_TIMEOUT: Duration = Duration::from_millis(500);
 /// Value of the mode in which cells obey stimuli.
 const TEST_MODE: i16 = 1;
 
 impl Bench<'_> {
     /// Waits briefly until the contact state of all cells in test mode is known; their counters show whether they have
     /// received stimuli before. If the scenario touches the skin, clears the contact state of the cells.
-    pub(super) fn know_contacts(&mut self, script: &mut Script) -> Result<(), RunError> {
+    pub(super) fn settle_contacts(&mut self, script: &mut Script) -> Result<(), RunError> {
         let unreported = |cell: &CellView| cell.unclear && !cell.responded.counters;
-        self.wait(ANSWERING, |bench, timeout| Ok(bench.count(unreported) == 0 || timeout.is_over(0)))?;
+        self.poll_until(REPORT_TIMEOUT, |bench, timeout| {
+            Ok(bench.count(unreported) == 0 || timeout.is_over(0))
+        })?;
         if script.touches.cells().next().is_some() {
-            self.wait(DISCOVERY_TIMEOUT, |bench, timeout| {
+            self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| {
                 bench.clear_contacts(script)?;
                 Ok(bench.count(|cell| cell.unclear) == 0 || timeout.is_over(0))
             })?;
@@ -46,7 +48,7 @@ impl Bench<'_> {
         if script.touches.cells().next().is_none() {
             return Ok(());
         }
-        let unclear = self.unclear();
+        let unclear = self.unclear_cells();
         let due = script.cleared.due(self.now(), unclear);
         for &(bus, cell) in &due {
             let Some(bus_link) = self.bus_links.get(bus) else { continue };
@@ -56,11 +58,11 @@ impl Bench<'_> {
         if due.is_empty() || script.has_not_begun() {
             return Ok(());
         }
-        self.remind(script, |it| due.contains(&(it.bus, it.node)))
+        self.resend_stimuli(script, |it| due.contains(&(it.bus, it.node)))
     }
 
     /// Returns the cells on working buses that may hold stimuli which this run has not received.
-    fn unclear(&self) -> Vec<(usize, CellId)> {
+    fn unclear_cells(&self) -> Vec<(usize, CellId)> {
         let mut unclear = Vec::new();
         for (bus, bus_link) in
             self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())

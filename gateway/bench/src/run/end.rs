@@ -17,7 +17,7 @@ use crate::error::RunError;
 use crate::record::feed::Unrecorded;
 use crate::record::{Recorder, backlog};
 use crate::summary::{BusSummary, CellSummary, LoopSummary, NetworkSummary, OutagesSummary, Summary};
-use crate::view::View;
+use crate::view::BusView;
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Responded};
 use trace::recording::account::RecordingAccount;
@@ -27,14 +27,14 @@ const FINAL_REPORT_TIMEOUT: Duration = Duration::from_secs(3);
 
 impl Bench<'_> {
     /// Runs the control loop to its end or to its failure. Returns the summary.
-    pub(super) fn watch(mut self) -> Summary {
+    pub(super) fn run_loop(mut self) -> Summary {
         let mut summary = Summary::empty(&self.options.skin);
         let mut measured = LoopTotals::new();
-        let failure = self.drive(&mut summary, &mut measured).err().map(|error| error.to_string());
+        let failure = self.control_loop(&mut summary, &mut measured).err().map(|error| error.to_string());
         let received = self.stop_receivers();
         summary.recording = self.finish_recording(&received);
         if failure.is_some() {
-            self.say_what_is_kept(summary.recording.as_ref());
+            self.report_kept_files(summary.recording.as_ref());
         }
         self.summarise(summary, &measured, &received).with_verdict(failure)
     }
@@ -44,7 +44,7 @@ impl Bench<'_> {
         let mut summary = Summary::empty(&self.options.skin);
         let received = self.stop_receivers();
         summary.recording = self.recorder.take().map(Recorder::discard);
-        self.say_what_is_kept(summary.recording.as_ref());
+        self.report_kept_files(summary.recording.as_ref());
         if error.exit_code() != 1 {
             return Err(error);
         }
@@ -52,7 +52,7 @@ impl Bench<'_> {
     }
 
     /// Prints the paths of the files that contain the frames received before a failure.
-    fn say_what_is_kept(&self, recording: Option<&RecordingAccount>) {
+    fn report_kept_files(&self, recording: Option<&RecordingAccount>) {
         if self.options.quiet {
             return;
         }
@@ -62,7 +62,7 @@ impl Bench<'_> {
     }
 
     /// Waits for late replies, and requests the counters and a last heartbeat of all cells.
-    pub(super) fn last_words(&self, interrupted: bool) -> Result<(), RunError> {
+    pub(super) fn request_final_reports(&self, interrupted: bool) -> Result<(), RunError> {
         let two_periods = Duration::try_from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz());
         thread::sleep(two_periods.unwrap_or_default());
         self.wait_until(Self::has_caught_up);
@@ -89,7 +89,7 @@ impl Bench<'_> {
     /// Returns true if all ready cells on working buses have sent a report for which `said` is true.
     fn all_have(&self, said: impl Fn(&Responded) -> bool) -> bool {
         self.bus_links.iter().filter(|bus_link| bus_link.link.state.is_there()).all(|bus_link| {
-            let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.responded));
+            let all = |view: &BusView| view.cells.iter().all(|cell| !cell.ready || said(&cell.responded));
             bus_link.view.lock().map_or(true, |view| all(&view))
         })
     }
@@ -134,7 +134,7 @@ impl Bench<'_> {
         Summary {
             cells: self.cell_summaries(received),
             cell_errors: self.ended.errors(),
-            halted: measured.halts.why().map(str::to_owned),
+            halted: measured.halts.present_reason().map(str::to_owned),
             halts: measured.halts.all(),
             further_halts: measured.halts.further,
             before_halt: measured.halts.history(&self.options.skin),
@@ -189,13 +189,13 @@ impl Bench<'_> {
                 deepest: network.deepest(),
                 differences: network.differences.iter().map(ToString::to_string).collect(),
                 unreachable: network.unreachable().collect(),
-                longest_unreachable_s: network.longest.seconds(),
+                longest_unreachable_s: network.longest_unreachable.seconds(),
                 parent_changes: table.parent_changes(),
             });
             let outages = OutagesSummary {
-                times: outages.times,
-                lost_s: outages.lost(Instant::now()).as_secs_f64(),
-                at_end: outages.lasts(),
+                times: outages.count,
+                lost_s: outages.total_lost(Instant::now()).as_secs_f64(),
+                at_end: outages.is_ongoing(),
                 ticks: measured.missing.get(index.min(31)).copied().unwrap_or(0),
             };
             let kind = link.kind.to_string();

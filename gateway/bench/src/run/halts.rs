@@ -7,15 +7,15 @@ use std::collections::VecDeque;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
-use crate::summary::{HaltSummary, TickBefore};
+use crate::summary::{HaltSummary, TickSummary};
 use control::cycle::Halt;
 use control::cycle::carried::bit;
 use control::cycle::turn::TimedRecord;
 
 /// Number of kept ticks: 0.4 s at 500 Hz.
-const TICKS: usize = 200;
+const KEPT_TICKS: usize = 200;
 /// Maximum number of halts listed one by one.
-const HALTS: usize = 100;
+const MAX_LISTED_HALTS: usize = 100;
 
 /// Halts of a run.
 #[derive(Debug, Default)]
@@ -34,7 +34,7 @@ pub(super) struct Halts {
 impl Halts {
     /// Adds the next tick, and the begin or end of a halt.
     pub(super) fn add_tick(&mut self, timed: &TimedRecord) {
-        if self.ring.len() == TICKS {
+        if self.ring.len() == KEPT_TICKS {
             self.ring.pop_front();
         }
         self.ring.push_back(*timed);
@@ -46,21 +46,21 @@ impl Halts {
                     at_s: seconds(record.tick.time),
                     tick: record.tick.number,
                     epoch: record.epoch.0,
-                    reason: reason(why),
+                    reason: halt_text(why),
                     until_s: None,
                 });
             }
             (None, Some(halted)) => {
                 halted.until_s = Some(seconds(record.tick.time));
-                self.end();
+                self.end_halt();
             }
             (Some(_), Some(_)) | (None, None) => {}
         }
     }
 
-    fn end(&mut self) {
+    fn end_halt(&mut self) {
         let Some(halted) = self.lasting.take() else { return };
-        if self.halts.len() < HALTS {
+        if self.halts.len() < MAX_LISTED_HALTS {
             self.halts.push(halted);
         } else {
             self.further += 1;
@@ -68,7 +68,7 @@ impl Halts {
     }
 
     /// Reason of the present halt, if any.
-    pub(super) fn why(&self) -> Option<&str> {
+    pub(super) fn present_reason(&self) -> Option<&str> {
         self.lasting.as_ref().map(|halted| halted.reason.as_str())
     }
 
@@ -78,18 +78,18 @@ impl Halts {
     }
 
     /// Ticks up to the last halt, oldest first.
-    pub(super) fn history(&self, skin: &Skin) -> Vec<TickBefore> {
-        self.before.iter().map(|timed| tick(timed, skin)).collect()
+    pub(super) fn history(&self, skin: &Skin) -> Vec<TickSummary> {
+        self.before.iter().map(|timed| tick_summary(timed, skin)).collect()
     }
 }
 
 /// Converts a tick for the summary.
 #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
-fn tick(timed: &TimedRecord, skin: &Skin) -> TickBefore {
+fn tick_summary(timed: &TimedRecord, skin: &Skin) -> TickSummary {
     let record = &timed.record;
     let joints = |all: &[f64]| all.iter().copied().take(skin.robot.joints.len()).collect();
     let lost = skin.buses.iter().enumerate().filter(|(index, _)| record.missing & bit(*index) != 0);
-    TickBefore {
+    TickSummary {
         tick: record.tick.number,
         time_s: seconds(record.tick.time),
         late_us: timed.late_ns as f64 / 1e3,
@@ -111,7 +111,7 @@ fn tick(timed: &TimedRecord, skin: &Skin) -> TickBefore {
     }
 }
 
-fn reason(why: Halt) -> String {
+fn halt_text(why: Halt) -> String {
     match why {
         Halt::BadCycles(why) => format!("too many bad cycles in a row: {why}"),
         Halt::Frame => "a halt frame was received".to_owned(),
@@ -188,13 +188,13 @@ mod tests {
         let limit = u64::from(testing::skin().safety.bad_cycles);
         let mut bench = Bench::new(1_000);
         bench.ticks(1_000 + limit - 1);
-        assert_eq!((bench.halts.why(), bench.halts.all().len()), (None, 0));
+        assert_eq!((bench.halts.present_reason(), bench.halts.all().len()), (None, 0));
         bench.ticks(5_000);
         let [halted] = bench.halts.all().try_into().unwrap();
         let tick = 1_000 + limit - 1;
         let reason = "too many bad cycles in a row: the external controller's answer is missing";
         assert_eq!((halted.tick, halted.reason.as_str(), halted.until_s), (tick, reason, None));
-        assert_eq!(bench.halts.why(), Some(reason));
+        assert_eq!(bench.halts.present_reason(), Some(reason));
         assert!((halted.at_s - f64::from(u32::try_from(tick).unwrap()) * 0.002).abs() < 1e-9, "{halted:?}");
         assert_eq!(u64::from(halted.epoch), tick / 8 % 256, "of the last joints, as the bus has it");
 
@@ -217,13 +217,13 @@ mod tests {
         for _ in 0..150 {
             bench.sums.halts += 1;
             bench.ticks(3);
-            assert_eq!(bench.halts.why(), Some("a halt frame was received"));
+            assert_eq!(bench.halts.present_reason(), Some("a halt frame was received"));
             bench.sums.resumes += 1;
             bench.ticks(2);
-            assert_eq!(bench.halts.why(), None);
+            assert_eq!(bench.halts.present_reason(), None);
         }
         let all = bench.halts.all();
-        assert_eq!((all.len(), bench.halts.further), (HALTS, 50));
+        assert_eq!((all.len(), bench.halts.further), (MAX_LISTED_HALTS, 50));
         for (number, halted) in (0_u64..).zip(&all) {
             assert_eq!(halted.tick, 10 + 5 * number);
             let lasted = halted.until_s.unwrap() - halted.at_s;
@@ -234,7 +234,7 @@ mod tests {
         let all = bench.halts.all();
         assert_eq!(
             (all.len(), all.last().unwrap().until_s),
-            (HALTS + 1, None),
+            (MAX_LISTED_HALTS + 1, None),
             "one that lasts is always there"
         );
         assert_eq!(bench.halts.history(&testing::skin()).last().unwrap().tick, all.last().unwrap().tick);

@@ -12,13 +12,13 @@ use crate::setup::names;
 use crate::summary::HostSummary;
 
 /// Interval between attempts to connect to a link.
-const LOOK_AGAIN: Duration = Duration::from_millis(500);
+const RECONNECT_INTERVAL: Duration = Duration::from_millis(500);
 
 /// The other hosts of a bus, and the connection to its link.
 #[derive(Debug)]
 pub(super) struct Hosts {
     reports: Option<ReportReader>,
-    look_at: Instant,
+    reconnect_at: Instant,
     known: KnownHosts,
 }
 
@@ -28,7 +28,7 @@ pub(super) struct HostChanges {
     /// Messages for the user.
     pub(super) notes: Vec<String>,
     /// Cells whose packets or stimuli may be lost.
-    pub(super) in_doubt: BTreeSet<CellId>,
+    pub(super) possibly_missed: BTreeSet<CellId>,
     /// Cells in doubt whose hosts are reachable.
     pub(super) reached: BTreeSet<CellId>,
 }
@@ -52,25 +52,25 @@ struct HostState {
 
 impl Hosts {
     pub(super) fn new() -> Self {
-        Self { reports: None, look_at: Instant::now(), known: KnownHosts::default() }
+        Self { reports: None, reconnect_at: Instant::now(), known: KnownHosts::default() }
     }
 
     /// Reads the reports of the bus's link without waiting for them.
     pub(super) fn read_reports(&mut self, link: &SharedBus) -> HostChanges {
         let (now, mut changes) = (Instant::now(), HostChanges::default());
-        if self.reports.is_none() && self.look_at <= now {
-            self.look_at = now + LOOK_AGAIN;
-            self.reports = link.reports().ok();
+        if self.reports.is_none() && self.reconnect_at <= now {
+            self.reconnect_at = now + RECONNECT_INTERVAL;
+            self.reports = link.connect_reports().ok();
         }
         match self.reports.as_mut().map(ReportReader::take) {
             Some(Ok(reports)) => {
                 for report in reports {
-                    self.known.take(&link.name, report, now, &mut changes);
+                    self.known.add_report(&link.name, report, now, &mut changes);
                 }
             }
             Some(Err(error)) => {
                 self.reports = None;
-                self.known.end(&link.name, &error.to_string(), now, &mut changes);
+                self.known.end_link(&link.name, &error.to_string(), now, &mut changes);
             }
             None => {}
         }
@@ -94,8 +94,8 @@ impl Hosts {
         let summary = |(name, of): (&String, &HostState)| HostSummary {
             name: name.clone(),
             cells: of.newest.nodes.len(),
-            gone: of.outages.times,
-            gone_s: of.outages.lost(Instant::now()).as_secs_f64(),
+            gone: of.outages.count,
+            gone_s: of.outages.total_lost(Instant::now()).as_secs_f64(),
             at_end: of.newest.is_there,
             lost_from: of.lost[0],
             lost_to: of.lost[1],
@@ -105,7 +105,7 @@ impl Hosts {
 }
 
 impl KnownHosts {
-    fn take(&mut self, bus: &str, report: LinkReport, now: Instant, changes: &mut HostChanges) {
+    fn add_report(&mut self, bus: &str, report: LinkReport, now: Instant, changes: &mut HostChanges) {
         let is_first = !std::mem::replace(&mut self.is_linked, true);
         for (host, newest) in report.hosts {
             let known = self.hosts.entry(host.clone()).or_default();
@@ -127,7 +127,7 @@ impl KnownHosts {
             if before.is_there != newest.is_there {
                 let how = if newest.is_there {
                     known.outages.end(now);
-                    if is_first || known.outages.times == 0 { "is linked" } else { "is reached again" }
+                    if is_first || known.outages.count == 0 { "is linked" } else { "is reached again" }
                 } else {
                     known.outages.begin(now);
                     "is gone, or not reached"
@@ -141,7 +141,7 @@ impl KnownHosts {
                     || before.heard.lives != newest.heard.lives
                     || was[1] != is[1]);
             if is_disturbed {
-                changes.in_doubt.extend(&cells);
+                changes.possibly_missed.extend(&cells);
                 if newest.is_there {
                     changes.reached.extend(&cells);
                 }
@@ -150,11 +150,11 @@ impl KnownHosts {
     }
 
     /// Handles the end of the link process on this machine. The next link process counts from zero.
-    fn end(&mut self, bus: &str, why: &str, now: Instant, changes: &mut HostChanges) {
+    fn end_link(&mut self, bus: &str, why: &str, now: Instant, changes: &mut HostChanges) {
         changes.notes.push(format!("the link of {bus} to other hosts has ended ({why})"));
         for known in self.hosts.values_mut() {
             let nodes = std::mem::take(&mut known.newest).nodes;
-            changes.in_doubt.extend(nodes.iter().filter_map(|&node| CellId::new(node.into()).ok()));
+            changes.possibly_missed.extend(nodes.iter().filter_map(|&node| CellId::new(node.into()).ok()));
             known.newest.nodes = nodes;
             known.outages.begin(now);
         }
@@ -188,8 +188,13 @@ mod tests {
         fn take(&mut self, hosts: &[(&str, bool, u64, u64, u64)]) -> (Vec<String>, usize, usize) {
             self.2 += 1;
             let mut changes = HostChanges::default();
-            self.0.known.take("vcan0", report(hosts), self.1 + Duration::from_secs(self.2), &mut changes);
-            (changes.notes, changes.in_doubt.len(), changes.reached.len())
+            self.0.known.add_report(
+                "vcan0",
+                report(hosts),
+                self.1 + Duration::from_secs(self.2),
+                &mut changes,
+            );
+            (changes.notes, changes.possibly_missed.len(), changes.reached.len())
         }
     }
 
@@ -231,8 +236,8 @@ mod tests {
         of.take(&[("b", true, 1, 10, 0)]);
         of.take(&[("b", true, 1, 15, 0)]);
         let mut changes = HostChanges::default();
-        of.0.known.end("vcan0", "end of file", of.1 + Duration::from_secs(3), &mut changes);
-        assert_eq!((changes.in_doubt.len(), changes.reached.len()), (2, 0));
+        of.0.known.end_link("vcan0", "end of file", of.1 + Duration::from_secs(3), &mut changes);
+        assert_eq!((changes.possibly_missed.len(), changes.reached.len()), (2, 0));
         assert!(of.0.is_away(CellId::new(9).unwrap()), "its heartbeats may still be on their way");
         let (notes, _, reached) = of.take(&[("b", true, 1, 2, 0)]);
         assert_eq!((notes.len(), reached), (1, 2));

@@ -14,7 +14,7 @@ use crate::remote::Lateness;
 use control::cycle::turn::TimedRecord;
 use model::accelerometer::RobotState;
 use model::quantiles::{Quantiles, histogram};
-use model::scenario::Mode;
+use model::scenario::TorqueSource;
 
 /// Totals over the tick records of the control loop.
 #[derive(Debug)]
@@ -92,7 +92,7 @@ impl LoopTotals {
     }
 
     /// Returns the motion of the robot in the last tick.
-    pub(super) fn moved(&self) -> Option<Moved> {
+    pub(super) fn last_motion(&self) -> Option<Moved> {
         let [before, last] = [self.before?, self.last?].map(|timed| timed.record);
         let [began, at_s] = [before, last].map(|record| Span(record.tick.time.0).seconds());
         let mut state = RobotState { position: last.q, speed: last.qdot, ..RobotState::default() };
@@ -104,7 +104,7 @@ impl LoopTotals {
     }
 
     /// Returns the text of the progress line for `width` columns.
-    pub(super) fn line(
+    pub(super) fn progress_text(
         &self,
         elapsed: Duration,
         (duration, skin): (Span, &Skin),
@@ -117,13 +117,13 @@ impl LoopTotals {
             elapsed_s: elapsed.as_secs_f64(),
             duration_s: duration.seconds(),
             lost,
-            halted: self.halts.why(),
+            halted: self.halts.present_reason(),
             contributing: record.contributing,
             cells: skin.cells.len(),
             stale: record.stale,
             dead: record.dead,
             late_us: Quantiles::from_histogram(&self.late, 1e-3).p99,
-            mode: if comparing { Mode::Compare } else { Mode::Distributed }.name(),
+            mode: if comparing { TorqueSource::Compare } else { TorqueSource::Distributed }.name(),
             torque_nm: record.torque.get(..skin.robot.joints.len()).unwrap_or(&record.torque),
         };
         line.text(width)

@@ -31,7 +31,7 @@ mod watch;
 
 use std::path::PathBuf;
 
-use calibration::motion::Motion;
+use calibration::motion::MotionPlan;
 use protocol::bus::KindChoices;
 use protocol::skin::Skin;
 
@@ -71,7 +71,7 @@ pub struct RunOptions {
     /// True if progress is hidden.
     pub quiet: bool,
     /// Motion of the robot that replaces the scenario's.
-    pub planned: Option<Motion>,
+    pub planned: Option<MotionPlan>,
     /// Lines to print when the loop starts.
     pub announced: Vec<String>,
 }
@@ -93,8 +93,8 @@ pub fn run(options: &RunOptions, remote: Option<JsonPipe>) -> Result<Summary, Ru
     bench.remote = remote.map(RemoteControl::new);
     match bench.begin() {
         Ok(()) => {
-            bench.announce();
-            Ok(bench.watch())
+            bench.print_announcements();
+            Ok(bench.run_loop())
         }
         Err(error) => bench.give_up(error),
     }

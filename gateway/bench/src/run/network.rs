@@ -13,10 +13,10 @@ use protocol::time::{Micros, Span};
 use thiserror::Error;
 
 use model::network::check::{self, Difference};
-use model::network::tree::{TreePlaces, places};
+use model::network::tree::{TreePlaces, tree_places};
 use model::repeat::Repeats;
 
-use crate::view::View;
+use crate::view::BusView;
 
 /// Interval after which a message is sent again to a cell that does not answer.
 const RETRY_INTERVAL: Span = Span::from_millis(200);
@@ -33,15 +33,15 @@ pub(super) struct Network {
     /// Cells to which their slots were sent, with the times.
     announced: Repeats<CellId>,
     /// Ports of each cell whose links must be down, one bit per port.
-    deaf: BTreeMap<CellId, u8>,
+    ports_down: BTreeMap<CellId, u8>,
     reported_links_down: Repeats<CellId>,
     /// Cells that send but have no route to a root, with the time at which this began.
-    without: BTreeMap<CellId, Micros>,
+    without_route: BTreeMap<CellId, Micros>,
     /// Cells that were reported as unreachable and still have no route, with the time at which this began.
     reported: BTreeMap<CellId, Micros>,
-    said_too_deep: bool,
+    reported_too_deep: bool,
     /// Longest time for which any cell was unreachable.
-    pub(super) longest: Span,
+    pub(super) longest_unreachable: Span,
     /// Time from the moment when all cells were ready until all had a route.
     pub(super) tree_ready: Option<Span>,
     /// Differences between the tree at the start and its description.
@@ -90,12 +90,12 @@ impl Network {
             slots: Slots { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
             period_us: skin.period_us().unwrap_or(u16::MAX),
             announced: Repeats::new(RETRY_INTERVAL),
-            deaf: BTreeMap::new(),
+            ports_down: BTreeMap::new(),
             reported_links_down: Repeats::new(RETRY_INTERVAL),
-            without: BTreeMap::new(),
+            without_route: BTreeMap::new(),
             reported: BTreeMap::new(),
-            said_too_deep: false,
-            longest: Span(0),
+            reported_too_deep: false,
+            longest_unreachable: Span(0),
             tree_ready: None,
             differences: Vec::new(),
         })
@@ -113,22 +113,24 @@ impl Network {
 
     /// Returns the cells that sent but were unreachable at the last check.
     pub(super) fn unreachable(&self) -> impl Iterator<Item = u8> {
-        self.without.keys().map(|cell| cell.get())
+        self.without_route.keys().map(|cell| cell.get())
     }
 
-    fn places(view: &View) -> TreePlaces {
-        places(view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)))
+    fn places(view: &BusView) -> TreePlaces {
+        tree_places(
+            view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)),
+        )
     }
 
     /// Returns the number of cells with a route to a root, and true if all cells that send have one and their pages
     /// agree.
-    pub(super) fn progress(view: &View) -> (usize, bool) {
+    pub(super) fn progress(view: &BusView) -> (usize, bool) {
         let places = Self::places(view);
         (places.depths.len(), places.unreachable.is_empty() && places.agree)
     }
 
     /// Returns the differences between the present tree and the description.
-    pub(super) fn check(&self, view: &View) -> Vec<Difference> {
+    pub(super) fn check(&self, view: &BusView) -> Vec<Difference> {
         check::differences(&self.wires, &view.network)
     }
 
@@ -136,8 +138,8 @@ impl Network {
     ///
     /// # Errors
     /// Returns [`TooDeep`] if the slots do not fit between two joint broadcasts. The error names values that would fit.
-    pub(super) fn fit(&mut self, view: &View) -> Result<(), TooDeep> {
-        let deepest = Self::places(view).deepest().unwrap_or(0);
+    pub(super) fn fit_slots(&mut self, view: &BusView) -> Result<(), TooDeep> {
+        let deepest = Self::places(view).max_depth().unwrap_or(0);
         let slots = u32::from(deepest) + 1;
         let (slot_us, period_us) = (u32::from(self.slots.slot_us), u32::from(self.period_us));
         if slots * slot_us > period_us {
@@ -163,14 +165,14 @@ impl Network {
     }
 
     /// Returns the ready cells that have not confirmed the slots of the present tree.
-    pub(super) fn unconfirmed(&self, view: &View) -> Vec<CellId> {
+    pub(super) fn unconfirmed(&self, view: &BusView) -> Vec<CellId> {
         let words = Some(self.reply_words());
         let unconfirmed = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
         unconfirmed.map(|cell| cell.node).collect()
     }
 
     /// Returns the messages for cells that have not answered in time.
-    pub(super) fn tell_again(&mut self, now: Micros, view: &View) -> Vec<Message> {
+    pub(super) fn repeat_messages(&mut self, now: Micros, view: &BusView) -> Vec<Message> {
         let due = self.announced.due(now, self.unconfirmed(view));
         due.into_iter().map(|cell| self.reply_message(Node::Cell(cell))).collect()
     }
@@ -181,9 +183,9 @@ impl Network {
             .zip(0..PORTS)
             .filter(|&(_, port)| self.wires.other_end(to, port).is_some_and(|(other, _)| other == from));
         let bits = ends.fold(0, |bits, (bit, _)| bits | 1 << bit);
-        let deaf = self.deaf.entry(to).or_default();
+        let deaf = self.ports_down.entry(to).or_default();
         *deaf = if link_down { *deaf | bits } else { *deaf & !bits };
-        self.reported_links_down.renew(to);
+        self.reported_links_down.make_due(to);
     }
 
     /// Returns the links that must be down in one or both directions, each once, with the smaller node id first.
@@ -192,17 +194,18 @@ impl Network {
             let down = (0..PORTS).filter(move |port| bits >> port & 1 == 1);
             down.filter_map(move |port| self.wires.other_end(to, port)).map(move |(from, _)| (from, to))
         };
-        self.deaf.iter().flat_map(ports).map(|(from, to)| [from.min(to), from.max(to)]).collect()
+        self.ports_down.iter().flat_map(ports).map(|(from, to)| [from.min(to), from.max(to)]).collect()
     }
 
     /// Returns the messages for cells whose links must go down, or up again.
-    fn report_links_down(&mut self, now: Micros, view: &View) -> Vec<Message> {
-        let target = |node: &CellId| self.deaf.get(node).copied();
+    fn report_links_down(&mut self, now: Micros, view: &BusView) -> Vec<Message> {
+        let requested_ports = |node: &CellId| self.ports_down.get(node).copied();
         let ready = view.cells.iter().filter(|cell| cell.ready);
-        let open = ready.filter(|cell| target(&cell.node).is_some_and(|deaf| deaf != cell.deaf));
+        let open =
+            ready.filter(|cell| requested_ports(&cell.node).is_some_and(|deaf| deaf != cell.ports_down));
         let due = self.reported_links_down.due(now, open.map(|cell| cell.node));
         let message = |cell: CellId| {
-            let deaf = target(&cell)?;
+            let deaf = requested_ports(&cell)?;
             let request = Request::Write {
                 number: Parameter::LinksDown.number(),
                 words: LinksDown { ports: deaf }.words(),
@@ -213,24 +216,24 @@ impl Network {
     }
 
     /// Checks the network while the loop runs.
-    pub(super) fn check_running(&mut self, now: Micros, view: &View) -> NetworkCheck {
+    pub(super) fn check_running(&mut self, now: Micros, view: &BusView) -> NetworkCheck {
         let mut look = NetworkCheck::default();
         let places = Self::places(view);
-        if places.deepest().is_some_and(|deepest| deepest > self.slots.deepest) {
-            match self.fit(view) {
+        if places.max_depth().is_some_and(|deepest| deepest > self.slots.deepest) {
+            match self.fit_slots(view) {
                 Ok(()) => look.messages.push(self.announce(now)),
-                Err(why) if !self.said_too_deep => {
-                    self.said_too_deep = true;
+                Err(why) if !self.reported_too_deep => {
+                    self.reported_too_deep = true;
                     look.notes.push(format!("{why}; deeper cells send too early, and their sums are late"));
                 }
                 Err(_) => {}
             }
         }
-        look.messages.extend(self.tell_again(now, view));
+        look.messages.extend(self.repeat_messages(now, view));
         look.messages.extend(self.report_links_down(now, view));
         let without: BTreeSet<_> = places.unreachable.into_iter().collect();
-        self.without.retain(|cell, since| {
-            self.longest = self.longest.max(now.elapsed_since(*since));
+        self.without_route.retain(|cell, since| {
+            self.longest_unreachable = self.longest_unreachable.max(now.elapsed_since(*since));
             without.contains(cell)
         });
         let mut back = Vec::new();
@@ -242,20 +245,20 @@ impl Network {
             !has_one
         });
         for &cell in &without {
-            self.without.entry(cell).or_insert(now);
+            self.without_route.entry(cell).or_insert(now);
         }
-        let bus_event = |(cell, since): (&CellId, &Micros)| {
+        let if_overdue = |(cell, since): (&CellId, &Micros)| {
             (now.elapsed_since(*since) >= REROUTE_TIMEOUT && !self.reported.contains_key(cell))
                 .then_some((*cell, *since))
         };
-        let bus_event: Vec<_> = self.without.iter().filter_map(bus_event).collect();
-        if let Some(oldest) = bus_event.iter().map(|(_, since)| now.elapsed_since(*since)).max() {
-            self.reported.extend(bus_event.iter().copied());
-            let cells: Vec<_> = bus_event.into_iter().map(|(cell, _)| cell).collect();
+        let newly_unreachable: Vec<_> = self.without_route.iter().filter_map(if_overdue).collect();
+        if let Some(oldest) = newly_unreachable.iter().map(|(_, since)| now.elapsed_since(*since)).max() {
+            self.reported.extend(newly_unreachable.iter().copied());
+            let cells: Vec<_> = newly_unreachable.into_iter().map(|(cell, _)| cell).collect();
             let is = if cells.len() == 1 { "is" } else { "are" };
             look.notes.push(format!(
                 "{} on {} {is} unreachable: no route to a root, in no sum for {:.1} s",
-                check::names(&cells),
+                check::cell_list(&cells),
                 self.name,
                 oldest.seconds()
             ));
@@ -265,7 +268,7 @@ impl Network {
             let has = if cells.len() == 1 { "has" } else { "have" };
             look.notes.push(format!(
                 "{} on {} {has} a route to a root again, after {:.1} s",
-                check::names(&cells),
+                check::cell_list(&cells),
                 self.name,
                 longest.seconds()
             ));
@@ -296,7 +299,7 @@ mod tests {
     }
 
     /// Creates a view of cells with these parents and depths; `None` is a dead cell.
-    fn view(trees: &[Option<(Option<u8>, u8)>], reply: Option<[i16; WORDS]>) -> View {
+    fn view(trees: &[Option<(Option<u8>, u8)>], reply: Option<[i16; WORDS]>) -> BusView {
         let cells = trees.iter().enumerate().map(|(at, tree)| CellView {
             node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
             seen: true,
@@ -305,12 +308,12 @@ mod tests {
             halted: false,
             unconfigured: false,
             measures: false,
-            other: false,
+            other_configuration: false,
             last_joints: Epoch(0),
             responded: Responded::default(),
             reply,
-            deaf: 0,
-            lacks: [None; SWITCHES],
+            ports_down: 0,
+            unconfirmed_switches: [None; SWITCHES],
             unclear: false,
         });
         let network = trees.iter().enumerate().map(|(at, tree)| ObservedCell {
@@ -325,14 +328,14 @@ mod tests {
             }),
             ports: None,
         });
-        View::new(cells.collect(), 0, network.collect())
+        BusView::new(cells.collect(), 0, network.collect())
     }
 
     #[test]
     fn a_tree_that_grows_deeper_gets_more_slots_as_far_as_they_fit() {
         let mut network = network();
         let flat = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(1), 1))];
-        network.fit(&view(&flat, None)).unwrap();
+        network.fit_slots(&view(&flat, None)).unwrap();
         let at = |rounds: u64| Micros(rounds * RETRY_INTERVAL.0);
         let now = at(1);
         let words = Some(network.reply_words());
@@ -362,14 +365,14 @@ mod tests {
     fn a_link_down_is_sent_to_its_receiving_end_until_confirmed_and_after_a_restart() {
         let mut network = network();
         let trees = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
-        network.fit(&view(&trees, None)).unwrap();
+        network.fit_slots(&view(&trees, None)).unwrap();
         let words = Some(network.reply_words());
         let cell = |node| CellId::new(node).unwrap();
         let mut now = Micros(0);
         let mut look = |network: &mut Network, deaf| {
             now = now + RETRY_INTERVAL;
             let mut view = view(&trees, words);
-            view.cells[1].deaf = deaf;
+            view.cells[1].ports_down = deaf;
             let announced = |message: &Message| {
                 let Message::Configure {
                     to: Node::Cell(to),
@@ -405,7 +408,7 @@ mod tests {
     fn an_unreachable_cell_is_reported_once_and_when_it_has_a_route_again() {
         let mut network = network();
         let whole = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
-        network.fit(&view(&whole, None)).unwrap();
+        network.fit_slots(&view(&whole, None)).unwrap();
         let words = Some(network.reply_words());
         let mut at = Micros(0);
         let mut look = |network: &mut Network, trees: &[_]| {
@@ -430,6 +433,6 @@ mod tests {
         );
         assert_eq!(network.unreachable().count(), 0);
         assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a route to a root again, after 1.0 s"]);
-        assert_eq!(network.longest, Span::from_millis(800));
+        assert_eq!(network.longest_unreachable, Span::from_millis(800));
     }
 }

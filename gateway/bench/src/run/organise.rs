@@ -12,17 +12,17 @@ use super::begin::DISCOVERY_TIMEOUT;
 use super::bench::Bench;
 use super::network::Network;
 use crate::error::RunError;
-use crate::view::View;
+use crate::view::BusView;
 
 /// Time after which a difference from the description counts as real: hellos and heartbeats come four times a second.
-const SETTLING: Duration = Duration::from_millis(1_500);
+const SETTLING_TIME: Duration = Duration::from_millis(1_500);
 
 impl Bench<'_> {
     /// Waits until the cells that answer with sums form a tree, and sends them their slots.
     pub(super) fn organise(&mut self) -> Result<(), RunError> {
-        self.shared.explore.store(true, Ordering::Relaxed);
+        self.shared.sends_to_roots.store(true, Ordering::Relaxed);
         let began = self.now();
-        self.wait(self.timeout(), |bench, timeout| {
+        self.poll_until(self.timeout(), |bench, timeout| {
             let (mut have_ways, mut whole, now) = (0, true, bench.now());
             for (network, view) in bench.networks() {
                 let (count, all) = Network::progress(&view);
@@ -35,9 +35,9 @@ impl Bench<'_> {
         })?;
         self.check_networks()?;
         for (network, view) in self.networks() {
-            network.fit(&view)?;
+            network.fit_slots(&view)?;
         }
-        self.tell_networks()?;
+        self.send_slots()?;
         for network in self
             .bus_links
             .iter()
@@ -58,7 +58,7 @@ impl Bench<'_> {
         // Without a request, pages of ports come with heartbeats only.
         self.send_to_all(&Message::Report)?;
         let mut changes = 0;
-        self.wait(SETTLING, |bench, timeout| {
+        self.poll_until(SETTLING_TIME, |bench, timeout| {
             let mut none = true;
             for (network, view) in bench.networks() {
                 let differences = network.check(&view);
@@ -84,10 +84,10 @@ impl Bench<'_> {
     }
 
     /// Sends all cells their slots, and waits for confirmations.
-    fn tell_networks(&mut self) -> Result<(), RunError> {
+    fn send_slots(&mut self) -> Result<(), RunError> {
         self.send_to_networks(|network, now, _| vec![network.announce(now)])?;
         let mut unconfirmed = Vec::new();
-        self.wait(DISCOVERY_TIMEOUT, |bench, timeout| {
+        self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| {
             unconfirmed.clear();
             for (network, view) in bench.networks() {
                 unconfirmed.extend(
@@ -96,7 +96,7 @@ impl Bench<'_> {
             }
             let is_last = unconfirmed.is_empty() || timeout.is_over(0);
             if !is_last {
-                bench.send_to_networks(Network::tell_again)?;
+                bench.send_to_networks(Network::repeat_messages)?;
             }
             Ok(is_last)
         })?;
@@ -114,7 +114,7 @@ impl Bench<'_> {
     /// Calls `messages` with each network and the view of its receiver, and sends the messages that it returns.
     fn send_to_networks(
         &mut self,
-        mut messages: impl FnMut(&mut Network, Micros, &View) -> Vec<Message>,
+        mut messages: impl FnMut(&mut Network, Micros, &BusView) -> Vec<Message>,
     ) -> Result<(), RunError> {
         let now = self.now();
         for bus_link in &mut self.bus_links {

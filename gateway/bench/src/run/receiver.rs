@@ -18,7 +18,7 @@ use crate::bus::link::{Outages, ReceiveEnd};
 use crate::bus::realtime::wall;
 use crate::bus::roots::RootWires;
 use crate::record::feed::{EpochContacts, Outlet, Unrecorded};
-use crate::view::{CellView, View};
+use crate::view::{BusView, CellView};
 use control::cycle::turn::Shared;
 use model::latched::ReceivedFrame;
 use model::table::{Notice, Snapshot, Table};
@@ -28,16 +28,16 @@ use trace::capture::BusNote;
 const CHECK_INTERVAL: Duration = Duration::from_millis(20);
 /// Maximum total number of cells for which the interval is [`LOOK`]. With more cells the interval grows proportionally,
 /// up to [`LONGEST_LOOK`].
-const CELLS_A_LOOK: usize = 1_000;
+const CELLS_PER_INTERVAL: usize = 1_000;
 /// Maximum interval between checks of timeouts; a cell counts as dead after 600 ms.
-const LONGEST_LOOK: Duration = Duration::from_millis(100);
+const MAX_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Returns the interval between checks of the timeouts while the loop runs, for a skin of `cells` cells. It grows with
 /// their number, so that the checks take the same share of time for all skins.
 #[must_use]
-pub fn look_at(cells: usize) -> Duration {
-    let times = u32::try_from(cells / CELLS_A_LOOK).unwrap_or(u32::MAX);
-    CHECK_INTERVAL.saturating_mul(times.max(1)).min(LONGEST_LOOK)
+pub fn check_interval(cells: usize) -> Duration {
+    let times = u32::try_from(cells / CELLS_PER_INTERVAL).unwrap_or(u32::MAX);
+    CHECK_INTERVAL.saturating_mul(times.max(1)).min(MAX_CHECK_INTERVAL)
 }
 
 /// An event that a receiver reports to the main thread immediately.
@@ -77,12 +77,12 @@ pub struct Receiver {
     /// State shared by all threads.
     pub shared: Arc<Shared>,
     /// State shown to the main thread.
-    pub view: Arc<Mutex<View>>,
+    pub view: Arc<Mutex<BusView>>,
     /// Events for the main thread.
-    pub bus_event: Sender<(usize, BusEvent)>,
+    pub events: Sender<(usize, BusEvent)>,
     /// Cells that, as the main thread has found, may have missed messages. They arrive here before the main thread
     /// sends those cells any further message.
-    pub in_doubt: mpsc::Receiver<BTreeSet<CellId>>,
+    pub possibly_missed: mpsc::Receiver<BTreeSet<CellId>>,
 }
 
 /// Result of a receiver.
@@ -121,18 +121,18 @@ impl Receiver {
         let mut account = ReportedState::default();
         let mut looked = Instant::now();
         while !self.shared.stop.load(Ordering::Relaxed) {
-            let wait = self.look_now();
+            let wait = self.present_interval();
             let step = self.follower.step(&mut self.receive_end, wait);
-            self.take(step, &mut account);
-            for cells in self.in_doubt.try_iter() {
+            self.handle_step(step, &mut account);
+            for cells in self.possibly_missed.try_iter() {
                 self.table.interrupt_cells(|cell| cells.contains(&cell));
             }
             self.handle_frames();
-            if self.shared.explore.load(Ordering::Relaxed) {
-                self.follower.roots.iter_mut().for_each(RootWires::explore);
+            if self.shared.sends_to_roots.load(Ordering::Relaxed) {
+                self.follower.roots.iter_mut().for_each(RootWires::start_sending);
             }
             self.record(&mut account);
-            if looked.elapsed() >= self.look_now() {
+            if looked.elapsed() >= self.present_interval() {
                 looked = Instant::now();
                 self.refresh_view(&mut account);
             }
@@ -140,40 +140,40 @@ impl Receiver {
         }
         let ended = Micros(wall() / 1_000);
         self.table.finish();
-        let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, last_words);
+        let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, report_remaining);
         let dropped = self.follower.dropped();
         ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages, ended }
     }
 
     /// Returns the present interval between checks of timeouts. It is short until the loop starts, because the main
     /// thread waits for the cells.
-    fn look_now(&self) -> Duration {
+    fn present_interval(&self) -> Duration {
         if self.shared.broadcasts.load(Ordering::Relaxed) == 0 { CHECK_INTERVAL } else { self.check_interval }
     }
 
     /// Handles an outcome of a step other than frames: a change of the bus's state.
-    fn take(&mut self, step: FollowStep, account: &mut ReportedState) {
+    fn handle_step(&mut self, step: FollowStep, account: &mut ReportedState) {
         match step {
             FollowStep::Frames(_) => {
-                if self.receive_end.regain() {
+                if self.receive_end.mark_working() {
                     account.outages.end(Instant::now());
                     self.note(BusNote::Back);
                     self.send_event(BusEvent::Up);
                 }
             }
             FollowStep::Nothing | FollowStep::Leftover(_) => {}
-            FollowStep::Down(error) => self.lose(false, BusEvent::Down(error), account),
+            FollowStep::Down(error) => self.report_loss(false, BusEvent::Down(error), account),
             FollowStep::Drained => self.table.interrupt(),
             FollowStep::Gone(error) => {
-                self.lose(true, BusEvent::Lost(error), account);
+                self.report_loss(true, BusEvent::Lost(error), account);
                 self.table.interrupt();
             }
             FollowStep::Refused(error) => self.send_event(BusEvent::Refused(error)),
         }
     }
 
-    fn lose(&mut self, gone: bool, bus_event: BusEvent, account: &mut ReportedState) {
-        if self.receive_end.lose(gone) {
+    fn report_loss(&mut self, gone: bool, bus_event: BusEvent, account: &mut ReportedState) {
+        if self.receive_end.mark_lost(gone) {
             account.outages.begin(Instant::now());
             self.note(BusNote::Lost);
             self.send_event(bus_event);
@@ -191,11 +191,11 @@ impl Receiver {
     fn handle_frames(&mut self) {
         self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
         let Self { follower, table, positions: queue, outlet, .. } = self;
-        follower.parts(|part| match part {
+        follower.for_each_item(|part| match part {
             FollowedItem::Feeds(root, feeds) => table.set_feeds(root, feeds),
             FollowedItem::Frame(received) => {
                 let at = Micros(received.at_nanos / 1_000);
-                let mut positions = |epoch| positions_of(queue, epoch);
+                let mut positions = |epoch| take_positions(queue, epoch);
                 table.handle_frame(at, received.own, &received.frame, &mut positions);
                 if let Some(outlet) = outlet {
                     let Received { frame, at_nanos, own } = received;
@@ -213,10 +213,10 @@ impl Receiver {
             outlet.dropped(wall(), dropped - account.announced);
             account.announced = dropped;
         }
-        let Some((number, epoch, at)) = self.table.newest() else { return };
-        if outlet.wants_touched() && account.newest.replace(number) != Some(number) {
-            let cells = self.table.sensors(at).collect();
-            outlet.touched(EpochContacts { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
+        let Some((number, epoch, at)) = self.table.newest_joints() else { return };
+        if outlet.records_contacts() && account.newest.replace(number) != Some(number) {
+            let cells = self.table.presumed_sensors(at).collect();
+            outlet.push_contacts(EpochContacts { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
         }
     }
 
@@ -243,20 +243,20 @@ impl Receiver {
         }
         let commands = read + account.unread;
         let network =
-            if self.follower.roots.is_some() { self.table.network(now).collect() } else { Vec::new() };
+            if self.follower.roots.is_some() { self.table.observed_cells(now).collect() } else { Vec::new() };
         if let Ok(mut view) = self.view.lock() {
-            *view = View::new(cells, commands, network);
+            *view = BusView::new(cells, commands, network);
         }
     }
 
     fn send_event(&self, bus_event: BusEvent) {
         // At the end of the run the main thread is gone.
-        let _ = self.bus_event.send((self.index, bus_event));
+        let _ = self.events.send((self.index, bus_event));
     }
 }
 
 /// Reports the items that did not fit into the queues, waiting up to 1 s until the queue has room for the report.
-fn last_words(outlet: &mut Outlet) -> Unrecorded {
+fn report_remaining(outlet: &mut Outlet) -> Unrecorded {
     let give_up = Instant::now() + Duration::from_secs(1);
     while !outlet.report_unrecorded(wall()) && Instant::now() < give_up {
         std::thread::sleep(Duration::from_millis(1));
@@ -265,7 +265,7 @@ fn last_words(outlet: &mut Outlet) -> Unrecorded {
 }
 
 /// Returns the positions of an epoch's joints. Drops positions of earlier epochs, whose broadcasts were not read back.
-fn positions_of(
+fn take_positions(
     queue: &mut rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
     epoch: Epoch,
 ) -> Option<[f64; MAX_JOINTS]> {

@@ -20,21 +20,21 @@ use super::bench::{Bench, RunBus};
 use super::commander::SwitchedBuses;
 use super::hosts::Hosts;
 use super::network::Network;
-use super::receiver::{BusEvent, Receiver, look_at};
+use super::receiver::{BusEvent, Receiver, check_interval};
 use crate::bus::follow::Follower;
-use crate::bus::link::{ReceiveEnd, SharedBus, Slot};
+use crate::bus::link::{BusSlot, ReceiveEnd, SharedBus};
 use crate::bus::realtime;
 use crate::bus::roots::{ReceiveFilter, RootWires};
 use crate::bus::served::{BusTarget, IfAbsent, ServedBus, open_or_serve, open_or_serve_all};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::error::RunError;
 use crate::processes::ended::EndedProcesses;
-use crate::processes::{Processes, allow_files, program};
+use crate::processes::{Processes, allow_files, program_path};
 use crate::record::feed::{self, Feed, Outlet};
 use crate::record::{Mcap, Outputs, Recorder, backlog, facts};
-use crate::signals::{SignalError, caught};
+use crate::signals::{SignalError, catch_signals};
 use crate::threads::spawn;
-use crate::view::View;
+use crate::view::BusView;
 use control::controller::{Controller, Planned};
 use control::cycle::Cycle;
 use control::cycle::turn::{BusPort, Shared, TimedRecord};
@@ -48,16 +48,17 @@ use trace::recording::series::FileHead;
 /// Maximum time for which the sending of stimuli and commands waits for a full bus. The loop's own frames never wait.
 const SEND_TIMEOUT: Duration = Duration::from_millis(10);
 /// Maximum time for which a receiver gathers frames; it normally gathers for the time of a tick.
-const GATHER: Duration = Duration::from_millis(10);
+const MAX_GATHER_TIME: Duration = Duration::from_millis(10);
 /// Remark on a receive buffer that is smaller than the requested size.
-const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
+const SMALL_BUFFER_REMARK: &str =
+    ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 
 /// Claims files and opens buses; [`Bench::begin`] starts the cells.
 pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let began = Instant::now();
-    let emulator = refuse(options)?;
+    let emulator = check_options(options)?;
     let skin = &options.skin;
-    let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
+    let signalled = catch_signals(&[SIGHUP, SIGINT, SIGTERM])?;
     // Ignore the signal, so that a file at its size limit is an ordinary write error.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|source| SignalError { signal: SIGXFSZ, source })?;
@@ -65,12 +66,12 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
         if signalled.load(Ordering::Relaxed) { RunError::Interrupted } else { refused.into() }
     })?;
     let numbered = options.record.candump.as_ref().is_some_and(|candump| candump.numbered);
-    let log = outputs.log().filter(|_| numbered).map(Path::to_owned);
+    let log = outputs.candump_path().filter(|_| numbered).map(Path::to_owned);
     // From here on an external controller can connect, so that it is ready when the loop starts.
     let controller: Box<dyn Controller> = match &options.planned {
         Some(motion) => {
             let motion = motion.clone();
-            Box::new(Planned::new(skin, move |seconds| motion.at(seconds).position))
+            Box::new(Planned::new(skin, move |seconds| motion.state_at(seconds).position))
         }
         None => controller_of(skin, &options.scenario.motion)?,
     };
@@ -86,30 +87,38 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let emulation = emulation.transpose()?;
     let targets = skin.buses.iter().enumerate().map(|(index, bus)| {
         let receive_filter = ReceiveFilter::for_bus(skin, index, !outputs.is_empty());
-        target_of(options, bus, receive_filter.filters)
+        bus_target(options, bus, receive_filter.filters)
     });
     let targets: Vec<_> = targets.collect();
-    let (opened, own) = open_or_serve_all(&targets, absent(options))?;
+    let (opened, own) = open_or_serve_all(&targets, if_absent(options))?;
     served.extend(own);
     let opened = skin.buses.iter().zip(targets).zip(opened);
-    let opened = opened.map(|((bus, (.., target)), opened)| linked(options, bus, target, opened));
+    let opened = opened.map(|((bus, (.., target)), opened)| create_link(options, bus, target, opened));
     let opened = opened.collect::<Result<Vec<_>, _>>()?;
     let shared = Arc::new(Shared::default());
     let (tell, bus_event) = mpsc::channel();
     let (mut bus_links, mut feeds) = (Vec::new(), Vec::new());
     for (index, (receive_end, slot)) in opened.into_iter().enumerate() {
-        let view = Arc::new(Mutex::new(View::default()));
+        let view = Arc::new(Mutex::new(BusView::default()));
         let recorded = || {
             feed::bus_feed(
                 skin.buses.len(),
-                outputs.wants_all(),
+                outputs.records_all(),
                 Arc::clone(&view),
                 Arc::clone(&receive_end.link.state),
             )
         };
         let (outlet, feed) = (!outputs.is_empty()).then(recorded).unzip();
         feeds.extend(feed);
-        bus_links.push(listen(options, index, (receive_end, slot), view, outlet, &shared, tell.clone())?);
+        bus_links.push(start_receiver(
+            options,
+            index,
+            (receive_end, slot),
+            view,
+            outlet,
+            &shared,
+            tell.clone(),
+        )?);
     }
     let (recorder, recorded) = record(options, outputs, feeds, &bus_links, &idle)?;
     Ok(Bench {
@@ -119,7 +128,7 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
         backlog_dropped,
         shared,
         bus_links,
-        bus_event,
+        events: bus_event,
         signalled,
         cycle,
         first_epoch: Epoch(0),
@@ -137,9 +146,9 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
 
 /// Returns an error if this program cannot run a valid description, or if a program or directory is missing. Otherwise
 /// returns the emulator, if cells are to be emulated.
-fn refuse(options: &RunOptions) -> Result<Option<Emulator<'_>>, RunError> {
+fn check_options(options: &RunOptions) -> Result<Option<Emulator<'_>>, RunError> {
     if options.spawn {
-        program("cell-node")?;
+        program_path("cell-node")?;
     }
     if let Some(flash) = options.flash.as_ref().filter(|flash| !flash.is_dir()) {
         return Err(RunError::NoFlash(flash.clone()));
@@ -167,7 +176,7 @@ fn emulate(
         let target =
             BusOptions { filters: Vec::new(), directory: directory.clone(), ..BusOptions::default() };
         let target = BusOptions { fd: bus.format == Format::Fd, ..target };
-        let (_, own) = open_or_serve(&bus.name, kinds.kind_of(&bus.name), &target, absent(options))?;
+        let (_, own) = open_or_serve(&bus.name, kinds.kind_of(&bus.name), &target, if_absent(options))?;
         served.extend(own);
     }
     let bench =
@@ -182,12 +191,12 @@ fn emulate(
 
 /// Returns the action for a bus that does not exist. It is refused if other programs use it: with emulated cells, or
 /// with cells that are not started here.
-const fn absent(options: &RunOptions) -> IfAbsent {
-    if options.spawn && options.emulated.is_none() { IfAbsent::Made } else { IfAbsent::Refused }
+const fn if_absent(options: &RunOptions) -> IfAbsent {
+    if options.spawn && options.emulated.is_none() { IfAbsent::Create } else { IfAbsent::Fail }
 }
 
 /// Returns the options for opening a bus.
-fn target_of<'a>(options: &RunOptions, described: &'a skin::SkinBus, filters: Vec<Filter>) -> BusTarget<'a> {
+fn bus_target<'a>(options: &RunOptions, described: &'a skin::SkinBus, filters: Vec<Filter>) -> BusTarget<'a> {
     let name = &described.name;
     let target = BusOptions {
         fd: described.format == Format::Fd,
@@ -202,19 +211,19 @@ fn target_of<'a>(options: &RunOptions, described: &'a skin::SkinBus, filters: Ve
 }
 
 /// Creates the link of an opened bus.
-fn linked(
+fn create_link(
     options: &RunOptions,
     described: &skin::SkinBus,
     target: BusOptions,
     bus: Bus,
-) -> Result<(ReceiveEnd, Slot), RunError> {
+) -> Result<(ReceiveEnd, BusSlot), RunError> {
     let name = &described.name;
     if described.reply != SkinReply::Torque && bus.kind().is_interface() && !bus.is_virtual()? {
         return Err(RunError::RealWires(name.clone()));
     }
     if !options.quiet {
         let (kind, bytes) = (bus.kind(), bus.receive_buffer());
-        let less = if bytes < options.receive_buffer { LIMITED } else { "" };
+        let less = if bytes < options.receive_buffer { SMALL_BUFFER_REMARK } else { "" };
         let why = match (options.kinds.kind_of(name), kind) {
             (KindChoice::Auto, BusKind::Embedded) => format!(" (there is no interface {name})"),
             _ => String::new(),
@@ -236,7 +245,7 @@ fn record(
     if outputs.is_empty() {
         return Ok((None, None));
     }
-    let (recorded, ticks) = outputs.wants_all().then(|| rtrb::RingBuffer::new(feed::TICKS)).unzip();
+    let (recorded, ticks) = outputs.records_all().then(|| rtrb::RingBuffer::new(feed::TICK_QUEUE)).unzip();
     let head =
         options.record.mcap.as_ref().map(|mcap| head(options, mcap, bus_links, idle)).unwrap_or_default();
     let feed = Feed { bus_feeds, ticks };
@@ -270,11 +279,11 @@ fn head(options: &RunOptions, mcap: &Mcap, bus_links: &[RunBus], idle: &Histogra
 }
 
 /// Starts the receiver of a bus.
-fn listen(
+fn start_receiver(
     options: &RunOptions,
     index: usize,
-    (receive_end, slot): (ReceiveEnd, Slot),
-    view: Arc<Mutex<View>>,
+    (receive_end, slot): (ReceiveEnd, BusSlot),
+    view: Arc<Mutex<BusView>>,
     outlet: Option<Outlet>,
     shared: &Arc<Shared>,
     bus_event: mpsc::Sender<(usize, BusEvent)>,
@@ -283,7 +292,7 @@ fn listen(
     let (link, shared) = (Arc::clone(&receive_end.link), Arc::clone(shared));
     let mut table = Table::new(skin, index);
     if !ReceiveFilter::for_bus(skin, index, outlet.is_some()).all_sums {
-        table.hear_sums_of_roots_only();
+        table.receive_root_sums_only();
     }
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; MAX_JOINTS])>::new(64);
@@ -295,20 +304,30 @@ fn listen(
         receive_end,
         follower: Follower::new(
             RootWires::for_bus(skin, index),
-            Duration::from_nanos(skin.timing.tick_nanos()).min(GATHER),
+            Duration::from_nanos(skin.timing.tick_nanos()).min(MAX_GATHER_TIME),
         ),
-        check_interval: look_at(skin.cells.len()),
+        check_interval: check_interval(skin.cells.len()),
         table,
         snapshots,
         positions: of_broadcasts,
         outlet,
         shared: Arc::clone(&shared),
         view: Arc::clone(&view),
-        bus_event,
-        in_doubt: not_reached,
+        events: bus_event,
+        possibly_missed: not_reached,
     };
     let receiver = Some(spawn(&format!("rx {}", link.name), move || receiver.run())?);
     let network = Network::for_bus(skin, index);
     let line = Some((line, slot));
-    Ok(RunBus { link, format, line, view, receiver, in_doubt, hosts: Hosts::new(), network, shared })
+    Ok(RunBus {
+        link,
+        format,
+        port: line,
+        view,
+        receiver,
+        possibly_missed: in_doubt,
+        hosts: Hosts::new(),
+        network,
+        shared,
+    })
 }

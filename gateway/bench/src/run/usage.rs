@@ -48,7 +48,7 @@ pub(super) struct Spent {
 
 impl Spent {
     /// Reads the times of this program, of cells and of bus servers.
-    pub(super) fn by(cells: &Processes, buses: &[ServedBus]) -> Self {
+    pub(super) fn measure(cells: &Processes, buses: &[ServedBus]) -> Self {
         let of = |pid: u32| Some((pid, processor_seconds(pid)?));
         Self {
             gateway: own_seconds(),

@@ -15,13 +15,13 @@ use protocol::skin::Cell;
 use protocol::time::Span;
 
 use super::accelerations::{Accelerations, Moved};
-use super::begin::{Announced, SWITCH_AGAIN};
+use super::begin::{Announced, SWITCH_RETRY_INTERVAL};
 use super::bench::Bench;
 use super::commanded::serve;
 use super::measured::LoopTotals;
 use super::receiver::BusEvent;
 use super::usage::{Spent, private_kib};
-use crate::bus::link::Slot;
+use crate::bus::link::BusSlot;
 use crate::bus::realtime::{self, Granted};
 use crate::error::RunError;
 use crate::progress::Progress;
@@ -38,7 +38,7 @@ const LEAD_EPOCHS: u64 = 5;
 /// Interval between two rounds of the main thread.
 pub(super) const ROUND_PAUSE: Duration = Duration::from_millis(10);
 /// Queue length for the loop's records: more than a second of ticks.
-const RECORDS: usize = 1_024;
+const RECORD_QUEUE: usize = 1_024;
 
 /// Result of the thread that runs the control loop.
 struct LoopEnd {
@@ -75,23 +75,27 @@ impl Script {
 
 impl Bench<'_> {
     /// Runs the control loop to its end or to its failure, and fills in the summary.
-    pub(super) fn drive(&mut self, summary: &mut Summary, measured: &mut LoopTotals) -> Result<(), RunError> {
+    pub(super) fn control_loop(
+        &mut self,
+        summary: &mut Summary,
+        measured: &mut LoopTotals,
+    ) -> Result<(), RunError> {
         let options = self.options;
-        let (records, mut inlet) = rtrb::RingBuffer::new(RECORDS);
+        let (records, mut inlet) = rtrb::RingBuffer::new(RECORD_QUEUE);
         let cycle = self.cycle.take().expect("the loop begins once");
-        let (lines, slots) = self.bus_links.iter_mut().filter_map(|bus_link| bus_link.line.take()).unzip();
+        let (lines, slots) = self.bus_links.iter_mut().filter_map(|bus_link| bus_link.port.take()).unzip();
         let scenario = Arc::new(options.scenario.clone());
         let turn = TickDriver::new(cycle, lines, scenario, Arc::clone(&self.shared), records);
-        let turn = turn.recorded(self.recorded.take());
+        let turn = turn.with_recorder(self.recorded.take());
         let touches = Touches::new(&options.scenario, &options.skin);
-        let (announced, started) = (Announced::new(SWITCH_AGAIN), Instant::now());
+        let (announced, started) = (Announced::new(SWITCH_RETRY_INTERVAL), Instant::now());
         let accelerations = Accelerations::new(options);
-        let cleared = Announced::new(SWITCH_AGAIN);
+        let cleared = Announced::new(SWITCH_RETRY_INTERVAL);
         let mut script = Script { touches, accelerations, epoch: 0, fault: 0, announced, cleared, started };
-        self.know_contacts(&mut script)?;
-        self.press(&mut script, None)?;
+        self.settle_contacts(&mut script)?;
+        self.send_stimuli(&mut script, None)?;
 
-        let before = Spent::by(&self.processes, &self.served);
+        let before = Spent::measure(&self.processes, &self.served);
         script.started = Instant::now();
         let control = self.start_loop(turn, slots)?;
         let mut progress = Progress::new(options.quiet);
@@ -99,7 +103,7 @@ impl Bench<'_> {
         while !control.is_finished() {
             thread::sleep(ROUND_PAUSE);
             summary.interrupted = self.signalled.load(Ordering::Relaxed);
-            failure = self.step(&mut script, &mut progress, measured, &mut inlet).err();
+            failure = self.run_round(&mut script, &mut progress, measured, &mut inlet).err();
             if failure.is_some() || summary.interrupted {
                 self.shared.stop_loop.store(true, Ordering::Relaxed);
             }
@@ -111,7 +115,8 @@ impl Bench<'_> {
         summary.duration_s = script.started.elapsed().as_secs_f64();
         progress.clear();
         measured.add_records(&mut inlet, self.began);
-        summary.processor = Spent::by(&self.processes, &self.served).cores_since(&before, summary.duration_s);
+        summary.processor =
+            Spent::measure(&self.processes, &self.served).cores_since(&before, summary.duration_s);
         let of_buses = self.served.iter().filter_map(|bus| private_kib(bus.pid()));
         summary.memory = PrivateMemory {
             cell_private_kib: self.processes.pids().filter_map(private_kib).max(),
@@ -129,10 +134,10 @@ impl Bench<'_> {
             Some(failure) => Err(failure),
             None => {
                 summary.no_controller = absence.map(|absence| absence.to_string());
-                self.last_words(summary.interrupted)
+                self.request_final_reports(summary.interrupted)
             }
         };
-        self.look_at_processes(&progress, true);
+        self.note_ended_processes(&progress, true);
         ended
     }
 
@@ -140,7 +145,7 @@ impl Bench<'_> {
     fn start_loop(
         &self,
         mut turn: TickDriver,
-        mut slots: Vec<Slot>,
+        mut slots: Vec<BusSlot>,
     ) -> Result<JoinHandle<LoopEnd>, ThreadError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
@@ -157,14 +162,14 @@ impl Bench<'_> {
     }
 
     /// Runs all checks of the main thread once.
-    fn step(
+    fn run_round(
         &mut self,
         script: &mut Script,
         progress: &mut Progress,
         measured: &mut LoopTotals,
         records: &mut rtrb::Consumer<TimedRecord>,
     ) -> Result<(), RunError> {
-        self.press(script, measured.moved())?;
+        self.send_stimuli(script, measured.last_motion())?;
         if self
             .bus_links
             .iter()
@@ -175,19 +180,19 @@ impl Bench<'_> {
             return Err(RunError::ReceiverEnded);
         }
         self.inject_faults(script, progress)?;
-        self.obey(measured, progress);
+        self.handle_remote(measured, progress);
         self.handle_events(script, progress)?;
-        self.look_at_processes(progress, false);
+        self.note_ended_processes(progress, false);
         self.serve_again(progress);
-        self.look_at_hosts(script, progress)?;
+        self.handle_hosts(script, progress)?;
         for note in self.watch_networks()? {
             progress.note(&note);
         }
-        self.switch_again(&mut script.announced)?;
+        self.repeat_switches(&mut script.announced)?;
         self.clear_contacts(script)?;
-        let was_halted = measured.halts.why().is_some();
+        let was_halted = measured.halts.present_reason().is_some();
         measured.add_records(records, self.began);
-        match (was_halted, measured.halts.why()) {
+        match (was_halted, measured.halts.present_reason()) {
             (false, Some(why)) => {
                 // One bus is enough, because the loop repeats on the other buses what is received on it.
                 let bus_link = self
@@ -212,13 +217,13 @@ impl Bench<'_> {
             let lost: Vec<_> = lost.map(|bus_link| bus_link.link.name.as_str()).collect();
             let comparing = self.shared.comparing.load(Ordering::Relaxed);
             let of = (self.options.scenario.duration, &self.options.skin);
-            measured.line(script.started.elapsed(), of, comparing, &lost, width)
+            measured.progress_text(script.started.elapsed(), of, comparing, &lost, width)
         });
         Ok(())
     }
 
     /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
-    fn press(&self, script: &mut Script, moved: Option<Moved>) -> Result<(), RunError> {
+    fn send_stimuli(&self, script: &mut Script, moved: Option<Moved>) -> Result<(), RunError> {
         let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
         // Skipped broadcasts have no epoch, but the scenario's time continues.
         let skipped = self.shared.broadcasts_skipped.load(Ordering::Relaxed);
@@ -236,13 +241,13 @@ impl Bench<'_> {
             }
             if let Some(accelerations) = &script.accelerations {
                 let now = seconds(&script.touches, epoch);
-                self.send_all(&accelerations.ahead(self.options, moved, (numbered, now)))?;
+                self.send_all(&accelerations.stimuli_ahead(self.options, moved, (numbered, now)))?;
             }
             script.epoch = epoch + 1;
         }
         if let Some(accelerations) = &mut script.accelerations {
             let now = seconds(&script.touches, broadcasts);
-            self.send_all(&accelerations.latest(self.options, moved, (broadcasts, now)))?;
+            self.send_all(&accelerations.latest_stimuli(self.options, moved, (broadcasts, now)))?;
         }
         Ok(())
     }
@@ -256,7 +261,11 @@ impl Bench<'_> {
     }
 
     /// Resends the scenario's stimuli to the selected cells. Does not change stimuli from other senders.
-    pub(super) fn remind(&self, script: &Script, selects: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
+    pub(super) fn resend_stimuli(
+        &self,
+        script: &Script,
+        selects: impl Fn(&Cell) -> bool,
+    ) -> Result<(), RunError> {
         let touched =
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
         for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| selects(cell)) {
@@ -287,11 +296,11 @@ impl Bench<'_> {
             }
             script.fault += 1;
             if let FaultKind::Wire { link_down, from, to, both_ways } = fault.kind {
-                self.switch_link(link_down, (from, to), both_ways, progress);
+                self.set_link(link_down, (from, to), both_ways, progress);
             }
             let FaultKind::Process { action, cells } = &fault.kind else { continue };
             for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
-                let done = self.processes.act(cell.bus, cell.node.get(), *action)?;
+                let done = self.processes.apply(cell.bus, cell.node.get(), *action)?;
                 let bus = self.name(cell.bus);
                 let failed = if done { "" } else { " (no process of ours)" };
                 progress.note(&format!("scenario: {action:?} cell {} on {bus}{failed}", cell.node));
@@ -302,7 +311,7 @@ impl Bench<'_> {
 
     /// Takes the links between two cells down, or brings them up again. The next check of the cells' network sends the
     /// change to the cells.
-    fn switch_link(
+    fn set_link(
         &mut self,
         link_down: bool,
         (from, to): (usize, usize),
@@ -331,22 +340,22 @@ impl Bench<'_> {
 
     /// Handles the events of the receivers.
     fn handle_events(&self, script: &Script, progress: &Progress) -> Result<(), RunError> {
-        let bus_event: Vec<_> = self.bus_event.try_iter().collect();
+        let events: Vec<_> = self.events.try_iter().collect();
         let mut returned = BTreeSet::new();
         let mut changed = BTreeMap::<(usize, &str), Vec<CellId>>::new();
-        for (bus, bus_event) in bus_event {
+        for (bus, bus_event) in events {
             match bus_event {
                 BusEvent::Notice(Notice::OtherGateway) => return Err(self.other_gateway(bus)),
                 BusEvent::Notice(Notice::Dead(cell)) => {
                     changed.entry((bus, "fallen silent")).or_default().push(cell)
                 }
-                BusEvent::Notice(Notice::Back(cell)) => {
+                BusEvent::Notice(Notice::Revived(cell)) => {
                     changed.entry((bus, "come back")).or_default().push(cell)
                 }
                 BusEvent::Notice(Notice::Restarted(cell)) => {
                     progress.note(&format!("cell {cell} on {} restarted", self.name(bus)));
                     // The restarted cell has lost its contact state.
-                    self.remind(script, |it| it.bus == bus && it.node == cell)?;
+                    self.resend_stimuli(script, |it| it.bus == bus && it.node == cell)?;
                 }
                 BusEvent::Notice(Notice::Returned(cell)) => {
                     // A heartbeat that was under way when its host was lost does not mean that the cell is back: it
@@ -376,7 +385,7 @@ impl Bench<'_> {
             }
         }
         if !returned.is_empty() {
-            self.tell_again(script, &returned)?;
+            self.resend_to_returned(script, &returned)?;
         }
         for ((bus, how), cells) in changed {
             let first: Vec<_> = cells.iter().take(6).map(ToString::to_string).collect();
@@ -391,7 +400,7 @@ impl Bench<'_> {
     }
 
     /// Shows notes about cell processes that have ended; with `last`, all pending notes.
-    fn look_at_processes(&mut self, progress: &Progress, last: bool) {
+    fn note_ended_processes(&mut self, progress: &Progress, last: bool) {
         let ended = self.processes.ended();
         for note in self.ended.add_ended(ended, last) {
             progress.note(&note);
@@ -399,26 +408,26 @@ impl Bench<'_> {
     }
 
     /// Handles the reports of links to other hosts.
-    fn look_at_hosts(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
+    fn handle_hosts(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
         let mut reached = BTreeSet::new();
         for (bus, bus_link) in self.bus_links.iter_mut().enumerate() {
             let changes = bus_link.hosts.read_reports(&bus_link.link);
             changes.notes.iter().for_each(|note| progress.note(note));
             reached.extend(changes.reached.into_iter().map(|cell| (bus, cell)));
-            if !changes.in_doubt.is_empty() {
+            if !changes.possibly_missed.is_empty() {
                 // The receiver must know these cells before any further messages are sent to them.
-                let _ = bus_link.in_doubt.send(changes.in_doubt);
+                let _ = bus_link.possibly_missed.send(changes.possibly_missed);
             }
         }
         if reached.is_empty() {
             return Ok(());
         }
-        self.tell_again(script, &reached)
+        self.resend_to_returned(script, &reached)
     }
 
     /// Resends stimuli and commands to cells that may have missed changes while they were absent.
-    fn tell_again(&self, script: &Script, cells: &BTreeSet<(usize, CellId)>) -> Result<(), RunError> {
-        self.remind(script, |it| cells.contains(&(it.bus, it.node)))?;
+    fn resend_to_returned(&self, script: &Script, cells: &BTreeSet<(usize, CellId)>) -> Result<(), RunError> {
+        self.resend_stimuli(script, |it| cells.contains(&(it.bus, it.node)))?;
         for bus_link in cells.iter().filter_map(|&(bus, _)| self.bus_links.get(bus)) {
             bus_link.link.state.returned.store(true, Ordering::Relaxed);
         }

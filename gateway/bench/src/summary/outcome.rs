@@ -4,7 +4,7 @@ use model::listing::ranges;
 use serde::Serialize;
 
 /// Maximum number of cell errors given one by one.
-const REASONS: usize = 4;
+const MAX_REASONS: usize = 4;
 
 /// Outcome of a run. If several variants apply, the last of them is the outcome; but a halt takes precedence over a
 /// lost bus.
@@ -95,13 +95,13 @@ impl CellError {
 /// failed.
 #[must_use]
 pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String> {
-    let each = errors.iter().take(REASONS).map(|error| match with_reasons {
+    let each = errors.iter().take(MAX_REASONS).map(|error| match with_reasons {
         true => format!("{} ({})", error.names(), error.reason),
         false => error.names(),
     });
     let each = each.collect::<Vec<_>>().join("; ");
     let above = if with_reasons { "" } else { ", given above" };
-    let more = match errors.len().saturating_sub(REASONS) {
+    let more = match errors.len().saturating_sub(MAX_REASONS) {
         0 => String::new(),
         more => format!("; and {more} more reasons, which --summary FILE keeps"),
     };
@@ -130,7 +130,7 @@ pub struct HaltSummary {
 
 /// Record of a tick before a halt.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct TickBefore {
+pub struct TickSummary {
     /// Number of the tick.
     pub tick: u64,
     /// Time at which the tick was due, in s since the start of the loop.
@@ -201,9 +201,9 @@ mod tests {
             let [absent, errors, halted, _] = flags;
             let failed = summary(flags).with_verdict(Some("a bus is lost".to_owned()));
             assert_eq!((failed.outcome, failed.outcome.exit_code()), (Outcome::Failed, 1));
-            assert_eq!(failed.complaints(true).last().unwrap(), "a bus is lost");
+            assert_eq!(failed.end_messages(true).last().unwrap(), "a bus is lost");
             let rated = summary(flags).with_verdict(None);
-            let lines = rated.complaints(true);
+            let lines = rated.end_messages(true);
             let last = lines.last().map_or("", String::as_str);
             let (code, words) = match rated.outcome {
                 Outcome::Halted => (3, "the robot was halted at 1.000 s"),

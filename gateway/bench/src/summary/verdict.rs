@@ -20,7 +20,7 @@ const SUM_ERROR_NM: f64 = 4.0 / 256.0;
 const SATURATED: &str = Event::Saturated.name();
 const STALE: &str = Event::StaleTorque.name();
 /// Maximum number of groups of node ids in a list; further groups are only counted.
-const RANGES: usize = 12;
+const MAX_RANGES: usize = 12;
 
 /// Verdict on a run.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
@@ -38,19 +38,19 @@ impl Verdict {
         let mut look_at = Vec::new();
         ending(&mut look_at, summary);
         let buses = || summary.buses.iter();
-        absent(&mut look_at, summary);
-        buses().for_each(|bus| unknown(&mut look_at, bus));
+        absent_cells(&mut look_at, summary);
+        buses().for_each(|bus| unexplained_losses(&mut look_at, bus));
         buses().for_each(|bus| network(&mut look_at, bus));
         wrong_torques(&mut look_at, summary);
         restarts(&mut look_at, summary);
         recording(&mut look_at, summary);
-        buses().for_each(|bus| lost(&mut look_at, bus));
+        buses().for_each(|bus| explained_losses(&mut look_at, bus));
         unchecked(&mut look_at, summary);
         control(&mut look_at, summary);
-        buses().for_each(|bus| late(&mut look_at, bus));
+        buses().for_each(|bus| late_replies(&mut look_at, bus));
         buses().for_each(|bus| incomplete(&mut look_at, bus));
         ticks(&mut look_at, summary);
-        buses().for_each(|bus| anomalies(&mut look_at, bus));
+        buses().for_each(|bus| irregular_frames(&mut look_at, bus));
         let ended_well = matches!(summary.outcome, Outcome::Done | Outcome::Interrupted);
         if look_at.is_empty() && !ended_well {
             look_at.push(format!("the run ended as {}", summary.outcome));
@@ -62,7 +62,7 @@ impl Verdict {
 impl Summary {
     /// Returns the totals of a run that is well, in one line.
     #[must_use]
-    pub fn sums_of_all(&self) -> String {
+    pub fn totals_line(&self) -> String {
         let of = |figure: fn(&BusSummary) -> u64| self.buses.iter().map(figure).sum::<u64>();
         let (complete, due) = (of(|bus| bus.epochs_complete), of(|bus| bus.epochs_due));
         let on = match self.buses.len() {
@@ -70,16 +70,16 @@ impl Summary {
             buses => format!(" on {buses} buses"),
         };
         let mut parts = vec![
-            many(self.cells.len(), "cell", "cells"),
-            format!("{complete} of {} complete{on}", many(due, "epoch", "epochs")),
+            count_noun(self.cells.len(), "cell", "cells"),
+            format!("{complete} of {} complete{on}", count_noun(due, "epoch", "epochs")),
         ];
         let replies = of(|bus| bus.replies.in_time);
         if replies > 0 {
-            parts.push(format!("{} in time", many(replies, "reply", "replies")));
+            parts.push(format!("{} in time", count_noun(replies, "reply", "replies")));
         }
         let contributions = of(|bus| bus.sums.map_or(0, |sums| sums.contributions.in_time));
         if contributions > 0 {
-            parts.push(format!("{} due in sums in time", many(contributions, "cell", "cells")));
+            parts.push(format!("{} due in sums in time", count_noun(contributions, "cell", "cells")));
         }
         let accuracy = &self.accuracy;
         let error = accuracy.single.mean().or_else(|| accuracy.sums.mean());
@@ -89,7 +89,7 @@ impl Summary {
 }
 
 /// Formats a count with its noun in the singular or plural.
-pub(crate) fn many(count: impl TryInto<u64>, one: &str, more: &str) -> String {
+pub(crate) fn count_noun(count: impl TryInto<u64>, one: &str, more: &str) -> String {
     let count = count.try_into().unwrap_or(u64::MAX);
     format!("{count} {}", if count == 1 { one } else { more })
 }
@@ -100,10 +100,10 @@ fn times(count: u64) -> String {
 }
 
 /// Formats cells of a bus: `cell 3 on vcan0`, `cells 1-4, 6 on vcan0`.
-fn named(nodes: &[u8], bus: &str) -> String {
+fn cell_names(nodes: &[u8], bus: &str) -> String {
     let all = ranges(nodes);
     let noun = if nodes.len() == 1 { "cell" } else { "cells" };
-    match all.get(..RANGES).filter(|_| all.len() > RANGES) {
+    match all.get(..MAX_RANGES).filter(|_| all.len() > MAX_RANGES) {
         Some(first) => format!("{} cells ({}, ...) on {bus}", nodes.len(), first.join(", ")),
         None => format!("{noun} {} on {bus}", all.join(", ")),
     }
@@ -118,7 +118,7 @@ fn cells_that(summary: &Summary, holds: impl Fn(&CellSummary) -> bool) -> Vec<St
     for nodes in buses.values_mut() {
         nodes.sort_unstable();
     }
-    buses.into_iter().map(|(bus, nodes)| named(&nodes, bus)).collect()
+    buses.into_iter().map(|(bus, nodes)| cell_names(&nodes, bus)).collect()
 }
 
 /// Lists counts with their nouns, without counts of 0.
@@ -146,7 +146,7 @@ fn ending(look_at: &mut Vec<String>, summary: &Summary) {
 }
 
 /// Adds findings on buses that were lost, and on cells that were silent at the end.
-fn absent(look_at: &mut Vec<String>, summary: &Summary) {
+fn absent_cells(look_at: &mut Vec<String>, summary: &Summary) {
     for bus in summary.buses.iter().filter(|bus| bus.outages.times > 0) {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         look_at.push(format!(
@@ -159,7 +159,7 @@ fn absent(look_at: &mut Vec<String>, summary: &Summary) {
     for bus in summary.buses.iter().filter(|bus| !bus.silent_cells.is_empty()) {
         look_at.push(format!(
             "{}: dead, or never heard; check that each runs and is wired",
-            named(&bus.silent_cells, &bus.name)
+            cell_names(&bus.silent_cells, &bus.name)
         ));
     }
     // A receiver that panicked has left no figures of its bus.
@@ -174,7 +174,7 @@ fn absent(look_at: &mut Vec<String>, summary: &Summary) {
         let gone =
             (host.gone > 0).then(|| format!("gone {} for {:.1} s in all", times(host.gone), host.gone_s));
         let end = (!host.at_end).then(|| "not reached at the end".to_owned());
-        let lost = (lost > 0).then(|| format!("{} lost", many(lost, "frame", "frames")));
+        let lost = (lost > 0).then(|| format!("{} lost", count_noun(lost, "frame", "frames")));
         let parts: Vec<_> = [gone, end, lost].into_iter().flatten().collect();
         if !parts.is_empty() {
             look_at.push(format!(
@@ -187,25 +187,25 @@ fn absent(look_at: &mut Vec<String>, summary: &Summary) {
 }
 
 /// Adds findings on replies and packets that are missing for an unknown reason.
-fn unknown(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn unexplained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     if replies.unknown > 0 {
         look_at.push(format!(
             "{} missing without a reason (unknown) on {name}: cells[].missing of --summary FILE has which cells",
-            many(replies.unknown, "reply", "replies")
+            count_noun(replies.unknown, "reply", "replies")
         ));
     }
     if up.unknown > 0 {
         look_at.push(format!(
             "{} sent by cells and not received, without a reason (unknown), on {name}: check its wiring and load",
-            many(up.unknown, "packet", "packets")
+            count_noun(up.unknown, "packet", "packets")
         ));
     }
     if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.missing > 0) {
         look_at.push(format!(
             "{} of {} due in sums missing on {name}: no route to a root, lost sums, or a busy machine",
             parts.missing,
-            many(parts.due, "cell", "cells")
+            count_noun(parts.due, "cell", "cells")
         ));
     }
 }
@@ -216,7 +216,7 @@ fn network(look_at: &mut Vec<String>, bus: &BusSummary) {
     if !network.unreachable.is_empty() {
         look_at.push(format!(
             "{}: no route to a root at the end, so no sum contains them; check their wires",
-            named(&network.unreachable, &bus.name)
+            cell_names(&network.unreachable, &bus.name)
         ));
     } else if network.tree_ready_s.is_none() {
         look_at.push(format!("the tree on {} was not complete when the run began", bus.name));
@@ -247,10 +247,11 @@ fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
     if saturated > 0 {
         look_at.push(format!(
             "{} saturated: larger than the torque format can carry, and not compared",
-            many(saturated, "torque", "torques")
+            count_noun(saturated, "torque", "torques")
         ));
     } else if accuracy.saturated > 0 {
-        look_at.push(format!("{} saturated, and not compared", many(accuracy.saturated, "word", "words")));
+        look_at
+            .push(format!("{} saturated, and not compared", count_noun(accuracy.saturated, "word", "words")));
     }
     for cells in cells_that(summary, |cell| !cell.stuck.is_empty()) {
         look_at.push(format!("{cells}: stuck, sent the same words while it should have sent others"));
@@ -262,7 +263,7 @@ fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
         if unexpected + in_sums > 0 {
             look_at.push(format!(
                 "{} that nothing touched, or that were halted, on {}: not compared",
-                many(unexpected + in_sums, "torque of cells", "torques of cells"),
+                count_noun(unexpected + in_sums, "torque of cells", "torques of cells"),
                 bus.name
             ));
         }
@@ -280,7 +281,7 @@ fn restarts(look_at: &mut Vec<String>, summary: &Summary) {
         if others > 0 {
             look_at.push(format!(
                 "{} on {}",
-                many(others, "restart of a cell", "restarts of cells"),
+                count_noun(others, "restart of a cell", "restarts of cells"),
                 bus.name
             ));
         }
@@ -300,14 +301,14 @@ fn recording(look_at: &mut Vec<String>, summary: &Summary) {
     if recording.lost + messages > 0 && summary.failure.is_none() {
         look_at.push(format!(
             "the recording is incomplete, without {} and {}: this machine was busy, or its disk is slow",
-            many(recording.lost, "frame", "frames"),
-            many(messages, "other message", "other messages")
+            count_noun(recording.lost, "frame", "frames"),
+            count_noun(messages, "other message", "other messages")
         ));
     }
 }
 
 /// Adds findings on losses whose reason is known.
-fn lost(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     let reasons = [
         (replies.lost, "lost on the way to the gateway"),
@@ -334,7 +335,7 @@ fn lost(look_at: &mut Vec<String>, bus: &BusSummary) {
     if bus.dropped_by_bus > up.dropped {
         look_at.push(format!(
             "{} of any sender dropped by {name}, because this machine did not read them in time",
-            many(bus.dropped_by_bus - up.dropped, "frame", "frames")
+            count_noun(bus.dropped_by_bus - up.dropped, "frame", "frames")
         ));
     }
 }
@@ -345,14 +346,14 @@ fn control(look_at: &mut Vec<String>, summary: &Summary) {
     if bad > 0 {
         let worst = control.bad_cycles.iter().max_by_key(|(_, count)| **count);
         let why = worst.map_or("", |(reason, _)| reason);
-        look_at.push(format!("{}, most of them because {why}", many(bad, "bad cycle", "bad cycles")));
+        look_at.push(format!("{}, most of them because {why}", count_noun(bad, "bad cycle", "bad cycles")));
     }
     if control.unsent > 0 {
-        let frames = many(control.unsent, "frame", "frames");
+        let frames = count_noun(control.unsent, "frame", "frames");
         look_at.push(format!("{frames} of the gateway not sent: a bus refused them"));
     }
     if control.records_lost > 0 {
-        let records = many(control.records_lost, "record of a tick", "records of ticks");
+        let records = count_noun(control.records_lost, "record of a tick", "records of ticks");
         look_at
             .push(format!("{records} lost, so figures of the control loop lack them: this machine was busy"));
     }
@@ -370,13 +371,13 @@ fn ticks(look_at: &mut Vec<String>, summary: &Summary) {
         look_at.push(format!(
             "{} of {} of the control loop skipped{joints}: this machine was busy{fifo}",
             control.ticks_skipped,
-            many(control.ticks + control.ticks_skipped, "tick", "ticks")
+            count_noun(control.ticks + control.ticks_skipped, "tick", "ticks")
         ));
     }
 }
 
 /// Adds findings on late replies, and on replies of cells that received the joints too late.
-fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn late_replies(look_at: &mut Vec<String>, bus: &BusSummary) {
     let RepliesSummary { due, late, too_late, skipped, .. } = bus.replies;
     let parts =
         nonzero([(late + too_late, "late"), (skipped, "skipped by cells that received the joints too late")]);
@@ -384,7 +385,7 @@ fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
         look_at.push(format!(
             "{} of {} on {}: this machine was busy, or the cells are slow; -v has the times",
             parts.join(" and "),
-            many(due, "reply", "replies"),
+            count_noun(due, "reply", "replies"),
             bus.name
         ));
     }
@@ -392,7 +393,7 @@ fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
         look_at.push(format!(
             "{} of {} due in sums late on {}: this machine was busy, or the tree is deep",
             parts.late,
-            many(parts.due, "cell", "cells"),
+            count_noun(parts.due, "cell", "cells"),
             bus.name
         ));
     }
@@ -408,14 +409,14 @@ fn incomplete(look_at: &mut Vec<String>, bus: &BusSummary) {
         look_at.push(format!(
             "{} of {} not complete on {}",
             missing,
-            many(bus.epochs_due, "epoch", "epochs"),
+            count_noun(bus.epochs_due, "epoch", "epochs"),
             bus.name
         ));
     }
 }
 
 /// Adds a finding on irregular frames, except those reported above: saturated torques and torques that came too late.
-fn anomalies(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn irregular_frames(look_at: &mut Vec<String>, bus: &BusSummary) {
     let odd = bus.events.iter().map(|(name, count)| match *name {
         SATURATED => (0, SATURATED),
         STALE => (count.saturating_sub(bus.replies.too_late), STALE),

@@ -5,11 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::summary::{
     BusSummary, CellError, CellSummary, ErrorCells, HaltSummary, HostSummary, LoopSummary, NetworkSummary,
-    Outcome, PrivateMemory, ProcessorUse, RecordingAccount, RepliesSummary, Summary, SumsSummary, TickBefore,
-    Verdict, WrittenFile,
+    Outcome, PrivateMemory, ProcessorUse, RecordingAccount, RepliesSummary, Summary, SumsSummary,
+    TickSummary, Verdict, WrittenFile,
 };
 use model::quantiles::{Quantiles, histogram};
-use model::table::{Accuracy, Event, Status, Table};
+use model::table::{Accuracy, CellStatus, Event, Table};
 use protocol::can::Format;
 use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::{CellId, Kind, Node};
@@ -55,7 +55,7 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
             until_s: None,
         }],
         further_halts: 0,
-        before_halt: vec![TickBefore {
+        before_halt: vec![TickSummary {
             tick: 250,
             time_s: 0.5,
             late_us: 1.0,
@@ -219,9 +219,10 @@ fn the_keys_of_quantiles_and_errors_are_documented() {
 
 #[test]
 fn the_names_in_maps_are_documented() {
-    let statuses = [Status::Unknown, Status::Quiet, Status::Active, Status::Stale, Status::Dead];
+    let statuses =
+        [CellStatus::Unknown, CellStatus::Quiet, CellStatus::Active, CellStatus::Stale, CellStatus::Dead];
     let names = Event::ALL.into_iter().map(Event::name);
-    let names = names.chain(Kind::ALL.into_iter().map(Kind::name)).chain(statuses.map(Status::name));
+    let names = names.chain(Kind::ALL.into_iter().map(Kind::name)).chain(statuses.map(CellStatus::name));
     for name in names {
         assert!(SUMMARY_MD.contains(&format!("`{name}`")), "{name}");
     }

@@ -15,16 +15,16 @@
     reason = "a test may stop, and prints figures"
 )]
 
-use crate::motion::Motion;
+use crate::motion::MotionPlan;
 use crate::neighbors::Spacing;
 use crate::observe::Observations;
 use crate::plan::{Bounds, plan};
-use crate::result::{CellResult, Trouble};
+use crate::result::{CellResult, Diagnosis};
 use crate::simulate::{Defect, observe};
-use crate::write::calibrated;
+use crate::write::calibrated_text;
 use crate::{Calibration, Refusal, Settings, calibrate};
 use model::accelerometer::Accelerometers;
-use model::accelerometer::kinematics::G;
+use model::accelerometer::kinematics::STANDARD_GRAVITY;
 use model::accelerometer::sensor::{DataSheet, rotation};
 use model::central::Central;
 use model::testing;
@@ -33,14 +33,14 @@ use protocol::skin::Skin;
 
 mod campaign;
 
-const GRAVITY: [f64; 3] = [0.0, 0.0, -G];
+const GRAVITY: [f64; 3] = [0.0, 0.0, -STANDARD_GRAVITY];
 
 fn seeds() -> u64 {
     std::env::var("SKINBUS_SEEDS").ok().and_then(|seeds| seeds.parse().ok()).unwrap_or(1)
 }
 
 fn settings(skin: &Skin) -> Settings {
-    let mut settings = Settings { threads: 2, ..Settings::of(skin) };
+    let mut settings = Settings { threads: 2, ..Settings::from_skin(skin) };
     if skin.robot.name == "UR5" {
         settings.bounds.center = vec![0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
     }
@@ -122,8 +122,8 @@ fn torque_error(truth: &Skin, found: &Skin) -> f64 {
             *q = (f64::from(step) * 1.3 + joint as f64 * 2.1).sin() * 1.5;
         }
         for cell in 0..truth.cells.len() {
-            let expected = truth_central.torque(cell, &truth_central.frames_at(&q), 5.0);
-            let got = found_central.torque(cell, &found_central.frames_at(&q), 5.0);
+            let expected = truth_central.torque(cell, &truth_central.frames_at_positions(&q), 5.0);
+            let got = found_central.torque(cell, &found_central.frames_at_positions(&q), 5.0);
             off += expected.iter().zip(got).map(|(one, other)| (one - other).abs()).sum::<f64>();
             size += expected.iter().map(|torque| torque.abs()).sum::<f64>();
         }
@@ -147,9 +147,9 @@ fn cells_on_a_ur5_are_found() {
         let calibration = calibrate(&unknown, &seen, &settings).unwrap();
         assert_eq!(calibration.cells.iter().flat_map(|cell| &cell.troubles).count(), 0);
         alone.add(&skin, &calibration, |_, _| true);
-        let text = calibrated(&skin, testing::UR5, &calibration).unwrap();
+        let text = calibrated_text(&skin, testing::UR5, &calibration).unwrap();
         torques.push(torque_error(&skin, &Skin::parse("new.toml", &text).unwrap()));
-        let spacing = Some(Spacing::of(0.028));
+        let spacing = Some(Spacing::with_distance(0.028));
         let settings = Settings { spacing, ..settings };
         together.add(&skin, &calibrate(&unknown, &seen, &settings).unwrap(), |_, _| true);
     }
@@ -170,7 +170,7 @@ fn cells_on_an_arm_of_seven_joints_are_found() {
         // The first joint turns about gravity: nothing determines the angle around it, or the height, of a cell on its
         // link.
         let determined = |result: &CellResult| {
-            !result.troubles.iter().any(|it| matches!(it, Trouble::NotObservable { .. }))
+            !result.troubles.iter().any(|it| matches!(it, Diagnosis::NotObservable { .. }))
         };
         for (cell, result) in skin.cells.iter().zip(&calibration.cells) {
             assert_eq!(result.found.unwrap().joint, cell.joint, "seed {seed}: node {}", cell.node);
@@ -195,7 +195,7 @@ fn dead_swapped_and_loose_cells_are_named_and_spoil_no_other() {
     let mut errors = Errors::default();
     for seed in 0..seeds() {
         let mut settings = settings(&skin);
-        settings.spacing = Some(Spacing::of(0.028));
+        settings.spacing = Some(Spacing::with_distance(0.028));
         let mut defects = vec![Defect::None; skin.cells.len()];
         // 13 cells of 253 are 5 %; 5 are 2 %, in two pairs and a half.
         for dead in (0..13).map(|index| (index * 19 + 7) % 253) {
@@ -225,19 +225,19 @@ fn dead_swapped_and_loose_cells_are_named_and_spoil_no_other() {
             let real = skin.cells.iter().position(|it| it.node == cell.node).unwrap();
             let troubles = &calibration.cells[index].troubles;
             let expected = match defects[real] {
-                Defect::Dead => Some(Trouble::Dead),
-                Defect::Stuck => Some(Trouble::Stuck),
-                Defect::Silent(_) => Some(Trouble::Silent { share: 0.0 }),
-                Defect::Loose(_) => Some(Trouble::Loose { times: 0.0 }),
+                Defect::Dead => Some(Diagnosis::Dead),
+                Defect::Stuck => Some(Diagnosis::Stuck),
+                Defect::Silent(_) => Some(Diagnosis::Silent { share: 0.0 }),
+                Defect::Loose(_) => Some(Diagnosis::Loose { times: 0.0 }),
                 Defect::None if real != index => {
-                    Some(Trouble::Swapped { node: skin.cells[index].node.get() })
+                    Some(Diagnosis::Swapped { node: skin.cells[index].node.get() })
                 }
                 Defect::None => None,
             };
             match (expected, troubles.as_slice()) {
                 (None, []) => {}
-                (Some(Trouble::Silent { .. }), [Trouble::Silent { .. }])
-                | (Some(Trouble::Loose { .. }), [Trouble::Loose { .. }]) => named += 1,
+                (Some(Diagnosis::Silent { .. }), [Diagnosis::Silent { .. }])
+                | (Some(Diagnosis::Loose { .. }), [Diagnosis::Loose { .. }]) => named += 1,
                 (Some(expected), [one]) if expected == *one => named += 1,
                 (expected, troubles) => {
                     panic!("seed {seed}: cell {index}: {troubles:?}, expected {expected:?}")
@@ -264,17 +264,17 @@ fn a_joint_that_does_not_move_is_named_as_what_would_help() {
     let mut motion = plan(&skin, &settings.bounds, &sheet, GRAVITY).unwrap();
     // The last joints stand still.
     for timed in &mut motion.steps {
-        use crate::motion::Step;
+        use crate::motion::MotionStep;
         match &mut timed.step {
-            Step::Hold { at } => at[5..].fill(1.5),
-            Step::Move { from, to } => (from[5..].fill(1.5), to[5..].fill(1.5)).1,
-            Step::Swing { about, amplitude, .. } => (about[5..].fill(1.5), amplitude[5..].fill(0.0)).1,
+            MotionStep::Hold { at } => at[5..].fill(1.5),
+            MotionStep::Move { from, to } => (from[5..].fill(1.5), to[5..].fill(1.5)).1,
+            MotionStep::Swing { about, amplitude, .. } => (about[5..].fill(1.5), amplitude[5..].fill(0.0)).1,
         }
     }
     let seen = observe(&skin, &motion, &Accelerometers::new(&skin, &sheet, 5, GRAVITY), &[]);
     let calibration = calibrate(&skin, &seen, &settings).unwrap();
     for (cell, result) in skin.cells.iter().zip(&calibration.cells) {
-        let unsure = result.troubles.iter().any(|trouble| matches!(trouble, Trouble::Joint { .. }));
+        let unsure = result.troubles.iter().any(|trouble| matches!(trouble, Diagnosis::Joint { .. }));
         assert_eq!(unsure, cell.joint >= 5, "node {}: {:?}", cell.node, result.troubles);
         assert!(!unsure || !result.is_written());
     }

@@ -82,7 +82,7 @@ fn alone(session: &mut Session<'_>) -> Result<(), StopReason> {
 
 fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
     let unit = arm::press(arm::unit_press(protocol::fixed::TorqueFormat::Q3_12));
-    let central = Central::of_cell(&arm::example_parameters(6));
+    let central = Central::for_single_cell(&arm::example_parameters(6));
     for round in 0..2 {
         session.press_and_step(&HERE, unit)?;
         let exchange = command(session, Message::Halt, "CMD-1")?;

@@ -5,21 +5,21 @@ use protocol::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
 use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, Parameters};
 
-use super::kinematics::look_at_words;
+use super::kinematics::check_torque_words;
 use crate::arm::{self, TestRandom};
 use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The number of random forces for each of several rules.
-const RANDOM: usize = 40;
+const RANDOM_FORCES: usize = 40;
 /// The number of forces that are sent to reveal a rounding error.
-const SHOWN: usize = 12;
+const ROUNDING_FORCES: usize = 12;
 
 /// The sensor words of a press: three of contact, and one of proximity.
 type Sensed = ([i16; 3], i16);
 
 /// Joint positions, and the words of J that were measured at them.
-struct Known {
+struct MeasuredPose {
     positions: [i16; MAX_JOINTS],
     j: [i16; MAX_JOINTS],
 }
@@ -34,7 +34,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     for _ in 0..4 {
         let positions = arm::positions(&mut dice, &parameters);
         let j = session.press_and_step(&positions, arm::press(arm::unit_press(TorqueFormat::Q3_12)))?.words();
-        known.push(Known { positions, j });
+        known.push(MeasuredPose { positions, j });
     }
     ties(session, &parameters, &known)?;
     for (contact, crafted) in rules() {
@@ -56,7 +56,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 fn press(
     session: &mut Session<'_>,
     parameters: &Parameters,
-    known: &Known,
+    known: &MeasuredPose,
     skin: SkinSensors,
     id: &'static str,
 ) -> Result<(), StopReason> {
@@ -75,13 +75,17 @@ fn press(
         format!("with {}, F_z must be {force} steps of 2^-16 N, but {came}", sensed())
     });
     if is_there {
-        look_at_words(session, parameters, &known.j, force, &step.words(), id);
+        check_torque_words(session, parameters, &known.j, force, &step.words(), id);
     }
     Ok(())
 }
 
 /// Checks products that end in exactly half a step, and words at the limits of their range.
-fn ties(session: &mut Session<'_>, parameters: &Parameters, known: &[Known]) -> Result<(), StopReason> {
+fn ties(
+    session: &mut Session<'_>,
+    parameters: &Parameters,
+    known: &[MeasuredPose],
+) -> Result<(), StopReason> {
     let format = parameters.torque_format;
     let bits = 30 - i64::from(format.fraction());
     let product = |j: i16, sum: i32| i64::from(j) * i64::from(sum) * 64;
@@ -189,7 +193,7 @@ fn rule(
     session: &mut Session<'_>,
     dice: &mut TestRandom,
     parameters: &Parameters,
-    known: &[Known],
+    known: &[MeasuredPose],
     crafted: &[Sensed],
 ) -> Result<(), StopReason> {
     let skin = |(contact, proximity): Sensed| SkinSensors {
@@ -206,7 +210,7 @@ fn rule(
         let contact = [0; 3].map(|_| dice.word() >> shift);
         (contact, (dice.word() >> shift) & i16::MAX)
     };
-    for place in 0..session.attempts(RANDOM) {
+    for place in 0..session.attempts(RANDOM_FORCES) {
         let shift = [0, 2, 4, 7];
         let (Some(known), Some(shift)) = (known.get(place % 4), shift.get(place / 2 % 4)) else { continue };
         press(session, parameters, known, skin(random(*shift)), "FORCE-1")?;
@@ -223,7 +227,7 @@ fn rule(
         if force > 1 && is_rounded_up(&parameters.contact, &skin) && known.j.iter().any(shows) {
             press(session, parameters, known, skin, "FORCE-1")?;
             shown += 1;
-            if shown >= session.attempts(SHOWN) {
+            if shown >= session.attempts(ROUNDING_FORCES) {
                 break;
             }
         }

@@ -194,7 +194,7 @@ pub(super) fn old(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.ready(&arm::example_parameters(6))? {
         return Ok(());
     }
-    let mut shown = Old::default();
+    let mut shown = BurstResults::default();
     for press in [4_096, 1_024, 2_048, 512] {
         burst(session, press, &mut shown)?;
     }
@@ -209,7 +209,7 @@ pub(super) fn old(session: &mut Session<'_>) -> Result<(), StopReason> {
 
 /// The results of the bursts of joints so far.
 #[derive(Debug, Default)]
-struct Old {
+struct BurstResults {
     /// The number of bursts in which old joints were answered.
     answered: usize,
     any: bool,
@@ -218,7 +218,7 @@ struct Old {
 /// The number of bursts of joints; JOINTS-4 fails if old joints are answered in all of them.
 const BURSTS: usize = 4;
 
-fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), StopReason> {
+fn burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -> Result<(), StopReason> {
     const BURST: u8 = 24;
     // In contact: skipped joints change the contact as little as the commit does.
     session.commit(&arm::example_parameters(6))?;
@@ -243,7 +243,7 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
     session.idle(Span::from_millis(60))?;
     session.consume();
     let answers: Vec<_> = session.answers().iter().filter_map(|it| Some((it.at, it.torque()?.0.0))).collect();
-    if let Some(text) = look_at_old(&sent, &answers) {
+    if let Some(text) = find_old_answer(&sent, &answers) {
         (shown.any, shown.answered) = (true, shown.answered + 1);
         // The time stamps of the bus differ from those of the cell: a single burst proves nothing.
         session.check("JOINTS-4", shown.answered < BURSTS, || text);
@@ -287,7 +287,7 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
 
 /// Returns a description of joints that were answered although they were too old, if there are any. A cell that answers
 /// one joints message after the next one has come is too late for that next one, and must not answer it.
-fn look_at_old(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String> {
+fn find_old_answer(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String> {
     const MARGIN: Span = Span(100);
     let late = answers.windows(2).find(|pair| match pair {
         [(before, _), (_, epoch)] => {

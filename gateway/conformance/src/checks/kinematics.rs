@@ -11,15 +11,15 @@ use crate::session::Session;
 /// The number of joint positions per arm.
 const POSES: usize = 20;
 /// The number of joint positions per arm, for arms that differ only in their number of joints.
-const FEW: usize = 4;
+const POSES_PER_LENGTH: usize = 4;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut dice = TestRandom::new(1);
     for parameters in arms(&mut dice, session.about.abilities) {
-        one(session, &mut dice, &parameters, POSES)?;
+        check_arm(session, &mut dice, &parameters, POSES)?;
     }
     for parameters in lengths(&mut dice, session.about.abilities) {
-        one(session, &mut dice, &parameters, FEW)?;
+        check_arm(session, &mut dice, &parameters, POSES_PER_LENGTH)?;
     }
     out_of_reach(session)
 }
@@ -81,7 +81,7 @@ fn lengths(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
 }
 
 /// Checks one arm at many joint positions.
-fn one(
+fn check_arm(
     session: &mut Session<'_>,
     dice: &mut TestRandom,
     parameters: &Parameters,
@@ -90,7 +90,7 @@ fn one(
     if !session.ready(parameters)? {
         return Ok(());
     }
-    let central = Central::of_cell(parameters);
+    let central = Central::for_single_cell(parameters);
     let format = parameters.torque_format;
     let mut positions = [0; MAX_JOINTS];
     for pose in 0..session.attempts(poses) {
@@ -99,16 +99,23 @@ fn one(
         let stays = if pose % 3 == 2 && parameters.joints > 6 { 6 } else { 0 };
         positions.iter_mut().zip(next).skip(stays).for_each(|(position, next)| *position = next);
         let j = session.press_and_step(&positions, arm::press(arm::unit_press(format)))?.words();
-        look_at_j(session, parameters, &central, &positions, &j);
+        check_jacobian(session, parameters, &central, &positions, &j);
         // The same joints again, with any force: J is known now.
         let press = arm::press(i32::from(dice.word()).abs() * 3);
         let words = session.press_and_step(&positions, press)?.words();
-        look_at_words(session, parameters, &j, arm::force(&parameters.contact, &press), &words, "TORQUE-1");
+        check_torque_words(
+            session,
+            parameters,
+            &j,
+            arm::force(&parameters.contact, &press),
+            &words,
+            "TORQUE-1",
+        );
     }
     Ok(())
 }
 
-fn look_at_j(
+fn check_jacobian(
     session: &mut Session<'_>,
     parameters: &Parameters,
     central: &Central,
@@ -130,7 +137,7 @@ fn look_at_j(
 }
 
 /// Checks the words of a torque with known J and force.
-pub(super) fn look_at_words(
+pub(super) fn check_torque_words(
     session: &mut Session<'_>,
     parameters: &Parameters,
     j: &[i16; MAX_JOINTS],
@@ -157,7 +164,7 @@ fn out_of_reach(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut long = Parameters { joint: 1, joints: 1, ..arm::example_parameters(1) };
     long.rows = [Row { a: far, ..Row::default() }; protocol::parameters::MAX_ROWS];
     long.pose.position = [far, Q1_14::ZERO, Q1_14::ZERO];
-    held(session, &long, &[0x2345; MAX_JOINTS], [0, 0x4000, 0])?;
+    check_saturated_jacobian(session, &long, &[0x2345; MAX_JOINTS], [0, 0x4000, 0])?;
     // The second joint slides along y of the first; the force is along x.
     let mut slides = Parameters { joint: 2, joints: 2, row: 2, table_rows: 2, ..arm::example_parameters(2) };
     slides.rows = [Row::default(); protocol::parameters::MAX_ROWS];
@@ -169,14 +176,14 @@ fn out_of_reach(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.about.abilities.first_missing(&slides).is_none() {
         let mut positions = [0; MAX_JOINTS];
         positions.iter_mut().skip(1).take(1).for_each(|slide| *slide = far.to_bits());
-        held(session, &slides, &positions, [-0x4000, 0, 0])?;
+        check_saturated_jacobian(session, &slides, &positions, [-0x4000, 0, 0])?;
     }
     Ok(())
 }
 
 /// Checks that J of the first joint saturates: at its lowest word with this normal of the cell, and at its highest word
 /// with the opposite normal.
-fn held(
+fn check_saturated_jacobian(
     session: &mut Session<'_>,
     arm: &Parameters,
     positions: &[i16; MAX_JOINTS],

@@ -95,7 +95,7 @@ fn computes(
     let press = arm::press(4_096);
     let step = session.press_and_step(&positions, press)?;
     let near = |parameters: &Parameters| {
-        let central = model::central::Central::of_cell(parameters);
+        let central = model::central::Central::for_single_cell(parameters);
         let exact = arm::exact_jacobian(&central, &positions);
         let force = arm::force(&parameters.contact, &press);
         let word = |x: f64| {

@@ -106,7 +106,7 @@ const FLAWS: &[Flaw] = &[
     (8, |it| it.row = 40),
 ];
 
-const MORE: &[Flaw] = &[
+const COMMIT_FLAWS: &[Flaw] = &[
     (2, |it| it.joints = 15),
     (2, |it| it.joints = 255),
     (3, |it| it.joint = 7),
@@ -147,7 +147,7 @@ fn commits(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.about.abilities.rows() == MAX_ROWS {
         one_row_more(session, &base)?;
     }
-    let all = FLAWS.iter().chain(MORE).chain(if can_rows { ROWS } else { &[] }).filter(is_apt);
+    let all = FLAWS.iter().chain(COMMIT_FLAWS).chain(if can_rows { ROWS } else { &[] }).filter(is_apt);
     for (reason, flaw) in all {
         let mut parameters = base;
         flaw(&mut parameters);

@@ -17,7 +17,7 @@ use crate::session::{ANSWER_TIMEOUT, CellPacket, Reply, Session, TrackedState};
 use claiming::{gives_way, invalid, stays, while_claiming};
 
 /// The time limit from switching the cell off to its first packet.
-const BOOT: Span = Span::from_millis(8_000);
+const BOOT_TIMEOUT: Span = Span::from_millis(8_000);
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.ready(&arm::example_parameters(2))?;
@@ -66,7 +66,7 @@ fn claim(session: &Session<'_>) -> Span {
 
 /// Switches the cell off and on, and returns the time of its first packet.
 fn restart(session: &mut Session<'_>) -> Result<Micros, StopReason> {
-    let came = restart_with(session, BOOT, |_| Ok(()))?;
+    let came = restart_with(session, BOOT_TIMEOUT, |_| Ok(()))?;
     came.ok_or_else(|| {
         let what = "a heartbeat with CLAIMING must come within 8 s after a restart, but none came";
         session.check("CLAIM-1", false, || what.to_owned());
@@ -115,7 +115,7 @@ fn await_claim(
     longest: Span,
     mut meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), StopReason>,
 ) -> Result<(), StopReason> {
-    const LOOK: Span = Span::from_millis(12);
+    const POLL_INTERVAL: Span = Span::from_millis(12);
     let give_up = session.now() + longest;
     let is_claim = |it: &CellPacket| it.beat().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING));
     loop {
@@ -124,9 +124,9 @@ fn await_claim(
             if !is_restarting {
                 return Ok(());
             }
-            session.idle(LOOK)?;
+            session.idle(POLL_INTERVAL)?;
         } else if is_restarting || session.now() < give_up {
-            let until = session.now() + LOOK;
+            let until = session.now() + POLL_INTERVAL;
             session.wait(until, |heard| heard.last().is_some_and(is_claim))?;
             if session.claimed().is_none() {
                 meanwhile(session)?;
@@ -230,7 +230,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     session.known.hash = Some(kept.hash());
     (session.known.halted, session.known.epoch) = (Some(false), Some(0));
     session.exchange_all(&[])?;
-    for parameter in Parameter::stored(kept.table().len()) {
+    for parameter in Parameter::stored(kept.all_rows().len()) {
         let reply = session.read(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
             format!(

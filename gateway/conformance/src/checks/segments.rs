@@ -11,7 +11,7 @@ use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The two segments of a packet.
-type Two = [Frame; 2];
+type SegmentPair = [Frame; 2];
 
 /// A step of a series: a segment, or a pause in ms.
 #[derive(Clone, Copy, Debug)]
@@ -31,12 +31,12 @@ struct Series {
     incomplete: u16,
 }
 
-fn two(session: &Session<'_>, message: &Message) -> Two {
+fn two(session: &Session<'_>, message: &Message) -> SegmentPair {
     let mut frames = session.frames(message).into_iter();
     core::array::from_fn(|_| frames.next().unwrap_or(Frame::EMPTY))
 }
 
-fn read(session: &Session<'_>, number: u8, tag: u8) -> Two {
+fn read(session: &Session<'_>, number: u8, tag: u8) -> SegmentPair {
     let to = Node::Cell(session.cell);
     two(session, &Message::Configure { to, tag, request: Request::Read { number } })
 }
@@ -44,7 +44,7 @@ fn read(session: &Session<'_>, number: u8, tag: u8) -> Two {
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.ready(&arm::example_parameters(6))?;
     for series in series(session) {
-        one(session, &series)?;
+        run_series(session, &series)?;
     }
     seven(session)?;
     if session.about.test_mode && session.about.committed {
@@ -146,7 +146,7 @@ fn flipped(frame: &Frame) -> Frame {
 }
 
 /// Checks a series, and repeats it up to three times if the bench was late.
-fn one(session: &mut Session<'_>, series: &Series) -> Result<(), StopReason> {
+fn run_series(session: &mut Session<'_>, series: &Series) -> Result<(), StopReason> {
     for _ in 0..3 {
         let before = session.counters()?.refused;
         session.begin_exchange();
@@ -206,7 +206,7 @@ fn seven(session: &mut Session<'_>) -> Result<(), StopReason> {
         .collect();
     let [a1, a2] = read(session, 0, 0x44);
     let acts = firsts.into_iter().chain([Send(a1), Send(a2)]).collect();
-    one(
+    run_series(
         session,
         &Series {
             what: "seven segments of which no two form a packet, and a packet",
@@ -229,7 +229,7 @@ fn seven(session: &mut Session<'_>) -> Result<(), StopReason> {
 fn between(
     session: &mut Session<'_>,
     what: &str,
-    [first, last]: Two,
+    [first, last]: SegmentPair,
     other: Result<Frame, FrameError>,
 ) -> Result<(), StopReason> {
     let Ok(other) = other else { return Ok(()) };

@@ -9,7 +9,7 @@ use protocol::parameters::{Events, MAX_JOINTS};
 use protocol::time::Span;
 
 use super::beats::format_ms;
-use super::sensing_model::Model;
+use super::sensing_model::EventModel;
 use crate::arm::{self, TestRandom};
 use crate::bus::StopReason;
 use crate::session::{CellPacket, Session};
@@ -121,7 +121,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
     session.write_first_words(SENSING, [2])?;
     session.idle(Span::from_millis(10))?;
     session.begin_exchange();
-    let mut model = Model::new(events);
+    let mut model = EventModel::new(events);
     for step in 0..session.attempts(STEPS) {
         let (skin, acceleration) = match crafted(&events).get(step) {
             Some(skin) => (*skin, None),
@@ -208,7 +208,7 @@ fn crafted(events: &Events) -> [SkinSensors; CRAFTED] {
 fn values(
     dice: &mut TestRandom,
     events: &Events,
-    model: &Model,
+    model: &EventModel,
     step: usize,
 ) -> (SkinSensors, Option<[Q3_12; 3]>) {
     let sent = model.sent_skin();

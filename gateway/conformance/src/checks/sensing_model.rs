@@ -37,7 +37,7 @@ impl Touch {
 
 /// The state of a cell in event mode: its latched values, the last values that it sent, and its contact and proximity.
 #[derive(Clone, Debug)]
-pub(super) struct Model {
+pub(super) struct EventModel {
     events: Events,
     latched: Readings,
     sent: Readings,
@@ -45,7 +45,7 @@ pub(super) struct Model {
     proximity: Touch,
 }
 
-impl Model {
+impl EventModel {
     /// Creates the state at a switch to event mode, if all latched values are 0.
     pub(super) fn new(events: Events) -> Self {
         let nothing = Readings::default();

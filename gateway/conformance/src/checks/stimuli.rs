@@ -5,7 +5,7 @@ use protocol::message::{AppliesFrom, Message, SensorPage};
 use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 
-use super::kinematics::look_at_words;
+use super::kinematics::check_torque_words;
 use crate::arm;
 use crate::bus::StopReason;
 use crate::session::Session;
@@ -14,7 +14,7 @@ const POSITIONS: [i16; MAX_JOINTS] =
     [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
 
 /// A cell with a known J at [`POSITIONS`].
-struct Pressed {
+struct PressedCell {
     parameters: Parameters,
     j: [i16; MAX_JOINTS],
 }
@@ -26,7 +26,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     let j =
         session.press_and_step(&POSITIONS, arm::press(arm::unit_press(parameters.torque_format)))?.words();
-    let cell = Pressed { parameters, j };
+    let cell = PressedCell { parameters, j };
     let before = session.counters()?;
     let mut count = next(session, &cell)?;
     count += first_epoch(session, &cell)?;
@@ -55,7 +55,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 /// Sends joints of an epoch, and checks by the torque that a press with this sum of contact words is latched.
 fn latched(
     session: &mut Session<'_>,
-    cell: &Pressed,
+    cell: &PressedCell,
     epoch: u8,
     sum: i32,
     id: &'static str,
@@ -74,13 +74,13 @@ fn latched(
         )
     });
     if is_there && sum > 0 {
-        look_at_words(session, &cell.parameters, &cell.j, force, &step.words(), id);
+        check_torque_words(session, &cell.parameters, &cell.j, force, &step.words(), id);
     }
     Ok(())
 }
 
 /// Checks stimuli for the next joints, and returns the number of stimuli sent.
-fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
+fn next(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     let start = session.known.last_epoch;
     for (jump, sum) in [(1, 1_000), (200, 1_500), (3, 0), (128, 2_000), (255, 2_500)] {
@@ -109,7 +109,7 @@ fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
 }
 
 /// Checks stimuli whose first epoch is near, far, or past the wrap-around, and returns the number of stimuli sent.
-fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
+fn first_epoch(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut held = 4_000;
     let mut count = 1;
     session.press(arm::press(held))?;
@@ -149,7 +149,7 @@ fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopRea
 }
 
 /// Checks stimuli for epochs that are over, and returns the number of stimuli sent.
-fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
+fn too_late(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     for (behind, jump) in [(0, 1), (5, 1), (2, 250), (127, 1)] {
         let last = session.known.last_epoch;
@@ -166,7 +166,7 @@ fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason
 }
 
 /// Checks several stimuli for the same joints, and returns the number of stimuli sent.
-fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
+fn order(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     for (first, second, jump) in [(1, 1, 1), (2, 1, 2), (1, 2, 2), (3, 0, 3)] {
         let last = session.known.last_epoch;
@@ -196,7 +196,7 @@ fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
 }
 
 /// Checks that eight stimuli can be pending, and the ninth is refused.
-fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> {
+fn pending(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     let before = session.counters()?;
     let last = session.known.last_epoch;
     let to = Node::Cell(session.cell);
@@ -231,7 +231,7 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> 
 }
 
 /// Checks that a write of parameter 5 clears the latched and the pending stimuli.
-fn forgotten(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> {
+fn forgotten(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     for on_between in [true, false] {
         session.press(arm::press(3_333))?;
         let epoch = session.next_epoch();
@@ -271,7 +271,7 @@ fn measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that a halted cell accepts and latches stimuli.
-fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> {
+fn halted(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     let epoch = session.next_epoch();
     session.begin_exchange();
     session.send_messages(&[Message::Halt])?;

@@ -11,7 +11,7 @@ use bench::bus::listen::now;
 use protocol::time::Span;
 
 /// The time that the thread sleeps before each measurement.
-const SLEEP: Duration = Duration::from_millis(1);
+const SLEEP_TIME: Duration = Duration::from_millis(1);
 
 #[derive(Debug, Default)]
 struct Shared {
@@ -37,7 +37,7 @@ impl Probe {
             while !own.over.load(Ordering::Relaxed) {
                 let due = now().0 + 1_000;
                 own.due.store(due, Ordering::Relaxed);
-                thread::sleep(SLEEP);
+                thread::sleep(SLEEP_TIME);
                 own.late.fetch_max(now().0.saturating_sub(due), Ordering::Relaxed);
             }
         })?;

@@ -197,7 +197,7 @@ impl Session<'_> {
     /// Stages parameters: writes all stored ones that differ from the staged ones.
     pub(crate) fn stage(&mut self, parameters: &Parameters) -> Result<(), StopReason> {
         let before = self.known.staged.take();
-        for parameter in Parameter::stored(parameters.table().len()) {
+        for parameter in Parameter::stored(parameters.all_rows().len()) {
             let words = parameters.words(parameter);
             if before.is_none_or(|before| before.words(parameter) != words) {
                 let reply = self.write(parameter.number(), words)?;
@@ -212,7 +212,7 @@ impl Session<'_> {
         let mut staged = *parameters;
         if let Some(before) = before {
             // Rows beyond the table stay unchanged.
-            let rows = staged.rows.iter_mut().zip(before.rows).skip(parameters.table().len().max(6));
+            let rows = staged.rows.iter_mut().zip(before.rows).skip(parameters.all_rows().len().max(6));
             rows.for_each(|(row, before)| *row = before);
         }
         self.known.staged = Some(staged);

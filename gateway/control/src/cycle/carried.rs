@@ -26,14 +26,14 @@ pub fn bit(bus: usize) -> u32 {
 
 /// The broadcasts of joints that a bus has carried.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Carried {
+pub(super) struct CarriedBroadcasts {
     /// Epoch of the last broadcast that was read back from the bus.
     last: Option<Epoch>,
     /// Number of that broadcast, counted from 1.
     number: u64,
 }
 
-impl Carried {
+impl CarriedBroadcasts {
     /// Returns the number of broadcasts that should have been read back from the bus and were not. `last` is the epoch
     /// of the last one read back. `epoch` is the epoch of the latest of `broadcasts` broadcasts, which may not have
     /// been read back yet.
@@ -48,7 +48,7 @@ impl Carried {
 }
 
 /// Returns the fraction of the last torque, 0 to 1, that counts after this many broadcasts were not read back.
-pub(super) fn part(unanswered: u64, safety: &Safety) -> f64 {
+pub(super) fn remaining_fraction(unanswered: u64, safety: &Safety) -> f64 {
     let hold = u64::from(safety.hold_epochs);
     if unanswered <= hold {
         return 1.0;

@@ -11,26 +11,26 @@ pub(super) struct Chain {
     /// For each joint of the chain, its index among the robot's joints, and its kind.
     joints: Vec<(usize, JointKind)>,
     /// The words of the last broadcast.
-    said: Joints,
+    broadcast: Joints,
 }
 
 impl Chain {
     pub(super) fn new(skin: &Skin, bus: usize) -> Self {
         let joints: Vec<_> = skin.joints_on_bus(bus).map(|(index, joint)| (index, joint.kind)).collect();
         let in_use = u8::try_from(joints.len()).unwrap_or(u8::MAX);
-        Self { joints, said: Joints { positions: [Q1_14::ZERO; MAX_JOINTS], in_use } }
+        Self { joints, broadcast: Joints { positions: [Q1_14::ZERO; MAX_JOINTS], in_use } }
     }
 
     /// Returns the words of the last broadcast.
     pub(super) const fn broadcast_joints(&self) -> Joints {
-        self.said
+        self.broadcast
     }
 
     /// Converts the robot's positions to the words of the next broadcast. A joint whose position is not a number keeps
     /// its last word; a robot also refuses velocities that lead to such a position.
     pub(super) fn set_positions(&mut self, q: &[f64; MAX_ROBOT_JOINTS]) {
-        for (word, &(joint, kind)) in self.said.positions.iter_mut().zip(&self.joints) {
-            if let Some(said) = q.get(joint).and_then(|&q| kind.word(q)) {
+        for (word, &(joint, kind)) in self.broadcast.positions.iter_mut().zip(&self.joints) {
+            if let Some(said) = q.get(joint).and_then(|&q| kind.position_to_word(q)) {
                 *word = said;
             }
         }

@@ -58,12 +58,12 @@ fn bad_cycles_in_a_row_halt_once_and_a_resume_releases() {
 }
 
 /// A controller that misses the given number of answers, then gives as many, and so on.
-struct Absent {
+struct FailingController {
     misses: Vec<u64>,
     ticks: u64,
 }
 
-impl Controller for Absent {
+impl Controller for FailingController {
     fn step(&mut self, _: &Input) -> ControllerOutput {
         self.ticks += 1;
         let moves = [0.5; MAX_ROBOT_JOINTS];
@@ -82,7 +82,7 @@ fn another_program_may_take_its_time_to_begin() {
     let kind = |start| ControllerKind::External { socket: "arm.sock".to_owned(), start };
     let halts = |skin: &Skin, misses: Vec<u64>| {
         let robot = SimulatedArm::new(skin, [0.0; MAX_ROBOT_JOINTS]);
-        let mut cycle = Cycle::new(skin, Box::new(Absent { misses, ticks: 0 }), Box::new(robot));
+        let mut cycle = Cycle::new(skin, Box::new(FailingController { misses, ticks: 0 }), Box::new(robot));
         let bus = BusTotals::default();
         let records: Vec<_> =
             (0..3_000).map(|number| cycle.tick(tick(number), 0, [works(&bus)]).record).collect();
@@ -121,14 +121,14 @@ fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
 }
 
 /// A loop over two buses with eight ticks per epoch. Each bus has a torque of 1 Nm.
-struct Two {
+struct TwoBuses {
     cycle: Cycle,
     buses: [BusTotals; 2],
     works: [bool; 2],
     number: u64,
 }
 
-impl Two {
+impl TwoBuses {
     fn new(lost_bus: LostBus) -> Self {
         let mut skin = testing::two_buses();
         skin.safety.lost_bus = lost_bus;
@@ -160,7 +160,7 @@ impl Two {
 
 #[test]
 fn a_lost_bus_decays_by_the_rule_for_cells_and_the_others_go_on() {
-    let mut two = Two::new(LostBus::Continue);
+    let mut two = TwoBuses::new(LostBus::Continue);
     for _ in 0..5 {
         let record = two.epoch([true, true]);
         assert_eq!((record.torque[0], record.contributing, record.missing), (2.0, 2, 0));
@@ -187,7 +187,7 @@ fn a_lost_bus_decays_by_the_rule_for_cells_and_the_others_go_on() {
 
 #[test]
 fn a_bus_that_carries_nothing_is_lost_also_without_a_report() {
-    let mut two = Two::new(LostBus::Continue);
+    let mut two = TwoBuses::new(LostBus::Continue);
     two.epoch([true, true]);
     let missing: Vec<_> = (0..300).map(|_| two.epoch([true, false]).missing).collect();
     assert_eq!(missing[..7], [0; 7]);
@@ -196,7 +196,7 @@ fn a_bus_that_carries_nothing_is_lost_also_without_a_report() {
 
 #[test]
 fn without_any_bus_the_torque_is_not_valid() {
-    let mut two = Two::new(LostBus::Continue);
+    let mut two = TwoBuses::new(LostBus::Continue);
     two.epoch([true, true]);
     two.works = [false, false];
     assert_eq!(two.epoch([false, false]).bad, Some(BadCycle::Torque));
@@ -206,7 +206,7 @@ fn without_any_bus_the_torque_is_not_valid() {
 
 #[test]
 fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
-    let mut two = Two::new(LostBus::Halt);
+    let mut two = TwoBuses::new(LostBus::Halt);
     assert_eq!(two.epoch([true, true]).bad, None);
     two.works[0] = false;
     assert_eq!(two.epoch([true, true]).bad, Some(BadCycle::Torque));
@@ -257,7 +257,7 @@ impl Controller for Present {
 /// halt.
 fn absence_after(ticks: u64, present: std::ops::Range<u64>) -> (Option<Absence>, Option<Halt>) {
     let (mut cycle, bus) = cycle(Box::new(Present(present)));
-    cycle.starts = Some(Micros(1_000_000));
+    cycle.start_deadline = Some(Micros(1_000_000));
     let mut halted = None;
     for number in 0..ticks {
         halted = cycle.tick(tick(number), 0, [works(&bus)]).record.halted;

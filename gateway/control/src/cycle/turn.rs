@@ -13,11 +13,11 @@ use protocol::parameters::MAX_JOINTS;
 use crate::cycle::carried::BusInput;
 use crate::cycle::{CentralTorque, Cycle, Tick, TickRecord};
 use crate::external::Absence;
-use model::scenario::{Mode, Scenario};
+use model::scenario::{Scenario, TorqueSource};
 use model::table::Snapshot;
 
 /// Interval in epochs between repeated halts while the robot is halted.
-const HALT_AGAIN: u8 = 8;
+const HALT_REPEAT_EPOCHS: u8 = 8;
 
 /// The state that all threads of a run share.
 #[derive(Debug, Default)]
@@ -27,7 +27,7 @@ pub struct Shared {
     /// True once the receivers are to end, after the loop.
     pub stop: AtomicBool,
     /// True once all cells are present, so that the gateway sends wire messages to roots.
-    pub explore: AtomicBool,
+    pub sends_to_roots: AtomicBool,
     /// True while the torques of the cells are compared with centrally computed ones.
     pub comparing: AtomicBool,
     /// Number of broadcasts sent so far.
@@ -128,7 +128,7 @@ impl TickDriver {
 
     /// Sets the queue to a recorder, which then gets all records as well.
     #[must_use]
-    pub fn recorded(mut self, queue: Option<rtrb::Producer<TimedRecord>>) -> Self {
+    pub fn with_recorder(mut self, queue: Option<rtrb::Producer<TimedRecord>>) -> Self {
         self.recorded = queue;
         self
     }
@@ -147,7 +147,7 @@ impl TickDriver {
 
     /// Runs one tick. `now` returns the time of a monotonic clock in ns, and `due` is the nominal start of the tick on
     /// that clock. `send` sends frames on the bus with the given index and returns true if the bus accepted them.
-    pub fn turn(
+    pub fn run_tick(
         &mut self,
         tick: Tick,
         skipped: u64,
@@ -157,7 +157,7 @@ impl TickDriver {
     ) {
         let began = now();
         let mode = self.scenario.mode_at(tick.time);
-        self.shared.comparing.store(mode == Mode::Compare, Ordering::Relaxed);
+        self.shared.comparing.store(mode == TorqueSource::Compare, Ordering::Relaxed);
         for line in &mut self.lines {
             line.snapshot.update();
         }
@@ -167,7 +167,7 @@ impl TickDriver {
             .iter()
             .map(|line| BusInput { sums: &line.snapshot.output_buffer().sums, works: line.state.is_there() });
         let outcome = self.cycle.tick(tick, skipped, heard);
-        let central = (mode == Mode::Compare).then(|| {
+        let central = (mode == TorqueSource::Compare).then(|| {
             let before = now();
             let reference_torque = self.cycle.central(snapshots());
             // Without `black_box` the compiler could drop this work if the result is unused.
@@ -176,24 +176,25 @@ impl TickDriver {
         self.requeue_for_returned_buses(outcome.record.halted.is_some());
         if let Some(epoch) = outcome.broadcast {
             // A cell that restarted, or missed the halt, would go on answering.
-            if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_AGAIN) {
+            if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_REPEAT_EPOCHS) {
                 self.pending_commands.fill(Some(Message::Halt));
             }
             self.send_pending(&mut send);
             // Many buses have the same joints: encode them once.
-            let mut said: Option<(usize, Format, Encoded, [f64; MAX_JOINTS])> = None;
+            let mut encoded_joints: Option<(usize, Format, Encoded, [f64; MAX_JOINTS])> = None;
             for (bus, line) in self.lines.iter_mut().enumerate() {
                 let chain = self.cycle.chain_of(bus);
-                let same = said.as_ref().filter(|(of, format, ..)| (*of, *format) == (chain, line.format));
+                let same =
+                    encoded_joints.as_ref().filter(|(of, format, ..)| (*of, *format) == (chain, line.format));
                 if same.is_none() {
                     let joints = Message::Joints { epoch, joints: self.cycle.joints(chain) };
                     let encoded = Encoded::new(&joints.encode(), line.format);
-                    said = Some((chain, line.format, encoded, self.cycle.positions_of(chain)));
+                    encoded_joints = Some((chain, line.format, encoded, self.cycle.chain_positions(chain)));
                 }
-                let Some((_, _, encoded, positions)) = &said else { continue };
+                let Some((_, _, encoded, positions)) = &encoded_joints else { continue };
                 // A full queue costs the receiver only the unrounded positions.
                 let _ = line.positions.push((epoch, *positions));
-                line.give(bus, encoded, &self.shared, &mut send);
+                line.send_frames(bus, encoded, &self.shared, &mut send);
             }
             self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
             self.shared.broadcasts.fetch_add(1, Ordering::Release);
@@ -259,11 +260,11 @@ impl BusPort {
         shared: &Shared,
         send: &mut impl FnMut(usize, &[Frame]) -> bool,
     ) -> bool {
-        self.give(bus, &Encoded::new(&message.encode(), self.format), shared, send)
+        self.send_frames(bus, &Encoded::new(&message.encode(), self.format), shared, send)
     }
 
     /// Sends the frames of a command on the bus. If the bus accepts them, counts the command and returns true.
-    fn give(
+    fn send_frames(
         &self,
         bus: usize,
         encoded: &Encoded,

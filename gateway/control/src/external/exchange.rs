@@ -34,7 +34,7 @@ pub(super) struct ExchangeCounts {
 
 impl ExchangeCounts {
     /// Returns all counters with their names.
-    pub(super) fn each(&self) -> impl Iterator<Item = (String, u64)> {
+    pub(super) fn named(&self) -> impl Iterator<Item = (String, u64)> {
         let own = [
             ("hellos", self.hellos),
             ("answers", self.answers),
@@ -71,7 +71,7 @@ impl ExchangeCounts {
         }
     }
 
-    fn nonsense(&mut self, why: InvalidDatagram) {
+    fn count_invalid(&mut self, why: InvalidDatagram) {
         let at = InvalidDatagram::ALL.iter().position(|it| *it == why);
         if let Some(count) = at.and_then(|at| self.nonsense.get_mut(at)) {
             *count += 1;
@@ -91,7 +91,7 @@ pub(super) enum Sender {
 pub(super) enum SendResult {
     Taken,
     QueueFull,
-    NobodyThere,
+    PeerGone,
 }
 
 /// The exchange of datagrams with the peer.
@@ -132,7 +132,7 @@ impl Exchange {
             }
             (Err(why), Sender::Peer) => {
                 self.nonsense = true;
-                self.counts.nonsense(why);
+                self.counts.count_invalid(why);
                 return false;
             }
             (Ok(ReceivedDatagram::Answer(answer)), Sender::Peer) => answer,
@@ -140,7 +140,7 @@ impl Exchange {
         match self.due {
             Some(due) if answer.tick > due => {
                 self.nonsense = true;
-                self.counts.nonsense(InvalidDatagram::Ahead);
+                self.counts.count_invalid(InvalidDatagram::Ahead);
             }
             Some(due) if answer.tick == due => {
                 if self.answer.is_some() {
@@ -175,14 +175,14 @@ impl Exchange {
     }
 
     /// Records the result of sending the state of a tick.
-    pub(super) fn sent(&mut self, tick: u64, sent: SendResult) {
+    pub(super) fn note_sent(&mut self, tick: u64, sent: SendResult) {
         match sent {
             SendResult::Taken => self.due = Some(tick),
             SendResult::QueueFull => {
                 self.due = Some(tick);
                 self.counts.unsent += 1;
             }
-            SendResult::NobodyThere => {
+            SendResult::PeerGone => {
                 self.connected = false;
                 self.counts.gone += 1;
             }

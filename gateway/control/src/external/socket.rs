@@ -19,7 +19,7 @@ use crate::controller::{Controller, ControllerOutput, Input, SpeedLimits};
 
 /// Maximum number of datagrams that are received per tick. Others remain in the socket's queue, so that no sender can
 /// delay the tick.
-const PER_TICK: usize = 16;
+const MAX_DATAGRAMS_PER_TICK: usize = 16;
 
 /// A controller in another program.
 #[derive(Debug)]
@@ -76,7 +76,7 @@ impl External {
     pub fn listen(path: &Path, skin: &Skin) -> Result<Self, SocketError> {
         Ok(Self {
             socket: bind(path)?,
-            file: file(path),
+            file: file_identity(path),
             path: path.to_owned(),
             peer: None,
             exchange: Exchange::new(skin.robot.joints.len()),
@@ -88,7 +88,7 @@ impl External {
     fn receive(&mut self) {
         // One byte more than the longest datagram, to detect longer ones.
         let mut bytes = [0; MAX_ANSWER_BYTES + 1];
-        for _ in 0..PER_TICK {
+        for _ in 0..MAX_DATAGRAMS_PER_TICK {
             let (length, from) = match self.socket.recv_from(&mut bytes) {
                 Ok(received) => received,
                 Err(error) if error.kind() == ErrorKind::WouldBlock => return,
@@ -101,7 +101,7 @@ impl External {
                 self.exchange.counts.failed += 1;
                 continue;
             }
-            let known = self.peer.as_ref().is_some_and(|peer| same(peer, &from));
+            let known = self.peer.as_ref().is_some_and(|peer| is_same_address(peer, &from));
             let sender = if known { Sender::Peer } else { Sender::Other };
             if self.exchange.handle(bytes.get(..length).unwrap_or(&bytes), sender) {
                 self.peer = Some(from);
@@ -115,13 +115,13 @@ impl External {
         let sent = match self.socket.send_to_addr(&state, peer) {
             Ok(_) => SendResult::Taken,
             // None of these errors means that the peer has gone.
-            Err(error) if passes(&error) => SendResult::QueueFull,
-            Err(_) => SendResult::NobodyThere,
+            Err(error) if is_transient(&error) => SendResult::QueueFull,
+            Err(_) => SendResult::PeerGone,
         };
-        if sent == SendResult::NobodyThere {
+        if sent == SendResult::PeerGone {
             self.peer = None;
         }
-        self.exchange.sent(input.tick, sent);
+        self.exchange.note_sent(input.tick, sent);
     }
 }
 
@@ -134,7 +134,7 @@ impl Controller for External {
     }
 
     fn counts(&self) -> Vec<(String, u64)> {
-        self.exchange.counts.each().collect()
+        self.exchange.counts.named().collect()
     }
 
     fn absence(&self, silent: Option<u32>) -> Option<Absence> {
@@ -144,7 +144,7 @@ impl Controller for External {
 
 impl Drop for External {
     fn drop(&mut self) {
-        if self.file.is_some() && file(&self.path) == self.file {
+        if self.file.is_some() && file_identity(&self.path) == self.file {
             // Ignore the error: the next gateway replaces a dead socket.
             let _ = std::fs::remove_file(&self.path);
         }
@@ -188,17 +188,17 @@ fn bind_private(path: &Path) -> io::Result<UnixDatagram> {
 }
 
 /// Returns true if an error of the socket may have passed by the next tick, so that it is no reason to end.
-fn passes(error: &io::Error) -> bool {
+fn is_transient(error: &io::Error) -> bool {
     let errno = Errno::from_io_error(error);
     matches!(errno, Some(Errno::AGAIN | Errno::INTR | Errno::NOMEM | Errno::NOBUFS))
 }
 
 /// Returns the device and inode of a file; `None` if there is no file.
-fn file(path: &Path) -> Option<(u64, u64)> {
+fn file_identity(path: &Path) -> Option<(u64, u64)> {
     std::fs::symlink_metadata(path).ok().map(|file| (file.dev(), file.ino()))
 }
 
 /// Returns true if two sockets have the same address. Both must have one.
-fn same(one: &SocketAddr, other: &SocketAddr) -> bool {
+fn is_same_address(one: &SocketAddr, other: &SocketAddr) -> bool {
     one.as_pathname() == other.as_pathname() && one.as_abstract_name() == other.as_abstract_name()
 }

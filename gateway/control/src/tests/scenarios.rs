@@ -16,7 +16,7 @@ use protocol::time::Micros;
 
 /// Maximum values over a run.
 #[derive(Debug, Default)]
-struct Most {
+struct Maxima {
     /// Maximum torque that one cell causes in a joint, in Nm.
     torque: f64,
     /// Maximum torque that all cells together cause in a joint, in Nm.
@@ -26,10 +26,10 @@ struct Most {
     /// Mask of the joints that reached a limit.
     at_limit: u32,
     /// Maximum distance of a joint from its start position, in rad.
-    way: f64,
+    distance: f64,
 }
 
-fn play(scenario: &str) -> Most {
+fn play(scenario: &str) -> Maxima {
     let skin = Skin::parse("ur5-253.toml", include_str!("../../../examples/ur5-253.toml")).unwrap();
     let scenario = Scenario::parse("scenario", scenario, &skin).unwrap();
     let start = scenario.motion.start;
@@ -38,7 +38,7 @@ fn play(scenario: &str) -> Most {
     let mut arm = SimulatedArm::new(&skin, start);
     let mut touches = Touches::new(&scenario, &skin);
     let mut sensors = vec![SkinSensors::default(); skin.cells.len()];
-    let mut most = Most::default();
+    let mut most = Maxima::default();
     let mut torque = [0.0; MAX_JOINTS];
     let per_broadcast = u64::from(skin.timing.ticks_per_broadcast);
     for tick in 0..scenario.duration.0 / 2_000 {
@@ -65,7 +65,7 @@ fn play(scenario: &str) -> Most {
         };
         most.at_limit |= arm.step(&velocity, 0.002).at_limit;
         for (q, start) in arm.positions().iter().zip(start) {
-            most.way = most.way.max((q - start).abs());
+            most.distance = most.distance.max((q - start).abs());
         }
     }
     most
@@ -77,7 +77,7 @@ fn the_demo_moves_the_arm_within_reason_and_grips_a_hundred_cells() {
     assert!(most.torque < 8.0, "fits Q3.12: {}", most.torque);
     assert!(most.sum < 20.0, "{}", most.sum);
     assert_eq!(most.at_limit, 0);
-    assert!((0.3..2.0).contains(&most.way), "{}", most.way);
+    assert!((0.3..2.0).contains(&most.distance), "{}", most.distance);
     assert!(most.active.iter().filter(|&&active| active >= 100).count() > 60, "a second of the grip");
     assert!(most.active.iter().filter(|&&active| active == 20).count() > 150, "palms");
     assert!(most.active.iter().filter(|&&active| active == 0).count() > 50, "and rest");
@@ -89,5 +89,5 @@ fn all_active_presses_every_cell_all_the_time() {
     assert!(most.active.iter().all(|&active| active == 253));
     assert_eq!(most.active.len(), 1_875);
     assert!(most.torque < 4.0, "far from the end of Q3.12: {}", most.torque);
-    assert!(most.way > 0.49, "{}", most.way);
+    assert!(most.distance > 0.49, "{}", most.distance);
 }

@@ -9,7 +9,7 @@ use super::{Mesh, MeshError, Triangle};
 
 /// The number of corners around a cylinder or a sphere. They are 5 degrees apart, so the normal of each face is within
 /// 2.5 degrees of the true one.
-const AROUND: u32 = 72;
+const CIRCLE_SEGMENTS: u32 = 72;
 
 fn checked(shape: &'static str, what: &'static str, value: f64) -> Result<f64, MeshError> {
     if value.is_finite() && value > 0.0 { Ok(value) } else { Err(MeshError::Size { shape, what, value }) }
@@ -51,7 +51,7 @@ impl Mesh {
         let top = checked("cylinder", "length", length)? / 2.0;
         // The profile goes from the center of one end, along the wall, to the center of the other end.
         let profile = [(0.0, -top), (radius, -top), (radius, top), (0.0, top)];
-        Self::new("cylinder", turned(&profile))
+        Self::new("cylinder", surface_of_revolution(&profile))
     }
 
     /// Creates a sphere with this radius, in m.
@@ -60,7 +60,7 @@ impl Mesh {
     /// Returns [`MeshError::Size`] if the radius is not above 0.
     pub fn sphere(radius: f64) -> Result<Self, MeshError> {
         let radius = checked("sphere", "radius", radius)?;
-        let half = AROUND / 2;
+        let half = CIRCLE_SEGMENTS / 2;
         let profile: Vec<_> = (0..=half)
             .map(|step| {
                 let angle = PI * f64::from(step) / f64::from(half);
@@ -68,19 +68,19 @@ impl Mesh {
                 (ring, -radius * angle.cos())
             })
             .collect();
-        Self::new("sphere", turned(&profile))
+        Self::new("sphere", surface_of_revolution(&profile))
     }
 }
 
 /// Returns the surface that results from rotating a profile about z. A profile is a list of radii and heights.
-fn turned(profile: &[(f64, f64)]) -> Vec<Triangle> {
+fn surface_of_revolution(profile: &[(f64, f64)]) -> Vec<Triangle> {
     let point = |(radius, z): (f64, f64), step: u32| {
-        let angle = TAU * f64::from(step % AROUND) / f64::from(AROUND);
+        let angle = TAU * f64::from(step % CIRCLE_SEGMENTS) / f64::from(CIRCLE_SEGMENTS);
         Point3::new(radius * angle.cos(), radius * angle.sin(), z)
     };
     let strips = profile.iter().zip(profile.iter().skip(1));
     let quads = strips.flat_map(|(&low, &high)| {
-        (0..AROUND).flat_map(move |step| {
+        (0..CIRCLE_SEGMENTS).flat_map(move |step| {
             quad([point(low, step), point(low, step + 1), point(high, step + 1), point(high, step)])
         })
     });

@@ -31,7 +31,7 @@ const MIN_NORMAL_COSINE: f64 = -0.2;
 const MAX_UNEVENNESS: f64 = 0.1;
 
 /// Returns the cells of all links with their wires, and the number of buses.
-pub(crate) fn wire(placed: &[Vec<CellPosition>], options: &CoverOptions) -> (Vec<CoverCell>, usize) {
+pub(crate) fn wire_cells(placed: &[Vec<CellPosition>], options: &CoverOptions) -> (Vec<CoverCell>, usize) {
     let sizes: Vec<_> = placed.iter().map(Vec::len).collect();
     let buses = shares(&sizes, options.nodes_per_bus);
     let all = placed.iter().enumerate().flat_map(|(link, spots)| {
@@ -133,7 +133,7 @@ impl Limb {
 
 /// Wires the cells of one bus.
 fn wired(bus: usize, places: &[UnwiredCell], pitch: f64) -> Vec<CoverCell> {
-    let wires = joined(places.len(), &near(places, pitch));
+    let wires = wires_by_cell(places.len(), &near(places, pitch));
     let roots = roots(&wires);
     let cell = |(index, place): (usize, &UnwiredCell)| {
         let others = wires.get(index).map_or(&[][..], Vec::as_slice);
@@ -167,7 +167,7 @@ fn near(places: &[UnwiredCell], pitch: f64) -> Vec<[usize; 2]> {
     let mut found = Vec::new();
     let grid = Grid::with_points(longest, places.iter().map(|place| &place.spot.point));
     for (index, place) in places.iter().enumerate() {
-        for other in grid.around(grid.cube(&place.spot.point)).filter(|&other| other > index) {
+        for other in grid.points_around(grid.cube(&place.spot.point)).filter(|&other| other > index) {
             let Some(there) = places.get(other).filter(|there| there.link == place.link) else { continue };
             let distance = (there.spot.point - place.spot.point).norm();
             if distance <= longest && there.spot.normal.dot(&place.spot.normal) > MIN_NORMAL_COSINE {
@@ -180,7 +180,7 @@ fn near(places: &[UnwiredCell], pitch: f64) -> Vec<[usize; 2]> {
 }
 
 /// Returns the cells that each cell is wired to.
-fn joined(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
+fn wires_by_cell(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
     let mut wires: Vec<Vec<usize>> = vec![Vec::new(); count];
     let mut groups: Vec<_> = (0..count).collect();
     let join = |wires: &mut Vec<Vec<usize>>, [a, b]: [usize; 2], most: usize| {

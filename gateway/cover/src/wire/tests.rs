@@ -55,7 +55,7 @@ fn a_full_cell_leaves_wires_to_others() {
     // Six cells are around cell 0, and are neighbours in a ring too; the spokes are shorter.
     let spokes = (1..7).map(|at| [0, at]);
     let ring = (1..7).map(|at| [at.min(at % 6 + 1), at.max(at % 6 + 1)]);
-    let wires = joined(7, &spokes.chain(ring).collect::<Vec<_>>());
+    let wires = wires_by_cell(7, &spokes.chain(ring).collect::<Vec<_>>());
     assert_eq!(wires[0].len(), PORTS);
     assert_eq!(reached(&wires, 0).len(), 7, "all are joined");
     assert!(wires.iter().all(|others| others.len() <= PORTS));
@@ -66,7 +66,7 @@ fn a_full_cell_leaves_wires_to_others() {
 fn cells_are_reached_before_others_get_more_wires() {
     // Five cells are all near each other; a sixth is near to only one of them, and farther away.
     let all = (0..5).flat_map(|a| (a + 1..5).map(move |b| [a, b]));
-    let wires = joined(6, &all.chain([[0, 5]]).collect::<Vec<_>>());
+    let wires = wires_by_cell(6, &all.chain([[0, 5]]).collect::<Vec<_>>());
     assert_eq!(wires[5], [0]);
     assert_eq!(reached(&wires, 5).len(), 6);
     assert_eq!(wires.iter().map(Vec::len).sum::<usize>(), 20, "the others have all wires that are left");

@@ -15,9 +15,9 @@ use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 use protocol::skin::Skin;
 
 /// Standard gravity in m/s2.
-pub const G: f64 = 9.806_65;
+pub const STANDARD_GRAVITY: f64 = 9.806_65;
 /// Gravity in the base frame of an upright robot, in m/s2.
-pub const UPRIGHT: [f64; 3] = [0.0, 0.0, -G];
+pub const UPRIGHT_GRAVITY: [f64; 3] = [0.0, 0.0, -STANDARD_GRAVITY];
 
 /// Positions, speeds and accelerations of the joints of one chain: rad, rad/s and rad/s2, or m, m/s and m/s2 for
 /// prismatic joints.
@@ -43,7 +43,7 @@ pub struct RowMotion {
 impl RowMotion {
     /// Returns the specific force at a position on the row (in m, in the frame of the row), in g.
     #[must_use]
-    pub fn at(&self, position: &Vector3<f64>) -> Vector3<f64> {
+    pub fn force_at(&self, position: &Vector3<f64>) -> Vector3<f64> {
         self.force + self.gradient * position
     }
 }
@@ -69,7 +69,7 @@ impl Arm {
     /// joint moves.
     #[must_use]
     pub fn rows(&self, state: &JointState) -> [RowMotion; MAX_ROWS + 1] {
-        let frames = self.central.frames_at(&state.position);
+        let frames = self.central.frames_at_positions(&state.position);
         let mut rows = [RowMotion::default(); MAX_ROWS + 1];
         let (mut spin, mut turn, mut linear) = (Vector3::zeros(), Vector3::zeros(), Vector3::zeros());
         let mut joints = state.speed.iter().zip(&state.acceleration);
@@ -95,16 +95,16 @@ impl Arm {
             let local = |vector: Vector3<f64>| rotation.tr_mul(&vector);
             let (spin, turn) = (local(spin), local(turn));
             let cross = spin.cross_matrix();
-            motion.force = local(linear - self.gravity) / G;
-            motion.gradient = (turn.cross_matrix() + cross * cross) / G;
+            motion.force = local(linear - self.gravity) / STANDARD_GRAVITY;
+            motion.gradient = (turn.cross_matrix() + cross * cross) / STANDARD_GRAVITY;
         }
         rows
     }
 
     /// Returns the transform from the frame of one row to that of another row of the same link.
     #[must_use]
-    pub fn between(&self, from: u8, to: u8) -> Isometry3<f64> {
-        let frames = self.central.frames_at(&[]);
+    pub fn transform_between(&self, from: u8, to: u8) -> Isometry3<f64> {
+        let frames = self.central.frames_at_positions(&[]);
         let (Some(from), Some(to)) = (frames.row(from.into()), frames.row(to.into())) else {
             return Isometry3::identity();
         };
@@ -115,8 +115,8 @@ impl Arm {
     /// Converts a position in the frame of a row to a position in the robot's base frame, in m, for these joint
     /// positions in rad or m.
     #[must_use]
-    pub fn place(&self, row: usize, position: &Vector3<f64>, joints: &[f64]) -> Vector3<f64> {
-        let frames = self.central.frames_at(joints);
+    pub fn base_position(&self, row: usize, position: &Vector3<f64>, joints: &[f64]) -> Vector3<f64> {
+        let frames = self.central.frames_at_positions(joints);
         frames
             .row(row)
             .map_or_else(Vector3::zeros, |frame| (frame * nalgebra::Point3::from(*position)).coords)
@@ -145,18 +145,20 @@ mod tests {
     #[test]
     fn the_force_is_the_second_difference_of_the_place_less_gravity() {
         for skin in [testing::ur5(), testing::panda(), testing::lift()] {
-            let arm = Arm::new(&skin, 0, UPRIGHT);
+            let arm = Arm::new(&skin, 0, UPRIGHT_GRAVITY);
             let joints = skin.chain(0).joints.len();
             let (t, step) = (0.37, 1e-4);
             let position = Vector3::new(0.03, -0.05, 0.11);
             let rows = arm.rows(&state(t, joints));
             for (row, motion) in rows.iter().enumerate().take(skin.chain(0).rows.len() + 1) {
-                let at = |t: f64| arm.place(row, &position, &state(t, joints).position);
+                let at = |t: f64| arm.base_position(row, &position, &state(t, joints).position);
                 let acceleration = (at(t + step) - 2.0 * at(t) + at(t - step)) / (step * step);
-                let frames = arm.central.frames_at(&state(t, joints).position);
+                let frames = arm.central.frames_at_positions(&state(t, joints).position);
                 let rotation = frames.row(row).unwrap().rotation.matrix().to_owned();
-                let expected = rotation.transpose() * (acceleration + Vector3::new(0.0, 0.0, G)) / G;
-                let off = (motion.at(&position) - expected).norm();
+                let expected = rotation.transpose()
+                    * (acceleration + Vector3::new(0.0, 0.0, STANDARD_GRAVITY))
+                    / STANDARD_GRAVITY;
+                let off = (motion.force_at(&position) - expected).norm();
                 assert!(off < 1e-5, "{} row {row}: {off}", skin.name);
             }
         }

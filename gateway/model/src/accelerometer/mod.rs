@@ -29,7 +29,7 @@ pub struct RobotState {
 impl RobotState {
     /// Returns the state of the joints of one chain; `joints` are the indices of these joints in the robot.
     #[must_use]
-    pub fn of_chain(&self, joints: &[usize]) -> JointState {
+    pub fn chain_state(&self, joints: &[usize]) -> JointState {
         let pick = |from: &[f64; MAX_ROBOT_JOINTS]| {
             let mut to = [0.0; MAX_JOINTS];
             for (to, &joint) in to.iter_mut().zip(joints) {
@@ -81,11 +81,11 @@ impl Accelerometers {
         tilt: impl Fn(usize, &Vector3<f64>) -> Vector3<f64> + 'a,
     ) -> impl Iterator<Item = Vector3<f64>> + 'a {
         skin.cells.iter().zip(&self.sensors).enumerate().map(move |(index, (cell, sensor))| {
-            let moment = state(sensor.sampled(now));
-            let state = moment.of_chain(&skin.chain(cell.bus).joints);
+            let moment = state(sensor.sample_instant(now));
+            let state = moment.chain_state(&skin.chain(cell.bus).joints);
             let rows = self.arms.get(cell.bus).and_then(Option::as_ref).map(|arm| arm.rows(&state));
             let row = rows.and_then(|rows| rows.get(usize::from(cell.row)).copied()).unwrap_or_default();
-            let force = row.at(&cell.position.into());
+            let force = row.force_at(&cell.position.into());
             let local = rotation(cell.orientation, cell.normal).inverse() * force;
             sensor.reading(now, &tilt(index, &local))
         })

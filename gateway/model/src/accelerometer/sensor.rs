@@ -131,7 +131,7 @@ impl DataSheet {
 
     /// Returns the standard deviation of a single reading, in g.
     #[must_use]
-    pub fn deviation(&self) -> f64 {
+    pub fn reading_deviation(&self) -> f64 {
         self.noise_g.hypot(self.step_g / 12.0_f64.sqrt())
     }
 }
@@ -187,7 +187,7 @@ impl Accelerometer {
     /// Returns the time of the motion that the newest readable sample at `now` shows: the sampling time minus the
     /// delay, in s.
     #[must_use]
-    pub fn sampled(&self, now: f64) -> f64 {
+    pub fn sample_instant(&self, now: f64) -> f64 {
         self.sample(now).1
     }
 
@@ -202,12 +202,12 @@ impl Accelerometer {
     }
 
     /// Returns the reading at `now`, in g; `force` is the specific force in the cell's frame at
-    /// [`Accelerometer::sampled`], in g.
+    /// [`Accelerometer::sample_instant`], in g.
     #[must_use]
     pub fn reading(&self, now: f64, force: &Vector3<f64>) -> Vector3<f64> {
         let (number, _) = self.sample(now);
-        let mut dice = Pcg64Mcg::seed_from_u64(mixed(self.seed ^ number.to_bits()));
-        let noise = Vector3::from_fn(|_, _| normal(&mut dice) * self.sheet.noise_g);
+        let mut dice = Pcg64Mcg::seed_from_u64(mix_bits(self.seed ^ number.to_bits()));
+        let noise = Vector3::from_fn(|_, _| standard_normal(&mut dice) * self.sheet.noise_g);
         let DataSheet { range_g, step_g, .. } = self.sheet;
         (self.matrix * force + self.bias + noise).map(|value| {
             let value = value.clamp(-range_g, range_g);
@@ -218,13 +218,13 @@ impl Accelerometer {
 
 /// Draws from the standard normal distribution (Box-Muller).
 #[must_use]
-pub fn normal(dice: &mut Pcg64Mcg) -> f64 {
+pub fn standard_normal(dice: &mut Pcg64Mcg) -> f64 {
     let [u, v]: [f64; 2] = [dice.random(), dice.random()];
     (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
 }
 
 /// Mixes the bits of a number, so that neighbouring numbers give independent ones: the finaliser of SplitMix64.
-const fn mixed(bits: u64) -> u64 {
+const fn mix_bits(bits: u64) -> u64 {
     let bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     let bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     bits ^ (bits >> 31)
@@ -255,7 +255,7 @@ mod tests {
         let sensor = Accelerometer::new(&DataSheet::PERFECT, 7);
         let force = Vector3::new(0.1, -0.7, 0.3);
         assert!((sensor.reading(1.5, &force) - force).norm() < 1e-12);
-        assert!((sensor.sampled(1.5) - 1.5).abs() < 1e-12);
+        assert!((sensor.sample_instant(1.5) - 1.5).abs() < 1e-12);
     }
 
     #[test]
@@ -269,7 +269,7 @@ mod tests {
             gain = [gain[0].min(sensor.gain().min() - 1.0), gain[1].max(sensor.gain().max() - 1.0)];
             for step in 0..20 {
                 let now = f64::from(step) * 0.016;
-                let old = now - sensor.sampled(now);
+                let old = now - sensor.sample_instant(now);
                 age = [age[0].min(old), age[1].max(old)];
             }
         }

@@ -31,7 +31,7 @@ fn torques_agree_with_the_table_of_another_program() {
             normal: [-nx, -ny, -nz].into(),
             contact: Contact::default(),
         }];
-        let torque = central.torque(0, &central.frames_at(&[q1, q2, q3, q4, q5, q6]), *f_z);
+        let torque = central.torque(0, &central.frames_at_positions(&[q1, q2, q3, q4, q5, q6]), *f_z);
         for (got, target) in torque.iter().zip(&row[14..]) {
             worst = worst.max((got - target).abs());
         }
@@ -47,7 +47,7 @@ fn words_and_numbers_agree_within_what_words_can_hold() {
     let q = [0.3, -1.2, 1.0, -1.4, -1.57, 0.2];
     let joints = q.map(|angle| Q1_14::from_radians(angle).unwrap());
     let coarse = words.torque(0, &words.frames(&joints), 5.0);
-    let fine = numbers.torque(0, &numbers.frames_at(&q), 5.0);
+    let fine = numbers.torque(0, &numbers.frames_at_positions(&q), 5.0);
     for (coarse, fine) in coarse.iter().zip(fine) {
         assert!((coarse - fine).abs() < 5.0 * 5e-4, "{coarse} is not near {fine}");
     }
@@ -64,7 +64,10 @@ fn an_offset_turns_the_joint() {
     let (q, moved) = ([0.0, -1.2, 1.0, 0.25, 0.0, 0.0], [0.0, -1.2, 1.0, 1.0, 0.0, 0.0]);
     let offset = Central::unquantised(&turned);
     let plain = Central::unquantised(&straight);
-    assert_eq!(offset.torque(0, &offset.frames_at(&q), 1.0), plain.torque(0, &plain.frames_at(&moved), 1.0));
+    assert_eq!(
+        offset.torque(0, &offset.frames_at_positions(&q), 1.0),
+        plain.torque(0, &plain.frames_at_positions(&moved), 1.0)
+    );
     let (offset, plain) = (Central::new(&turned), Central::new(&straight));
     let [q, moved] = [q, moved].map(|q| q.map(|angle| Q1_14::from_radians(angle).unwrap()));
     for (a, b) in
@@ -113,9 +116,9 @@ proptest! {
         let central = Central::unquantised(&skin);
         let q = q.map(|bits| Q1_14::from_bits(bits).to_radians());
         let place = central.cells[0];
-        let at = |q: &[f64; 6]| central.frames_at(q).frames[usize::from(k)] * place.position;
-        let force = central.frames_at(&q).frames[usize::from(k)].rotation * place.normal * -2.0;
-        let torque = central.torque(0, &central.frames_at(&q), 2.0);
+        let at = |q: &[f64; 6]| central.frames_at_positions(q).frames[usize::from(k)] * place.position;
+        let force = central.frames_at_positions(&q).frames[usize::from(k)].rotation * place.normal * -2.0;
+        let torque = central.torque(0, &central.frames_at_positions(&q), 2.0);
         for joint in 0..6 {
             let (mut less, mut more) = (q, q);
             less[joint] -= 1e-5;

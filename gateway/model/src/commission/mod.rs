@@ -32,8 +32,8 @@ use protocol::time::{Micros, Span};
 use address_table::AddressTable;
 use task::{Stage, Task};
 
-use crate::repeat::{Attempt, Limits, RetryAction};
-pub use outcome::{AbortReason, Outcome, Reason, Step};
+use crate::repeat::{Attempt, RetryAction, RetryLimits};
+pub use outcome::{AbortReason, Outcome, Reason, RequestStep};
 pub use report::{CellReport, Progress, Report, UnknownNode};
 pub use task::CommissionOptions;
 
@@ -45,7 +45,8 @@ const DISCOVERY_TIMEOUT: Span = Span::from_millis(3_000);
 const MAX_PENDING_CELLS: usize = 16;
 /// Retry limits of a broadcast request while most cells do not answer. If no cell answers within this time, each
 /// remaining cell gets a request of its own.
-const BROADCAST_LIMITS: Limits = Limits { first: BROADCAST_TIMEOUT, longest: BROADCAST_TIMEOUT, tries: 3 };
+const BROADCAST_LIMITS: RetryLimits =
+    RetryLimits { first_timeout: BROADCAST_TIMEOUT, max_timeout: BROADCAST_TIMEOUT, max_transmissions: 3 };
 const BROADCAST_TIMEOUT: Span = Span::from_millis(150);
 /// Interval of syncs while waiting for heartbeats.
 const SYNC_INTERVAL: Span = Span::from_millis(300);
@@ -60,21 +61,21 @@ enum Phase {
     /// Listening without sending, until this time.
     Listen(Micros),
     /// Waiting for cells to appear; holds the time when the last one appeared.
-    Find(Micros),
+    Discover(Micros),
     /// Writing parameters to cells, and committing them.
     Write,
     /// Reading back all parameters from cells.
     Read,
     /// Waiting for heartbeats with the expected hash; holds the time of the last sync.
-    Beat(Micros),
+    AwaitHeartbeats(Micros),
     /// Finished: nothing is sent any more.
     Over,
 }
 
 /// A broadcast request and the state of its retries.
 #[derive(Clone, Copy, Debug)]
-struct Call {
-    step: Step,
+struct Broadcast {
+    step: RequestStep,
     tag: u8,
     /// Number of cells that needed the request when it was first sent.
     needed: usize,
@@ -87,17 +88,17 @@ struct Call {
 pub struct Commission {
     wish: CommissionOptions,
     /// Maximum number of answers to one broadcast request that the receive buffer can hold.
-    room: usize,
+    max_answers: usize,
     tasks: Vec<Task>,
     by_serial: HashMap<u32, usize>,
     /// Serial numbers of the cells that the description has on other buses, with the names of these buses.
     elsewhere: BTreeMap<u32, String>,
     address_table: AddressTable,
     phase: Phase,
-    calls: VecDeque<Step>,
-    call: Option<Call>,
+    pending_broadcasts: VecDeque<RequestStep>,
+    broadcast: Option<Broadcast>,
     /// All broadcast requests so far, each with its tag; late answers to earlier ones still count.
-    called: Vec<(Step, u8)>,
+    sent_broadcasts: Vec<(RequestStep, u8)>,
     outbox: VecDeque<Message>,
     announced: Option<Micros>,
     requests: u64,
@@ -120,15 +121,15 @@ impl Commission {
             others.filter_map(|cell| Some((cell.serial, skin.buses.get(cell.bus)?.name.clone()))).collect();
         Self {
             wish,
-            room,
+            max_answers: room,
             tasks,
             by_serial,
             elsewhere,
             address_table: AddressTable::default(),
             phase: Phase::Listen(now + LISTEN_TIME),
-            calls: VecDeque::new(),
-            call: None,
-            called: Vec::new(),
+            pending_broadcasts: VecDeque::new(),
+            broadcast: None,
+            sent_broadcasts: Vec::new(),
             outbox: VecDeque::new(),
             announced: None,
             requests: 0,
@@ -156,7 +157,7 @@ impl Commission {
         } else if let Message::Configure { request: Request::Write { number, .. }, .. } = *message
             && is_stored(number)
         {
-            self.end(AbortReason::Meddler);
+            self.end(AbortReason::OtherWriter);
         } else if let Message::Network {
             from: Node::Cell(node),
             page: NetworkPage::Heartbeat(heartbeat),
@@ -165,11 +166,11 @@ impl Commission {
         {
             self.handle_heartbeat(now, node, &heartbeat);
         } else if let Message::Configured { from, tag, answer } = *message {
-            let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
+            let called = self.sent_broadcasts.iter().rev().copied().find(|(_, called)| *called == tag);
             let wish = self.wish;
             let Some(task) = self.holder(from) else { return };
-            task.answer(now, tag, answer, called.map(|(step, _)| step), wish);
-            if let Some(call) = self.call.as_mut().filter(|_| called.is_some()) {
+            task.handle_answer(now, tag, answer, called.map(|(step, _)| step), wish);
+            if let Some(call) = self.broadcast.as_mut().filter(|_| called.is_some()) {
                 call.attempt.extend(now);
             }
         }
@@ -202,7 +203,7 @@ impl Commission {
         let Some(task) = self.task(heartbeat.serial) else { return };
         let new = task.number.is_none();
         task.handle_heartbeat(now, number, heartbeat, wish);
-        if let (true, Phase::Find(since)) = (new, &mut self.phase) {
+        if let (true, Phase::Discover(since)) = (new, &mut self.phase) {
             *since = now;
         }
     }
@@ -241,14 +242,15 @@ impl Commission {
     /// Handles expired timeouts, and queues the messages to send. A call before any timeout has no effect.
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.tasks.len() {
-            let again = self.tasks.get_mut(place).and_then(|task| Some((task.number, task.time(now)?)));
+            let again =
+                self.tasks.get_mut(place).and_then(|task| Some((task.number, task.handle_timeout(now)?)));
             if let Some((Some(node), (step, tag))) = again {
                 self.repeated += 1;
                 self.request(place, Node::Cell(node), step, tag);
             }
         }
         // Advance through all phases that are complete.
-        while let Some(next) = self.turn(now) {
+        while let Some(next) = self.run_phase(now) {
             self.phase = next;
         }
         if self.may_send() && self.announced.is_none_or(|at| now.elapsed_since(at) >= HEARTBEAT_INTERVAL) {
@@ -260,7 +262,7 @@ impl Commission {
     }
 
     /// Does the work of the current phase. Returns the next phase if the current one is complete.
-    fn turn(&mut self, now: Micros) -> Option<Phase> {
+    fn run_phase(&mut self, now: Micros) -> Option<Phase> {
         match self.phase {
             Phase::Listen(until) => {
                 if now < until {
@@ -270,38 +272,40 @@ impl Commission {
                     // Requests heartbeats from cells that have not sent one yet.
                     self.outbox.push_back(Message::Sync);
                 }
-                Some(Phase::Find(now))
+                Some(Phase::Discover(now))
             }
-            Phase::Find(since) => {
+            Phase::Discover(since) => {
                 let all = self.tasks.iter().all(|task| task.stage != Stage::Missing);
                 if !all && now.elapsed_since(since) < DISCOVERY_TIMEOUT {
                     return None;
                 }
-                self.calls = self.common_writes();
+                self.pending_broadcasts = self.common_writes();
                 Some(Phase::Write)
             }
             Phase::Write => {
-                if self.works(now, |stage| matches!(stage, Stage::Ask | Stage::Write)) {
+                if self.send_requests(now, |stage| matches!(stage, Stage::QueryAbilities | Stage::Write)) {
                     return None;
                 }
-                self.calls = self.all_stored().map(Step::Read).collect();
+                self.pending_broadcasts = self.all_stored().map(RequestStep::Read).collect();
                 Some(Phase::Read)
             }
             Phase::Read => {
-                if self.works(now, |stage| matches!(stage, Stage::Ask | Stage::Write | Stage::Read)) {
+                if self.send_requests(now, |stage| {
+                    matches!(stage, Stage::QueryAbilities | Stage::Write | Stage::Read)
+                }) {
                     return None;
                 }
-                if self.any(|stage| matches!(stage, Stage::Beat(_))) {
+                if self.any_open(|stage| matches!(stage, Stage::AwaitHeartbeat(_))) {
                     self.outbox.push_back(Message::Sync);
                 }
-                Some(Phase::Beat(now))
+                Some(Phase::AwaitHeartbeats(now))
             }
-            Phase::Beat(synced) => {
-                if self.works(now, |stage| stage != Stage::Missing) {
-                    let waits = self.any(|stage| matches!(stage, Stage::Beat(_)));
+            Phase::AwaitHeartbeats(synced) => {
+                if self.send_requests(now, |stage| stage != Stage::Missing) {
+                    let waits = self.any_open(|stage| matches!(stage, Stage::AwaitHeartbeat(_)));
                     if waits && now.elapsed_since(synced) >= SYNC_INTERVAL {
                         self.outbox.push_back(Message::Sync);
-                        self.phase = Phase::Beat(now);
+                        self.phase = Phase::AwaitHeartbeats(now);
                     }
                     return None;
                 }
@@ -312,14 +316,14 @@ impl Commission {
         }
     }
 
-    fn any(&self, is: impl Fn(Stage) -> bool) -> bool {
+    fn any_open(&self, is: impl Fn(Stage) -> bool) -> bool {
         self.tasks.iter().any(|task| !task.is_done() && is(task.stage))
     }
 
     /// Queues the requests that are possible now for the cells whose stage satisfies `is`. Returns true if any such
     /// cell remains, or if a cell is still claiming its node id.
-    fn works(&mut self, now: Micros, is: impl Fn(Stage) -> bool) -> bool {
-        if self.call_everyone(now) {
+    fn send_requests(&mut self, now: Micros, is: impl Fn(Stage) -> bool) -> bool {
+        if self.send_broadcasts(now) {
             return true;
         }
         let mut pending = self.tasks.iter().filter(|task| task.is_requested()).count();
@@ -328,69 +332,71 @@ impl Commission {
                 break;
             }
             let Some(task) = self.tasks.get_mut(place).filter(|task| is(task.stage)) else { continue };
-            if let (Some(node), Some((step, tag))) = (task.number, task.step(now)) {
+            if let (Some(node), Some((step, tag))) = (task.number, task.next_request(now)) {
                 pending += 1;
                 self.request(place, Node::Cell(node), step, tag);
             }
         }
-        self.any(is) || self.tasks.iter().any(|task| !task.is_done() && task.unsettled.is_some())
+        self.any_open(is) || self.tasks.iter().any(|task| !task.is_done() && task.unsettled.is_some())
     }
 
     /// Sends or repeats broadcast requests. Returns true if one is pending.
-    fn call_everyone(&mut self, now: Micros) -> bool {
+    fn send_broadcasts(&mut self, now: Micros) -> bool {
         loop {
-            if let Some(call) = &mut self.call {
+            if let Some(call) = &mut self.broadcast {
                 let mut waiting = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(call.step));
                 let first = waiting.next().map(|(place, _)| place);
                 // If most cells did not answer, a repeated broadcast costs less than a request to each.
-                match first.map(|place| (place, call.attempt.turn(now))) {
+                match first.map(|place| (place, call.attempt.handle_timeout(now))) {
                     Some((_, RetryAction::Wait)) => return true,
-                    Some((place, RetryAction::Again)) if 2 * (waiting.count() + 1) > call.needed => {
-                        let Call { step, tag, .. } = *call;
+                    Some((place, RetryAction::Resend)) if 2 * (waiting.count() + 1) > call.needed => {
+                        let Broadcast { step, tag, .. } = *call;
                         self.repeated += 1;
                         self.request(place, Node::Everyone, step, tag);
                         return true;
                     }
-                    Some((_, RetryAction::Again | RetryAction::GiveUp)) | None => self.call = None,
+                    Some((_, RetryAction::Resend | RetryAction::GiveUp)) | None => self.broadcast = None,
                 }
             }
-            let Some(step) = self.calls.pop_front() else { return false };
+            let Some(step) = self.pending_broadcasts.pop_front() else { return false };
             let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(step));
             // A write that only one cell needs goes to that cell alone.
             let (Some((place, _)), Some(_)) = (needing.next(), needing.next()) else { continue };
             let needed = needing.count() + 2;
-            if !self.may_call(step) {
+            if !self.may_broadcast(step) {
                 continue;
             }
             // There are fewer broadcast requests than tags.
-            let tag = BROADCAST_TAG | self.called.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
-            self.called.push((step, tag));
-            self.call = Some(Call { step, tag, needed, attempt: Attempt::new(now, BROADCAST_LIMITS) });
+            let tag = BROADCAST_TAG | self.sent_broadcasts.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
+            self.sent_broadcasts.push((step, tag));
+            self.broadcast =
+                Some(Broadcast { step, tag, needed, attempt: Attempt::new(now, BROADCAST_LIMITS) });
             self.request(place, Node::Everyone, step, tag);
         }
     }
 
     /// Returns true if this request may be broadcast: the receive buffer must hold all answers, and a write must not
     /// reach cells outside the description.
-    fn may_call(&self, step: Step) -> bool {
-        let fits = self.address_table.all().count() <= self.room;
+    fn may_broadcast(&self, step: RequestStep) -> bool {
+        let fits = self.address_table.all().count() <= self.max_answers;
         let known = |serial| self.by_serial.get(&serial).and_then(|&place| self.tasks.get(place));
         let ours = |serial| known(serial).is_some_and(|task| !is_failed(task.stage));
-        fits && (matches!(step, Step::Read(_)) || self.address_table.all().all(|(_, serial)| ours(serial)))
+        fits && (matches!(step, RequestStep::Read(_))
+            || self.address_table.all().all(|(_, serial)| ours(serial)))
     }
 
     /// Returns the writes that are the same for all cells that need them.
-    fn common_writes(&self) -> VecDeque<Step> {
+    fn common_writes(&self) -> VecDeque<RequestStep> {
         let common = |parameter: &Parameter| {
             let mut words = self
                 .tasks
                 .iter()
-                .filter(|task| matches!(task.stage, Stage::Ask | Stage::Write))
+                .filter(|task| matches!(task.stage, Stage::QueryAbilities | Stage::Write))
                 .map(|task| task.words(*parameter));
             let first = words.next();
             words.all(|other| Some(other) == first)
         };
-        self.all_stored().filter(common).map(Step::Write).collect()
+        self.all_stored().filter(common).map(RequestStep::Write).collect()
     }
 
     /// Returns the parameters of the cell with the largest number of parameters.
@@ -399,13 +405,13 @@ impl Commission {
         Parameter::stored(MAX_ROWS).take(longest)
     }
 
-    fn request(&mut self, place: usize, to: Node, step: Step, tag: u8) {
+    fn request(&mut self, place: usize, to: Node, step: RequestStep, tag: u8) {
         let Some(task) = self.tasks.get(place) else { return };
         let number = step.parameter().number();
         let request = match step {
-            Step::Write(parameter) => Request::Write { number, words: task.words(parameter) },
-            Step::Commit => Request::Write { number, words: task.words(Parameter::Commit) },
-            Step::Read(_) => Request::Read { number },
+            RequestStep::Write(parameter) => Request::Write { number, words: task.words(parameter) },
+            RequestStep::Commit => Request::Write { number, words: task.words(Parameter::Commit) },
+            RequestStep::Read(_) => Request::Read { number },
         };
         self.requests += 1;
         self.outbox.push_back(Message::Configure { to, tag, request });
@@ -422,11 +428,11 @@ impl Commission {
         let phase = match self.phase {
             Phase::Listen(until) => return Some(until),
             Phase::Over => return None,
-            Phase::Find(since) => Some(since + DISCOVERY_TIMEOUT),
-            Phase::Beat(synced) => Some(synced + SYNC_INTERVAL),
+            Phase::Discover(since) => Some(since + DISCOVERY_TIMEOUT),
+            Phase::AwaitHeartbeats(synced) => Some(synced + SYNC_INTERVAL),
             Phase::Write | Phase::Read => None,
         };
-        let call = self.call.map(|call| call.attempt.due());
+        let call = self.broadcast.map(|call| call.attempt.due());
         let announcement = self.announced.map(|at| at + HEARTBEAT_INTERVAL);
         let tasks = self.tasks.iter().filter_map(Task::due);
         tasks.chain([phase, call, announcement].into_iter().flatten()).min()

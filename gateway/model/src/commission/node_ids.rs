@@ -80,7 +80,7 @@ fn value(node: CellId) -> Value<'static> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::generate::{Target, generate};
+    use crate::generate::{SkinRequest, generate};
 
     fn cell(node: u8) -> CellId {
         CellId::new(node.into()).unwrap()
@@ -117,7 +117,7 @@ neighbors = [2, 0, 0, 0]
 "#;
 
     fn text() -> String {
-        let text = generate(&Target { cells: 3, ..Target::default() }).unwrap();
+        let text = generate(&SkinRequest { cells: 3, ..SkinRequest::default() }).unwrap();
         let (head, _) = text.split_once("\n[[cell]]").unwrap();
         format!("{head}{CELLS}")
     }

@@ -14,7 +14,7 @@ use crate::decode::parameter::{ParameterName, ParameterWords};
 
 /// A step of the commissioning of a cell: a request that is sent to it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Step {
+pub enum RequestStep {
     /// Stage a parameter.
     Write(Parameter),
     /// Store the staged parameters in flash, and use them.
@@ -23,7 +23,7 @@ pub enum Step {
     Read(Parameter),
 }
 
-impl Step {
+impl RequestStep {
     /// Returns the parameter of the request.
     pub(super) const fn parameter(self) -> Parameter {
         match self {
@@ -33,7 +33,7 @@ impl Step {
     }
 }
 
-impl fmt::Display for Step {
+impl fmt::Display for RequestStep {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let name = ParameterName(self.parameter().number());
         match self {
@@ -92,7 +92,7 @@ pub enum Reason {
     #[error("did not answer {step}, although it was sent {tries} times")]
     Silent {
         /// The unanswered request.
-        step: Step,
+        step: RequestStep,
         /// Number of transmissions.
         tries: u8,
     },
@@ -100,7 +100,7 @@ pub enum Reason {
     #[error("refuses {step}: {}", reason(i64::from(*.code)))]
     Refused {
         /// The refused request.
-        step: Step,
+        step: RequestStep,
         /// The reason code in the answer of the cell.
         code: i16,
     },
@@ -115,7 +115,7 @@ pub enum Reason {
     )]
     Differs {
         /// The request that was answered.
-        step: Step,
+        step: RequestStep,
         /// The expected words.
         target: [i16; WORDS],
         /// The words in the answer.
@@ -146,16 +146,18 @@ pub enum AbortReason {
     /// Another gateway sends on the bus.
     OtherGateway,
     /// Another program writes parameters of cells on the bus.
-    Meddler,
+    OtherWriter,
 }
 
 impl AbortReason {
     /// Returns the reason as a sentence for users, with the name of the bus.
     #[must_use]
-    pub fn on(self, bus: &str) -> String {
+    pub fn describe(self, bus: &str) -> String {
         match self {
             Self::OtherGateway => format!("another gateway is on {bus}: stop it first"),
-            Self::Meddler => format!("another program configures cells on {bus}: wait until it has finished"),
+            Self::OtherWriter => {
+                format!("another program configures cells on {bus}: wait until it has finished")
+            }
         }
     }
 }

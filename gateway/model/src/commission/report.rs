@@ -72,10 +72,10 @@ impl Commission {
         let failed = count(&|task| is_failed(task.stage));
         let doing = match self.phase {
             Phase::Listen(_) => "listening",
-            Phase::Find(_) => "looking for cells",
+            Phase::Discover(_) => "looking for cells",
             Phase::Write => "writing",
             Phase::Read => "reading back",
-            Phase::Beat(_) => "waiting for heartbeats",
+            Phase::AwaitHeartbeats(_) => "waiting for heartbeats",
             Phase::Over => "done",
         };
         Progress {
@@ -96,9 +96,11 @@ impl Commission {
             number: task.number,
             outcome: match task.stage {
                 Stage::Done(outcome) => outcome,
-                Stage::Missing | Stage::Ask | Stage::Write | Stage::Read | Stage::Beat(_) => {
-                    Outcome::Failed(Reason::Stopped)
-                }
+                Stage::Missing
+                | Stage::QueryAbilities
+                | Stage::Write
+                | Stage::Read
+                | Stage::AwaitHeartbeat(_) => Outcome::Failed(Reason::Stopped),
             },
         };
         let unknown_node = |(number, serial): (CellId, u32)| UnknownNode {

@@ -6,14 +6,17 @@ use protocol::packet::WORDS;
 use protocol::parameters::{Abilities, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
-use super::outcome::{Outcome, Reason, Step};
-use crate::repeat::{Attempt, Limits, RetryAction};
+use super::outcome::{Outcome, Reason, RequestStep};
+use crate::repeat::{Attempt, RetryAction, RetryLimits};
 
 /// Retry limit and timeout of a request to one cell.
-const REQUEST_LIMITS: Limits =
-    Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
+const REQUEST_LIMITS: RetryLimits = RetryLimits {
+    first_timeout: Span::from_millis(100),
+    max_timeout: Span::from_millis(800),
+    max_transmissions: 6,
+};
 /// Retry limit and timeouts of a commit request; longer than [`ANSWER`], because the cell writes its flash.
-const COMMIT_LIMITS: Limits = Limits { first: Span::from_millis(400), ..REQUEST_LIMITS };
+const COMMIT_LIMITS: RetryLimits = RetryLimits { first_timeout: Span::from_millis(400), ..REQUEST_LIMITS };
 /// Maximum number of times that the writing of a cell starts over after the cell restarted meanwhile.
 const MAX_ROUNDS: u8 = 6;
 /// Maximum time for a cell to hold a node id after it started or lost its node id.
@@ -27,13 +30,13 @@ pub(super) enum Stage {
     /// The cell has not sent a heartbeat yet.
     Missing,
     /// The abilities of the cell are being read.
-    Ask,
+    QueryAbilities,
     /// The cell needs parameters, and then a commit.
     Write,
     /// The cell has committed, or had the expected hash; its parameters are being read back and compared.
     Read,
     /// Waiting for a heartbeat with the expected hash; holds the start of the wait.
-    Beat(Micros),
+    AwaitHeartbeat(Micros),
     /// The commissioning of the cell has finished, with this result.
     Done(Outcome),
 }
@@ -41,7 +44,7 @@ pub(super) enum Stage {
 /// A request to the cell that has not been answered yet.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
-    step: Step,
+    step: RequestStep,
     tag: u8,
     attempt: Attempt,
 }
@@ -68,7 +71,7 @@ pub(super) struct Task {
     tag: u8,
     rounds: u8,
     /// The node id that the cell had before its present one.
-    before: Option<CellId>,
+    previous_number: Option<CellId>,
     /// The time since when the cell cannot receive requests, because it claims a node id or has lost it; `None` if it
     /// can.
     pub(super) unsettled: Option<Micros>,
@@ -103,7 +106,7 @@ impl Task {
             pending: None,
             tag: 0,
             rounds: 0,
-            before: None,
+            previous_number: None,
             unsettled: None,
             reported_hash: 0,
         }
@@ -119,7 +122,7 @@ impl Task {
 
     /// Returns the parameters that the skin's configuration of the cell has.
     pub(super) fn stored(&self) -> impl Iterator<Item = Parameter> + use<> {
-        Parameter::stored(self.target.table().len())
+        Parameter::stored(self.target.all_rows().len())
     }
 
     /// Returns the bit of a parameter in `written`; zero if the cell's configuration lacks the parameter.
@@ -140,14 +143,14 @@ impl Task {
     }
 
     /// Returns true if the cell still needs this step of a broadcast request.
-    pub(super) fn needs(&self, step: Step) -> bool {
+    pub(super) fn needs(&self, step: RequestStep) -> bool {
         let of_step = self.bit(step.parameter());
         let missing = |mask| of_step != 0 && mask & of_step == 0;
         let can = self.number.is_some() && self.unsettled.is_none() && self.pending.is_none();
         can && match step {
-            Step::Write(_) => self.stage == Stage::Write && missing(self.written),
-            Step::Read(_) => self.stage == Stage::Read && missing(self.read),
-            Step::Commit => false,
+            RequestStep::Write(_) => self.stage == Stage::Write && missing(self.written),
+            RequestStep::Read(_) => self.stage == Stage::Read && missing(self.read),
+            RequestStep::Commit => false,
         }
     }
 
@@ -161,10 +164,10 @@ impl Task {
     ) {
         if let Some(old) = self.number.filter(|&old| old != number) {
             // One change is a cell with a new node id; a change back means two cells.
-            if self.before == Some(number) {
+            if self.previous_number == Some(number) {
                 return self.fail(Reason::Twins(old.min(number), old.max(number)));
             }
-            self.before = Some(old);
+            self.previous_number = Some(old);
             self.restart();
         }
         self.number = Some(number);
@@ -179,9 +182,13 @@ impl Task {
         }
         self.unsettled = None;
         match self.stage {
-            Stage::Missing => self.place(wish),
-            Stage::Beat(_) if self.reported_hash == self.hash => self.finish(),
-            Stage::Ask | Stage::Write | Stage::Read | Stage::Beat(_) | Stage::Done(_) => {}
+            Stage::Missing => self.choose_stage(wish),
+            Stage::AwaitHeartbeat(_) if self.reported_hash == self.hash => self.finish(),
+            Stage::QueryAbilities
+            | Stage::Write
+            | Stage::Read
+            | Stage::AwaitHeartbeat(_)
+            | Stage::Done(_) => {}
         }
     }
 
@@ -190,19 +197,22 @@ impl Task {
     fn restart(&mut self) {
         self.pending = None;
         (self.written, self.read) = (0, 0);
-        if matches!(self.stage, Stage::Ask | Stage::Write | Stage::Read | Stage::Beat(_)) {
+        if matches!(self.stage, Stage::QueryAbilities | Stage::Write | Stage::Read | Stage::AwaitHeartbeat(_))
+        {
             self.stage = Stage::Missing;
         }
     }
 
     /// Chooses the stage of a cell that has settled.
-    fn place(&mut self, wish: CommissionOptions) {
+    fn choose_stage(&mut self, wish: CommissionOptions) {
         let has_it = self.reported_hash == self.hash;
         self.stage = match (has_it, wish.dry_run, wish.verify || self.touched) {
             (true, _, true) => Stage::Read,
             (true, _, false) => Stage::Done(Outcome::AlreadySo),
             // A configuration that needs only the default abilities requires no query.
-            (false, ..) if Abilities::default().first_missing(&self.target).is_some() => Stage::Ask,
+            (false, ..) if Abilities::default().first_missing(&self.target).is_some() => {
+                Stage::QueryAbilities
+            }
             (false, true, _) => Stage::Done(Outcome::WouldWrite),
             (false, false, _) => Stage::Write,
         };
@@ -227,40 +237,41 @@ impl Task {
     }
 
     /// Starts the next request of the cell and returns it with its tag; returns `None` if a request is pending.
-    pub(super) fn step(&mut self, now: Micros) -> Option<(Step, u8)> {
+    pub(super) fn next_request(&mut self, now: Micros) -> Option<(RequestStep, u8)> {
         if self.pending.is_some() || self.unsettled.is_some() || self.number.is_none() {
             return None;
         }
         let step = match self.stage {
-            Stage::Ask => Step::Read(Parameter::Identity),
-            Stage::Write => self.first_missing(self.written).map_or(Step::Commit, Step::Write),
-            Stage::Read => Step::Read(self.first_missing(self.read)?),
-            Stage::Missing | Stage::Beat(_) | Stage::Done(_) => return None,
+            Stage::QueryAbilities => RequestStep::Read(Parameter::Identity),
+            Stage::Write => self.first_missing(self.written).map_or(RequestStep::Commit, RequestStep::Write),
+            Stage::Read => RequestStep::Read(self.first_missing(self.read)?),
+            Stage::Missing | Stage::AwaitHeartbeat(_) | Stage::Done(_) => return None,
         };
         // The upper half of the tags is reserved for broadcast requests.
         self.tag = self.tag.wrapping_add(1) & 0x7F;
         // A commit may take effect without an answer.
-        self.touched |= step == Step::Commit;
-        let attempt = Attempt::new(now, if step == Step::Commit { COMMIT_LIMITS } else { REQUEST_LIMITS });
+        self.touched |= step == RequestStep::Commit;
+        let attempt =
+            Attempt::new(now, if step == RequestStep::Commit { COMMIT_LIMITS } else { REQUEST_LIMITS });
         self.pending = Some(Pending { step, tag: self.tag, attempt });
         Some((step, self.tag))
     }
 
     /// Handles timeouts: repeats the request, and fails at the retry limit or if the cell does not settle.
-    pub(super) fn time(&mut self, now: Micros) -> Option<(Step, u8)> {
+    pub(super) fn handle_timeout(&mut self, now: Micros) -> Option<(RequestStep, u8)> {
         if self.unsettled.is_some_and(|since| now.elapsed_since(since) >= SETTLE_TIMEOUT) && !self.is_done() {
             self.fail(Reason::Gone);
         }
-        if let Stage::Beat(since) = self.stage
+        if let Stage::AwaitHeartbeat(since) = self.stage
             && now.elapsed_since(since) >= HEARTBEAT_TIMEOUT
         {
             self.fail(Reason::Hash { target: self.hash, got: self.reported_hash });
         }
         let Pending { step, tag, attempt } = self.pending.as_mut()?;
-        let (step, tag, tries) = (*step, *tag, attempt.tries());
-        match attempt.turn(now) {
+        let (step, tag, tries) = (*step, *tag, attempt.transmissions());
+        match attempt.handle_timeout(now) {
             RetryAction::Wait => None,
-            RetryAction::Again => Some((step, tag)),
+            RetryAction::Resend => Some((step, tag)),
             RetryAction::GiveUp => {
                 self.fail(Reason::Silent { step, tries });
                 None
@@ -271,30 +282,34 @@ impl Task {
     /// Returns the time of the next call of [`Task::time`]; `None` if no timeout is running.
     pub(super) fn due(&self) -> Option<Micros> {
         let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLE_TIMEOUT);
-        let beat = if let Stage::Beat(since) = self.stage { Some(since + HEARTBEAT_TIMEOUT) } else { None };
+        let beat = if let Stage::AwaitHeartbeat(since) = self.stage {
+            Some(since + HEARTBEAT_TIMEOUT)
+        } else {
+            None
+        };
         [self.pending.map(|pending| pending.attempt.due()), settled, beat].into_iter().flatten().min()
     }
 
     /// Handles an answer of the cell to the pending request, or to the broadcast request `call` with this tag.
-    pub(super) fn answer(
+    pub(super) fn handle_answer(
         &mut self,
         now: Micros,
         tag: u8,
         answer: Answer,
-        call: Option<Step>,
+        call: Option<RequestStep>,
         wish: CommissionOptions,
     ) {
         let own = self.pending.filter(|pending| pending.tag == tag).map(|pending| pending.step);
         let called = call.filter(|&step| self.needs(step));
         let Some(step) = own.or(called) else { return };
         let parameter = step.parameter();
-        let is_write = !matches!(step, Step::Read(_));
+        let is_write = !matches!(step, RequestStep::Read(_));
         match answer {
             Answer::Refused { number, reason } if number == parameter.number() => {
                 self.pending = None;
-                if step == Step::Commit && reason == Answer::WRONG_HASH {
+                if step == RequestStep::Commit && reason == Answer::WRONG_HASH {
                     // The cell restarted in between, without a heartbeat that arrived.
-                    return self.again(Reason::Refused { step, code: reason });
+                    return self.start_over(Reason::Refused { step, code: reason });
                 }
                 self.fail(Reason::Refused { step, code: reason });
             }
@@ -302,7 +317,7 @@ impl Task {
                 if number == parameter.number() && written == is_write =>
             {
                 self.pending = None;
-                if self.stage == Stage::Ask {
+                if self.stage == Stage::QueryAbilities {
                     let [.., abilities] = words;
                     return match (Abilities::from_word(abilities).first_missing(&self.target), wish.dry_run) {
                         (Some(ability), _) => self.fail(Reason::Cannot(ability)),
@@ -312,7 +327,7 @@ impl Task {
                 }
                 let target = self.words(parameter);
                 if words == target {
-                    return self.is_right(now, step);
+                    return self.confirm(now, step);
                 }
                 let differs = Reason::Differs { step, target, got: words };
                 if is_write {
@@ -320,7 +335,7 @@ impl Task {
                 } else if wish.dry_run {
                     self.stage = Stage::Done(Outcome::WouldWrite);
                 } else {
-                    self.again(differs);
+                    self.start_over(differs);
                 }
             }
             // The answer belongs to an earlier request with this tag.
@@ -328,15 +343,15 @@ impl Task {
         }
     }
 
-    fn is_right(&mut self, now: Micros, step: Step) {
+    fn confirm(&mut self, now: Micros, step: RequestStep) {
         let bit = self.bit(step.parameter());
         match step {
-            Step::Write(_) => self.written |= bit,
-            Step::Commit => (self.stage, self.read) = (Stage::Read, 0),
-            Step::Read(_) => {
+            RequestStep::Write(_) => self.written |= bit,
+            RequestStep::Commit => (self.stage, self.read) = (Stage::Read, 0),
+            RequestStep::Read(_) => {
                 self.read |= bit;
                 if self.first_missing(self.read).is_none() {
-                    self.stage = Stage::Beat(now);
+                    self.stage = Stage::AwaitHeartbeat(now);
                     // A heartbeat may have brought the right hash meanwhile.
                     if self.reported_hash == self.hash {
                         self.finish();
@@ -347,7 +362,7 @@ impl Task {
     }
 
     /// Starts the writing of the cell over; fails with `why` after the maximum number of rounds.
-    fn again(&mut self, why: Reason) {
+    fn start_over(&mut self, why: Reason) {
         self.rounds += 1;
         if self.rounds > MAX_ROUNDS {
             return self.fail(why);

@@ -63,18 +63,18 @@ impl ErrorFrame {
 
 /// Returns the error classes in the identifier of an error frame.
 pub fn error_classes(id: u32) -> impl Iterator<Item = &'static str> {
-    names(id, &CLASSES)
+    set_bit_names(id, &CLASSES)
 }
 
 /// Returns the names of the bits that are set in `bits`.
-fn names<'a>(bits: u32, names: &'a [&str]) -> impl Iterator<Item = &'a str> {
+fn set_bit_names<'a>(bits: u32, names: &'a [&str]) -> impl Iterator<Item = &'a str> {
     names.iter().enumerate().filter(move |(bit, _)| bits >> bit & 1 != 0).map(|(_, name)| *name)
 }
 
 impl Display for ErrorFrame {
     fn fmt(&self, f: &mut Formatter<'_>) -> Result {
         let [arbitration, controller, violation, place, transceiver, _, tx, rx] = self.data;
-        let details = |bits: u8, all: &[&str]| names(bits.into(), all).collect::<Vec<_>>().join(",");
+        let details = |bits: u8, all: &[&str]| set_bit_names(bits.into(), all).collect::<Vec<_>>().join(",");
         let mut is_first = true;
         for (bit, name) in (0..).zip(CLASSES) {
             let class = self.classes & 1 << bit;

@@ -6,7 +6,7 @@ use protocol::message::State;
 use protocol::packet::WORDS;
 use protocol::schema::{self, Field, FieldFormat, Layout, TextPart, TextPiece, Units};
 
-use super::ports::{Port, PortSet, joined, write_neighbors};
+use super::ports::{PortName, PortSet, write_joined, write_neighbors};
 
 /// The words of the parameter with this number, formatted as values with units.
 #[derive(Clone, Copy, Debug)]
@@ -41,7 +41,7 @@ impl Display for ParameterName {
 
 /// Writes the fields of a layout as text, read from these bytes.
 pub(super) fn write_layout(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
-    fields(f, layout, Bytes { bytes, units: Units::default() })
+    write_fields(f, layout, Bytes { bytes, units: Units::default() })
 }
 
 /// The bytes of a packet, and the units of joints, torques and sums.
@@ -52,9 +52,9 @@ pub(super) struct Bytes<'a> {
 }
 
 /// Writes the fields of a layout.
-pub(super) fn fields(f: &mut Formatter<'_>, layout: &Layout, words: Bytes<'_>) -> fmt::Result {
+pub(super) fn write_fields(f: &mut Formatter<'_>, layout: &Layout, words: Bytes<'_>) -> fmt::Result {
     let number = layout.fields.first().map_or(0, |first| first.raw(words.bytes, 0));
-    fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), words, &|_, name| {
+    write_parts(f, &layout.text, u16::try_from(number).unwrap_or_default(), words, &|_, name| {
         Ok(field(&layout.fields, name))
     })
 }
@@ -66,15 +66,16 @@ pub(super) fn field<'a>(fields: &'a [Field], name: &str) -> Option<&'a Field> {
 
 /// A function that returns the field with a name. If the name is not a field, it writes the value itself and returns
 /// `None`.
-pub(super) type Find<'a> = dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fmt::Error> + 'a;
+pub(super) type FieldLookup<'a> =
+    dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fmt::Error> + 'a;
 
 /// Writes the parts of a text that apply to a value, with their fields filled in.
-pub(super) fn fill<'a>(
+pub(super) fn write_parts<'a>(
     f: &mut Formatter<'_>,
     text: &[TextPart],
     number: u16,
     words: Bytes<'_>,
-    find: &Find<'a>,
+    find: &FieldLookup<'a>,
 ) -> fmt::Result {
     for part in text {
         let of = part.of.as_deref().map(|name| find(f, name)).transpose()?.flatten();
@@ -82,18 +83,23 @@ pub(super) fn fill<'a>(
         if !(part.when[0].into()..=part.when[1].into()).contains(&number) {
             continue;
         }
-        pieces(f, &part.pieces, words, find)?;
+        write_pieces(f, &part.pieces, words, find)?;
     }
     Ok(())
 }
 
-fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[TextPiece], words: Bytes<'_>, find: &Find<'a>) -> fmt::Result {
+fn write_pieces<'a>(
+    f: &mut Formatter<'_>,
+    pieces: &[TextPiece],
+    words: Bytes<'_>,
+    find: &FieldLookup<'a>,
+) -> fmt::Result {
     for piece in pieces {
         match piece {
             TextPiece::Literal(text) => f.write_str(text)?,
             TextPiece::Field { name, decimals } => {
                 if let Some(field) = find(f, name)? {
-                    show(f, field, words, *decimals)?;
+                    write_field(f, field, words, *decimals)?;
                 }
             }
             TextPiece::Either { name, words: [no, yes] } => {
@@ -107,7 +113,7 @@ fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[TextPiece], words: Bytes<'_>, fin
 
 /// Writes a field in the format that the text part requests. If an element has another unit than the field, its unit
 /// follows.
-fn show(
+fn write_field(
     f: &mut Formatter<'_>,
     field: &Field,
     Bytes { bytes, units }: Bytes<'_>,
@@ -117,12 +123,12 @@ fn show(
     match &field.format {
         FieldFormat::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
         FieldFormat::Hex => write!(f, "{first:04X}"),
-        FieldFormat::Port => write!(f, "{}", Port(first)),
+        FieldFormat::Port => write!(f, "{}", PortName(first)),
         FieldFormat::Ports(..) => write!(f, "{}", PortSet(first)),
-        FieldFormat::State => write!(f, "{}", Flags(State(u16::try_from(first).unwrap_or_default()))),
+        FieldFormat::State => write!(f, "{}", StateText(State(u16::try_from(first).unwrap_or_default()))),
         FieldFormat::Parameter(_) => write!(f, "{}", ParameterName::from_raw(first)),
         FieldFormat::Reason => write!(f, "{} (reason {first})", schema::reason(first)),
-        FieldFormat::Total(_) => write!(f, "{:.decimals$}", field.total(bytes)),
+        FieldFormat::Total(_) => write!(f, "{:.decimals$}", field.sum_of_words(bytes)),
         FieldFormat::Group(parts) => write_neighbors(f, parts, bytes, field.elements()),
         FieldFormat::Fixed(_)
         | FieldFormat::Threshold(_)
@@ -154,11 +160,11 @@ fn show(
 }
 
 /// A state word, for example `configured+active, joint 2, version 1`.
-struct Flags(State);
+struct StateText(State);
 
-impl Display for Flags {
+impl Display for StateText {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        joined(f, self.0.flag_names())?;
+        write_joined(f, self.0.flag_names())?;
         write!(f, ", joint {}, version {}", self.0.joint(), self.0.version())
     }
 }

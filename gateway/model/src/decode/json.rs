@@ -7,7 +7,7 @@ use protocol::id::{Id, Kind};
 use protocol::message::{Message, State};
 use protocol::packet::{Bytes, PacketError};
 use protocol::port::LinkId;
-use protocol::schema::{self, Absent, Field, FieldFormat, Layout, PacketSchema, Units};
+use protocol::schema::{self, Field, FieldFormat, Layout, PacketSchema, Units, WhenAbsent};
 use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
 use super::fields::ParameterName;
@@ -65,8 +65,8 @@ impl Serialize for Values {
             map.serialize_entry("back", back)?;
             map.serialize_entry("says", &layout.name)?;
         }
-        entries(&mut map, end, &layout.name, bytes, *units)?;
-        entries(&mut map, &layout.fields, &layout.name, bytes, *units)?;
+        serialize_fields(&mut map, end, &layout.name, bytes, *units)?;
+        serialize_fields(&mut map, &layout.fields, &layout.name, bytes, *units)?;
         map.end()
     }
 }
@@ -77,13 +77,13 @@ struct Group<'a>(&'a [Field], &'a [u8]);
 impl Serialize for Group<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
-        entries(&mut map, self.0, "", self.1, Units::default())?;
+        serialize_fields(&mut map, self.0, "", self.1, Units::default())?;
         map.end()
     }
 }
 
 /// Serialises each field that the packet contains. Epoch and tag are omitted, because they are keys of the frame.
-fn entries<M: SerializeMap>(
+fn serialize_fields<M: SerializeMap>(
     map: &mut M,
     fields: &[Field],
     page: &str,
@@ -94,7 +94,7 @@ fn entries<M: SerializeMap>(
     for field in fields.iter().filter(|field| !matches!(field.name.as_str(), "" | "epoch" | "tag")) {
         let raw = field.raw(bytes, 0);
         if !field.is_present(bytes, first) {
-            if field.absent == Absent::Null {
+            if field.absent == WhenAbsent::Null {
                 map.serialize_entry(&field.name, &())?;
             }
         } else if let FieldFormat::Page(_) = field.format {
@@ -105,7 +105,7 @@ fn entries<M: SerializeMap>(
             map.serialize_entry("joint", &state.joint())?;
             map.serialize_entry("version", &state.version())?;
         } else {
-            map.serialize_entry(&field.name, &Shown(field, bytes, units))?;
+            map.serialize_entry(&field.name, &FieldValue(field, bytes, units))?;
             if field.format == FieldFormat::Reason {
                 map.serialize_entry("because", schema::reason(raw))?;
             }
@@ -115,9 +115,9 @@ fn entries<M: SerializeMap>(
 }
 
 /// The value of a field for JSON, or an array of values if the field has several elements.
-struct Shown<'a>(&'a Field, &'a [u8], Units);
+struct FieldValue<'a>(&'a Field, &'a [u8], Units);
 
-impl Serialize for Shown<'_> {
+impl Serialize for FieldValue<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let Self(field, bytes, units) = *self;
         let (first, elements) = (field.raw(bytes, 0), 0..field.elements_in(bytes));
@@ -128,7 +128,7 @@ impl Serialize for Shown<'_> {
             FieldFormat::Hex => serializer.collect_str(&format_args!("{first:04X}")),
             FieldFormat::Parameter(_) => serializer.collect_str(&ParameterName::from_raw(first)),
             FieldFormat::Ports(..) => serializer.collect_seq(PortSet(first).ports()),
-            FieldFormat::Total(_) => serializer.serialize_f64(field.total(bytes)),
+            FieldFormat::Total(_) => serializer.serialize_f64(field.sum_of_words(bytes)),
             FieldFormat::Group(parts) => {
                 let of = |element: usize| Group(parts, bytes.get(element * 2..).unwrap_or_default());
                 serializer.collect_seq(elements.map(of))
@@ -192,31 +192,31 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
     match *decoded {
         Decoded::Foreign(foreign) => {
             if let Foreign::Data(fault) = foreign {
-                line.fails(fault);
+                line.set_crc_error(fault);
             }
             line.error = Some(foreign.to_string());
         }
         Decoded::Wire(link_id, message) => {
             line.kind = Some("wire");
-            line.crc = Some(word(last_word(record)));
+            line.crc = Some(hex_word(packet_crc(record)));
             let (bytes, layout) = wires::encoded(message);
             line.epoch = wires::epoch(message);
             line.values = Some(Values { link_id: Some(link_id), end: &[], layout, bytes, units });
         }
-        Decoded::Segment { id } => line.about(id),
+        Decoded::Segment { id } => line.set_subject(id),
         Decoded::Damaged { id, fault } => {
-            line.about(id);
-            line.fails(fault);
+            line.set_subject(id);
+            line.set_crc_error(fault);
             line.error = Some(fault.to_string());
         }
         Decoded::Meaningless { packet, error } => {
-            line.about(packet.id);
+            line.set_subject(packet.id);
             line.error = Some(error.to_string());
-            line.crc = Some(word(last_word(record)));
+            line.crc = Some(hex_word(packet_crc(record)));
         }
         Decoded::Message(message) => {
-            line.about(message.id());
-            line.crc = Some(word(last_word(record)));
+            line.set_subject(message.id());
+            line.crc = Some(hex_word(packet_crc(record)));
             line.saturated = message.is_saturated();
             line.set_message(&message, units);
         }
@@ -226,25 +226,25 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
 }
 
 /// Returns the CRC of a packet, from the last two bytes of the frame that ends it.
-fn last_word(record: &Record<'_>) -> u16 {
+fn packet_crc(record: &Record<'_>) -> u16 {
     record.frame.data().last_chunk().map_or(0, |last| u16::from_le_bytes(*last))
 }
 
-fn word(word: u16) -> String {
+fn hex_word(word: u16) -> String {
     format!("{word:04X}")
 }
 
 impl FrameObject<'_> {
     /// Sets the keys for the packet kind and the node, from the identifier.
-    fn about(&mut self, id: Id) {
+    fn set_subject(&mut self, id: Id) {
         self.kind = Some(id.name());
         self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
     }
 
     /// Sets the keys for the received and the expected CRC, if the packet's fault is a wrong CRC.
-    fn fails(&mut self, fault: PacketError) {
+    fn set_crc_error(&mut self, fault: PacketError) {
         if let PacketError::Crc { expected, got } = fault {
-            (self.crc, self.crc_expected) = (Some(word(got)), Some(word(expected)));
+            (self.crc, self.crc_expected) = (Some(hex_word(got)), Some(hex_word(expected)));
         }
     }
 
@@ -252,7 +252,7 @@ impl FrameObject<'_> {
         (self.epoch, self.tag) = (message.epoch().map(|epoch| epoch.0), message.tag());
         let packet = message.encode();
         let layout = schema::layout(message, &packet);
-        let end = PacketSchema::for_id(packet.id).map_or(&[][..], |schema| schema.end(layout));
+        let end = PacketSchema::for_id(packet.id).map_or(&[][..], |schema| schema.trailing_fields(layout));
         let is_bare = end.is_empty() && layout.fields.is_empty();
         self.values =
             (!is_bare).then(|| Values { link_id: None, end, layout, bytes: packet.fields(), units });

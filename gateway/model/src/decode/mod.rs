@@ -86,7 +86,7 @@ pub enum Foreign {
 }
 
 impl Foreign {
-    fn of(frame: &Frame) -> Self {
+    fn from_frame(frame: &Frame) -> Self {
         if frame.is_error() {
             Self::Error(ErrorFrame::new(frame))
         } else if frame.is_remote() {
@@ -132,45 +132,45 @@ impl Decoded {
 /// Returns the message of a frame over a simulated wire. Returns `None` if the identifier or the CRC is not that of a
 /// wire: other buses use 29-bit identifiers, too.
 #[must_use]
-pub fn wired(frame: &Frame) -> Option<(port::LinkId, PortMessage)> {
+pub fn wire_message(frame: &Frame) -> Option<(port::LinkId, PortMessage)> {
     let link_id = port::LinkId::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
     Some((link_id, link_id.decode_frame(frame)?))
 }
 
 /// Classifies a frame that cannot be a packet.
 fn not_data(frame: &Frame) -> Decoded {
-    let wired = wired(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
-    wired.unwrap_or_else(|| Decoded::Foreign(Foreign::of(frame)))
+    let wired = wire_message(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
+    wired.unwrap_or_else(|| Decoded::Foreign(Foreign::from_frame(frame)))
 }
 
 /// Frame counts of one identifier, which decide whether it carries packets.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Traffic {
+pub struct IdentifierTraffic {
     packets: u64,
     others: u64,
 }
 
-impl Traffic {
+impl IdentifierTraffic {
     /// Minimum number of packets that prove that an identifier carries packets: a random frame is a packet with
     /// probability 1/65 536.
-    const PACKETS: u64 = 2;
+    const MIN_PACKETS: u64 = 2;
     /// Maximum number of other frames for each packet, for an identifier that carries packets.
-    const OTHERS: u64 = 32;
+    const MAX_OTHERS_PER_PACKET: u64 = 32;
 
     /// Counts a packet.
-    pub const fn packet(&mut self) {
+    pub const fn count_packet(&mut self) {
         self.packets += 1;
     }
 
     /// Counts a frame that is neither a packet nor a segment.
-    pub const fn other(&mut self) {
+    pub const fn count_other(&mut self) {
         self.others += 1;
     }
 
     /// Returns true if the identifier carries packets. If so, other frames with it count as damaged, else as foreign.
     #[must_use]
     pub const fn carries_packets(self) -> bool {
-        self.packets >= Self::PACKETS && self.others <= Self::OTHERS * self.packets
+        self.packets >= Self::MIN_PACKETS && self.others <= Self::MAX_OTHERS_PER_PACKET * self.packets
     }
 }
 
@@ -204,13 +204,13 @@ struct Classifier {
 struct Slot {
     /// Numbers of the frames that may be segments of a packet and wait for its other segments.
     waiting: VecDeque<u64>,
-    traffic: Traffic,
+    traffic: IdentifierTraffic,
 }
 
 impl Slot {
     /// Settles the pending frames as refused, except the newest `kept`; their numbers and classes are appended to
     /// `settled`.
-    fn drop_beyond(&mut self, kept: usize, id: Id, settled: &mut Vec<(u64, Decoded)>) {
+    fn refuse_older(&mut self, kept: usize, id: Id, settled: &mut Vec<(u64, Decoded)>) {
         for _ in kept..self.waiting.len() {
             if let Some(number) = self.waiting.pop_front() {
                 settled.push((number, self.refuse(id, PacketError::Incomplete)));
@@ -220,7 +220,7 @@ impl Slot {
 
     /// Classifies a frame that is neither a packet nor a segment.
     const fn refuse(&mut self, id: Id, fault: PacketError) -> Decoded {
-        self.traffic.other();
+        self.traffic.count_other();
         if self.traffic.carries_packets() {
             Decoded::Damaged { id, fault }
         } else {
@@ -235,7 +235,7 @@ type Classified = (Decoded, Vec<(u64, Decoded)>);
 
 impl Classifier {
     /// Classifies the frame with this number.
-    fn take(&mut self, number: u64, received: &Received<'_>) -> Classified {
+    fn classify(&mut self, number: u64, received: &Received<'_>) -> Classified {
         let id = match received.packet {
             Ok((packet, message)) => {
                 let settled = self.packet(&packet);
@@ -249,14 +249,14 @@ impl Classifier {
             Err(NoPacket::Damaged(id, fault)) => {
                 let (slot, mut settled) = (self.ids.entry(id), Vec::new());
                 if fault == PacketError::Ambiguous {
-                    slot.drop_beyond(0, id, &mut settled);
+                    slot.refuse_older(0, id, &mut settled);
                 }
                 return (slot.refuse(id, fault), settled);
             }
         };
         let (slot, mut settled) = (self.ids.entry(id), Vec::new());
         slot.waiting.push_back(number);
-        slot.drop_beyond(received.pending.after, id, &mut settled);
+        slot.refuse_older(received.pending.after, id, &mut settled);
         (Decoded::Segment { id }, settled)
     }
 
@@ -265,9 +265,9 @@ impl Classifier {
     fn packet(&mut self, packet: &Packet) -> Vec<(u64, Decoded)> {
         let id = packet.id;
         let (slot, mut settled) = (self.ids.entry(id), Vec::new());
-        slot.drop_beyond(packet.words.length().segments() - 1, id, &mut settled);
+        slot.refuse_older(packet.words.length().segments() - 1, id, &mut settled);
         settled.extend(slot.waiting.drain(..).map(|number| (number, Decoded::Segment { id })));
-        slot.traffic.packet();
+        slot.traffic.count_packet();
         settled
     }
 }
@@ -282,16 +282,16 @@ impl Decoder {
     /// Classifies the next frame. A classic frame may be a [`Decoded::Segment`] first and be settled later;
     /// [`settle::Settler`] waits for that. Memory is bounded for any input. Never panics.
     pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
-        self.take(0, at, bus, frame).1.0
+        self.classify(0, at, bus, frame).1.0
     }
 
     /// Classifies the frame with this number. Also returns the number of its bus.
-    fn take(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> (u64, Classified) {
+    fn classify(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> (u64, Classified) {
         if data_id(frame).is_err() {
             return (0, (not_data(frame), Vec::new()));
         }
         let bus = self.bus(bus);
-        (bus.number, bus.classifier.take(number, &bus.packets.read(at, frame)))
+        (bus.number, bus.classifier.classify(number, &bus.packets.read(at, frame)))
     }
 
     /// Returns the class of a segment whose packet will not be completed.

@@ -32,7 +32,7 @@ pub enum ParameterTextError {
     )]
     ReadOnly,
     /// The number of values differs from the number of fields of the parameter.
-    #[error("{name} is written with {} ({fields}), not with {got}", values(*.target))]
+    #[error("{name} is written with {} ({fields}), not with {got}", value_count_text(*.target))]
     Count {
         /// The parameter.
         name: &'static str,
@@ -63,7 +63,7 @@ pub enum ParameterTextError {
     },
 }
 
-fn values(count: usize) -> String {
+fn value_count_text(count: usize) -> String {
     if count == 1 { "one value".to_owned() } else { format!("{count} values") }
 }
 
@@ -71,7 +71,7 @@ fn values(count: usize) -> String {
 ///
 /// # Errors
 /// Returns [`ParameterTextError::Unknown`] if the text is neither a name nor a number up to 127.
-pub fn number(text: &str) -> Result<u8, ParameterTextError> {
+pub fn parse_number(text: &str) -> Result<u8, ParameterTextError> {
     let named = schema::find_parameter(text).map(|layout| layout.number);
     let number = || text.parse().ok().filter(|&number| number <= MAX);
     named.or_else(number).ok_or_else(|| ParameterTextError::Unknown { got: text.to_owned() })
@@ -81,8 +81,8 @@ pub fn number(text: &str) -> Result<u8, ParameterTextError> {
 ///
 /// # Errors
 /// Returns [`ParameterTextError`] if the parameter does not exist, or if a value is not allowed.
-pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), ParameterTextError> {
-    let number = number(parameter)?;
+pub fn parse_write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), ParameterTextError> {
+    let number = parse_number(parameter)?;
     let mut words = [0; WORDS];
     let wrong = |field: String, text: &str, allowed| ParameterTextError::Value {
         field,
@@ -94,14 +94,14 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
             return Err(ParameterTextError::Words { number, got: values.len() });
         }
         for (word, text) in words.iter_mut().zip(values) {
-            *word = raw(text).map_err(|allowed| wrong("word".to_owned(), text, allowed))?;
+            *word = parse_raw_word(text).map_err(|allowed| wrong("word".to_owned(), text, allowed))?;
         }
         return Ok((number, words));
     };
     if Parameter::from_number(number) == Some(Parameter::Identity) {
         return Err(ParameterTextError::ReadOnly);
     }
-    let fields: Vec<_> = written(layout, values).collect();
+    let fields: Vec<_> = fields_to_write(layout, values).collect();
     let needed = fields.iter().filter(|(field, _)| !field.optional).count();
     if !(needed..=fields.len()).contains(&values.len()) {
         let names: Vec<_> = fields.iter().map(|(_, name)| name.as_str()).collect();
@@ -109,15 +109,19 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
         return Err(ParameterTextError::Count { name, target, fields: names.join(" "), got });
     }
     for (word, ((field, name), text)) in words.iter_mut().zip(fields.into_iter().zip(values)) {
-        *word = read(field, text).map_err(|allowed| wrong(name, text, allowed))?;
+        *word = parse_value(field, text).map_err(|allowed| wrong(name, text, allowed))?;
     }
     Ok((number, words))
 }
 
 /// Returns the fields that a write sets, with their names, in the order of the words. The first value may decide which
 /// fields follow.
-fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (&'static Field, String)> {
-    let first = layout.fields.first().zip(values.first()).and_then(|(field, text)| read(field, text).ok());
+fn fields_to_write(
+    layout: &'static Layout,
+    values: &[String],
+) -> impl Iterator<Item = (&'static Field, String)> {
+    let first =
+        layout.fields.first().zip(values.first()).and_then(|(field, text)| parse_value(field, text).ok());
     let follows = move |field: &&Field| field.is_present_for(first.map(i64::from));
     layout
         .fields
@@ -130,7 +134,7 @@ fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (
 ///
 /// # Errors
 /// Returns a description of the allowed values.
-pub fn read(field: &Field, text: &str) -> Result<i16, String> {
+pub fn parse_value(field: &Field, text: &str) -> Result<i16, String> {
     let allowed = || field.allowed.clone();
     let known = |number: &i16| match field.range {
         FieldRange::Within(min, max) => (i32::from(min)..=i32::from(max)).contains(&i32::from(*number)),
@@ -140,16 +144,16 @@ pub fn read(field: &Field, text: &str) -> Result<i16, String> {
     };
     match field.format {
         FieldFormat::Choice => field.value_of(text).ok_or_else(allowed),
-        FieldFormat::Ports(..) => ports(text).ok_or_else(allowed),
+        FieldFormat::Ports(..) => parse_ports(text).ok_or_else(allowed),
         FieldFormat::Hex => u16::from_str_radix(text, 16).map(u16::cast_signed).map_err(|_| allowed()),
         FieldFormat::Word | FieldFormat::Unsigned(_) => {
             text.parse().ok().filter(|&number| number > 0).map(u16::cast_signed).ok_or_else(allowed)
         }
         FieldFormat::Signed | FieldFormat::Flag(_) => text.parse().ok().filter(known).ok_or_else(allowed),
-        FieldFormat::Angle | FieldFormat::Position => angle(text),
-        FieldFormat::Threshold(fraction) => step(text, fraction, Q::<0>::try_at_least),
+        FieldFormat::Angle | FieldFormat::Position => parse_angle(text),
+        FieldFormat::Threshold(fraction) => parse_fixed(text, fraction, Q::<0>::try_at_least),
         FieldFormat::Fixed(fraction) | FieldFormat::Saturating(fraction) | FieldFormat::Total(fraction) => {
-            let word = step(text, fraction, Q::<0>::try_nearest);
+            let word = parse_fixed(text, fraction, Q::<0>::try_nearest);
             match field.range {
                 FieldRange::All | FieldRange::NotNegativeAtCommit => word,
                 FieldRange::NotNegative => {
@@ -170,7 +174,7 @@ pub fn read(field: &Field, text: &str) -> Result<i16, String> {
         | FieldFormat::Page(_)
         | FieldFormat::Reason
         | FieldFormat::Torque
-        | FieldFormat::Group(_) => raw(text),
+        | FieldFormat::Group(_) => parse_raw_word(text),
     }
 }
 
@@ -178,7 +182,7 @@ pub fn read(field: &Field, text: &str) -> Result<i16, String> {
 ///
 /// # Errors
 /// Returns a description of the allowed values.
-pub fn raw(text: &str) -> Result<i16, String> {
+pub fn parse_raw_word(text: &str) -> Result<i16, String> {
     let word = match text.strip_prefix("0x").or_else(|| text.strip_prefix("0X")) {
         Some(digits) => u16::from_str_radix(digits, 16).ok().map(u16::cast_signed),
         None => text.parse().ok(),
@@ -190,7 +194,7 @@ pub fn raw(text: &str) -> Result<i16, String> {
 ///
 /// # Errors
 /// Returns a description of the allowed values.
-pub fn real(text: &str) -> Result<f64, String> {
+pub fn parse_finite(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|value: &f64| value.is_finite()).ok_or_else(|| "it must be a number".to_owned())
 }
 
@@ -198,19 +202,19 @@ pub fn real(text: &str) -> Result<f64, String> {
 ///
 /// # Errors
 /// Returns a description of the allowed values.
-pub fn angle(text: &str) -> Result<i16, String> {
-    Q1_14::from_radians(real(text)?).map(Q::to_bits).ok_or_else(|| "it must be a number".to_owned())
+pub fn parse_angle(text: &str) -> Result<i16, String> {
+    Q1_14::from_radians(parse_finite(text)?).map(Q::to_bits).ok_or_else(|| "it must be a number".to_owned())
 }
 
 /// Parses a number as steps of 2^-fraction; scaling by a power of two is exact.
-fn step(text: &str, fraction: u32, round: fn(f64) -> Result<Q<0>, OutOfRange>) -> Result<i16, String> {
+fn parse_fixed(text: &str, fraction: u32, round: fn(f64) -> Result<Q<0>, OutOfRange>) -> Result<i16, String> {
     let scale = f64::from(1_u32 << fraction);
     let range = |error: OutOfRange| format!("it must be in [{}, {})", error.min / scale, error.bound / scale);
-    round(real(text)? * scale).map(Q::to_bits).map_err(range)
+    round(parse_finite(text)? * scale).map(Q::to_bits).map_err(range)
 }
 
 /// Parses ports separated by a plus or a comma, possibly with `uplink`, or `none`.
-fn ports(text: &str) -> Option<i16> {
+fn parse_ports(text: &str) -> Option<i16> {
     let bit = |port: &str| match port {
         "uplink" => Some(1 << UPLINK),
         number => number.parse().ok().filter(|port| *port < PORTS).map(|port: usize| 1 << port),
@@ -228,7 +232,7 @@ mod tests {
 
     fn says(parameter: &str, values: &[&str]) -> String {
         let values: Vec<_> = values.iter().map(|&value| value.to_owned()).collect();
-        write(parameter, &values).unwrap_err().to_string()
+        parse_write(parameter, &values).unwrap_err().to_string()
     }
 
     #[test]
@@ -237,7 +241,7 @@ mod tests {
             let name = ParameterName(byte).to_string();
             let known = Parameter::from_number(byte).is_some();
             assert_eq!(known, !name.starts_with("parameter "), "{byte}");
-            assert_eq!(number(if known { &name } else { name.rsplit_once(' ').unwrap().1 }), Ok(byte));
+            assert_eq!(parse_number(if known { &name } else { name.rsplit_once(' ').unwrap().1 }), Ok(byte));
         }
     }
 
@@ -269,7 +273,7 @@ mod tests {
         assert_eq!(says("99", &["65536"]), "word = 65536: a word is -32768 to 32767, or 0x0 to 0xFFFF");
         assert_eq!(says("99", &["0"; 7]), "7 words are too many for parameter 99: at most 6");
         assert_eq!(
-            write("99", &["0", "-1", "2", "3", "4", "0xFFFF"].map(str::to_owned)),
+            parse_write("99", &["0", "-1", "2", "3", "4", "0xFFFF"].map(str::to_owned)),
             Ok((99, [0, -1, 2, 3, 4, -1]))
         );
     }
@@ -278,7 +282,7 @@ mod tests {
     fn switches_are_written_by_the_names_of_what_they_do() {
         let words = |parameter: &str, values: &str| {
             let values: Vec<_> = values.split(' ').map(str::to_owned).collect();
-            write(parameter, &values).unwrap()
+            parse_write(parameter, &values).unwrap()
         };
         assert_eq!(words("reply", "torque"), (6, [0; WORDS]));
         assert_eq!(words("reply", "sum 1500 6 1"), (6, [1, 1500, 6, 1, 0, 0]));
@@ -349,7 +353,7 @@ mod tests {
             ("links_down", "0+3+uplink", "deaf ports 0+3+4"),
         ] {
             let values: Vec<_> = values.split(' ').map(str::to_owned).collect();
-            let (number, words) = write(parameter, &values).unwrap();
+            let (number, words) = parse_write(parameter, &values).unwrap();
             assert_eq!(ParameterWords(number, words).to_string(), text);
         }
         assert_eq!(ParameterWords(6, [2, 1, 1, 1, 0, 0]).to_string(), "words 2 1 1 1 0 0");
@@ -358,6 +362,6 @@ mod tests {
     #[test]
     fn by_number_the_values_are_words() {
         let values = ["2", "-6", "0xFFFF"].map(str::to_owned);
-        assert_eq!(write("1", &values), Ok((1, [2, -6, -1, 0, 0, 0])));
+        assert_eq!(parse_write("1", &values), Ok((1, [2, -6, -1, 0, 0, 0])));
     }
 }

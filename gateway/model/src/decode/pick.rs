@@ -56,7 +56,7 @@ impl FromStr for Selector {
 ///
 /// # Errors
 /// Returns the text with the allowed values.
-pub fn node(word: &str) -> Result<Node, String> {
+pub fn parse_node(word: &str) -> Result<Node, String> {
     match word {
         "gateway" => Ok(Node::Gateway),
         "everyone" => Ok(Node::Everyone),
@@ -81,7 +81,7 @@ impl FromStr for Party {
     /// Parses `NODE` or `BUS:NODE`; a node is `gateway`, `everyone`, or a node id.
     fn from_str(word: &str) -> Result<Self, String> {
         let (bus, name) = split_bus(word)?;
-        Ok(Self { bus: bus.map(str::to_owned), node: node(name)? })
+        Ok(Self { bus: bus.map(str::to_owned), node: parse_node(name)? })
     }
 }
 
@@ -96,7 +96,7 @@ pub struct IdMask {
 impl IdMask {
     /// Returns true if a frame's identifier matches. An 11-bit and a 29-bit identifier never match.
     #[must_use]
-    pub fn takes(&self, frame: &Frame) -> bool {
+    pub fn matches(&self, frame: &Frame) -> bool {
         frame.is_extended() == self.is_extended
             && !frame.is_error()
             && (frame.id() ^ self.id) & self.mask == 0
@@ -155,14 +155,14 @@ impl FrameFilter {
     /// Returns true if all filters match a frame. The frame arrived on `bus` at `nanos`, has the class `decoded`, and
     /// its time counts from `origin`.
     #[must_use]
-    pub fn takes(&self, origin: u64, nanos: u64, bus: &str, frame: &Frame, decoded: &Decoded) -> bool {
+    pub fn matches(&self, origin: u64, nanos: u64, bus: &str, frame: &Frame, decoded: &Decoded) -> bool {
         let is_foreign = matches!(decoded, Decoded::Foreign(_));
         let id = data_id(frame).ok().filter(|_| !is_foreign);
-        self.takes_time(origin, nanos)
+        self.matches_time(origin, nanos)
             && (self.buses.is_empty() || self.buses.iter().any(|it| it == bus))
-            && (self.ids.is_empty() || self.ids.iter().any(|it| it.takes(frame)))
-            && self.takes_kind(id, decoded)
-            && self.takes_party(id, bus)
+            && (self.ids.is_empty() || self.ids.iter().any(|it| it.matches(frame)))
+            && self.matches_kind(id, decoded)
+            && self.matches_party(id, bus)
     }
 
     /// Returns the buses that the filters name, with repetitions.
@@ -188,13 +188,13 @@ impl FrameFilter {
         }
     }
 
-    fn takes_time(&self, origin: u64, nanos: u64) -> bool {
+    fn matches_time(&self, origin: u64, nanos: u64) -> bool {
         let after_from = self.from.is_none_or(|from| nanos >= origin.saturating_add(from));
         let before_to = self.to.is_none_or(|to| nanos < origin.saturating_add(to));
         after_from && before_to
     }
 
-    fn takes_kind(&self, id: Option<Id>, decoded: &Decoded) -> bool {
+    fn matches_kind(&self, id: Option<Id>, decoded: &Decoded) -> bool {
         let is_damaged = matches!(decoded, Decoded::Damaged { .. });
         self.kinds.is_empty()
             || self.kinds.iter().any(|selector| match selector {
@@ -206,7 +206,7 @@ impl FrameFilter {
             })
     }
 
-    fn takes_party(&self, id: Option<Id>, bus: &str) -> bool {
+    fn matches_party(&self, id: Option<Id>, bus: &str) -> bool {
         let node = id.map(|id| match id.kind {
             Kind::Command => Node::Gateway,
             Kind::Sum
@@ -239,7 +239,7 @@ mod tests {
     }
 
     fn takes(pick: &FrameFilter, frame: &Frame) -> bool {
-        pick.takes(0, 0, "can0", frame, &Decoder::new(None).decode(Micros(0), "can0", frame))
+        pick.matches(0, 0, "can0", frame, &Decoder::new(None).decode(Micros(0), "can0", frame))
     }
 
     #[test]
@@ -276,7 +276,7 @@ mod tests {
         let mut decoder = Decoder::new(None);
         let mut taken = |frame: &Frame| {
             let decoded = decoder.decode(Micros(0), "can0", frame);
-            ["torque", "foreign", "damaged"].map(|kind| of(kind).takes(0, 0, "can0", frame, &decoded))
+            ["torque", "foreign", "damaged"].map(|kind| of(kind).matches(0, 0, "can0", frame, &decoded))
         };
         assert_eq!(taken(&wrong), [false, true, false]);
         assert_eq!([0, 1].map(|_| taken(&frame(0x20C))), [[true, false, false]; 2]);
@@ -289,7 +289,7 @@ mod tests {
     fn times_count_from_the_first_frame_and_leave_out_the_end() {
         let pick = FrameFilter { from: Some(10), to: Some(20), ..FrameFilter::default() };
         let taken: Vec<u64> = (95..=125)
-            .filter(|&at| pick.takes(100, at, "can0", &frame(1), &Decoded::Foreign(Foreign::Remote)))
+            .filter(|&at| pick.matches(100, at, "can0", &frame(1), &Decoded::Foreign(Foreign::Remote)))
             .collect();
         assert_eq!(taken, (110..120).collect::<Vec<_>>());
     }
@@ -330,6 +330,6 @@ mod tests {
             "{kind}"
         );
         let expected = "\"255\" is not a node: allowed are node ids 1 to 254, gateway and everyone";
-        assert_eq!(node("255"), Err(expected.to_owned()));
+        assert_eq!(parse_node("255"), Err(expected.to_owned()));
     }
 }

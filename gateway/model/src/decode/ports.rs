@@ -6,9 +6,9 @@ use protocol::port::UPLINK;
 use protocol::schema::Field;
 
 /// A port of a cell by its number; the number after the last port stands for the uplink to the gateway.
-pub(super) struct Port(pub(super) i64);
+pub(super) struct PortName(pub(super) i64);
 
-impl Display for Port {
+impl Display for PortName {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match usize::try_from(self.0) {
             Ok(UPLINK) => f.write_str("uplink"),
@@ -33,7 +33,7 @@ pub(super) fn write_neighbors(
             f.write_str("silent")?;
             continue;
         }
-        write!(f, "leads to {} of ", Port(part("port")))?;
+        write!(f, "leads to {} of ", PortName(part("port")))?;
         match part("node") {
             0 => f.write_str("a cell without a node id")?,
             number => write!(f, "{number}")?,
@@ -60,12 +60,12 @@ impl PortSet {
 
 impl Display for PortSet {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        joined(f, self.ports())
+        write_joined(f, self.ports())
     }
 }
 
 /// Writes items joined with plus signs, or `none`.
-pub(super) fn joined(f: &mut Formatter<'_>, all: impl Iterator<Item = impl Display>) -> fmt::Result {
+pub(super) fn write_joined(f: &mut Formatter<'_>, all: impl Iterator<Item = impl Display>) -> fmt::Result {
     let mut any = false;
     for one in all {
         write!(f, "{}{one}", if any { "+" } else { "" })?;

@@ -38,14 +38,14 @@ pub struct Settler<T> {
 struct Entry<T> {
     item: T,
     at: Micros,
-    state: State,
+    state: EntryState,
 }
 
 #[derive(Debug)]
-enum State {
+enum EntryState {
     Settled(Decoded),
     /// The frame is pending; holds the number of its bus and its identifier.
-    Waits(u64, Id),
+    Pending(u64, Id),
 }
 
 impl<T> Settler<T> {
@@ -64,17 +64,17 @@ impl<T> Settler<T> {
     /// Adds the next frame. Call [`Settler::pop`] until it returns `None` before adding another.
     pub fn push(&mut self, at: Micros, bus: &str, frame: &Frame, item: T) {
         let number = self.oldest + self.waiting.len() as u64;
-        let (bus, (decoded, settled)) = self.decoder.take(number, at, bus, frame);
+        let (bus, (decoded, settled)) = self.decoder.classify(number, at, bus, frame);
         for (older, decoded) in settled {
             let older = older.checked_sub(self.oldest).and_then(|index| usize::try_from(index).ok());
             if let Some(entry) = older.and_then(|index| self.waiting.get_mut(index)) {
-                entry.state = State::Settled(decoded);
+                entry.state = EntryState::Settled(decoded);
             }
         }
         let state = if let Decoded::Segment { id } = decoded {
-            State::Waits(bus, id)
+            EntryState::Pending(bus, id)
         } else {
-            State::Settled(decoded)
+            EntryState::Settled(decoded)
         };
         self.now = at;
         self.is_at_end = false;
@@ -99,20 +99,20 @@ impl<T> Settler<T> {
 
     /// Removes and returns the oldest frame with its class; `None` if that class is still open.
     pub fn pop(&mut self) -> Option<(T, Decoded)> {
-        if let Entry { at, state: State::Waits(bus, id), .. } = *self.waiting.front()? {
+        if let Entry { at, state: EntryState::Pending(bus, id), .. } = *self.waiting.front()? {
             let is_in_time =
                 self.now.elapsed_since(at) <= Span(Reassembler::max_gap(id).0 + REORDER_TOLERANCE.0);
             if is_in_time && !self.is_at_end && self.waiting.len() < MAX_PENDING_FRAMES {
                 return None;
             }
             let decoded = self.decoder.give_up(self.oldest, bus, id);
-            self.waiting.front_mut()?.state = State::Settled(decoded);
+            self.waiting.front_mut()?.state = EntryState::Settled(decoded);
         }
         let Entry { item, state, .. } = self.waiting.pop_front()?;
         self.oldest += 1;
         match state {
-            State::Settled(decoded) => Some((item, decoded)),
-            State::Waits(..) => None,
+            EntryState::Settled(decoded) => Some((item, decoded)),
+            EntryState::Pending(..) => None,
         }
     }
 }

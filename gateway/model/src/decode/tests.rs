@@ -297,15 +297,15 @@ fn with_an_identifier_that_carries_packets_it_is_damaged() {
 
 #[test]
 fn chance_makes_no_identifier_ours() {
-    let mut traffic = Traffic::default();
-    traffic.packet();
+    let mut traffic = IdentifierTraffic::default();
+    traffic.count_packet();
     assert!(!traffic.carries_packets(), "one packet may be chance");
-    traffic.packet();
-    for _ in 0..2 * Traffic::OTHERS {
+    traffic.count_packet();
+    for _ in 0..2 * IdentifierTraffic::MAX_OTHERS_PER_PACKET {
         assert!(traffic.carries_packets());
-        traffic.other();
+        traffic.count_other();
     }
-    traffic.other();
+    traffic.count_other();
     assert!(!traffic.carries_packets(), "two packets among many frames may be, too");
 }
 

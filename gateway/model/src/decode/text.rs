@@ -7,7 +7,7 @@ use protocol::message::Message;
 use protocol::schema::{self, PacketSchema, Units};
 
 use super::Decoded;
-use super::fields::{Bytes, field, fields, fill};
+use super::fields::{Bytes, field, write_fields, write_parts};
 use super::wires::WireText;
 
 impl Display for Decoded {
@@ -40,7 +40,7 @@ impl Display for InUnits<'_> {
             Decoded::Segment { id } => write!(f, "{}", Subject(id)),
             Decoded::Damaged { id, fault } => write!(f, "{}: {fault}", Subject(id)),
             Decoded::Meaningless { packet, error } => write!(f, "{}: {error}", Subject(packet.id)),
-            Decoded::Message(message) => write!(f, "{}", Meaning(&message, units)),
+            Decoded::Message(message) => write!(f, "{}", MessageText(&message, units)),
         }
     }
 }
@@ -63,9 +63,9 @@ impl Display for Subject {
 }
 
 /// The text of a message.
-struct Meaning<'a>(&'a Message, Units);
+struct MessageText<'a>(&'a Message, Units);
 
-impl Display for Meaning<'_> {
+impl Display for MessageText<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let packet = self.0.encode();
         write!(f, "{}", Subject(packet.id))?;
@@ -75,8 +75,8 @@ impl Display for Meaning<'_> {
         let (layout, bytes) = (schema::layout(self.0, &packet), packet.fields());
         f.write_str(" ")?;
         let words = Bytes { bytes: &bytes, units: self.1 };
-        fill(f, &schema.text, u16::from(packet.count), words, &|f, name| match name {
-            "" => fields(f, layout, words).map(|()| None),
+        write_parts(f, &schema.text, u16::from(packet.count), words, &|f, name| match name {
+            "" => write_fields(f, layout, words).map(|()| None),
             "page" => f.write_str(&layout.name).map(|()| None),
             _ => Ok(field(&schema.end, name).or_else(|| field(&layout.fields, name))),
         })

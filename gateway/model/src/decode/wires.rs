@@ -8,7 +8,7 @@ use protocol::port::{Hello, LinkId, PortMessage, Rank, Walk};
 use protocol::schema::{self, Layout};
 
 use super::fields::write_layout;
-use super::ports::Port;
+use super::ports::PortName;
 
 /// Encodes a message over a wire. Returns the bytes and the layout of their fields.
 pub(super) fn encoded(message: PortMessage) -> (Bytes, &'static Layout) {
@@ -57,7 +57,7 @@ fn write_hello(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
         0 => f.write_str(", no node id")?,
         number => write!(f, ", node id {number}")?,
     }
-    write!(f, ", {}", Port(i64::from(port)))?;
+    write!(f, ", {}", PortName(i64::from(port)))?;
     for (set, word) in [(hears, "hears"), (up, "sums go here"), (unnumbered, "a node id is missing")] {
         if set {
             write!(f, ", {word}")?;

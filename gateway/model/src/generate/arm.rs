@@ -26,7 +26,7 @@ const PORTS: usize = 4;
 
 /// An arm that can carry a skin.
 #[derive(Debug)]
-pub(super) struct Arm {
+pub(super) struct ArmShape {
     pub(super) name: &'static str,
     /// Standard Denavit-Hartenberg rows, base to tip.
     pub(super) joints: [DenavitHartenberg; 6],
@@ -53,7 +53,7 @@ pub(super) struct Limb {
 /// The UR5. Its limbs are offset from the joints' frames: the shoulder is 135.85 mm wide, and the elbow leads back by
 /// 119.7 mm; the table has all of this in the d of joint 4. The tubes' radii are 60 and 50 mm, and the cells sit 5 mm
 /// above them; the joints' housings stay uncovered.
-pub(super) const UR5: Arm = Arm {
+pub(super) const UR5: ArmShape = ArmShape {
     name: "UR5",
     joints: [
         row(0.0, core::f64::consts::FRAC_PI_2, 0.089_159),
@@ -75,7 +75,7 @@ const fn row(a: f64, alpha: f64, d: f64) -> DenavitHartenberg {
 
 /// An arm with the cells that lie on it.
 #[derive(Debug)]
-pub(super) struct Covered {
+pub(super) struct CoveredArm {
     pub(super) name: &'static str,
     pub(super) joints: [DenavitHartenberg; 6],
     pub(super) pitch_mm: usize,
@@ -97,51 +97,51 @@ pub(super) struct PlacedCell {
 }
 
 /// Places the cells in rings around the limbs, at the distance of the published skin, or closer if they do not fit.
-pub(super) fn cover(arm: &Arm, cells: usize, buses: usize) -> Result<Covered, GenerateError> {
+pub(super) fn place_cells(arm: &ArmShape, cells: usize, buses: usize) -> Result<CoveredArm, GenerateError> {
     let (pitch_mm, shares) = (MIN_PITCH_MM..=PITCH_MM)
         .rev()
-        .find_map(|pitch_mm| Some((pitch_mm, share(&arm.limbs, metres(pitch_mm), cells, buses)?)))
+        .find_map(|pitch_mm| Some((pitch_mm, divide_cells(&arm.limbs, metres(pitch_mm), cells, buses)?)))
         .ok_or(GenerateError::NoRoom { cells, min_mm: MIN_PITCH_MM })?;
     let mut on_buses = Vec::with_capacity(buses);
     for (limb, share) in arm.limbs.iter().zip(&shares) {
-        let rings = Rings::of(limb, metres(pitch_mm));
+        let rings = Rings::for_limb(limb, metres(pitch_mm));
         for bus in 0..share.buses {
             let from = bus * share.cells / share.buses;
-            on_buses.push(rings.wired(limb, share.cells, from..(bus + 1) * share.cells / share.buses));
+            on_buses.push(rings.wired_cells(limb, share.cells, from..(bus + 1) * share.cells / share.buses));
         }
     }
     if let (1, [upper, lower]) = (buses, on_buses.as_mut_slice()) {
-        join(upper, lower);
+        join_limbs(upper, lower);
         on_buses.truncate(1);
     }
     on_buses.retain(|places| !places.is_empty());
-    on_buses.iter_mut().for_each(|places| root(places));
+    on_buses.iter_mut().for_each(|places| choose_root(places));
     let [upper, lower] = &arm.limbs;
     let limbs = [(upper.name, shares[0].cells), (lower.name, shares[1].cells)];
-    Ok(Covered { name: arm.name, joints: arm.joints, pitch_mm, limbs, buses: on_buses })
+    Ok(CoveredArm { name: arm.name, joints: arm.joints, pitch_mm, limbs, buses: on_buses })
 }
 
 /// The number of cells and of buses on one limb.
 #[derive(Debug)]
-struct Share {
+struct LimbShare {
     cells: usize,
     buses: usize,
 }
 
 /// Divides the cells by the limbs' capacity. A bus stays on one limb, unless there is only one bus. Returns `None` if
 /// the cells do not fit.
-fn share(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Option<[Share; 2]> {
-    let [upper, lower] = limbs.each_ref().map(|limb| Rings::of(limb, pitch).room());
+fn divide_cells(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Option<[LimbShare; 2]> {
+    let [upper, lower] = limbs.each_ref().map(|limb| Rings::for_limb(limb, pitch).capacity());
     let nearest = |whole: usize, part: usize, of: usize| (2 * whole * part + of) / (2 * of);
     let shares = if buses == 1 {
         let cells_upper = nearest(cells, upper, upper + lower);
-        [Share { cells: cells_upper, buses: 1 }, Share { cells: cells - cells_upper, buses: 1 }]
+        [LimbShare { cells: cells_upper, buses: 1 }, LimbShare { cells: cells - cells_upper, buses: 1 }]
     } else {
         let buses_upper = nearest(buses, upper, upper + lower).clamp(1, buses - 1);
         let cells_upper = nearest(cells, buses_upper, buses);
         [
-            Share { cells: cells_upper, buses: buses_upper },
-            Share { cells: cells - cells_upper, buses: buses - buses_upper },
+            LimbShare { cells: cells_upper, buses: buses_upper },
+            LimbShare { cells: cells - cells_upper, buses: buses - buses_upper },
         ]
     };
     (shares[0].cells <= upper && shares[1].cells <= lower).then_some(shares)
@@ -151,7 +151,7 @@ fn share(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Option<[S
 #[derive(Clone, Copy, Debug)]
 struct Rings {
     /// Number of cells in a ring, at least 3.
-    around: usize,
+    cells_per_ring: usize,
     /// Number of rings that fit on the limb.
     count: usize,
     pitch: f64,
@@ -159,38 +159,40 @@ struct Rings {
 
 impl Rings {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "small and positive")]
-    fn of(limb: &Limb, pitch: f64) -> Self {
+    fn for_limb(limb: &Limb, pitch: f64) -> Self {
         let around = (TAU * limb.radius / pitch).ceil() as usize;
-        let count = (limb.length / Self { around, count: 0, pitch }.step()).floor() as usize + 1;
-        Self { around, count, pitch }
+        let count = (limb.length / Self { cells_per_ring: around, count: 0, pitch }.ring_distance()).floor()
+            as usize
+            + 1;
+        Self { cells_per_ring: around, count, pitch }
     }
 
     /// Returns the distance between rings, in m.
-    fn step(&self) -> f64 {
+    fn ring_distance(&self) -> f64 {
         self.pitch * 0.75_f64.sqrt()
     }
 
-    const fn room(&self) -> usize {
-        self.around * self.count
+    const fn capacity(&self) -> usize {
+        self.cells_per_ring * self.count
     }
 
     /// Returns the ring of a cell and its index in that ring; odd rings are counted backwards.
     const fn spot(&self, number: usize) -> (usize, usize) {
-        let (ring, place) = (number / self.around, number % self.around);
-        (ring, if ring % 2 == 0 { place } else { self.around - 1 - place })
+        let (ring, place) = (number / self.cells_per_ring, number % self.cells_per_ring);
+        (ring, if ring % 2 == 0 { place } else { self.cells_per_ring - 1 - place })
     }
 
     /// Returns the number of the cell at a place, given as ring and index in the ring.
     const fn number(&self, (ring, place): (usize, usize)) -> usize {
-        ring * self.around + if ring % 2 == 0 { place } else { self.around - 1 - place }
+        ring * self.cells_per_ring + if ring % 2 == 0 { place } else { self.cells_per_ring - 1 - place }
     }
 
     /// Returns the cells with these `numbers`, wired to each other; `all` is the number of cells on the limb.
-    fn wired(&self, limb: &Limb, all: usize, numbers: core::ops::Range<usize>) -> Vec<PlacedCell> {
-        let rings = all.div_ceil(self.around);
+    fn wired_cells(&self, limb: &Limb, all: usize, numbers: core::ops::Range<usize>) -> Vec<PlacedCell> {
+        let rings = all.div_ceil(self.cells_per_ring);
         let place = |number| {
             let (ring, place) = self.spot(number);
-            let last = self.around - 1;
+            let last = self.cells_per_ring - 1;
             let neighbors = [
                 Some((ring, if place == 0 { last } else { place - 1 })),
                 Some((ring, if place == last { 0 } else { place + 1 })),
@@ -198,13 +200,13 @@ impl Rings {
                 Some((ring + 1, place)),
             ];
             let within = |spot| Some(self.number(spot)).filter(|number| numbers.contains(number));
-            let turn = TAU * (real(place) + real(ring % 2) / 2.0) / real(self.around);
-            let radius = real(self.around) * self.pitch / TAU;
+            let turn = TAU * (real(place) + real(ring % 2) / 2.0) / real(self.cells_per_ring);
+            let radius = real(self.cells_per_ring) * self.pitch / TAU;
             let [x, z] = limb.middle;
             PlacedCell {
                 joint: limb.joint,
                 position: [
-                    x + (real(rings - 1) / 2.0 - real(ring)) * self.step(),
+                    x + (real(rings - 1) / 2.0 - real(ring)) * self.ring_distance(),
                     radius * turn.sin(),
                     z + radius * turn.cos(),
                 ],
@@ -219,7 +221,7 @@ impl Rings {
 
 /// Puts the cells of two limbs on one bus. A cable connects the free port 3 of the last cell with the free port 2 of
 /// the first cell of the other limb.
-fn join(upper: &mut Vec<PlacedCell>, lower: &mut Vec<PlacedCell>) {
+fn join_limbs(upper: &mut Vec<PlacedCell>, lower: &mut Vec<PlacedCell>) {
     let shift = upper.len();
     for wire in lower.iter_mut().flat_map(|place| &mut place.wires).flatten() {
         *wire += shift;
@@ -232,7 +234,7 @@ fn join(upper: &mut Vec<PlacedCell>, lower: &mut Vec<PlacedCell>) {
 
 /// Wires the gateway to a central cell of a bus: the first one with the fewest wires to its farthest cell, so that sums
 /// have the shortest path.
-fn root(places: &mut [PlacedCell]) {
+fn choose_root(places: &mut [PlacedCell]) {
     let nearest = (0..places.len()).min_by_key(|&from| depth(places, from));
     if let Some(root) = nearest.and_then(|at| places.get_mut(at)) {
         root.root = true;

@@ -14,9 +14,9 @@ use thiserror::Error;
 
 /// The robot, the size and the timing of a skin to generate.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Target {
+pub struct SkinRequest {
     /// The robot that wears the skin.
-    pub robot: Robot,
+    pub robot: RobotModel,
     /// Number of cells, 1 to 254 per bus.
     pub cells: usize,
     /// Number of buses; the cells of one bus are adjacent.
@@ -29,10 +29,10 @@ pub struct Target {
     pub format: Format,
 }
 
-impl Default for Target {
+impl Default for SkinRequest {
     fn default() -> Self {
         Self {
-            robot: Robot::Ur5,
+            robot: RobotModel::Ur5,
             cells: 253,
             buses: 1,
             broadcast_hz: 62.5,
@@ -44,7 +44,7 @@ impl Default for Target {
 
 /// A robot with a known arm.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Robot {
+pub enum RobotModel {
     /// Universal Robots UR5
     Ur5,
 }
@@ -102,7 +102,7 @@ pub enum GenerateError {
 /// # Errors
 /// Returns [`GenerateError`] if the cells do not fit on the buses or on the arm, or if a requested number is out of
 /// range.
-pub fn generate(target: &Target) -> Result<String, GenerateError> {
+pub fn generate(target: &SkinRequest) -> Result<String, GenerateError> {
     let (cells, buses) = (target.cells, target.buses);
     if buses == 0 || cells < buses {
         return Err(GenerateError::TooFew { cells, buses });
@@ -110,11 +110,11 @@ pub fn generate(target: &Target) -> Result<String, GenerateError> {
     let needed = cells.div_ceil(CellId::COUNT);
     if needed > buses {
         // An error that more buses would not fix is reported first.
-        generate(&Target { buses: needed, ..*target })?;
+        generate(&SkinRequest { buses: needed, ..*target })?;
         return Err(GenerateError::TooMany { cells, buses, needed });
     }
     let arm = match target.robot {
-        Robot::Ur5 => arm::cover(&arm::UR5, cells, buses)?,
+        RobotModel::Ur5 => arm::place_cells(&arm::UR5, cells, buses)?,
     };
     let text = text::toml(target, &arm);
     Skin::parse("generated skin", &text)?;

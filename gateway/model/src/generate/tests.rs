@@ -2,11 +2,11 @@ use protocol::skin::Cell;
 
 use super::*;
 
-fn target(cells: usize, buses: usize) -> Target {
-    Target { cells, buses, ..Target::default() }
+fn target(cells: usize, buses: usize) -> SkinRequest {
+    SkinRequest { cells, buses, ..SkinRequest::default() }
 }
 
-fn skin(target: &Target) -> Skin {
+fn skin(target: &SkinRequest) -> Skin {
     Skin::parse("generated", &generate(target).unwrap()).unwrap()
 }
 
@@ -24,12 +24,12 @@ fn wired<'a>(skin: &'a Skin, cell: &'a Cell) -> impl Iterator<Item = &'a Cell> {
 fn the_example_is_what_its_first_line_makes() {
     let example = include_str!("../../../examples/ur5-253.toml");
     assert!(example.starts_with("# skinbus skin generate --cells 253\n"));
-    assert!(generate(&Target::default()).unwrap() == example, "generate it again with that command");
+    assert!(generate(&SkinRequest::default()).unwrap() == example, "generate it again with that command");
 }
 
 #[test]
 fn wires_are_symmetric_and_lead_to_hexagon_neighbours() {
-    let skin = skin(&Target::default());
+    let skin = skin(&SkinRequest::default());
     let mut cables = Vec::new();
     for cell in &skin.cells {
         assert!(cell.neighbors.iter().flatten().count() >= 2, "{cell:?}");
@@ -48,7 +48,7 @@ fn wires_are_symmetric_and_lead_to_hexagon_neighbours() {
 
 #[test]
 fn cells_do_not_overlap_and_look_outwards() {
-    let skin = skin(&Target::default());
+    let skin = skin(&SkinRequest::default());
     for (index, cell) in skin.cells.iter().enumerate() {
         for other in skin.cells.iter().take(index).filter(|other| other.joint == cell.joint) {
             assert!(apart(cell, other) > 0.0275, "{} and {}", cell.node, other.node);
@@ -105,13 +105,13 @@ fn more_cells_than_the_arm_has_room_for_lie_closer() {
 
 #[test]
 fn the_reply_and_the_format_are_the_requested_ones() {
-    let target = Target {
+    let target = SkinRequest {
         reply: Reply::Sum,
         format: Format::Classic,
         broadcast_hz: 50.0,
         buses: 2,
         cells: 300,
-        robot: Robot::Ur5,
+        robot: RobotModel::Ur5,
     };
     let text = generate(&target).unwrap();
     let first =
@@ -131,7 +131,7 @@ fn the_reply_and_the_format_are_the_requested_ones() {
 
 #[test]
 fn errors_name_what_is_allowed() {
-    let says = |target: Target| generate(&target).unwrap_err().to_string();
+    let says = |target: SkinRequest| generate(&target).unwrap_err().to_string();
     assert_eq!(
         says(target(255, 1)),
         "255 cells do not fit on one bus: a bus has 254 node ids; use --buses 2"
@@ -147,7 +147,7 @@ fn errors_name_what_is_allowed() {
     );
     assert_eq!(says(target(100_000, 1)), says(target(100_000, 400)), "more buses would not help");
     assert_eq!(
-        says(Target { broadcast_hz: 60.0, ..Target::default() }),
+        says(SkinRequest { broadcast_hz: 60.0, ..SkinRequest::default() }),
         "generated skin:23:22: timing.joint_broadcast_hz = 60: must divide control_hz = 500 evenly"
     );
 }

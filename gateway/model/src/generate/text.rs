@@ -3,15 +3,15 @@
 use protocol::skin::DenavitHartenberg;
 use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
 
-use super::arm::{self, Covered, PlacedCell};
-use super::{Format, Reply, Target};
+use super::arm::{self, CoveredArm, PlacedCell};
+use super::{Format, Reply, SkinRequest};
 
 /// Maximum share of the broadcast period that the slots of sums may take.
-const SLOTS_SHARE: f64 = 0.75;
+const MAX_SLOTS_SHARE: f64 = 0.75;
 
-pub(super) fn toml(target: &Target, arm: &Covered) -> String {
-    let Target { robot: _, cells, buses, broadcast_hz, reply, format } = target;
-    let usual = Target::default();
+pub(super) fn toml(target: &SkinRequest, arm: &CoveredArm) -> String {
+    let SkinRequest { robot: _, cells, buses, broadcast_hz, reply, format } = target;
+    let usual = SkinRequest::default();
     let [(upper, on_upper), (lower, on_lower)] = arm.limbs;
     let options = [
         (*buses != usual.buses, format!(" --buses {buses}")),
@@ -56,7 +56,7 @@ pub(super) fn toml(target: &Target, arm: &Covered) -> String {
     draft.set_with_comment("damping", Value::Numbers(&[4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), 11, "Nm s/rad");
     draft.set("max_speed_rad_s", Value::Numbers(&[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]));
     for (bus, places) in arm.buses.iter().enumerate() {
-        places.iter().zip(1..).for_each(|(place, node)| cell(&mut draft, bus, place, node));
+        places.iter().zip(1..).for_each(|(place, node)| add_cell(&mut draft, bus, place, node));
     }
     draft.text()
 }
@@ -66,7 +66,7 @@ fn bus_name(bus: usize) -> String {
 }
 
 /// Adds a cell to the draft, on a bus and with a node id.
-fn cell(draft: &mut Draft, bus: usize, place: &PlacedCell, node: usize) {
+fn add_cell(draft: &mut Draft, bus: usize, place: &PlacedCell, node: usize) {
     // A rotation about x, the limb's direction: the cell's z axis points away from the limb.
     let (sin, cos) = (-place.turn / 2.0).sin_cos();
     let [qx, qw] = [sin, cos].map(|value| round(value, 1e9));
@@ -95,7 +95,7 @@ fn cell(draft: &mut Draft, bus: usize, place: &PlacedCell, node: usize) {
 fn slot_us(places: &[PlacedCell], broadcast_hz: f64) -> u64 {
     let root = places.iter().position(|place| place.root).unwrap_or_default();
     let slots = arm::depth(places, root) + 1;
-    (1e5 * SLOTS_SHARE / broadcast_hz / slots as f64).floor().max(1.0) as u64 * 10
+    (1e5 * MAX_SLOTS_SHARE / broadcast_hz / slots as f64).floor().max(1.0) as u64 * 10
 }
 
 /// Rounds to a step of `1 / steps`; never returns minus zero.

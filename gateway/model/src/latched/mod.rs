@@ -7,7 +7,7 @@
 //! | [`state`] | the state before a point of a capture, and the messages that restore it | replays |
 //! | [`touched`] | the cells in contact, as far as known | replays |
 //!
-//! Both follow each cell's contact by [`Contact`](crate::tracker::Contact) and the owner of each node id by
+//! Both follow each cell's contact by [`Contact`](crate::tracker::ContactState) and the owner of each node id by
 //! [`Claim`](crate::tracker::AddressClaim), under the same rules of `docs/reference/cell.md`:
 //!
 //! | message | effect |
@@ -25,5 +25,5 @@ pub mod state;
 pub mod touched;
 
 pub use packets::{LatchedPackets, ReceivedFrame};
-pub use state::State;
+pub use state::LatchedState;
 pub use touched::KnownContacts;

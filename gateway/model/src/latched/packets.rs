@@ -22,7 +22,7 @@ use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use crate::packets::{ByIdentifier, NoPacket, PacketReader};
-use crate::tracker::{AddressClaim, Contact, HeartbeatKind, PerCell};
+use crate::tracker::{AddressClaim, ContactState, HeartbeatKind, PerCell};
 
 /// A frame that was received from the bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -70,7 +70,7 @@ struct LatchedCell {
     /// The last write of each parameter since the last commit, and a commit that has not been answered yet.
     staged: BTreeMap<u8, Arc<PlacedPacket>>,
     requested: SharedPacket,
-    contact: Contact<ContactPage>,
+    contact: ContactState<ContactPage>,
     /// The packet with which the cell proved that all its stimuli are on the bus: its counters, or its answer to a
     /// write of its mode.
     shown: SharedPacket,
@@ -80,7 +80,7 @@ struct LatchedCell {
 #[derive(Clone, Debug)]
 pub struct LatchedPackets {
     /// Number of packets so far; gives each packet its position in the order of the bus.
-    places: u64,
+    packet_count: u64,
     cells: PerCell<LatchedCell>,
     joints: Option<(Epoch, Arc<PlacedPacket>)>,
     /// The last halt or resume.
@@ -96,7 +96,7 @@ pub struct LatchedPackets {
 impl Default for LatchedPackets {
     fn default() -> Self {
         Self {
-            places: 0,
+            packet_count: 0,
             cells: PerCell::default(),
             joints: None,
             halt: None,
@@ -118,7 +118,11 @@ impl LatchedCell {
 
     /// Passes to the contact state a page that may prove that all stimuli were received here. Keeps the packet if the
     /// page proves it.
-    fn show(&mut self, contact_page: ContactPage, show: impl FnOnce(&mut Contact<ContactPage>, ContactPage)) {
+    fn apply_proof(
+        &mut self,
+        contact_page: ContactPage,
+        show: impl FnOnce(&mut ContactState<ContactPage>, ContactPage),
+    ) {
         let placed_packet = Arc::clone(&contact_page.placed_packet);
         let before = self.contact.known().is_some();
         show(&mut self.contact, contact_page);
@@ -178,7 +182,7 @@ impl LatchedCell {
         let joints = contact_page.before.as_ref().map_or(0, |joints| joints.place);
         if !self
             .contact
-            .waiting()
+            .pending()
             .iter()
             .any(|(_, _, contact_page)| contact_page.placed_packet.place < joints)
         {
@@ -191,7 +195,7 @@ impl LatchedCell {
             .into_iter()
             .chain(&self.starts);
         let written = self.switches.values().chain(self.committed.values()).chain(self.staged.values());
-        let waiting = self.contact.waiting().iter().map(|(_, _, contact_page)| contact_page);
+        let waiting = self.contact.pending().iter().map(|(_, _, contact_page)| contact_page);
         let contact_page = self.contact.latched().map(|(_, contact_page)| contact_page).chain(waiting);
         let contact_page = contact_page.flat_map(|ContactPage { placed_packet, before, since }| {
             core::iter::once(placed_packet).chain(before).chain(since)
@@ -238,8 +242,8 @@ impl LatchedPackets {
             frames
         };
         let Ok(message) = self.packets.decode(&packet) else { return };
-        self.places += 1;
-        self.apply_message(&message, &Arc::new(PlacedPacket { place: self.places, frames }));
+        self.packet_count += 1;
+        self.apply_message(&message, &Arc::new(PlacedPacket { place: self.packet_count, frames }));
     }
 
     /// Returns true if segments of a gateway packet are pending. A new part of the recording must not begin between
@@ -269,17 +273,17 @@ impl LatchedPackets {
         } else if let Message::Halt | Message::Resume = message {
             self.halt = Some(Arc::clone(placed_packet));
         } else if let Message::Network { from, page, .. } = *message {
-            let Some(cell) = self.cells.named(from).first_mut() else { return };
+            let Some(cell) = self.cells.addressed_mut(from).first_mut() else { return };
             if let NetworkPage::Heartbeat(heartbeat) = page {
                 cell.heartbeat(&heartbeat, placed_packet);
             } else if let NetworkPage::Tree(_) = page {
                 cell.tree = Some(Arc::clone(placed_packet));
             } else if let NetworkPage::Received(heard) = page {
-                cell.show(contact_page(), |contact, tag| contact.count(heard.stimuli, tag));
+                cell.apply_proof(contact_page(), |contact, tag| contact.compare_count(heard.stimuli, tag));
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             let obeys = words.first() == Some(&1);
-            self.cells.named(to).iter_mut().for_each(|cell| cell.write(number, placed_packet, obeys));
+            self.cells.addressed_mut(to).iter_mut().for_each(|cell| cell.write(number, placed_packet, obeys));
         } else if let Message::Configured {
             from,
             answer: Answer::Value { number, written: true, words },
@@ -290,12 +294,12 @@ impl LatchedPackets {
             if number == Parameter::Commit.number() {
                 cell.commit();
             } else if number == Parameter::Mode.number() && words.first() == Some(&1) {
-                cell.show(contact_page(), Contact::confirm_mode);
+                cell.apply_proof(contact_page(), ContactState::confirm_mode);
             }
         } else if let Message::Stimulus { to, from, page } = *message {
             let contact_page = contact_page();
             self.cells
-                .named(to)
+                .addressed_mut(to)
                 .iter_mut()
                 .for_each(|cell| cell.contact.push(from, page, contact_page.clone(), last));
         } else if let Message::Sensors { from, epoch, page } = *message {

@@ -19,25 +19,25 @@ use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use super::touched::KnownContacts;
-use crate::tracker::{AddressClaim, Contact, HeartbeatKind, PerCell};
+use crate::tracker::{AddressClaim, ContactState, HeartbeatKind, PerCell};
 
 /// Maximum number of messages since the last joints that are kept for a replay.
 const MAX_PENDING_MESSAGES: usize = 16_384;
 
 /// The contact state of one cell, without data for each stimulus.
-type ContactState = Contact<()>;
+type KnownContact = ContactState<()>;
 
 /// Resets the contact state to no contact; `obeys` is true for a cell in test mode.
-fn clear(contact_state: &mut ContactState, obeys: bool) {
+fn reset_contact(contact_state: &mut KnownContact, obeys: bool) {
     contact_state.reset();
     contact_state.set_obeys(obeys);
 }
 
 /// Returns true if the cell is in contact at the joints of `epoch` and later; `None` if unknown.
-fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
+fn is_touched_from(contact_state: &KnownContact, epoch: Epoch) -> Option<bool> {
     let touches =
         |(skin, ()): &(SkinSensors, ())| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
-    if contact_state.waiting().is_empty() {
+    if contact_state.pending().is_empty() {
         return contact_state.skin().map(touches);
     }
     let mut then = contact_state.clone();
@@ -46,7 +46,7 @@ fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
 }
 
 /// Returns the latched sensors pages that differ from those of a cell that has just started.
-fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
+fn pages(contact_state: &KnownContact) -> impl Iterator<Item = SensorPage> {
     let nothing = Readings::default().pages();
     contact_state.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
 }
@@ -57,39 +57,42 @@ struct StateBeforeJoints {
     /// Parameter writes in order, without those that later writes replaced.
     writes: Vec<(Node, u8, Message)>,
     halted: bool,
-    cells: PerCell<ContactState>,
+    cells: PerCell<KnownContact>,
 }
 
 /// The state of one bus.
 #[derive(Clone, Debug, Default)]
-pub struct State {
+pub struct LatchedState {
     before: StateBeforeJoints,
     /// The owners of node ids.
     claims: PerCell<AddressClaim>,
     /// The last joints with their epoch. The contact state before them decides whether a cell was in contact at them.
     joints: Option<(Epoch, Joints)>,
     /// Messages since the last joints, in the order in which they were sent.
-    since: Vec<Message>,
+    messages_since: Vec<Message>,
 }
 
 impl StateBeforeJoints {
     /// Applies a message that was sent after the joints with the epoch `last`.
-    fn take(&mut self, message: &Message, last: Option<Epoch>) {
+    fn apply(&mut self, message: &Message, last: Option<Epoch>) {
         if let Message::Halt | Message::Resume = message {
             self.halted = *message == Message::Halt;
         } else if let Message::Stimulus { to, from, page } = *message {
-            self.cells.named(to).iter_mut().for_each(|cell| cell.push(from, page, (), last));
+            self.cells.addressed_mut(to).iter_mut().for_each(|cell| cell.push(from, page, (), last));
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             self.write(to, number, *message);
             if number == Parameter::Mode.number() {
-                self.cells.named(to).iter_mut().for_each(|cell| clear(cell, words.first() == Some(&1)));
+                self.cells
+                    .addressed_mut(to)
+                    .iter_mut()
+                    .for_each(|cell| reset_contact(cell, words.first() == Some(&1)));
             }
         }
     }
 
     /// Resets the contact state of a restarted cell, and drops its writes of volatile parameters.
     fn start_again(&mut self, cell: Node) {
-        self.cells.named(cell).iter_mut().for_each(|cell| clear(cell, true));
+        self.cells.addressed_mut(cell).iter_mut().for_each(|cell| reset_contact(cell, true));
         self.writes.retain(|(to, number, _)| *to != cell || !is_volatile(*number));
     }
 
@@ -114,7 +117,7 @@ fn is_volatile(number: u8) -> bool {
     Parameter::from_number(number).is_some_and(Parameter::is_volatile)
 }
 
-impl State {
+impl LatchedState {
     /// Applies the next message of the bus.
     pub fn apply(&mut self, message: &Message) {
         if let Message::Joints { epoch, joints } = *message {
@@ -128,13 +131,13 @@ impl State {
         | Message::Stimulus { .. }
         | Message::Configure { request: Request::Write { .. }, .. } = message
         {
-            if self.since.len() == MAX_PENDING_MESSAGES {
+            if self.messages_since.len() == MAX_PENDING_MESSAGES {
                 self.fold();
             }
-            self.since.push(*message);
+            self.messages_since.push(*message);
         } else if let Message::Sensors { from, epoch, page } = *message {
             // The cell's own report counts if its contact state is not known otherwise.
-            let cell = self.before.cells.get_mut(from).filter(|cell| cell.waiting().is_empty());
+            let cell = self.before.cells.get_mut(from).filter(|cell| cell.pending().is_empty());
             if let Some(cell) = cell.filter(|_| self.joints.is_none_or(|(last, _)| last == epoch)) {
                 cell.apply_reported_page(page, ());
             }
@@ -142,7 +145,7 @@ impl State {
             // Use the order of the capture: its times may be wrong.
             let hear = |claim: &mut AddressClaim| claim.receive(Micros(0), heartbeat);
             let started = |claim: &mut AddressClaim| matches!(hear(claim), HeartbeatKind::Started { .. });
-            if self.claims.named(*from).iter_mut().any(started) {
+            if self.claims.addressed_mut(*from).iter_mut().any(started) {
                 self.start_again(*from);
             }
         }
@@ -155,7 +158,7 @@ impl State {
             let switched = matches!(message, Message::Configure { to, request: Request::Write { number, .. }, .. } if *to == cell && is_volatile(*number));
             feels || switched
         };
-        self.since.retain(|message| !is_forgotten(message));
+        self.messages_since.retain(|message| !is_forgotten(message));
     }
 
     /// Moves the messages since the last joints into the state before them, as new joints follow.
@@ -164,8 +167,8 @@ impl State {
         if let Some(epoch) = last {
             self.before.cells.iter_mut().for_each(|(_, cell)| cell.latch(epoch, |()| {}));
         }
-        for message in self.since.drain(..) {
-            self.before.take(&message, last);
+        for message in self.messages_since.drain(..) {
+            self.before.apply(&message, last);
         }
     }
 
@@ -199,22 +202,27 @@ impl State {
     pub fn is_fresh(&self) -> bool {
         let StateBeforeJoints { writes, halted, cells } = &self.before;
         let contact =
-            cells.iter().any(|(_, cell)| pages(cell).next().is_some() || !cell.waiting().is_empty());
-        !contact && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
+            cells.iter().any(|(_, cell)| pages(cell).next().is_some() || !cell.pending().is_empty());
+        !contact && writes.is_empty() && !halted && self.joints.is_none() && self.messages_since.is_empty()
     }
 
     /// Returns true if a message commits parameters, so that cells use new ones.
     #[must_use]
-    pub fn configures(&self) -> bool {
+    pub fn has_commit(&self) -> bool {
         let commit = Parameter::Commit.number();
         let commits = |message: &Message| matches!(message, Message::Configure { request: Request::Write { number, .. }, .. } if *number == commit);
-        self.before.writes.iter().any(|(_, _, message)| commits(message)) || self.since.iter().any(commits)
+        self.before.writes.iter().any(|(_, _, message)| commits(message))
+            || self.messages_since.iter().any(commits)
     }
 
     /// Returns the messages that bring `cells` into this state. On a bus without joints so far, `next` are the joints
     /// that will follow: they let the cells forget the epoch of an earlier gateway.
     #[must_use]
-    pub fn restoring(&self, cells: impl Fn(CellId) -> bool, next: Option<(Epoch, Joints)>) -> Vec<Message> {
+    pub fn restoring_messages(
+        &self,
+        cells: impl Fn(CellId) -> bool,
+        next: Option<(Epoch, Joints)>,
+    ) -> Vec<Message> {
         let StateBeforeJoints { writes, halted, cells: contact_states } = &self.before;
         // Links can be down only in test mode, and the mode may have been written again since.
         let links_down = |write: &&(Node, u8, Message)| write.1 == Parameter::LinksDown.number();
@@ -232,7 +240,7 @@ impl State {
             .collect();
         let pending = known
             .iter()
-            .flat_map(|(cell, it)| it.waiting().iter().map(|&(from, page, ())| stimulus(*cell, from, page)));
+            .flat_map(|(cell, it)| it.pending().iter().map(|&(from, page, ())| stimulus(*cell, from, page)));
         let pending: Vec<_> = pending.collect();
         let steps_before = |steps: u8, (epoch, joints): (Epoch, Joints)| Message::Joints {
             epoch: epoch.advanced_by(0_u8.wrapping_sub(steps)),
@@ -252,7 +260,7 @@ impl State {
             messages.push(Message::Halt);
         }
         messages.extend(last.map(|last| steps_before(0, last)));
-        messages.extend(&self.since);
+        messages.extend(&self.messages_since);
         messages
     }
 }
@@ -287,11 +295,11 @@ mod tests {
     }
 
     fn restored(messages: &[Message]) -> Vec<Message> {
-        let mut state = State::default();
+        let mut state = LatchedState::default();
         for message in messages {
             state.apply(message);
         }
-        state.restoring(|_| true, None)
+        state.restoring_messages(|_| true, None)
     }
 
     #[test]
@@ -428,18 +436,18 @@ mod tests {
 
     #[test]
     fn a_bus_without_joints_makes_cells_drop_another_epoch() {
-        let state = State::default();
+        let state = LatchedState::default();
         assert!(state.is_fresh());
         let next = Some((Epoch(0), Joints::default()));
-        assert_eq!(state.restoring(|_| true, next), [Message::Resume, joints(255)]);
+        assert_eq!(state.restoring_messages(|_| true, next), [Message::Resume, joints(255)]);
     }
 
     #[test]
     fn only_cells_that_are_there_are_pressed() {
-        let mut state = State::default();
+        let mut state = LatchedState::default();
         state.apply(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page: press(1.0) });
         state.apply(&joints(1));
-        let messages = state.restoring(|it| it.get() == 7, None);
+        let messages = state.restoring_messages(|it| it.get() == 7, None);
         assert_eq!(
             messages,
             [Message::Resume, joints(255), joints(0), to(7, AppliesFrom::Next, 1.0), joints(1)]

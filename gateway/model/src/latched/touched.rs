@@ -15,7 +15,7 @@ impl Default for KnownContacts {
 impl KnownContacts {
     /// Returns true if a cell is in contact; `None` if unknown.
     #[must_use]
-    pub fn is(&self, cell: CellId) -> Option<bool> {
+    pub fn in_contact(&self, cell: CellId) -> Option<bool> {
         self.0.get(cell.index()).copied().flatten()
     }
 
@@ -35,9 +35,9 @@ mod tests {
     fn every_cell_has_a_place_of_its_own() {
         let mut touched = KnownContacts::default();
         for (before, cell) in CellId::all().enumerate() {
-            assert_eq!(CellId::all().filter(|cell| touched.is(*cell).is_some()).count(), before);
+            assert_eq!(CellId::all().filter(|cell| touched.in_contact(*cell).is_some()).count(), before);
             touched.insert(cell, before % 3 == 0);
-            assert_eq!(touched.is(cell), Some(before % 3 == 0));
+            assert_eq!(touched.in_contact(cell), Some(before % 3 == 0));
         }
     }
 }

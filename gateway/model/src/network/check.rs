@@ -11,7 +11,7 @@ use protocol::port::PORTS;
 use protocol::skin::Wires;
 use thiserror::Error;
 
-use super::tree::{TreePlaces, places};
+use super::tree::{TreePlaces, tree_places};
 
 /// The reports of one cell, and the description of the cell.
 #[derive(Clone, Copy, Debug)]
@@ -60,7 +60,7 @@ pub enum WorkingDirection {
 
 impl WorkingDirection {
     /// Describes a damaged wire between two cells for users.
-    fn between(self, first: CellId, second: CellId) -> String {
+    fn describe(self, first: CellId, second: CellId) -> String {
         match self {
             Self::Nothing => "does not work".to_owned(),
             Self::There => format!("works only from cell {first} to cell {second}"),
@@ -110,7 +110,7 @@ pub enum Difference {
     #[error("cell {0} is configured for another skin: configure it with `skinbus commission`")]
     OtherSkin(CellId),
     /// A described wire does not work.
-    #[error("the wire from {first} to {second} {}: check its plugs", carries.between(first.cell, second.cell))]
+    #[error("the wire from {first} to {second} {}: check its plugs", carries.describe(first.cell, second.cell))]
     MissingWire {
         /// The end with the smaller node id.
         first: WireEnd,
@@ -138,12 +138,12 @@ pub enum Difference {
     #[error("a cell without a node id is at {0}: it gets one from the network, unless all are used")]
     Unnumbered(WireEnd),
     /// Cells whose parents form a circle, in order.
-    #[error("{} are each other's parents, a circle that would count cells twice: restart them", names(.0))]
+    #[error("{} are each other's parents, a circle that would count cells twice: restart them", cell_list(.0))]
     Circle(Vec<CellId>),
     /// Cells without a route to a root.
     #[error(
         "{} {} no route to a root: their torques are missing from all sums; check their wires",
-        names(.0),
+        cell_list(.0),
         if .0.len() == 1 { "has" } else { "have" }
     )]
     Unreachable(Vec<CellId>),
@@ -173,7 +173,7 @@ fn other_version(version: Option<u16>) -> String {
 
 /// Lists cells for users: at most six of them, and the number of the others.
 #[must_use]
-pub fn names(cells: &[CellId]) -> String {
+pub fn cell_list(cells: &[CellId]) -> String {
     let first: Vec<_> = cells.iter().take(6).map(ToString::to_string).collect();
     let (word, first) = (if cells.len() == 1 { "cell" } else { "cells" }, first.join(", "));
     match cells.len().saturating_sub(6) {
@@ -203,13 +203,13 @@ impl Difference {
 /// Returns all differences between the wires and cells of a network and the description, each once.
 #[must_use]
 pub fn differences(wires: &Wires, cells: &[ObservedCell]) -> Vec<Difference> {
-    let mut found: Vec<_> = cells.iter().flat_map(|cell| of_cell(cell, cells)).collect();
+    let mut found: Vec<_> = cells.iter().flat_map(|cell| cell_differences(cell, cells)).collect();
     let versions = other_versions(wires, cells);
     found.extend(versions.iter().map(|(&cell, &version)| Difference::Version { cell, version }));
-    let network = Network::new(wires, cells, &versions);
-    network.wires(&mut found);
-    let TreePlaces { circles, unreachable, .. } =
-        places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
+    let network = PortMap::new(wires, cells, &versions);
+    network.wire_differences(&mut found);
+    let TreePlaces { cycles: circles, unreachable, .. } =
+        tree_places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
     let circling: BTreeSet<_> = circles.iter().flatten().copied().collect();
     found.extend(circles.into_iter().map(Difference::Circle));
     let described = |node: &CellId| cells.iter().any(|cell| cell.node == *node && cell.serial.is_some());
@@ -222,7 +222,7 @@ pub fn differences(wires: &Wires, cells: &[ObservedCell]) -> Vec<Difference> {
 }
 
 /// Returns the differences that concern a cell alone, without its wires.
-fn of_cell(cell: &ObservedCell, all: &[ObservedCell]) -> Vec<Difference> {
+fn cell_differences(cell: &ObservedCell, all: &[ObservedCell]) -> Vec<Difference> {
     let node = cell.node;
     let heartbeat = cell.heartbeat.filter(|_| cell.alive);
     let Some(described) = cell.serial else {
@@ -269,47 +269,47 @@ fn other_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId, Opt
 }
 
 /// The reported neighbours at all ports of a bus, beside the described ones.
-struct Network<'a> {
+struct PortMap<'a> {
     wires: &'a Wires,
     /// The cells whose ports can be compared: present, with a unique node id, and of this program's version.
-    sound: BTreeMap<CellId, &'a Ports>,
+    comparable: BTreeMap<CellId, &'a Ports>,
 }
 
-impl<'a> Network<'a> {
+impl<'a> PortMap<'a> {
     fn new(wires: &'a Wires, cells: &'a [ObservedCell], versions: &BTreeMap<CellId, Option<u16>>) -> Self {
         let sound = |cell: &&ObservedCell| {
             let single = cell.heartbeat.is_some_and(|heartbeat| !heartbeat.state.has(State::DUPLICATE));
             cell.alive && single && !versions.contains_key(&cell.node)
         };
         let sound = cells.iter().filter(sound).filter_map(|cell| Some((cell.node, cell.ports.as_ref()?)));
-        Self { wires, sound: sound.collect() }
+        Self { wires, comparable: sound.collect() }
     }
 
     /// Returns the described end to which a port should lead.
-    fn described(&self, end: WireEnd) -> Option<WireEnd> {
+    fn described_end(&self, end: WireEnd) -> Option<WireEnd> {
         self.wires.other_end(end.cell, end.port).map(|(cell, port)| WireEnd { cell, port })
     }
 
     fn state(&self, end: WireEnd) -> Option<protocol::message::PortState> {
-        self.sound.get(&end.cell)?.ports.get(end.port).copied()
+        self.comparable.get(&end.cell)?.ports.get(end.port).copied()
     }
 
     /// Returns the end to which a port leads; `None` if the cell receives nothing there.
-    fn leads(&self, end: WireEnd) -> Option<WireEnd> {
+    fn actual_end(&self, end: WireEnd) -> Option<WireEnd> {
         let state = self.state(end).filter(|state| state.receives)?;
         let cell = CellId::new(state.number.into()).ok()?;
         Some(WireEnd { cell, port: state.port.into() })
     }
 
     fn ends(&self) -> impl Iterator<Item = WireEnd> {
-        self.sound.keys().flat_map(|&cell| (0..PORTS).map(move |port| WireEnd { cell, port }))
+        self.comparable.keys().flat_map(|&cell| (0..PORTS).map(move |port| WireEnd { cell, port }))
     }
 
-    fn wires(&self, found: &mut Vec<Difference>) {
+    fn wire_differences(&self, found: &mut Vec<Difference>) {
         let mut named = BTreeSet::new();
         let mut elsewhere = BTreeSet::new();
         for end in self.ends() {
-            let described = self.described(end);
+            let described = self.described_end(end);
             let state = self.state(end).filter(|state| state.receives);
             if state.is_some_and(|state| state.number == 0 && !state.other_version) {
                 found.push(Difference::Unnumbered(end));
@@ -317,7 +317,8 @@ impl<'a> Network<'a> {
                 continue;
             }
             // Skip the far ends of cells that cannot be compared, too.
-            let Some(leads) = self.leads(end).filter(|leads| self.sound.contains_key(&leads.cell)) else {
+            let Some(leads) = self.actual_end(end).filter(|leads| self.comparable.contains_key(&leads.cell))
+            else {
                 continue;
             };
             if described == Some(leads) {
@@ -327,14 +328,14 @@ impl<'a> Network<'a> {
             if !named.insert((end.min(leads), end.max(leads))) {
                 continue;
             }
-            found.push(match (described, self.described(leads)) {
+            found.push(match (described, self.described_end(leads)) {
                 (Some(described), _) => Difference::SwappedWire { end, leads, described },
                 (None, Some(described)) => Difference::SwappedWire { end: leads, leads: end, described },
                 (None, None) => Difference::ExtraWire(end.min(leads), end.max(leads)),
             });
         }
         for first in self.ends() {
-            let Some(second) = self.described(first).filter(|&second| first < second) else { continue };
+            let Some(second) = self.described_end(first).filter(|&second| first < second) else { continue };
             let (Some(here), Some(there)) = (self.state(first), self.state(second)) else { continue };
             if elsewhere.contains(&first) || elsewhere.contains(&second) || (here.works && there.works) {
                 continue;

@@ -16,20 +16,20 @@ pub struct TreePlaces {
     /// Cells that send but have no route to a root, including those in cycles.
     pub unreachable: Vec<CellId>,
     /// Cells whose parents form a cycle.
-    pub circles: Vec<Vec<CellId>>,
+    pub cycles: Vec<Vec<CellId>>,
 }
 
 impl TreePlaces {
     /// Returns the depth of the deepest cell.
     #[must_use]
-    pub fn deepest(&self) -> Option<u8> {
+    pub fn max_depth(&self) -> Option<u8> {
         self.depths.values().copied().max()
     }
 }
 
 /// Computes the tree from each cell's node id, a flag that is true if the cell sends now, and the cell's report of its
 /// place.
-pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> TreePlaces {
+pub fn tree_places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> TreePlaces {
     let alive: BTreeMap<_, _> =
         cells.filter(|(_, alive, _)| *alive).map(|(node, _, tree)| (node, tree)).collect();
     let parent = |node: &CellId| {
@@ -44,7 +44,7 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Tree
             if route.contains(&at) {
                 let circle: Vec<_> = route.iter().copied().skip_while(|&cell| cell != at).collect();
                 if circle.iter().all(|&cell| circling.insert(cell)) {
-                    places.circles.push(from_the_smallest(circle));
+                    places.cycles.push(from_the_smallest(circle));
                 }
                 break places.unreachable.push(node);
             }
@@ -90,12 +90,12 @@ mod tests {
     #[test]
     fn depths_are_counted_along_parents() {
         let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 1), says(3, Some(2), 1, 2)];
-        let found = places(cells.into_iter());
-        assert_eq!((found.deepest(), found.agree), (Some(2), true));
-        assert_eq!((found.unreachable, found.circles), (vec![], vec![]));
+        let found = tree_places(cells.into_iter());
+        assert_eq!((found.max_depth(), found.agree), (Some(2), true));
+        assert_eq!((found.unreachable, found.cycles), (vec![], vec![]));
         // A report with another depth is out of date.
         let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 2)];
-        assert!(!places(cells.into_iter()).agree);
+        assert!(!tree_places(cells.into_iter()).agree);
     }
 
     #[test]
@@ -114,10 +114,10 @@ mod tests {
             says(10, Some(12), 0, 1),
             says(13, Some(12), 0, 2),
         ];
-        let found = places(cells.into_iter());
+        let found = tree_places(cells.into_iter());
         let without: Vec<_> = found.unreachable.iter().map(|cell| cell.get()).collect();
         assert_eq!(without, [2, 3, 4, 6, 7, 8, 10, 11, 12, 13]);
-        assert_eq!(found.circles, [vec![cell(10), cell(12), cell(11)]]);
+        assert_eq!(found.cycles, [vec![cell(10), cell(12), cell(11)]]);
         assert_eq!(found.depths.keys().collect::<Vec<_>>(), [&cell(1)]);
     }
 }

@@ -20,11 +20,11 @@ const HELLO_TIMEOUT: Span = Span::from_millis(600);
 /// Time after which an unanswered walk counts as lost.
 const WALK_TIMEOUT: Span = Span::from_millis(400);
 /// Port number of the gateway's side, as sent in hellos.
-const PORT: u8 = 0;
+const GATEWAY_PORT: u8 = 0;
 
 /// The wire from the gateway to one root.
 #[derive(Clone, Copy, Debug)]
-struct Wire {
+struct RootWire {
     /// The index of the wire in the description.
     root: usize,
     last_hello: Option<(Hello, Micros)>,
@@ -33,7 +33,7 @@ struct Wire {
 
 /// A walk on its way below one root, which assigns node ids to cells.
 #[derive(Clone, Copy, Debug)]
-struct Walking {
+struct ActiveWalk {
     root: usize,
     walk: Walk,
     since: Micros,
@@ -42,13 +42,13 @@ struct Walking {
 /// The gateway's ends of the wires to all roots of one bus.
 #[derive(Debug)]
 pub struct Uplinks {
-    wires: Vec<Wire>,
+    wires: Vec<RootWire>,
     round: u8,
-    used: BTreeSet<u8>,
-    walks: u8,
-    walking: Option<Walking>,
+    used_node_ids: BTreeSet<u8>,
+    last_walk_number: u8,
+    active_walk: Option<ActiveWalk>,
     /// Earliest time of the next walk. Until then, cells with node ids from a lost walk can claim them.
-    wait: Micros,
+    next_walk: Micros,
     next_hello: Micros,
     outbox: VecDeque<(usize, PortMessage)>,
 }
@@ -58,22 +58,22 @@ impl Uplinks {
     /// walk numbers of an earlier gateway.
     #[must_use]
     pub fn new(roots: usize, walk: u8, now: Micros) -> Self {
-        let wire = |root| Wire { root, last_hello: None, is_child: false };
+        let wire = |root| RootWire { root, last_hello: None, is_child: false };
         Self {
             wires: (0..roots).map(wire).collect(),
             round: 1,
-            used: BTreeSet::new(),
-            walks: walk,
-            walking: None,
-            wait: Micros(0),
+            used_node_ids: BTreeSet::new(),
+            last_walk_number: walk,
+            active_walk: None,
+            next_walk: Micros(0),
             next_hello: now,
             outbox: VecDeque::new(),
         }
     }
 
     /// Marks a node id as used by a cell on the bus.
-    pub fn claimed(&mut self, cell: CellId) {
-        self.used.insert(cell.get());
+    pub fn mark_used(&mut self, cell: CellId) {
+        self.used_node_ids.insert(cell.get());
     }
 
     /// Returns the next message to send, with the index of the root to which it goes.
@@ -84,8 +84,9 @@ impl Uplinks {
     /// Returns the time of the next call of [`Uplinks::handle_time`].
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
-        let lost = self.walking.map(|walking| walking.since + WALK_TIMEOUT);
-        let waits = Some(self.wait).filter(|_| self.walking.is_none() && self.needs_node_ids().is_some());
+        let lost = self.active_walk.map(|walking| walking.since + WALK_TIMEOUT);
+        let waits =
+            Some(self.next_walk).filter(|_| self.active_walk.is_none() && self.needs_node_ids().is_some());
         [lost, waits].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
@@ -96,7 +97,7 @@ impl Uplinks {
     }
 
     /// Handles a message from a root over its wire.
-    pub fn handle(&mut self, now: Micros, root: usize, message: PortMessage) {
+    pub fn handle_message(&mut self, now: Micros, root: usize, message: PortMessage) {
         let rank = Rank { round: self.round, depth: 0 };
         let Some(wire) = self.wires.get_mut(root) else { return };
         match message {
@@ -105,10 +106,10 @@ impl Uplinks {
                 wire.last_hello = Some((hello, now));
                 // Only the root knows whether a grant arrived, and whether one from an earlier gateway is still valid.
                 wire.is_child = hello.is_parent;
-                if hello.is_parent && hello.rank.is_some_and(|own| own.is_better_than(rank.below())) {
-                    self.renew(now, hello.rank.map_or(self.round, |own| own.round));
+                if hello.is_parent && hello.rank.is_some_and(|own| own.is_better_than(rank.child())) {
+                    self.start_round_after(now, hello.rank.map_or(self.round, |own| own.round));
                 } else if is_new || !hello.receives {
-                    self.hello(now, root);
+                    self.send_hello(now, root);
                 }
             }
             PortMessage::Join => self.outbox.push_back((root, PortMessage::Grant(rank))),
@@ -116,8 +117,8 @@ impl Uplinks {
                 wire.is_child = false;
                 self.outbox.push_back((root, PortMessage::LeaveAck));
             }
-            PortMessage::Repair(round) => self.renew(now, round),
-            PortMessage::Probe => self.hello(now, root),
+            PortMessage::Repair(round) => self.start_round_after(now, round),
+            PortMessage::Probe => self.send_hello(now, root),
             PortMessage::Return(walk) => self.end_walk(now, root, walk),
             PortMessage::Grant(_)
             | PortMessage::Refuse
@@ -126,23 +127,23 @@ impl Uplinks {
             | PortMessage::Nack(_)
             | PortMessage::NodeId(_) => {}
         }
-        self.walk(now);
+        self.start_walk(now);
     }
 
     /// Starts a round later than `round`, unless a later one has started already.
-    fn renew(&mut self, now: Micros, round: u8) {
+    fn start_round_after(&mut self, now: Micros, round: u8) {
         if self.round.wrapping_sub(round).cast_signed() <= 0 {
             self.round = round.wrapping_add(1);
         }
-        self.hello_to_all(now);
+        self.send_hellos(now);
     }
 
-    fn hello(&mut self, now: Micros, root: usize) {
+    fn send_hello(&mut self, now: Micros, root: usize) {
         let heard = self.wires.get(root).and_then(|wire| wire.last_hello);
         let hello = Hello {
             version: VERSION,
             number: 0,
-            port: PORT,
+            port: GATEWAY_PORT,
             receives: heard.is_some_and(|(_, at)| now.elapsed_since(at) <= HELLO_TIMEOUT),
             is_parent: false,
             unnumbered: false,
@@ -151,9 +152,9 @@ impl Uplinks {
         self.outbox.push_back((root, PortMessage::Hello(hello)));
     }
 
-    fn hello_to_all(&mut self, now: Micros) {
+    fn send_hellos(&mut self, now: Micros) {
         for root in 0..self.wires.len() {
-            self.hello(now, root);
+            self.send_hello(now, root);
         }
     }
 
@@ -166,51 +167,53 @@ impl Uplinks {
                 wire.is_child &=
                     wire.last_hello.is_some_and(|(_, at)| now.elapsed_since(at) <= HELLO_TIMEOUT);
             }
-            self.hello_to_all(now);
+            self.send_hellos(now);
         }
-        if self.walking.is_some_and(|walking| now.elapsed_since(walking.since) >= WALK_TIMEOUT) {
-            self.walking = None;
-            self.wait = now + WALK_TIMEOUT;
+        if self.active_walk.is_some_and(|walking| now.elapsed_since(walking.since) >= WALK_TIMEOUT) {
+            self.active_walk = None;
+            self.next_walk = now + WALK_TIMEOUT;
         }
-        self.walk(now);
+        self.start_walk(now);
     }
 
     /// Returns the index of a root that has a cell without a node id below it.
     fn needs_node_ids(&self) -> Option<usize> {
         let needs =
-            |wire: &&Wire| wire.is_child && wire.last_hello.is_some_and(|(hello, _)| hello.unnumbered);
+            |wire: &&RootWire| wire.is_child && wire.last_hello.is_some_and(|(hello, _)| hello.unnumbered);
         self.wires.iter().find(needs).map(|wire| wire.root)
     }
 
     /// Sends a walk, with the first range of free node ids, to a root that has cells without node ids below it.
-    fn walk(&mut self, now: Micros) {
-        if self.walking.is_some() || now < self.wait {
+    fn start_walk(&mut self, now: Micros) {
+        if self.active_walk.is_some() || now < self.next_walk {
             return;
         }
-        let Some((root, (first, last))) = self.needs_node_ids().zip(self.free()) else { return };
-        self.walks = self.walks.wrapping_add(1);
-        let walk = Walk { walk: self.walks, first, last };
-        self.walking = Some(Walking { root, walk, since: now });
+        let Some((root, (first, last))) = self.needs_node_ids().zip(self.free_range()) else { return };
+        self.last_walk_number = self.last_walk_number.wrapping_add(1);
+        let walk = Walk { walk: self.last_walk_number, first, last };
+        self.active_walk = Some(ActiveWalk { root, walk, since: now });
         self.outbox.push_back((root, PortMessage::NodeId(walk)));
     }
 
     /// Returns the first and last node id of the first range of free node ids.
-    fn free(&self) -> Option<(u8, u8)> {
-        let first = (1..=CellId::MAX.get()).find(|number| !self.used.contains(number))?;
-        let last = (first..=CellId::MAX.get()).take_while(|number| !self.used.contains(number)).last()?;
+    fn free_range(&self) -> Option<(u8, u8)> {
+        let first = (1..=CellId::MAX.get()).find(|number| !self.used_node_ids.contains(number))?;
+        let last =
+            (first..=CellId::MAX.get()).take_while(|number| !self.used_node_ids.contains(number)).last()?;
         Some((first, last))
     }
 
     fn end_walk(&mut self, now: Micros, root: usize, remaining: Walk) {
-        let Some(walking) = self.walking.filter(|it| it.root == root && it.walk.walk == remaining.walk)
+        let Some(walking) = self.active_walk.filter(|it| it.root == root && it.walk.walk == remaining.walk)
         else {
             return;
         };
-        self.used.extend(walking.walk.first..remaining.first.min(walking.walk.last.saturating_add(1)));
-        self.walking = None;
+        self.used_node_ids
+            .extend(walking.walk.first..remaining.first.min(walking.walk.last.saturating_add(1)));
+        self.active_walk = None;
         if remaining.first == walking.walk.first {
             // The root assigned none: it does not know its children yet.
-            self.wait = now + Span::from_millis(20);
+            self.next_walk = now + Span::from_millis(20);
         }
     }
 }
@@ -257,14 +260,14 @@ mod tests {
     #[test]
     fn a_root_is_a_child_as_long_as_its_hellos_say_so() {
         let mut uplinks = Uplinks::new(2, 0, Micros(0));
-        uplinks.handle(Micros(0), 1, hello_up(false));
+        uplinks.handle_message(Micros(0), 1, hello_up(false));
         assert_eq!([0, 1, 2].map(|root| uplinks.is_child(root)), [false, true, false]);
         uplinks.handle_time(Micros(600 * MS));
         assert!(uplinks.is_child(1));
         uplinks.handle_time(Micros(1_000 * MS));
         assert!(!uplinks.is_child(1), "silent");
-        uplinks.handle(Micros(1_000 * MS), 1, hello_up(false));
-        uplinks.handle(Micros(1_000 * MS), 1, PortMessage::Leave);
+        uplinks.handle_message(Micros(1_000 * MS), 1, hello_up(false));
+        uplinks.handle_message(Micros(1_000 * MS), 1, PortMessage::Leave);
         assert!(!uplinks.is_child(1), "left");
     }
 
@@ -272,9 +275,9 @@ mod tests {
     fn a_walk_has_the_first_range_of_free_node_ids() {
         let mut uplinks = Uplinks::new(1, 7, Micros(0));
         for used in [1, 2, 5] {
-            uplinks.claimed(CellId::new(used).unwrap());
+            uplinks.mark_used(CellId::new(used).unwrap());
         }
-        uplinks.handle(Micros(0), 0, hello_up(true));
+        uplinks.handle_message(Micros(0), 0, hello_up(true));
         let walk = |walk, first, last| PortMessage::NodeId(Walk { walk, first, last });
         let walks = |uplinks: &mut Uplinks| {
             let mut messages = said(uplinks);
@@ -283,9 +286,9 @@ mod tests {
         };
         assert_eq!(walks(&mut uplinks), [(0, walk(8, 3, 4))]);
         // One of them was assigned.
-        uplinks.handle(Micros(MS), 0, PortMessage::Return(Walk { walk: 8, first: 4, last: 4 }));
+        uplinks.handle_message(Micros(MS), 0, PortMessage::Return(Walk { walk: 8, first: 4, last: 4 }));
         assert_eq!(walks(&mut uplinks), [(0, walk(9, 4, 4))]);
-        uplinks.handle(Micros(2 * MS), 0, PortMessage::Return(Walk { walk: 9, first: 5, last: 4 }));
+        uplinks.handle_message(Micros(2 * MS), 0, PortMessage::Return(Walk { walk: 9, first: 5, last: 4 }));
         assert_eq!(walks(&mut uplinks), [(0, walk(10, 6, CellId::MAX.get()))]);
     }
 }

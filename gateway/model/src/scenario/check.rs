@@ -7,15 +7,15 @@ use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 use protocol::time::Span;
 
 use super::names::NameTable;
-use super::times::{EndS, length};
-use super::{Mode, ModeChange, Motion, MotionKind, Scenario, Touch, faults, pressed, raw, sensors};
+use super::times::{DurationS, check_duration};
+use super::{ModeChange, Motion, MotionKind, Scenario, TorqueSource, Touch, faults, pressed, raw, sensors};
 
 pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     if raw.version != 1 {
         return Err(KeyPath::top_level_key("version").fault(raw.version, "this program reads version 1"));
     }
-    let end = EndS(raw.duration_s());
-    let duration = length(&KeyPath::top_level_key("duration_s"), end.0)?;
+    let end = DurationS(raw.duration_s());
+    let duration = check_duration(&KeyPath::top_level_key("duration_s"), end.0)?;
     let negative = |_| KeyPath::top_level_key("seed").fault(raw.seed, "must not be negative");
     let seed = u64::try_from(raw.seed).map_err(negative)?;
     let motion = motion(&raw.motion, skin)?;
@@ -23,7 +23,7 @@ pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     let names = NameTable::new(skin);
     let touches = pressed::touches(&raw.touch, end, &names)?;
     let touches_repeat =
-        raw.touches_repeat_s.map(|seconds| repeat(&raw.touch, &touches, seconds)).transpose()?;
+        raw.touches_repeat_s.map(|seconds| check_repeat(&raw.touch, &touches, seconds)).transpose()?;
     let faults = faults::faults(&raw.fault, end, &names)?;
     let sensors = sensors::sensors(&raw.sensors, end)?;
     Ok(Scenario { duration, seed, motion, modes, touches, touches_repeat, faults, sensors })
@@ -39,14 +39,15 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         }
         Ok(core::array::from_fn(|joint| values.get(joint).copied().unwrap_or(0.0)))
     };
-    let (start_key, start) = either(&at, ("start", &raw.start), ("start_rad", &raw.start_rad))?;
+    let (start_key, start) = with_former_key(&at, ("start", &raw.start), ("start_rad", &raw.start_rad))?;
     // The value in range nearest to zero.
     let mut nearest = [0.0; MAX_ROBOT_JOINTS];
     for (start, joint) in nearest.iter_mut().zip(&robot.joints) {
         *start = f64::clamp(0.0, joint.limits[0], joint.limits[1]);
     }
     let start = start.map_or(Ok(nearest), |it| joints(start_key, it))?;
-    let (key, amplitude) = either(&at, ("amplitude", &raw.amplitude), ("amplitude_rad", &raw.amplitude_rad))?;
+    let (key, amplitude) =
+        with_former_key(&at, ("amplitude", &raw.amplitude), ("amplitude_rad", &raw.amplitude_rad))?;
     let kinds =
         [("hold", Some(MotionKind::Hold)), ("sine", None), ("kinesthetic", Some(MotionKind::Kinesthetic))];
     let needed = "needed with kind = \"sine\"";
@@ -59,8 +60,8 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         (None, Some(_), None) => return Err(at.key("period_s").fault("", needed)),
         (None, Some(amplitude), Some(period_s)) => {
             let amplitude = joints(key, amplitude)?;
-            length(&at.key("period_s"), period_s)?;
-            speeds(&at.key(key), skin, &amplitude, period_s)?;
+            check_duration(&at.key("period_s"), period_s)?;
+            check_speeds(&at.key(key), skin, &amplitude, period_s)?;
             (MotionKind::Sine { amplitude, period_s }, amplitude.map(f64::abs))
         }
     };
@@ -78,7 +79,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
 }
 
 /// Returns the value under a key or under the key's former name, with the name that the file uses.
-fn either<'a, T>(
+fn with_former_key<'a, T>(
     at: &KeyPath,
     (key, value): (&'static str, &'a Option<T>),
     (former, given): (&'static str, &'a Option<T>),
@@ -93,7 +94,12 @@ fn either<'a, T>(
 }
 
 /// Checks that no joint exceeds its speed limit. A swinging joint is fastest at the start of the motion.
-fn speeds(at: &KeyPath, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s: f64) -> Checked<()> {
+fn check_speeds(
+    at: &KeyPath,
+    skin: &Skin,
+    amplitude: &[f64; MAX_ROBOT_JOINTS],
+    period_s: f64,
+) -> Checked<()> {
     let limits = skin.controller.max_speed.iter().zip(&skin.robot.joints);
     for (index, (amplitude, (&max, joint))) in amplitude.iter().zip(limits).enumerate() {
         let (speed, unit) = (TAU * amplitude.abs() / period_s, joint.kind.unit());
@@ -108,23 +114,23 @@ fn speeds(at: &KeyPath, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period
     Ok(())
 }
 
-fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
+fn modes(raw: &[raw::Mode], end: DurationS) -> Checked<Vec<ModeChange>> {
     let mut modes: Vec<ModeChange> = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
         let path = KeyPath::top_level_key("mode").element(index);
-        let at = end.moment(&path.key("at_s"), raw.at_s)?;
+        let at = end.time_before_end(&path.key("at_s"), raw.at_s)?;
         if modes.last().is_some_and(|last| last.at >= at) {
             return Err(path.key("at_s").fault(raw.at_s, "modes must be in order of time"));
         }
-        let kinds = [Mode::Compare, Mode::Distributed].map(|mode| (mode.name(), mode));
+        let kinds = [TorqueSource::Compare, TorqueSource::Distributed].map(|mode| (mode.name(), mode));
         modes.push(ModeChange { at, mode: path.key("kind").choose(&raw.kind, &kinds)? });
     }
     Ok(modes)
 }
 
 /// Checks the period of the touches: each touch must end before all begin again.
-fn repeat(raw: &[raw::Touch], touches: &[Touch], seconds: f64) -> Checked<Span> {
-    let period = length(&KeyPath::top_level_key("touches_repeat_s"), seconds)?;
+fn check_repeat(raw: &[raw::Touch], touches: &[Touch], seconds: f64) -> Checked<Span> {
+    let period = check_duration(&KeyPath::top_level_key("touches_repeat_s"), seconds)?;
     for (index, (raw, touch)) in raw.iter().zip(touches).enumerate() {
         // A touch without a length must begin within the period.
         let lasts = if touch.length == Span(u64::MAX) { 0 } else { touch.length.0 };

@@ -4,7 +4,7 @@ use protocol::time::Span;
 
 /// Interpolates a curve at a time in µs: linear between its points, which are sorted by time, and constant outside
 /// them. Returns `None` without any points.
-pub(super) fn linear<T: Copy>(points: &[(T, f64)], at: u64, micros: impl Fn(T) -> u64) -> Option<f64> {
+pub(super) fn interpolate<T: Copy>(points: &[(T, f64)], at: u64, micros: impl Fn(T) -> u64) -> Option<f64> {
     let after = points.partition_point(|(point, _)| micros(*point) <= at);
     let before = after.checked_sub(1).and_then(|index| points.get(index));
     match (before, points.get(after)) {

@@ -4,19 +4,19 @@ use protocol::document::{Checked, KeyPath};
 use protocol::time::Span;
 
 use super::names::{CellSelection, NameTable};
-use super::times::{EndS, length};
+use super::times::{DurationS, check_duration};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
 pub(super) const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
      \"stuck\", \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
 
 /// Checks the faults and sorts them by time.
-pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &NameTable<'_>) -> Checked<Vec<Fault>> {
+pub(super) fn faults(raw: &[raw::Fault], end: DurationS, names: &NameTable<'_>) -> Checked<Vec<Fault>> {
     let mut faults = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let entry = Entry { at: KeyPath::top_level_key("fault").element(index), raw, names };
+        let entry = FaultEntry { at: KeyPath::top_level_key("fault").element(index), raw, names };
         let fault = entry.fault(end)?;
-        faults.extend(entry.end_of(&fault)?);
+        faults.extend(entry.repair(&fault)?);
         faults.push(fault);
     }
     faults.sort_by_key(|fault| fault.at);
@@ -24,16 +24,16 @@ pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &NameTable<'_>) -> Ch
 }
 
 /// One entry of `[[fault]]` in a scenario's file.
-struct Entry<'a> {
+struct FaultEntry<'a> {
     at: KeyPath,
     raw: &'a raw::Fault,
     names: &'a NameTable<'a>,
 }
 
-impl Entry<'_> {
-    fn fault(&self, end: EndS) -> Checked<Fault> {
+impl FaultEntry<'_> {
+    fn fault(&self, end: DurationS) -> Checked<Fault> {
         let raw = self.raw;
-        let at = end.moment(&self.at.key("at_s"), raw.at_s)?;
+        let at = end.time_before_end(&self.at.key("at_s"), raw.at_s)?;
         let kind = match raw.kind.as_str() {
             "kill" => self.process(ProcessAction::Kill)?,
             "stop" => self.process(ProcessAction::Stop)?,
@@ -44,21 +44,21 @@ impl Entry<'_> {
             "link_up" | "mend" => self.wire(false, &["one_way"])?,
             "stuck" => self.sensor(SensorFault::Stuck, &["for_s"])?,
             "drift" => {
-                let n_per_s = self.given("n_per_s", raw.n_per_s, f64::NEG_INFINITY, f64::INFINITY)?;
+                let n_per_s = self.required("n_per_s", raw.n_per_s, f64::NEG_INFINITY, f64::INFINITY)?;
                 self.sensor(SensorFault::Drift { n_per_s }, &["for_s", "n_per_s"])?
             }
-            "drop" => self.hits(|probability| BusFault::Drop { probability })?,
-            "duplicate" => self.hits(|probability| BusFault::Duplicate { probability })?,
-            "corrupt" => self.hits(|probability| BusFault::Corrupt { probability })?,
-            "reorder" => self.hits(|probability| BusFault::Reorder { probability })?,
+            "drop" => self.random_bus_fault(|probability| BusFault::Drop { probability })?,
+            "duplicate" => self.random_bus_fault(|probability| BusFault::Duplicate { probability })?,
+            "corrupt" => self.random_bus_fault(|probability| BusFault::Corrupt { probability })?,
+            "reorder" => self.random_bus_fault(|probability| BusFault::Reorder { probability })?,
             "delay" => {
-                let probability = self.given("probability", raw.probability, 0.0, 1.0)?;
+                let probability = self.required("probability", raw.probability, 0.0, 1.0)?;
                 let delay = self.delay()?;
                 let keys = &["for_s", "probability", "delay_us"];
                 self.bus(BusFault::Delay { probability, delay }, keys)?
             }
             "babble" => {
-                let frames_per_s = self.given("frames_per_s", raw.frames_per_s, 1.0, 100_000.0)?;
+                let frames_per_s = self.required("frames_per_s", raw.frames_per_s, 1.0, 100_000.0)?;
                 let got = raw.id.unwrap_or(0);
                 let id = u16::try_from(got).ok().filter(|&id| id < 0x800);
                 let id = id.ok_or_else(|| self.at.key("id").fault(got, "an identifier is 0 to 0x7FF"))?;
@@ -70,21 +70,21 @@ impl Entry<'_> {
     }
 
     fn process(&self, action: ProcessAction) -> Checked<FaultKind> {
-        self.only(&[])?;
+        self.refuse_other_keys(&[])?;
         Ok(FaultKind::Process { action, cells: self.cells()? })
     }
 
     fn wire(&self, link_down: bool, keys: &[&str]) -> Checked<FaultKind> {
-        self.only(keys)?;
+        self.refuse_other_keys(keys)?;
         if self.raw.all {
             return Err(self.at.key("all").fault(true, "the two cells of a wire are needed"));
         }
-        let (from, to) = self.names.wired(self.named())?;
+        let (from, to) = self.names.wired_pair(self.selection())?;
         Ok(FaultKind::Wire { link_down, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
     }
 
     /// Returns the repair that follows a wire fault of limited duration.
-    fn end_of(&self, fault: &Fault) -> Checked<Option<Fault>> {
+    fn repair(&self, fault: &Fault) -> Checked<Option<Fault>> {
         let FaultKind::Wire { link_down: true, from, to, both_ways } = fault.kind else { return Ok(None) };
         if self.raw.for_s.is_none() {
             return Ok(None);
@@ -94,35 +94,35 @@ impl Entry<'_> {
     }
 
     fn sensor(&self, fault: SensorFault, keys: &[&str]) -> Checked<FaultKind> {
-        self.only(keys)?;
+        self.refuse_other_keys(keys)?;
         Ok(FaultKind::Sensor { fault, length: self.length()?, cells: self.cells()? })
     }
 
-    fn hits(&self, make: impl FnOnce(f64) -> BusFault) -> Checked<FaultKind> {
-        let probability = self.given("probability", self.raw.probability, 0.0, 1.0)?;
+    fn random_bus_fault(&self, make: impl FnOnce(f64) -> BusFault) -> Checked<FaultKind> {
+        let probability = self.required("probability", self.raw.probability, 0.0, 1.0)?;
         self.bus(make(probability), &["for_s", "probability"])
     }
 
     fn bus(&self, fault: BusFault, keys: &[&str]) -> Checked<FaultKind> {
-        self.only(keys)?;
-        let bus = self.names.bus(self.named())?;
+        self.refuse_other_keys(keys)?;
+        let bus = self.names.bus(self.selection())?;
         let is_filtered = self.raw.cells.is_some();
-        let cells = if is_filtered { self.names.cells_on(self.named(), bus)? } else { Vec::new() };
+        let cells = if is_filtered { self.names.cells_on(self.selection(), bus)? } else { Vec::new() };
         Ok(FaultKind::Bus { fault, length: self.length()?, bus, cells })
     }
 
     fn cells(&self) -> Checked<Vec<usize>> {
-        self.names.cells(self.named())
+        self.names.cells(self.selection())
     }
 
-    fn named(&self) -> CellSelection<'_> {
+    fn selection(&self) -> CellSelection<'_> {
         let Self { at, raw, .. } = self;
         CellSelection { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all }
     }
 
     /// Returns the duration of the fault; without `for_s` it lasts to the end.
     fn length(&self) -> Checked<Span> {
-        self.raw.for_s.map_or(Ok(Span(u64::MAX)), |seconds| length(&self.at.key("for_s"), seconds))
+        self.raw.for_s.map_or(Ok(Span(u64::MAX)), |seconds| check_duration(&self.at.key("for_s"), seconds))
     }
 
     fn delay(&self) -> Checked<Span> {
@@ -135,7 +135,7 @@ impl Entry<'_> {
     }
 
     /// Returns a number that this kind of fault requires; it must be from `min` to `max`.
-    fn given(&self, key: &'static str, value: Option<f64>, min: f64, max: f64) -> Checked<f64> {
+    fn required(&self, key: &'static str, value: Option<f64>, min: f64, max: f64) -> Checked<f64> {
         let why = || match (min, max) {
             (f64::NEG_INFINITY, _) => format!("a finite number is needed with kind = {:?}", self.raw.kind),
             _ => format!("{min} to {max} are needed with kind = {:?}", self.raw.kind),
@@ -146,7 +146,7 @@ impl Entry<'_> {
     }
 
     /// Refuses keys that have no meaning for this kind of fault.
-    fn only(&self, keys: &[&str]) -> Checked<()> {
+    fn refuse_other_keys(&self, keys: &[&str]) -> Checked<()> {
         let raw = self.raw;
         let given = [
             ("for_s", raw.for_s.is_some()),

@@ -5,8 +5,8 @@ use core::f64::consts::PI;
 use protocol::fixed::Q5_10;
 use protocol::time::{Micros, Span};
 
-use super::curve::{linear, seconds};
-use super::{Profile, Touch};
+use super::curve::{interpolate, seconds};
+use super::{ForceProfile, Touch};
 
 /// The maximum total force of three contact words, in N.
 pub const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
@@ -26,22 +26,24 @@ pub fn contact_words(force_n: f64) -> [Q5_10; 3] {
 
 impl Touch {
     /// Returns true if the touch is active at a time.
-    pub(super) fn holds_at(&self, time: Micros) -> bool {
+    pub(super) fn is_active_at(&self, time: Micros) -> bool {
         self.at <= time && time.elapsed_since(self.at) < self.length
     }
 
     /// Returns the force in N at a time; `None` if the touch is not active.
-    pub(super) fn level(&self, time: Micros) -> Option<f64> {
-        if !self.holds_at(time) {
+    pub(super) fn force_at(&self, time: Micros) -> Option<f64> {
+        if !self.is_active_at(time) {
             return None;
         }
         let since = time.elapsed_since(self.at);
         let part = seconds(since) / seconds(self.length);
         Some(match &self.profile {
-            Profile::Step => self.force_n,
-            Profile::Ramp => self.force_n * part,
-            Profile::HalfSine => self.force_n * (PI * part).sin(),
-            Profile::Points(points) => linear(points, since.0, |Span(micros)| micros).unwrap_or(0.0),
+            ForceProfile::Step => self.force_n,
+            ForceProfile::Ramp => self.force_n * part,
+            ForceProfile::HalfSine => self.force_n * (PI * part).sin(),
+            ForceProfile::Points(points) => {
+                interpolate(points, since.0, |Span(micros)| micros).unwrap_or(0.0)
+            }
         })
     }
 }

@@ -14,7 +14,7 @@ use rand_pcg::Pcg64Mcg;
 
 use super::force::contact_words;
 use super::sensors::{ForceErrors, REFERENCE_C, Sensors};
-use crate::accelerometer::sensor::normal;
+use crate::accelerometer::sensor::standard_normal;
 
 /// Time constants of creep in s; their sum approximates a logarithm of time.
 const CREEP_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
@@ -56,7 +56,7 @@ struct CellSensors {
     temperature_gain: f64,
     read_n: f64,
     creep_n: [f64; CREEP_S.len()],
-    walk_n: f64,
+    drift_n: f64,
     dice: Pcg64Mcg,
 }
 
@@ -135,7 +135,7 @@ impl CellSensors {
             temperature_gain,
             read_n: 0.0,
             creep_n: [0.0; CREEP_S.len()],
-            walk_n: 0.0,
+            drift_n: 0.0,
             dice,
         }
     }
@@ -150,13 +150,13 @@ impl CellSensors {
             *creep += (force_n - *creep) * -(-period_s / time_s).exp_m1();
         }
         if errors.drift_n > 0.0 {
-            self.walk_n += errors.drift_n * (period_s / 3_600.0).sqrt() * normal(&mut self.dice);
+            self.drift_n += errors.drift_n * (period_s / 3_600.0).sqrt() * standard_normal(&mut self.dice);
         }
-        let noise = if errors.noise_n > 0.0 { errors.noise_n * normal(&mut self.dice) } else { 0.0 };
+        let noise = if errors.noise_n > 0.0 { errors.noise_n * standard_normal(&mut self.dice) } else { 0.0 };
         let gain =
             1.0 + errors.gain * self.gain + errors.temperature_gain_per_c * self.temperature_gain * degrees;
         let zero = errors.offset_n * self.offset + errors.temperature_n_per_c * self.temperature_n * degrees;
-        gain * (self.read_n + errors.creep * self.creep_n.iter().sum::<f64>()) + zero + self.walk_n + noise
+        gain * (self.read_n + errors.creep * self.creep_n.iter().sum::<f64>()) + zero + self.drift_n + noise
     }
 }
 

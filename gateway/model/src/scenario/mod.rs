@@ -45,7 +45,7 @@ pub struct Scenario {
     pub seed: u64,
     /// The motion of the robot.
     pub motion: Motion,
-    /// The gateway's modes, in order of time; before the first, the mode is [`Mode::Compare`].
+    /// The gateway's modes, in order of time; before the first, the mode is [`TorqueSource::Compare`].
     pub modes: Vec<ModeChange>,
     /// The touches, in the file's order.
     pub touches: Vec<Touch>,
@@ -126,12 +126,12 @@ pub struct ModeChange {
     /// The time of the change.
     pub at: Micros,
     /// The new mode.
-    pub mode: Mode,
+    pub mode: TorqueSource,
 }
 
 /// The source of the torques that the gateway uses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum Mode {
+pub enum TorqueSource {
     /// `compare`: the gateway uses the cells' torques, and computes all of them centrally as well.
     #[default]
     Compare,
@@ -139,7 +139,7 @@ pub enum Mode {
     Distributed,
 }
 
-impl Mode {
+impl TorqueSource {
     /// Returns the name of the mode in a scenario's file.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -162,14 +162,14 @@ pub struct Touch {
     /// The peak force on each of the cells, in N.
     pub force_n: f64,
     /// The course of the force.
-    pub profile: Profile,
+    pub profile: ForceProfile,
     /// The values besides the force.
     pub values: TouchValues,
 }
 
 /// The course of a touch's force over time.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Profile {
+pub enum ForceProfile {
     /// `half-sine`: the force follows half a period of a sine.
     HalfSine,
     /// `step`: the full force during the whole touch.
@@ -181,7 +181,7 @@ pub enum Profile {
     Points(Vec<(Span, f64)>),
 }
 
-impl Profile {
+impl ForceProfile {
     /// Returns the name of the profile in a scenario's file; `points` for a list of points.
     #[must_use]
     pub const fn name(&self) -> &'static str {
@@ -384,8 +384,12 @@ impl Scenario {
 
     /// Returns the gateway's mode at a time.
     #[must_use]
-    pub fn mode_at(&self, time: Micros) -> Mode {
-        self.modes.iter().rev().find(|change| change.at <= time).map_or_else(Mode::default, |it| it.mode)
+    pub fn mode_at(&self, time: Micros) -> TorqueSource {
+        self.modes
+            .iter()
+            .rev()
+            .find(|change| change.at <= time)
+            .map_or_else(TorqueSource::default, |it| it.mode)
     }
 }
 

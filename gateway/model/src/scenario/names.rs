@@ -48,7 +48,7 @@ impl<'a> NameTable<'a> {
     }
 
     /// Returns the index of the bus with this name. Errors show `at` and `value` as the key and its value.
-    fn named(&self, at: &KeyPath, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
+    fn bus_named(&self, at: &KeyPath, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
         let wrong = || at.fault(value, format_args!("no such bus; there is {}", self.buses()));
         self.skin.bus_named(name).ok_or_else(wrong)
     }
@@ -59,10 +59,10 @@ impl<'a> NameTable<'a> {
     }
 
     /// Returns the index of the bus that the key `bus` names. The key may be omitted if the skin has only one bus.
-    fn key(&self, given: CellSelection<'_>) -> Checked<usize> {
+    fn bus_of_key(&self, given: CellSelection<'_>) -> Checked<usize> {
         let at = given.at.key("bus");
         match given.bus {
-            Some(name) => self.named(&at, &format_args!("{name:?}"), name),
+            Some(name) => self.bus_named(&at, &format_args!("{name:?}"), name),
             None if self.skin.buses.len() == 1 => Ok(0),
             None => {
                 let first = self.bus_name(0);
@@ -80,31 +80,32 @@ impl<'a> NameTable<'a> {
                 let cell = self.cell(&given.at.key("cells").element(0), first, given)?;
                 Ok(self.skin.cells.get(cell).map_or(0, |cell| cell.bus))
             }
-            _ => self.key(given),
+            _ => self.bus_of_key(given),
         }
     }
 
     /// Returns the index of the cell that the file names at `at`.
     fn cell(&self, at: &KeyPath, named: &raw::CellReference, given: CellSelection<'_>) -> Checked<usize> {
         let (bus, node) = match named {
-            raw::CellReference::Node(node) => (self.key(given)?, *node),
+            raw::CellReference::Node(node) => (self.bus_of_key(given)?, *node),
             raw::CellReference::Text(text) => {
                 let name: CellName = text.parse().map_err(|why: String| at.fault(named, why))?;
                 let bus = match &name.bus {
-                    Some(bus) => self.named(at, named, bus)?,
-                    None => self.key(given)?,
+                    Some(bus) => self.bus_named(at, named, bus)?,
+                    None => self.bus_of_key(given)?,
                 };
                 (bus, name.node.get().into())
             }
         };
         self.index.get(&(bus, node)).copied().ok_or_else(|| {
-            let why = format!("no cell of {:?} has node {node}: {}", self.bus_name(bus), self.nodes(bus));
+            let why =
+                format!("no cell of {:?} has node {node}: {}", self.bus_name(bus), self.node_ids_text(bus));
             at.fault(named, why)
         })
     }
 
     /// Formats the node ids of a bus as a list for an error.
-    fn nodes(&self, bus: usize) -> String {
+    fn node_ids_text(&self, bus: usize) -> String {
         let mut nodes: Vec<_> = self.skin.cells_on_bus(bus).map(|cell| cell.node.get()).collect();
         nodes.sort_unstable();
         let all = ranges(&nodes);
@@ -116,9 +117,9 @@ impl<'a> NameTable<'a> {
     }
 
     /// Returns the indices of the cells that a table lists, in the file's order. A cell must not occur twice.
-    fn each(&self, given: CellSelection<'_>, named: &[raw::CellReference]) -> Checked<Vec<usize>> {
+    fn listed_cells(&self, given: CellSelection<'_>, named: &[raw::CellReference]) -> Checked<Vec<usize>> {
         if given.bus.is_some() {
-            self.key(given)?;
+            self.bus_of_key(given)?;
         }
         let path = given.at.key("cells");
         let mut cells = Vec::with_capacity(named.len());
@@ -140,14 +141,14 @@ impl<'a> NameTable<'a> {
             Some(_) if given.all => Err(path.fault("", "give either cells or all = true, not both")),
             None if !given.all => Err(path.fault("", "which cells? give their node ids, or all = true")),
             None => {
-                let bus = given.bus.map(|_| self.key(given)).transpose()?;
+                let bus = given.bus.map(|_| self.bus_of_key(given)).transpose()?;
                 let cells = self.skin.cells.iter().enumerate();
                 let target = cells.filter(|(_, cell)| bus.is_none_or(|bus| cell.bus == bus));
                 Ok(target.map(|(index, _)| index).collect())
             }
             Some([]) => Err(path.fault("[]", "at least one cell is needed")),
             Some(named) => {
-                let mut cells = self.each(given, named)?;
+                let mut cells = self.listed_cells(given, named)?;
                 cells.sort_unstable();
                 Ok(cells)
             }
@@ -174,7 +175,7 @@ impl<'a> NameTable<'a> {
 
     /// Returns the indices of the two cells that a table lists, in the file's order. Both must be on one bus, and a
     /// wire must connect them.
-    pub(super) fn wired(&self, given: CellSelection<'_>) -> Checked<(usize, usize)> {
+    pub(super) fn wired_pair(&self, given: CellSelection<'_>) -> Checked<(usize, usize)> {
         let path = given.at.key("cells");
         self.cells(given)?;
         let named = given.cells.unwrap_or_default();

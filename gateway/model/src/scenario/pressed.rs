@@ -5,29 +5,29 @@ use protocol::time::Span;
 
 use super::force::MAX_FORCE_N;
 use super::names::{CellSelection, NameTable};
-use super::times::{EndS, LONGEST_S, length};
-use super::{Profile, Touch, TouchValues, raw};
+use super::times::{DurationS, MAX_DURATION_S, check_duration};
+use super::{ForceProfile, Touch, TouchValues, raw};
 
 /// Checks the touches; returns them in the file's order.
-pub(super) fn touches(raw: &[raw::Touch], end: EndS, names: &NameTable<'_>) -> Checked<Vec<Touch>> {
+pub(super) fn touches(raw: &[raw::Touch], end: DurationS, names: &NameTable<'_>) -> Checked<Vec<Touch>> {
     let mut touches = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
         let at = KeyPath::top_level_key("touch").element(index);
         touches.push(touch(&at, raw, end, names)?);
-        together(&at, &touches, names)?;
+        check_total_force(&at, &touches, names)?;
     }
     Ok(touches)
 }
 
-fn touch(at: &KeyPath, raw: &raw::Touch, end: EndS, names: &NameTable<'_>) -> Checked<Touch> {
+fn touch(at: &KeyPath, raw: &raw::Touch, end: DurationS, names: &NameTable<'_>) -> Checked<Touch> {
     let (profile, length, force_n) = match &raw.profile {
-        raw::Profile::Word(word) => named(at, raw, word)?,
-        raw::Profile::Points(points) => drawn(at, raw, points)?,
+        raw::Profile::Word(word) => named_profile(at, raw, word)?,
+        raw::Profile::Points(points) => point_profile(at, raw, points)?,
     };
     let values = TouchValues::check(at, raw)?;
     let given = CellSelection { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all };
     Ok(Touch {
-        at: end.moment(&at.key("at_s"), raw.at_s)?,
+        at: end.time_before_end(&at.key("at_s"), raw.at_s)?,
         length,
         cells: names.cells(given)?,
         force_n,
@@ -37,8 +37,9 @@ fn touch(at: &KeyPath, raw: &raw::Touch, end: EndS, names: &NameTable<'_>) -> Ch
 }
 
 /// Returns the profile that a touch names with a word, the duration of the touch, and its peak force in N.
-fn named(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, f64)> {
-    let profiles = [Profile::HalfSine, Profile::Step, Profile::Ramp].map(|profile| (profile.name(), profile));
+fn named_profile(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(ForceProfile, Span, f64)> {
+    let profiles = [ForceProfile::HalfSine, ForceProfile::Step, ForceProfile::Ramp]
+        .map(|profile| (profile.name(), profile));
     let Some((_, profile)) = profiles.iter().find(|(name, _)| *name == word).cloned() else {
         let words = profiles.map(|(name, _)| format!("{name:?}")).join(", ");
         let why = format!("{words} or points [[t_s, force_n], ...]");
@@ -48,11 +49,11 @@ fn named(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, 
     let Some(force_n) = raw.force_n else {
         return Err(at_force.fault("", format_args!("needed with profile = {word:?}")));
     };
-    newtons(&at_force, force_n)?;
+    check_force(&at_force, force_n)?;
     let length = match (raw.for_s, &profile) {
-        (Some(seconds), _) => length(&at.key("for_s"), seconds)?,
-        (None, Profile::Step) => Span(u64::MAX),
-        (None, Profile::HalfSine | Profile::Ramp | Profile::Points(_)) => {
+        (Some(seconds), _) => check_duration(&at.key("for_s"), seconds)?,
+        (None, ForceProfile::Step) => Span(u64::MAX),
+        (None, ForceProfile::HalfSine | ForceProfile::Ramp | ForceProfile::Points(_)) => {
             return Err(at.key("for_s").fault("", format_args!("needed with profile = {word:?}")));
         }
     };
@@ -60,7 +61,7 @@ fn named(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, 
 }
 
 /// Returns the profile that a touch gives as points, the duration of the touch, and its peak force in N.
-fn drawn(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, Span, f64)> {
+fn point_profile(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(ForceProfile, Span, f64)> {
     let path = at.key("profile");
     let mut points: Vec<(Span, f64)> = Vec::with_capacity(given.len() + 1);
     let mut peak_n = 0.0_f64;
@@ -70,8 +71,8 @@ fn drawn(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile
             let why = format_args!("a point is two numbers, [t_s, force_n], not {}", given.len());
             return Err(point.fault("", why));
         };
-        if !(0.0..=LONGEST_S).contains(&seconds) {
-            let why = format!("must be 0 to {LONGEST_S:e} s after the start of the touch");
+        if !(0.0..=MAX_DURATION_S).contains(&seconds) {
+            let why = format!("must be 0 to {MAX_DURATION_S:e} s after the start of the touch");
             return Err(point.element(0).fault(seconds, why));
         }
         let moment = span_from_seconds(seconds);
@@ -79,7 +80,7 @@ fn drawn(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile
             let why = "the times of points must increase, by at least 1e-6 s";
             return Err(point.element(0).fault(seconds, why));
         }
-        newtons(&point.element(1), force_n)?;
+        check_force(&point.element(1), force_n)?;
         if points.is_empty() && moment > Span(0) {
             points.push((Span(0), 0.0));
         }
@@ -103,11 +104,11 @@ fn drawn(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile
         let why = format!("the largest force of the profile's points is {peak_n} N: leave force_n out");
         return Err(at.key("force_n").fault(force_n, why));
     }
-    Ok((Profile::Points(points), length, peak_n))
+    Ok((ForceProfile::Points(points), length, peak_n))
 }
 
 /// Checks that a force fits three contact words.
-fn newtons(at: &KeyPath, force_n: f64) -> Checked<()> {
+fn check_force(at: &KeyPath, force_n: f64) -> Checked<()> {
     if (0.0..=MAX_FORCE_N).contains(&force_n) {
         return Ok(());
     }
@@ -118,10 +119,10 @@ fn newtons(at: &KeyPath, force_n: f64) -> Checked<()> {
 /// Checks that the forces of simultaneous touches together fit the contact words of every cell. `touches` ends with the
 /// touch to check; those before it in the file have passed. The check adds peak forces at the start of each touch,
 /// where the number of simultaneous touches is largest.
-fn together(at: &KeyPath, touches: &[Touch], names: &NameTable<'_>) -> Checked<()> {
+fn check_total_force(at: &KeyPath, touches: &[Touch], names: &NameTable<'_>) -> Checked<()> {
     let Some((last, before)) = touches.split_last() else { return Ok(()) };
-    for start in touches.iter().map(|touch| touch.at).filter(|&at| last.holds_at(at)) {
-        let at_once: Vec<&Touch> = before.iter().filter(|touch| touch.holds_at(start)).collect();
+    for start in touches.iter().map(|touch| touch.at).filter(|&at| last.is_active_at(at)) {
+        let at_once: Vec<&Touch> = before.iter().filter(|touch| touch.is_active_at(start)).collect();
         if at_once.is_empty() {
             continue;
         }
@@ -135,10 +136,10 @@ fn together(at: &KeyPath, touches: &[Touch], names: &NameTable<'_>) -> Checked<(
                     names.name(*cell)
                 );
                 return Err(match last.profile {
-                    Profile::Points(_) => {
+                    ForceProfile::Points(_) => {
                         at.key("profile").fault(format_args!("up to {} N", last.force_n), why)
                     }
-                    Profile::HalfSine | Profile::Step | Profile::Ramp => {
+                    ForceProfile::HalfSine | ForceProfile::Step | ForceProfile::Ramp => {
                         at.key("force_n").fault(last.force_n, why)
                     }
                 });
@@ -170,12 +171,16 @@ mod tests {
     fn a_profile_of_points_is_linear_between_them_and_ends_at_the_last_one() {
         let touch = one("profile = [[0.0, 2.0], [0.5, 4], [1.0, 1.0]]");
         assert_eq!((touch.length, touch.force_n), (Span(1_000_000), 4.0));
-        let at = |micros: u64| touch.level(Micros(1_000_000 + micros));
+        let at = |micros: u64| touch.force_at(Micros(1_000_000 + micros));
         assert_eq!([0, 250_000, 500_000, 750_000].map(at), [2.0, 3.0, 4.0, 2.5].map(Some));
-        assert_eq!((touch.level(Micros(999_999)), at(1_000_000)), (None, None));
+        assert_eq!((touch.force_at(Micros(999_999)), at(1_000_000)), (None, None));
         assert!((at(999_999).unwrap() - 1.0).abs() < 1e-4);
         let later = one("profile = [[0.5, 3.0]]");
-        assert_eq!(later.profile, Profile::Points(vec![(Span(0), 0.0), (Span(500_000), 3.0)]), "from 0 N");
+        assert_eq!(
+            later.profile,
+            ForceProfile::Points(vec![(Span(0), 0.0), (Span(500_000), 3.0)]),
+            "from 0 N"
+        );
         let same = one("profile = [[0.0, 2.0], [0.5, 4], [1.0, 1.0]]\nfor_s = 1.0\nforce_n = 4.0");
         assert_eq!(same, touch, "keys that agree");
         let flat = read("profile = [[0.0, 3.0], [20.0, 3.0]]").unwrap();
@@ -246,7 +251,7 @@ mod tests {
 
     #[test]
     fn a_profile_below_the_thresholds_is_remarked() {
-        let remarks = read("profile = [[1.0, 0.01]]").unwrap().remarks(&skin());
+        let remarks = read("profile = [[1.0, 0.01]]").unwrap().warnings(&skin());
         let said = "the touch at 1 s: the largest force of its profile, 0.01 N, is below the thresholds of its cells";
         assert!(remarks[0].starts_with(said), "{remarks:?}");
     }
@@ -279,7 +284,7 @@ mod tests {
             prop_assume!(end > 0);
             let touch = one(&written(&points));
             prop_assert_eq!(touch.length, Span(end));
-            let at = |since: u64| touch.level(Micros(1_000_000 + since));
+            let at = |since: u64| touch.force_at(Micros(1_000_000 + since));
             for &(moment, force_n) in points.iter().filter(|(moment, _)| *moment < end) {
                 prop_assert_eq!(at(moment), Some(force_n), "at a point, its force");
             }

@@ -5,7 +5,7 @@ use core::fmt;
 use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
-use super::times::LONGEST_S;
+use super::times::MAX_DURATION_S;
 use super::{DEFAULT_DURATION, MotionKind};
 use crate::accelerometer::sensor::DataSheetInput;
 
@@ -44,7 +44,7 @@ pub(super) enum Profile {
 
 impl Default for Profile {
     fn default() -> Self {
-        Self::Word(super::Profile::Step.name().to_owned())
+        Self::Word(super::ForceProfile::Step.name().to_owned())
     }
 }
 
@@ -123,7 +123,7 @@ impl Scenario {
         let faults = self.fault.iter().map(|fault| end(fault.at_s, fault.for_s));
         let ends = touches.chain(faults).chain(self.mode.iter().map(|mode| mode.at_s));
         let last = || ends.fold(0.0, f64::max) + 1.0;
-        self.duration_s.unwrap_or_else(|| last().clamp(DEFAULT_DURATION.seconds(), LONGEST_S))
+        self.duration_s.unwrap_or_else(|| last().clamp(DEFAULT_DURATION.seconds(), MAX_DURATION_S))
     }
 }
 

@@ -4,15 +4,15 @@ use protocol::message::{Readings, SkinSensors};
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::Span;
 
-use super::{MotionKind, Profile, Scenario, Touch, contact_words};
+use super::{ForceProfile, MotionKind, Scenario, Touch, contact_words};
 use crate::central::force;
 
 impl Scenario {
     /// Returns one warning for each part of the scenario that will have no effect on this skin.
     #[must_use]
-    pub fn remarks(&self, skin: &Skin) -> Vec<String> {
+    pub fn warnings(&self, skin: &Skin) -> Vec<String> {
         let controller = unused_controller(self.motion.kind, skin);
-        let touches = self.touches.iter().filter_map(|touch| weak(touch, skin));
+        let touches = self.touches.iter().filter_map(|touch| weak_touch(touch, skin));
         controller.into_iter().chain(touches).collect()
     }
 }
@@ -30,7 +30,7 @@ fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
 }
 
 /// Returns a warning if the force and the proximity of a touch are below the thresholds of all its cells.
-fn weak(touch: &Touch, skin: &Skin) -> Option<String> {
+fn weak_touch(touch: &Touch, skin: &Skin) -> Option<String> {
     let mut readings = Readings::default();
     touch.values.apply(&mut readings);
     let sensors = SkinSensors { contact: contact_words(touch.force_n), ..readings.skin };
@@ -39,8 +39,10 @@ fn weak(touch: &Touch, skin: &Skin) -> Option<String> {
     in_vain.then(|| {
         let at_s = Span(touch.at.0).seconds();
         let peak = match touch.profile {
-            Profile::Points(_) => format!("the largest force of its profile, {} N,", touch.force_n),
-            Profile::HalfSine | Profile::Step | Profile::Ramp => format!("force_n = {}", touch.force_n),
+            ForceProfile::Points(_) => format!("the largest force of its profile, {} N,", touch.force_n),
+            ForceProfile::HalfSine | ForceProfile::Step | ForceProfile::Ramp => {
+                format!("force_n = {}", touch.force_n)
+            }
         };
         format!("the touch at {at_s} s: {peak} is below the thresholds of its cells: they send no torque")
     })

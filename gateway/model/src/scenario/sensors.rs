@@ -4,9 +4,9 @@ use protocol::document::{Checked, KeyPath};
 use protocol::fixed::Q9_6;
 use protocol::time::Micros;
 
-use super::curve::linear;
+use super::curve::interpolate;
 use super::raw;
-use super::times::EndS;
+use super::times::DurationS;
 use crate::accelerometer::sensor::DataSheet;
 
 /// The reference temperature of data sheet errors, in °C.
@@ -62,7 +62,7 @@ impl Sensors {
     /// Returns the temperature of all cells at a time, if it is simulated.
     #[must_use]
     pub fn temperature_at(&self, time: Micros) -> Option<f64> {
-        linear(&self.temperature, time.0, |Micros(micros)| micros)
+        interpolate(&self.temperature, time.0, |Micros(micros)| micros)
     }
 }
 
@@ -98,7 +98,7 @@ impl ForceErrors {
 }
 
 /// Checks the table `[sensors]`.
-pub(super) fn sensors(raw: &raw::Sensors, end: EndS) -> Checked<Sensors> {
+pub(super) fn sensors(raw: &raw::Sensors, end: DurationS) -> Checked<Sensors> {
     let at = KeyPath::top_level_key("sensors");
     let temperature = temperature(&at.key("temperature_c"), &raw.temperature_c, end)?;
     let force = raw.force.as_ref().map_or(Ok(ForceErrors::PERFECT), |raw| force(&at.key("force"), raw))?;
@@ -106,11 +106,11 @@ pub(super) fn sensors(raw: &raw::Sensors, end: EndS) -> Checked<Sensors> {
     Ok(Sensors { temperature, force, acceleration })
 }
 
-fn temperature(at: &KeyPath, points: &[[f64; 2]], end: EndS) -> Checked<Vec<(Micros, f64)>> {
+fn temperature(at: &KeyPath, points: &[[f64; 2]], end: DurationS) -> Checked<Vec<(Micros, f64)>> {
     let mut temperature: Vec<(Micros, f64)> = Vec::with_capacity(points.len());
     for (index, &[seconds, degrees]) in points.iter().enumerate() {
         let at = at.element(index);
-        let moment = end.moment_or_end(&at.element(0), seconds)?;
+        let moment = end.time_to_end(&at.element(0), seconds)?;
         if temperature.last().is_some_and(|(last, _)| *last >= moment) {
             return Err(at.element(0).fault(seconds, "times must increase"));
         }

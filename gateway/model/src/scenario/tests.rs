@@ -104,8 +104,8 @@ fn a_good_scenario_is_read() {
     let scenario = good();
     assert_eq!((scenario.duration, scenario.seed), (Span(12_000_000), 7));
     assert!(matches!(scenario.motion.kind, MotionKind::Sine { .. }));
-    assert_eq!(scenario.mode_at(Micros(5_699_999)), Mode::Compare);
-    assert_eq!(scenario.mode_at(Micros(5_700_000)), Mode::Distributed);
+    assert_eq!(scenario.mode_at(Micros(5_699_999)), TorqueSource::Compare);
+    assert_eq!(scenario.mode_at(Micros(5_700_000)), TorqueSource::Distributed);
     assert_eq!(scenario.touches[0].cells, [0, 2]);
     assert_eq!(scenario.touches[1].values.temperature.unwrap()[1].to_f64(), 31.5);
     let [kill, delay] = scenario.faults.as_slice() else { panic!("{:?}", scenario.faults) };
@@ -120,14 +120,14 @@ fn a_good_scenario_is_read() {
 fn most_keys_have_defaults() {
     let scenario = Scenario::parse("s.toml", "version = 1\nduration_s = 2.5\n", &skin()).unwrap();
     assert_eq!(scenario, Scenario::idle(Span(2_500_000)));
-    assert_eq!(scenario.mode_at(Micros(0)), Mode::Compare);
+    assert_eq!(scenario.mode_at(Micros(0)), TorqueSource::Compare);
     let parse = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap();
     assert_eq!(parse(""), Scenario::idle(DEFAULT_DURATION));
     // The shortest file with an effect: a constant force on one cell, until the end.
     let short = parse("[[touch]]\ncells = [1]\nforce_n = 3.0\n");
     let touch = &short.touches[0];
     assert_eq!((short.duration, touch.at, touch.length), (DEFAULT_DURATION, Micros(0), Span(u64::MAX)));
-    assert_eq!((&touch.profile, touch.cells.as_slice()), (&Profile::Step, [0].as_slice()));
+    assert_eq!((&touch.profile, touch.cells.as_slice()), (&ForceProfile::Step, [0].as_slice()));
     let pressed = Touches::new(&short, &skin()).sensors(0, 1_000_000);
     assert_eq!(pressed.contact, contact_words(3.0), "also when the run is longer");
     let later = "[[touch]]\nat_s = 12.5\nfor_s = 1.0\nall = true\nforce_n = 3.0\nprofile = \"ramp\"\n";
@@ -175,7 +175,7 @@ fn every_kind_of_fault_and_motion_is_named_as_it_is_read() {
 fn what_has_no_effect_is_remarked() {
     let skin = three();
     let remarks = |text: &str, skin: &Skin| {
-        Scenario::parse("s.toml", &format!("version = 1\n{text}"), skin).unwrap().remarks(skin)
+        Scenario::parse("s.toml", &format!("version = 1\n{text}"), skin).unwrap().warnings(skin)
     };
     let touch = |force: &str| format!("[[touch]]\nat_s = 0.5\ncells = [1, 2]\nforce_n = {force}\n");
     assert!(remarks(&touch("3.0"), &skin).is_empty());

@@ -5,11 +5,11 @@ use protocol::time::{Micros, Span};
 
 /// The duration of a scenario in s, which limits the times in its file.
 #[derive(Clone, Copy)]
-pub(super) struct EndS(pub(super) f64);
+pub(super) struct DurationS(pub(super) f64);
 
-impl EndS {
+impl DurationS {
     /// Checks that a time in s is from 0 to before the end of the scenario.
-    pub(super) fn moment(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
+    pub(super) fn time_before_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         if (0.0..self.0).contains(&seconds) {
             return Ok(Micros(span_from_seconds(seconds).0));
         }
@@ -17,7 +17,7 @@ impl EndS {
     }
 
     /// Checks that a time in s is from 0 to the end of the scenario, the end included.
-    pub(super) fn moment_or_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
+    pub(super) fn time_to_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         if (0.0..=self.0).contains(&seconds) {
             return Ok(Micros(span_from_seconds(seconds).0));
         }
@@ -31,11 +31,11 @@ impl EndS {
 }
 
 /// The longest duration in s: one year.
-pub(super) const LONGEST_S: f64 = 3.2e7;
+pub(super) const MAX_DURATION_S: f64 = 3.2e7;
 
 /// Checks a duration in s: above 0 and at most [`LONGEST_S`].
-pub(super) fn length(at: &KeyPath, seconds: f64) -> Checked<Span> {
-    if (1e-6..=LONGEST_S).contains(&seconds) {
+pub(super) fn check_duration(at: &KeyPath, seconds: f64) -> Checked<Span> {
+    if (1e-6..=MAX_DURATION_S).contains(&seconds) {
         return Ok(span_from_seconds(seconds));
     }
     Err(at.fault(seconds, "must be above 0, and at most 3.2e7"))

@@ -154,12 +154,12 @@ impl Touches {
         let Some(mut measured) = self.measured.take() else { return };
         self.before.clear();
         if let Some(before) = before {
-            self.measure(&mut measured, before);
+            self.advance_to(&mut measured, before);
             self.before.extend(measured.words());
         } else {
             self.before.resize(self.cells.len(), Readings::default());
         }
-        self.measure(&mut measured, epoch);
+        self.advance_to(&mut measured, epoch);
         let words = self.cells.iter().zip(&self.before).zip(measured.words());
         changed.extend(words.filter_map(|((touched, before), now)| touched.stimulus(before, now)));
         self.measured = Some(measured);
@@ -167,7 +167,7 @@ impl Touches {
 
     /// Computes the readings of imperfect sensors up to an epoch. If that epoch is earlier than the last computed one,
     /// the computation starts again from the first.
-    fn measure(&mut self, measured: &mut ImperfectSensors, epoch: u64) {
+    fn advance_to(&mut self, measured: &mut ImperfectSensors, epoch: u64) {
         if measured.next() > epoch + 1 {
             measured.restart();
         }
@@ -185,12 +185,12 @@ impl Touches {
     fn true_input(&self, touched: &AffectedCell, time: Micros) -> TrueInput {
         let mut there = TrueInput::default();
         for touch in touched.touches.iter().filter_map(|&index| self.touches.get(index)) {
-            let Some(level) = self.level(touch, time) else { continue };
+            let Some(level) = self.force_at(touch, time) else { continue };
             there.force_n += level;
             touch.values.apply(&mut there.readings);
             there.is_warmed |= touch.values.temperature.is_some();
         }
-        for wrong in touched.faults.iter().filter(|wrong| wrong.holds_at(time)) {
+        for wrong in touched.faults.iter().filter(|wrong| wrong.is_active_at(time)) {
             match wrong.fault {
                 SensorFault::Stuck => there.is_stuck = true,
                 SensorFault::Drift { n_per_s } => {
@@ -205,12 +205,12 @@ impl Touches {
         let times = [before.map(|before| self.time_of(before)), Some(self.time_of(epoch))];
         let phases = times.map(|time| time.map(|time| self.phase(time)));
         for (levels, touch) in self.levels.iter_mut().zip(&self.touches) {
-            *levels = phases.map(|phase| phase.and_then(|phase| touch.level(phase)));
+            *levels = phases.map(|phase| phase.and_then(|phase| touch.force_at(phase)));
         }
         let this = &*self;
         this.cells.iter().filter_map(move |touched| {
             let [before, now] = if touched.faults.is_empty() {
-                this.words_of_levels(touched)?
+                this.scratch_words(touched)?
             } else {
                 times.map(|time| time.map_or_else(Readings::default, |time| this.words_at(touched, time)))
             };
@@ -241,7 +241,7 @@ impl Touches {
                 return measured.words().get(cell).copied().unwrap_or_default();
             }
             let (mut this, mut again) = (self.clone(), measured.clone());
-            this.measure(&mut again, epoch);
+            this.advance_to(&mut again, epoch);
             return again.words().get(cell).copied().unwrap_or_default();
         }
         match self.cells.binary_search_by_key(&cell, |touched| touched.cell) {
@@ -274,12 +274,12 @@ impl Touches {
     }
 
     /// Returns the force of a touch in N at a time; `None` if the touch is not active.
-    fn level(&self, touch: &Touch, time: Micros) -> Option<f64> {
-        touch.level(self.phase(time))
+    fn force_at(&self, touch: &Touch, time: Micros) -> Option<f64> {
+        touch.force_at(self.phase(time))
     }
 
     /// Returns the words before and now, from the scratch memory; `None` if no touch of this cell changed.
-    fn words_of_levels(&self, touched: &AffectedCell) -> Option<[Readings; 2]> {
+    fn scratch_words(&self, touched: &AffectedCell) -> Option<[Readings; 2]> {
         let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
         if levels().all(|(_, [before, now])| before == now) {
             return None;
@@ -291,12 +291,12 @@ impl Touches {
 
     /// Returns the words of a cell at a time, with its faults.
     fn words_at(&self, touched: &AffectedCell, time: Micros) -> Readings {
-        let faults = || touched.faults.iter().filter(|wrong| wrong.holds_at(time));
+        let faults = || touched.faults.iter().filter(|wrong| wrong.is_active_at(time));
         // A stuck sensor keeps its value from the start of the fault.
         let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
         let time = stuck.unwrap_or(time);
         let drift = touched.faults.iter().map(|wrong| match wrong.fault {
-            SensorFault::Drift { n_per_s } if wrong.holds_at(time) => {
+            SensorFault::Drift { n_per_s } if wrong.is_active_at(time) => {
                 n_per_s * seconds(time.elapsed_since(wrong.at))
             }
             SensorFault::Drift { .. } | SensorFault::Stuck => 0.0,
@@ -304,7 +304,7 @@ impl Touches {
         let levels = touched
             .touches
             .iter()
-            .filter_map(|&index| Some((index, self.level(self.touches.get(index)?, time))));
+            .filter_map(|&index| Some((index, self.force_at(self.touches.get(index)?, time))));
         self.words(levels, drift.sum())
     }
 
@@ -339,7 +339,7 @@ fn differing(before: &Readings, now: &Readings) -> [bool; SensorPage::SIMULATED.
 }
 
 impl TimedSensorFault {
-    fn holds_at(&self, time: Micros) -> bool {
+    fn is_active_at(&self, time: Micros) -> bool {
         self.at <= time && time.elapsed_since(self.at) < self.length
     }
 }

@@ -17,17 +17,17 @@ pub struct RoundingErrors {
 }
 
 impl RoundingErrors {
-    fn take(&mut self, format: TorqueFormat, torque: f64) {
+    fn add(&mut self, format: TorqueFormat, torque: f64) {
         let word = format.nearest(torque);
         if is_saturated(word) {
             self.beyond += 1;
         } else {
-            self.errors.add(format.real(word) - torque);
+            self.errors.add(format.to_real(word) - torque);
         }
     }
 
     fn with(self, other: Self) -> Self {
-        Self { errors: self.errors.with(other.errors), beyond: self.beyond + other.beyond }
+        Self { errors: self.errors.merged(other.errors), beyond: self.beyond + other.beyond }
     }
 }
 
@@ -76,13 +76,13 @@ impl Accuracy {
             joints.zip(words.as_slice()).zip(both).take(joint)
         {
             for (rounded, format) in self.formats.iter_mut().zip(TorqueFormat::ALL) {
-                rounded.take(format, *quantised);
+                rounded.add(format, *quantised);
             }
             if is_saturated(word) {
                 self.saturated += 1;
                 continue;
             }
-            let torque = format.real(word);
+            let torque = format.to_real(word);
             *error = torque - quantised;
             self.single.add(*error);
             of_cell.add(*error);
@@ -104,7 +104,7 @@ impl Accuracy {
     pub fn with(self, other: Self) -> Self {
         let joint_by_joint = |mut sum: [Errors; MAX_JOINTS], other: [Errors; MAX_JOINTS]| {
             for (sum, other) in sum.iter_mut().zip(other) {
-                *sum = sum.with(other);
+                *sum = sum.merged(other);
             }
             sum
         };
@@ -116,11 +116,11 @@ impl Accuracy {
             formats,
             single_by_joint: joint_by_joint(self.single_by_joint, other.single_by_joint),
             whole_by_joint: joint_by_joint(self.whole_by_joint, other.whole_by_joint),
-            single: self.single.with(other.single),
-            unquantised: self.unquantised.with(other.unquantised),
-            whole: self.whole.with(other.whole),
-            sums: self.sums.with(other.sums),
-            sums_averaged: self.sums_averaged.with(other.sums_averaged),
+            single: self.single.merged(other.single),
+            unquantised: self.unquantised.merged(other.unquantised),
+            whole: self.whole.merged(other.whole),
+            sums: self.sums.merged(other.sums),
+            sums_averaged: self.sums_averaged.merged(other.sums_averaged),
             saturated: self.saturated + other.saturated,
         }
     }
@@ -133,7 +133,7 @@ mod tests {
     #[test]
     fn torques_beyond_the_range_of_a_format_are_counted_apart() {
         let (format, mut rounded) = (TorqueFormat::Q3_12, RoundingErrors::default());
-        [1.0, 1.0 + 0.25 / 4_096.0, 8.0, -9.0].into_iter().for_each(|torque| rounded.take(format, torque));
+        [1.0, 1.0 + 0.25 / 4_096.0, 8.0, -9.0].into_iter().for_each(|torque| rounded.add(format, torque));
         assert_eq!((rounded.errors.count(), rounded.errors.max(), rounded.beyond), (2, 0.25 / 4_096.0, 2));
         assert_eq!(rounded.with(rounded).beyond, 4);
     }

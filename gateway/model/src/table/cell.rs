@@ -10,14 +10,14 @@ use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
 use super::errors::Errors;
-use super::held::{Change, HeldTorque};
+use super::held::{HeldTorque, SumChange};
 use super::replies::{Outstanding, Replies, ReplyExpectation};
 use super::root_totals::RootSums;
 use super::sensed::SensorFrames;
 use super::sent::SentJoints;
-use super::status::Status;
+use super::status::CellStatus;
 use super::switched::{SWITCHES, Switch, SwitchStates};
-use crate::tracker::{CellTracker, Contact, HeartbeatKind, Update, Uplink};
+use crate::tracker::{CellTracker, ContactState, HeartbeatKind, Update, Uplink};
 
 /// The packets that a cell has sent since they were requested.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -30,7 +30,7 @@ pub struct Responded {
 
 /// The halt state of a cell.
 #[derive(Clone, Copy, Debug, Default)]
-struct Halt {
+struct HaltState {
     halted: bool,
     /// True if the bus carried a halt or a resume since the cell's last heartbeat.
     commanded: bool,
@@ -60,13 +60,13 @@ pub struct CellState {
     pub sensed: SensorFrames,
     pub(super) tracked: CellTracker,
     pub(super) said: Responded,
-    contact: Contact<()>,
+    contact: ContactState<()>,
     switched: SwitchStates,
-    halt: Halt,
+    halt: HaltState,
     sent: SentJoints,
     pub(super) outstanding: Outstanding,
     pub(super) answered: Option<u64>,
-    held: HeldTorque,
+    held_torque: HeldTorque,
     pub(super) sums: Option<RootSums>,
 }
 
@@ -90,13 +90,13 @@ impl CellState {
             sensed: SensorFrames::default(),
             tracked: CellTracker::default(),
             said: Responded::default(),
-            contact: Contact::default(),
+            contact: ContactState::default(),
             switched,
-            halt: Halt::default(),
+            halt: HaltState::default(),
             sent: SentJoints::default(),
             outstanding: Outstanding::default(),
             answered: None,
-            held: HeldTorque::default(),
+            held_torque: HeldTorque::default(),
             sums: summed.then(|| RootSums::new(described.root)),
         }
     }
@@ -128,7 +128,7 @@ impl CellState {
     /// Returns true if the cell now sends constant words although the expected words change.
     #[must_use]
     pub fn is_stuck(&self) -> bool {
-        self.outstanding.stuck.is_now()
+        self.outstanding.stuck.is_stuck()
     }
 
     /// Returns true if the cell measures, so that stimuli have no effect on it; `None` before its first heartbeat.
@@ -153,18 +153,23 @@ impl CellState {
 
     /// Records the cell's receive counters. `passed` is the number of joints that were sent while the page was on its
     /// way. Later pages are compared with the first one since a start.
-    pub(super) fn report(&mut self, passed: u64) {
+    pub(super) fn record_counters(&mut self, passed: u64) {
         let heard = self.pages().received;
         self.sent.report(heard, passed);
-        heard.iter().for_each(|heard| self.contact.count(heard.stimuli, ()));
+        heard.iter().for_each(|heard| self.contact.compare_count(heard.stimuli, ()));
     }
 
     /// Applies a heartbeat of the cell. Returns the change of the running sum.
-    pub(super) fn take_heartbeat(&mut self, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
+    pub(super) fn apply_heartbeat(
+        &mut self,
+        update: &Update,
+        heartbeat: &Heartbeat,
+        epoch: Epoch,
+    ) -> SumChange {
         // Ignores heartbeats of a cell that does not own the node id.
         let of_owner =
             |word: &HeartbeatKind| !matches!(word, HeartbeatKind::Claimant | HeartbeatKind::Outsider);
-        let Some(word) = update.word.filter(of_owner) else { return Change::default() };
+        let Some(word) = update.word.filter(of_owner) else { return SumChange::default() };
         let started = matches!(word, HeartbeatKind::Started { .. } | HeartbeatKind::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
         if word != HeartbeatKind::Overtaken {
@@ -196,7 +201,7 @@ impl CellState {
         }
         // A heartbeat does not release a sum, which may hold torques of other cells.
         if self.sums.is_some() || !started && heartbeat.state.has(State::ACTIVE) {
-            return Change::default();
+            return SumChange::default();
         }
         self.release()
     }
@@ -230,11 +235,11 @@ impl CellState {
 
     /// Records a sensors frame of the cell. `is_newest` is true if the cell had the newest joints when it sent the
     /// frame.
-    pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
+    pub(super) fn record_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
         self.sensed.record(at, page, events);
-        self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
+        self.switched.subtracts_baseline |= matches!(page, SensorPage::Baseline(_));
         if self.sensors().is_some() {
-            self.contact.latched().for_each(|(right, _)| self.outstanding.stuck.take_page(page, &right));
+            self.contact.latched().for_each(|(right, _)| self.outstanding.stuck.compare_page(page, &right));
         }
         if is_newest {
             self.contact.apply_reported_page(*page, ());
@@ -276,7 +281,7 @@ impl CellState {
     /// Returns true if the cell's torques follow from stimuli alone: it neither measures nor subtracts a zero.
     fn computes_with_stimuli(&self) -> bool {
         self.tracked.claim().has_state(State::TEST_MODE)
-            && !self.switched.subtracts
+            && !self.switched.subtracts_baseline
             && !self.tracked.account.is_interrupted()
     }
 
@@ -295,25 +300,25 @@ impl CellState {
 
     /// Starts a broadcast for the cell: a reply that did not arrive within three epochs counts as missing, and the held
     /// torque decays. Returns the change of the running sum, and the number of epochs without a new torque.
-    pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (Change, u32) {
+    pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (SumChange, u32) {
         self.sent.count();
         let due = in_contact && self.is_ready();
         let is_known = self.sensors().is_some();
         if let Some(sums) = &mut self.sums {
-            self.outstanding.open_only(due, is_known);
+            self.outstanding.restart_with(due, is_known);
             sums.open();
         } else {
             if self.outstanding.open(due, is_known) {
-                self.replies.miss(1, self.tracked.is_dead());
+                self.replies.count_missing(1, self.tracked.is_dead());
             }
             self.replies.due += u64::from(due);
         }
-        if !self.held.is_some() {
-            return (Change::default(), 0);
+        if !self.held_torque.is_some() {
+            return (SumChange::default(), 0);
         }
         let answered = self.answered.unwrap_or(number);
         let unanswered = u32::try_from(number.saturating_sub(answered + 1)).unwrap_or(u32::MAX);
-        (self.held.decay(unanswered, safety, self.sums.is_some()), unanswered)
+        (self.held_torque.decay(unanswered, safety, self.sums.is_some()), unanswered)
     }
 
     /// Records a repeated broadcast, which the cell receives and drops; no reply is due.
@@ -323,7 +328,7 @@ impl CellState {
 
     /// Returns true if the running sum contains a torque of the cell.
     pub(super) const fn contributes(&self) -> bool {
-        self.held.contributes()
+        self.held_torque.contributes()
     }
 
     /// Returns true if the cell is in contact. If its sensors are unknown, its own report decides.
@@ -333,7 +338,7 @@ impl CellState {
 
     /// Records a torque that answers the broadcast `number`, which is `lag` broadcasts before the newest. `is_zero` is
     /// true for a zero torque, which only ends a contact. Returns whether the torque was due.
-    pub(super) fn answer(&mut self, number: u64, lag: usize, is_zero: bool) -> ReplyExpectation {
+    pub(super) fn record_reply(&mut self, number: u64, lag: usize, is_zero: bool) -> ReplyExpectation {
         self.answered = Some(number);
         let asked = self.outstanding.answer(lag);
         let replies = &mut self.replies;
@@ -349,43 +354,43 @@ impl CellState {
 
     /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next sum. A sum for an older
     /// broadcast than that of the held sum changes nothing. Returns the change of the running sum.
-    pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; MAX_JOINTS]) -> Change {
+    pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; MAX_JOINTS]) -> SumChange {
         if self.answered.is_some_and(|last| number < last) {
-            return Change::default();
+            return SumChange::default();
         }
         self.answered = Some(number);
-        self.held.hold_sum(words, count)
+        self.held_torque.hold_sum(words, count)
     }
 
     /// Returns true if the held torque is older than the broadcast before `number`.
-    pub(super) fn is_behind(&self, number: u64) -> bool {
-        self.held.is_some() && self.answered.is_some_and(|last| last + 1 < number)
+    pub(super) fn is_outdated(&self, number: u64) -> bool {
+        self.held_torque.is_some() && self.answered.is_some_and(|last| last + 1 < number)
     }
 
     /// Returns the number of cells in the held torque.
     pub(super) fn held_cells(&self) -> u32 {
-        self.held.cells()
+        self.held_torque.cells()
     }
 
     /// Holds a torque in steps of Q3.12 until the next one; zeros end a contact. Returns the change of the running sum.
-    pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> Change {
-        self.held.hold(words)
+    pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> SumChange {
+        self.held_torque.hold(words)
     }
 
     /// Releases the held torque. Returns the change of the running sum.
-    pub(super) fn release(&mut self) -> Change {
-        self.held.release()
+    pub(super) fn release(&mut self) -> SumChange {
+        self.held_torque.release()
     }
 
     /// Records a halt on the bus: the cell stops answering. Returns the change of the running sum.
-    pub(super) fn halt(&mut self) -> Change {
-        self.halt = Halt { halted: true, commanded: true };
+    pub(super) fn halt(&mut self) -> SumChange {
+        self.halt = HaltState { halted: true, commanded: true };
         self.release()
     }
 
     /// Records a resume on the bus: the cell answers the next broadcast.
     pub(super) const fn resume(&mut self) {
-        self.halt = Halt { halted: false, commanded: true };
+        self.halt = HaltState { halted: false, commanded: true };
     }
 
     /// Returns two counts of unanswered joints: those that the cell reports as skipped because they were old, and those
@@ -408,7 +413,7 @@ impl CellState {
     }
 
     /// Records a write of a parameter that changes how the cell answers from now on.
-    pub(super) fn write(&mut self, number: u8) {
+    pub(super) fn record_write(&mut self, number: u8) {
         self.doubt_outstanding();
         if number == Parameter::Mode.number() {
             self.contact.write_mode();
@@ -420,7 +425,7 @@ impl CellState {
     fn doubt_outstanding(&mut self) {
         let due = self.outstanding.clear();
         // On a bus with sums, the sum counts a missing contribution.
-        self.replies.miss(if self.sums.is_some() { 0 } else { due }, true);
+        self.replies.count_missing(if self.sums.is_some() { 0 } else { due }, true);
     }
 
     /// Ends the counting: replies still outstanding count as missing.
@@ -428,7 +433,7 @@ impl CellState {
         self.tracked.account.finish();
         if self.sums.is_none() {
             let due = self.outstanding.clear();
-            self.replies.miss(due, self.tracked.is_dead());
+            self.replies.count_missing(due, self.tracked.is_dead());
         }
     }
 
@@ -443,24 +448,26 @@ impl CellState {
             // Its contribution is missing in a sum, and its own held sum decays.
             return;
         }
-        self.replies.miss(due, false);
+        self.replies.count_missing(due, false);
         let unexplained = self.replies.missing.saturating_sub(self.replies.too_late);
         self.replies.in_doubt = in_doubt.unwrap_or(unexplained);
         self.answered = None;
     }
 
-    pub(super) fn status(&self, now: Micros, newest: Option<u64>) -> Status {
+    pub(super) fn status(&self, now: Micros, newest: Option<u64>) -> CellStatus {
         if self.tracked.last_packet().is_none() {
-            return Status::Unknown;
+            return CellStatus::Unknown;
         }
         if self.tracked.is_dead() || self.tracked.is_silent(now) {
-            return Status::Dead;
+            return CellStatus::Dead;
         }
         match (self.answered, newest) {
-            _ if !self.held.is_some() && self.sums.is_some() && self.is_in_contact() => Status::Active,
-            _ if !self.held.is_some() => Status::Quiet,
-            (Some(answered), Some(newest)) if answered + 1 < newest => Status::Stale,
-            _ => Status::Active,
+            _ if !self.held_torque.is_some() && self.sums.is_some() && self.is_in_contact() => {
+                CellStatus::Active
+            }
+            _ if !self.held_torque.is_some() => CellStatus::Quiet,
+            (Some(answered), Some(newest)) if answered + 1 < newest => CellStatus::Stale,
+            _ => CellStatus::Active,
         }
     }
 }
@@ -482,7 +489,7 @@ mod tests {
             let page = NetworkPage::Heartbeat(heartbeat);
             let message = Message::Network { from: Node::Cell(cell.node), epoch: Epoch(0), page };
             let update = cell.tracked.receive(Micros(0), &message, None);
-            cell.take_heartbeat(&update, &heartbeat, Epoch(0));
+            cell.apply_heartbeat(&update, &heartbeat, Epoch(0));
         };
         says(&mut cell, 1, State::CONFIGURED);
         assert!(cell.is_ready());

@@ -32,7 +32,7 @@ pub enum Event {
     /// A frame of another gateway.
     OtherGateway,
     /// A write by another sender of a cell's replies or mode.
-    Switched,
+    OtherWriter,
 }
 
 impl From<PacketError> for Event {
@@ -61,7 +61,7 @@ impl Event {
         Self::Saturated,
         Self::Duplicate,
         Self::OtherGateway,
-        Self::Switched,
+        Self::OtherWriter,
     ];
 
     /// Returns the name of the event in tables and summaries.
@@ -80,7 +80,7 @@ impl Event {
             Self::Saturated => "saturated",
             Self::Duplicate => "duplicate number",
             Self::OtherGateway => "second gateway",
-            Self::Switched => "switched by others",
+            Self::OtherWriter => "switched by others",
         }
     }
 }
@@ -100,7 +100,7 @@ pub struct Counters {
 }
 
 impl Counters {
-    pub(super) fn frame(&mut self, kind: Kind, own: bool) {
+    pub(super) fn count_frame(&mut self, kind: Kind, own: bool) {
         let counters = if own { &mut self.sent } else { &mut self.received };
         if let Some(counter) = counters.get_mut(kind as usize) {
             *counter += 1;
@@ -113,7 +113,7 @@ impl Counters {
         }
     }
 
-    pub(super) const fn epoch(&mut self, due: bool, complete: bool) {
+    pub(super) const fn count_epoch(&mut self, due: bool, complete: bool) {
         self.epochs += 1;
         self.epochs_due += due as u64;
         self.epochs_complete += (due && complete) as u64;
@@ -147,11 +147,11 @@ mod tests {
         let mut counters = Counters::default();
         [(false, false), (true, false), (true, true), (false, true)]
             .into_iter()
-            .for_each(|(due, complete)| counters.epoch(due, complete));
+            .for_each(|(due, complete)| counters.count_epoch(due, complete));
         assert_eq!((counters.epochs, counters.epochs_due, counters.epochs_complete), (4, 2, 1));
-        counters.frame(Kind::Torque, false);
-        counters.frame(Kind::Torque, false);
-        counters.frame(Kind::Command, true);
+        counters.count_frame(Kind::Torque, false);
+        counters.count_frame(Kind::Torque, false);
+        counters.count_frame(Kind::Command, true);
         let of = |kind| (counters.received(kind), counters.sent(kind));
         assert_eq!([Kind::Torque, Kind::Command].map(of), [(2, 0), (0, 1)]);
     }

@@ -10,51 +10,51 @@ use crate::quantiles::histogram;
 pub struct Delays {
     last_reply: Histogram<u64>,
     reply: Histogram<u64>,
-    not_taken: Histogram<u64>,
+    joints_pending: Histogram<u64>,
 }
 
 impl Default for Delays {
     fn default() -> Self {
-        Self { last_reply: histogram(), reply: histogram(), not_taken: histogram() }
+        Self { last_reply: histogram(), reply: histogram(), joints_pending: histogram() }
     }
 }
 
 // Recording cannot fail: the histograms resize themselves.
 impl Delays {
-    pub(super) fn last_reply(&mut self, span: Span) {
+    pub(super) fn record_last_reply(&mut self, span: Span) {
         let _ = self.last_reply.record(span.0);
     }
 
-    pub(super) fn reply(&mut self, span: Span) {
+    pub(super) fn record_reply(&mut self, span: Span) {
         let _ = self.reply.record(span.0);
     }
 
     pub(super) fn record_pending_joints(&mut self, span: Span) {
-        let _ = self.not_taken.record(span.0);
+        let _ = self.joints_pending.record(span.0);
     }
 
     pub(super) fn reset(&mut self) {
-        for histogram in [&mut self.last_reply, &mut self.reply, &mut self.not_taken] {
+        for histogram in [&mut self.last_reply, &mut self.reply, &mut self.joints_pending] {
             histogram.reset();
         }
     }
 
     /// Returns the delays in µs from a broadcast to its last reply in time, one for each epoch with a reply.
     #[must_use]
-    pub const fn of_last_replies(&self) -> &Histogram<u64> {
+    pub const fn last_replies(&self) -> &Histogram<u64> {
         &self.last_reply
     }
 
     /// Returns the delays in µs from a broadcast to each reply, late replies included; empty on a bus with sums.
     #[must_use]
-    pub const fn of_replies(&self) -> &Histogram<u64> {
+    pub const fn replies(&self) -> &Histogram<u64> {
         &self.reply
     }
 
     /// Returns for each heartbeat the age in µs of the oldest joints on the bus that the cell had not received when it
     /// sent the heartbeat; 0 if it had received all.
     #[must_use]
-    pub const fn of_joints_not_taken(&self) -> &Histogram<u64> {
-        &self.not_taken
+    pub const fn pending_joints(&self) -> &Histogram<u64> {
+        &self.joints_pending
     }
 }

@@ -9,11 +9,11 @@ use protocol::time::{Micros, Span};
 use super::Table;
 use super::cell::CellState;
 use super::replies::Expected as Reply;
-use super::root_totals::Expected;
+use super::root_totals::ExpectedSum;
 use crate::tracker::MAX_LATE_EPOCHS;
 
 /// Looks up the positions in rad or m from which a broadcast's words were rounded.
-pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; MAX_JOINTS]> + 'a;
+pub type PositionLookup<'a> = dyn FnMut(Epoch) -> Option<[f64; MAX_JOINTS]> + 'a;
 
 /// The newest broadcast, which the cells are answering.
 #[derive(Clone, Copy, Debug)]
@@ -95,12 +95,12 @@ impl Table {
         }
         self.close_epoch();
         self.release_decayed(epoch);
-        let frames = self.comparing.then(|| {
+        let frames = self.is_comparing.then(|| {
             let q = q.unwrap_or_else(|| self.central.positions(&joints.positions));
-            (self.central.frames(&joints.positions), self.unquantised.frames_at(&q))
+            (self.central.frames(&joints.positions), self.unquantised.frames_at_positions(&q))
         });
         let (mut due, mut stale, mut age, mut known) = (0, 0, 0, true);
-        let mut whole = frames.as_ref().map(|_| Expected { constant: true, ..Expected::default() });
+        let mut whole = frames.as_ref().map(|_| ExpectedSum { constant: true, ..ExpectedSum::default() });
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let skin = cell.latch(epoch);
@@ -147,15 +147,15 @@ impl Table {
     pub(super) fn close_epoch(&mut self) {
         let Some(before) = self.broadcast else { return };
         if let Some(last) = before.last_reply {
-            self.delays.last_reply(last.elapsed_since(before.at));
+            self.delays.record_last_reply(last.elapsed_since(before.at));
         }
         if let Some(root_totals) = &mut self.root_totals {
             let (due, complete) = root_totals.close();
-            return self.counters.epoch(due, complete);
+            return self.counters.count_epoch(due, complete);
         }
-        self.counters.epoch(before.due > 0, before.in_time == before.due);
+        self.counters.count_epoch(before.due > 0, before.in_time == before.due);
         let is_complete = before.due > 0 && before.in_time == before.due;
-        let is_compared = self.comparing && is_complete && before.is_whole;
+        let is_compared = self.is_comparing && is_complete && before.is_whole;
         self.difference = is_compared.then_some(before.error);
         if is_compared {
             self.accuracy.whole_skin(before.error.get(..self.carried.joints).unwrap_or_default());

@@ -57,7 +57,7 @@ impl Errors {
 
     /// Merges two sets of errors.
     #[must_use]
-    pub fn with(self, other: Self) -> Self {
+    pub fn merged(self, other: Self) -> Self {
         Self { sum: self.sum + other.sum, max: self.max.max(other.max), count: self.count + other.count }
     }
 }
@@ -72,6 +72,6 @@ mod tests {
         assert_eq!(errors.mean(), None);
         [0.5, -1.0, 3.0].into_iter().for_each(|error| errors.add(error));
         assert_eq!((errors.mean(), errors.max(), errors.count()), (Some(1.5), 3.0, 3));
-        assert_eq!((errors.with(errors).mean(), errors.with(errors).count()), (Some(1.5), 6));
+        assert_eq!((errors.merged(errors).mean(), errors.merged(errors).count()), (Some(1.5), 6));
     }
 }

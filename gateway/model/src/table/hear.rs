@@ -8,15 +8,15 @@ use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use super::cell::CellState;
-use super::held::Change;
+use super::held::SumChange;
 use super::replies::ReplyExpectation;
 use super::root_totals::{RootTotals, Sum, SumUse};
-use super::{Event, Notice, Positions, Table};
+use super::{Event, Notice, PositionLookup, Table};
 use crate::packets::{NoPacket, Pending, Received};
 use crate::tracker::{HeartbeatKind, Update};
 
 /// Parameters whose write changes at once how a cell answers.
-const SWITCHED: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
+const REPLY_PARAMETERS: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
 impl Table {
     /// Reassembles and decodes a frame of this bus, for [`receive`](Self::receive) and other consumers.
@@ -26,7 +26,7 @@ impl Table {
 
     /// Handles a frame that was on the bus at `at`; `own` is true if this gateway sent it. For a broadcast of this
     /// gateway, `positions` returns the positions in rad or m from which its words were rounded, if they are known.
-    pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut Positions<'_>) {
+    pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut PositionLookup<'_>) {
         let (packet, pending) = self.packets.packet(at, frame);
         match packet {
             Ok(packet) => {
@@ -38,7 +38,13 @@ impl Table {
     }
 
     /// Does [`handle_frame`](Self::handle_frame) for a frame that has been [`read`](Self::read).
-    pub fn receive(&mut self, at: Micros, own: bool, received: &Received<'_>, positions: &mut Positions<'_>) {
+    pub fn receive(
+        &mut self,
+        at: Micros,
+        own: bool,
+        received: &Received<'_>,
+        positions: &mut PositionLookup<'_>,
+    ) {
         match &received.packet {
             Ok((packet, message)) => {
                 self.receive_packet(at, own, packet.id, message.as_ref().ok(), positions);
@@ -54,9 +60,9 @@ impl Table {
         own: bool,
         id: Id,
         message: Option<&Message>,
-        positions: &mut Positions<'_>,
+        positions: &mut PositionLookup<'_>,
     ) {
-        self.counters.frame(id.kind, own);
+        self.counters.count_frame(id.kind, own);
         match message {
             Some(message) if own => self.receive_own(at, message, positions),
             Some(message) => self.receive_foreign(at, id, message),
@@ -80,13 +86,13 @@ impl Table {
         if !own && !self.is_used(id) {
             return self.counters.count(Event::Foreign);
         }
-        self.counters.frame(id.kind, own);
+        self.counters.count_frame(id.kind, own);
         self.reject(id, own, event);
     }
 
     /// Returns true if the skin describes a sender with this identifier on this bus.
     fn is_used(&self, id: Id) -> bool {
-        let is_cell = |cell: CellId| self.place(cell).is_some();
+        let is_cell = |cell: CellId| self.index_of(cell).is_some();
         match (id.kind, Node::from_byte(id.node)) {
             (Kind::Command, _) => Command::from_byte(id.node).is_some(),
             (Kind::Network, Node::Gateway) | (Kind::Configure | Kind::Stimulus, Node::Everyone) => true,
@@ -104,14 +110,14 @@ impl Table {
     }
 
     /// Handles a frame of this gateway, read back from the bus.
-    pub(super) fn receive_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
+    pub(super) fn receive_own(&mut self, at: Micros, message: &Message, positions: &mut PositionLookup<'_>) {
         if let Message::Joints { epoch, joints } = *message {
             self.open_epoch(at, epoch, &joints, positions(epoch));
         } else if let Message::Stimulus { to, from, page } = *message {
-            self.stimulate(to, from, page);
+            self.record_stimulus(to, from, page);
         } else if let Message::Configure { to, request: Request::Write { number, .. }, .. } = *message {
             if number == Parameter::Mode.number() {
-                self.write(to, number);
+                self.record_write(to, number);
             }
         } else if *message == Message::Halt {
             self.each_cell(CellState::halt);
@@ -129,7 +135,7 @@ impl Table {
             Message::Joints { .. } => {
                 self.counters.count(Event::OtherGateway);
                 // A gateway sends joints continuously; a single frame may come from any sender.
-                if self.outsiders.joints_at(at) {
+                if self.outsiders.record_joints(at) {
                     self.snapshot.sums.other_gateways += 1;
                     self.notices.push_back(Notice::OtherGateway);
                 }
@@ -143,12 +149,12 @@ impl Table {
                 self.snapshot.sums.resumes += 1;
                 self.cells.iter_mut().for_each(CellState::resume);
             }
-            Message::Stimulus { to, from, page } => self.stimulate(to, from, page),
+            Message::Stimulus { to, from, page } => self.record_stimulus(to, from, page),
             Message::Configure { to, request: Request::Write { number, .. }, .. }
-                if SWITCHED.iter().any(|parameter| parameter.number() == number) =>
+                if REPLY_PARAMETERS.iter().any(|parameter| parameter.number() == number) =>
             {
-                self.counters.count(Event::Switched);
-                self.write(to, number);
+                self.counters.count(Event::OtherWriter);
+                self.record_write(to, number);
             }
             Message::Sync | Message::Report | Message::Configure { .. } => {}
             Message::Sum { .. }
@@ -159,15 +165,18 @@ impl Table {
         }
     }
 
-    fn stimulate(&mut self, to: Node, from: AppliesFrom, page: SensorPage) {
+    fn record_stimulus(&mut self, to: Node, from: AppliesFrom, page: SensorPage) {
         let last = self.broadcast.map(|broadcast| broadcast.epoch);
         for cell in self.cells.iter_mut().filter(|cell| to.addresses(cell.node)) {
             cell.stimulate(from, page, last);
         }
     }
 
-    fn write(&mut self, to: Node, number: u8) {
-        self.cells.iter_mut().filter(|cell| to.addresses(cell.node)).for_each(|cell| cell.write(number));
+    fn record_write(&mut self, to: Node, number: u8) {
+        self.cells
+            .iter_mut()
+            .filter(|cell| to.addresses(cell.node))
+            .for_each(|cell| cell.record_write(number));
     }
 
     fn receive_from_cell(&mut self, at: Micros, id: Id, message: &Message) {
@@ -185,7 +194,7 @@ impl Table {
         let update = cell.tracked.receive(at, message, self.broadcast.map(|broadcast| broadcast.number));
         if update.revived {
             self.snapshot.sums.dead -= 1;
-            self.notices.push_back(Notice::Back(cell.node));
+            self.notices.push_back(Notice::Revived(cell.node));
         }
         let is_answer = if let Message::Network { page, .. } = message {
             page.is_only_reported()
@@ -197,26 +206,28 @@ impl Table {
         }
         if let Message::Network { epoch, page, .. } = *message {
             if let NetworkPage::Heartbeat(heartbeat) = page {
-                self.take_heartbeat(at, place, &update, &heartbeat, epoch);
+                self.receive_heartbeat(at, place, &update, &heartbeat, epoch);
             } else if let NetworkPage::Received(_) = page {
                 cell.sensed.answer_report();
-                cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.broadcasts_since(epoch)));
+                cell.record_counters(
+                    self.broadcast.as_ref().map_or(0, |newest| newest.broadcasts_since(epoch)),
+                );
             } else if let NetworkPage::Rejected(_) = page {
                 cell.said.counters = true;
             }
         } else if let Message::Sensors { epoch, page, .. } = *message {
             let is_newest = self.broadcast.as_ref().is_none_or(|broadcast| broadcast.epoch == epoch);
-            cell.take_sensors(at, &page, is_newest, &self.events);
+            cell.record_sensors(at, &page, is_newest, &self.events);
         } else if let Message::Configured { answer, .. } = *message {
             cell.receive_answer(&answer);
         } else if let Message::Torque { epoch, torque, .. } = *message {
-            self.take_torque(at, place, epoch, &torque);
+            self.receive_torque(at, place, epoch, &torque);
         } else if let Message::Sum { epoch, count, torque, .. } = *message {
-            self.take_sum(at, place, epoch, Sum { count, words: torque.padded().map(i32::from) });
+            self.receive_sum(at, place, epoch, Sum { count, words: torque.padded().map(i32::from) });
         }
     }
 
-    fn take_heartbeat(
+    fn receive_heartbeat(
         &mut self,
         at: Micros,
         place: usize,
@@ -225,7 +236,7 @@ impl Table {
         epoch: Epoch,
     ) {
         let Some(cell) = self.cells.get_mut(place) else { return };
-        let takes_joints = update.word == Some(HeartbeatKind::Known)
+        let takes_joints = update.word == Some(HeartbeatKind::Continued)
             && !heartbeat.state.has(State::CLAIMING)
             && !heartbeat.state.has(State::HALTED);
         if takes_joints && let Some(broadcast) = &self.broadcast {
@@ -241,11 +252,11 @@ impl Table {
         if update.returned {
             self.notices.push_back(Notice::Returned(cell.node));
         }
-        let change = cell.take_heartbeat(update, heartbeat, epoch);
+        let change = cell.apply_heartbeat(update, heartbeat, epoch);
         self.apply(change);
     }
 
-    fn take_torque(&mut self, at: Micros, place: usize, epoch: Epoch, torque: &Words) {
+    fn receive_torque(&mut self, at: Micros, place: usize, epoch: Epoch, torque: &Words) {
         if self.root_totals.is_some() {
             return self.counters.count(Event::UnknownNode);
         }
@@ -270,8 +281,8 @@ impl Table {
         }
         let format = self.carried.torque_format;
         let is_zero = torque.as_slice().iter().all(|&word| word == 0);
-        let asked = cell.answer(number, lag, is_zero);
-        self.delays.reply(at.elapsed_since(broadcast.broadcast_time(lag)));
+        let asked = cell.record_reply(number, lag, is_zero);
+        self.delays.record_reply(at.elapsed_since(broadcast.broadcast_time(lag)));
         if lag == 0 {
             broadcast.last_reply = Some(at);
             broadcast.in_time += u32::from(asked == ReplyExpectation::Due);
@@ -283,7 +294,7 @@ impl Table {
                 self.accuracy.compare(cell.joint, format, torque, &expected, &mut cell.outstanding.errors);
             cell.outstanding
                 .stuck
-                .take_torque(torque.padded(), expected.quantised.map(|torque| format.nearest(torque)));
+                .compare_torque(torque.padded(), expected.quantised.map(|torque| format.nearest(torque)));
             if lag == 0 {
                 for (sum, error) in broadcast.error.iter_mut().zip(error) {
                     *sum += error;
@@ -294,7 +305,7 @@ impl Table {
         self.apply(change);
     }
 
-    fn take_sum(&mut self, at: Micros, place: usize, epoch: Epoch, sum: Sum) {
+    fn receive_sum(&mut self, at: Micros, place: usize, epoch: Epoch, sum: Sum) {
         let (Some(root_totals), Some(cell)) = (&mut self.root_totals, self.cells.get_mut(place)) else {
             return self.counters.count(Event::UnknownNode);
         };
@@ -311,7 +322,7 @@ impl Table {
             root_totals.counts.stale += 1;
             return;
         };
-        if root_totals.take(lag, best, sum) == SumUse::Resent {
+        if root_totals.record_sum(lag, best, sum) == SumUse::Resent {
             return;
         }
         if lag == 0 {
@@ -331,7 +342,9 @@ impl Table {
     fn release_moved(&mut self, number: u64) {
         let Some(due) = self.root_totals.as_ref().and_then(RootTotals::due) else { return };
         if self.snapshot.sums.contributing > due {
-            self.each_cell(|cell| if cell.is_behind(number) { cell.release() } else { Change::default() });
+            self.each_cell(
+                |cell| if cell.is_outdated(number) { cell.release() } else { SumChange::default() },
+            );
         }
     }
 }

@@ -6,7 +6,7 @@ use protocol::skin::Safety;
 
 /// A change of the running sum: steps by joint, and cells.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(super) struct Change {
+pub(super) struct SumChange {
     pub(super) torque: [i32; MAX_JOINTS],
     pub(super) contributing: i32,
 }
@@ -25,28 +25,28 @@ pub(super) struct HeldTorque {
 impl HeldTorque {
     /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact. Returns the change of the running
     /// sum.
-    pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> Change {
+    pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> SumChange {
         self.torque = (words != [0; MAX_JOINTS]).then_some((words, 1));
         self.contribute(words, u8::from(self.torque.is_some()))
     }
 
     /// Holds a sum of `count` cells; a sum of zero cells ends all contacts. Returns the change of the running sum.
-    pub(super) fn hold_sum(&mut self, words: [i32; MAX_JOINTS], count: u8) -> Change {
+    pub(super) fn hold_sum(&mut self, words: [i32; MAX_JOINTS], count: u8) -> SumChange {
         // Even with cells in contact, all words may round to 0.
         self.torque = (count > 0).then_some((words, count));
         self.contribute(words, count)
     }
 
     /// Releases the torque. Returns the change of the running sum.
-    pub(super) fn release(&mut self) -> Change {
+    pub(super) fn release(&mut self) -> SumChange {
         self.torque = None;
         self.contribute([0; MAX_JOINTS], 0)
     }
 
     /// Keeps the torque or lets it decay, after this number of unanswered epochs. Returns the change of the running
     /// sum.
-    pub(super) fn decay(&mut self, unanswered: u32, safety: &Safety, is_sum: bool) -> Change {
-        let Some((held, cells)) = self.torque else { return Change::default() };
+    pub(super) fn decay(&mut self, unanswered: u32, safety: &Safety, is_sum: bool) -> SumChange {
+        let Some((held, cells)) = self.torque else { return SumChange::default() };
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(unanswered);
         if left == 0 && unanswered > 0 {
             // The contribution has decayed to zero, although the cell has not reported the end of its contact.
@@ -60,14 +60,14 @@ impl HeldTorque {
         self.contribute(rest, if counts { cells } else { 0 })
     }
 
-    fn contribute(&mut self, words: [i32; MAX_JOINTS], cells: u8) -> Change {
+    fn contribute(&mut self, words: [i32; MAX_JOINTS], cells: u8) -> SumChange {
         let counted = core::mem::replace(&mut self.contributing, cells);
         let before = core::mem::replace(&mut self.contribution, words);
         let mut torque = words;
         for (torque, before) in torque.iter_mut().zip(before) {
             *torque -= before;
         }
-        Change { torque, contributing: i32::from(cells) - i32::from(counted) }
+        SumChange { torque, contributing: i32::from(cells) - i32::from(counted) }
     }
 
     /// Returns the number of cells in the held torque; 0 if nothing is held.

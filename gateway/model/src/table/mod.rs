@@ -41,7 +41,7 @@ use crate::network::check::ObservedCell;
 use crate::packets::PacketReader;
 
 use epoch::Broadcast;
-use held::{Change, to_nm};
+use held::{SumChange, to_nm};
 use outsiders::Outsiders;
 use root_totals::RootTotals;
 use switched::SwitchStates;
@@ -51,12 +51,12 @@ pub use accuracy::{Accuracy, RoundingErrors};
 pub use cell::{CellState, Responded};
 pub use counters::{Counters, Event};
 pub use delays::Delays;
-pub use epoch::Positions;
+pub use epoch::PositionLookup;
 pub use errors::Errors;
 pub use replies::Replies;
 pub use root_totals::{Contributions, SumCounts};
 pub use sensed::SensorFrames;
-pub use status::Status;
+pub use status::CellStatus;
 pub use switched::{SWITCHES, Switch};
 
 /// The totals of a bus that a tick of the control loop needs. Their size does not depend on the number of cells.
@@ -107,7 +107,7 @@ pub enum Notice {
     /// A cell is silent.
     Dead(CellId),
     /// A dead cell sends again.
-    Back(CellId),
+    Revived(CellId),
     /// A cell restarted. It is not in contact until its stimuli are sent again.
     Restarted(CellId),
     /// A cell reports another cell with its node id.
@@ -126,7 +126,7 @@ pub struct Table {
     events: Events,
     central: Central,
     unquantised: Central,
-    comparing: bool,
+    is_comparing: bool,
     cells: Vec<CellState>,
     /// For each node id, the index of the cell in `cells`.
     places: [Option<usize>; CellId::COUNT],
@@ -183,10 +183,10 @@ impl Table {
             events: skin.events,
             central: Central::new(&part),
             unquantised: Central::unquantised(&part),
-            comparing: false,
+            is_comparing: false,
             cells,
             places,
-            packets: PacketReader::of_skin(skin, bus),
+            packets: PacketReader::for_bus(skin, bus),
             broadcast: None,
             root_totals: summed.then(RootTotals::default),
             outsiders: Outsiders::default(),
@@ -203,8 +203,8 @@ impl Table {
 
     /// Declares that the gateway receives only the sums of roots. The sums that other cells send then cannot be
     /// counted.
-    pub fn hear_sums_of_roots_only(&mut self) {
-        self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.tracked.account.without_sums());
+    pub fn receive_root_sums_only(&mut self) {
+        self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.tracked.account.exclude_sums());
     }
 
     /// Sets whether a root sends its sums to the gateway. If it does not, the sum of another root contains them, and
@@ -221,7 +221,7 @@ impl Table {
 
     /// Starts or stops the comparison of distributed torques with central ones, from the next epoch on.
     pub const fn set_comparing(&mut self, comparing: bool) {
-        self.comparing = comparing;
+        self.is_comparing = comparing;
     }
 
     /// Returns the newest data for a tick.
@@ -244,7 +244,7 @@ impl Table {
 
     /// Returns the index of a cell in [`cells`](Self::cells); `None` if the skin does not have it on this bus.
     #[must_use]
-    pub fn place(&self, cell: CellId) -> Option<usize> {
+    pub fn index_of(&self, cell: CellId) -> Option<usize> {
         self.places.get(cell.index()).copied().flatten()
     }
 
@@ -260,7 +260,7 @@ impl Table {
         let Some(root_totals) = &self.root_totals else { return self.accuracy };
         let error = &root_totals.error;
         Accuracy {
-            sums: error.each,
+            sums: error.single,
             sums_averaged: error.averaged,
             saturated: error.saturated,
             ..self.accuracy
@@ -311,7 +311,7 @@ impl Table {
     }
 
     fn cell_mut(&mut self, cell: CellId) -> Option<&mut CellState> {
-        let place = self.place(cell)?;
+        let place = self.index_of(cell)?;
         self.cells.get_mut(place)
     }
 
@@ -333,7 +333,7 @@ impl Table {
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
-            if cell.tracked.falls_silent(now) {
+            if cell.tracked.handle_timeout(now) {
                 self.snapshot.sums.dead += 1;
                 self.notices.push_back(Notice::Dead(cell.node));
                 let change = cell.release();
@@ -354,7 +354,7 @@ impl Table {
         }
     }
 
-    fn each_cell(&mut self, change: impl Fn(&mut CellState) -> Change) {
+    fn each_cell(&mut self, change: impl Fn(&mut CellState) -> SumChange) {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let change = change(cell);
@@ -363,7 +363,7 @@ impl Table {
     }
 
     /// Adds the change of a cell's contribution to the running sum.
-    fn apply(&mut self, change: Change) {
+    fn apply(&mut self, change: SumChange) {
         for ((sum, torque), difference) in
             self.sum.iter_mut().zip(&mut self.snapshot.sums.torque).zip(change.torque)
         {
@@ -376,13 +376,13 @@ impl Table {
 
     /// Returns the cells of the network for a comparison with the description: the skin's cells in its order, then the
     /// cells that the skin does not have.
-    pub fn network(&self, now: Micros) -> impl Iterator<Item = ObservedCell> {
+    pub fn observed_cells(&self, now: Micros) -> impl Iterator<Item = ObservedCell> {
         let described = self.statuses(now).map(|(cell, status)| ObservedCell {
             node: cell.node,
             serial: Some(cell.serial),
             configuration: cell.configuration,
             heartbeat: cell.heartbeat(),
-            alive: !matches!(status, Status::Dead | Status::Unknown),
+            alive: !matches!(status, CellStatus::Dead | CellStatus::Unknown),
             tree: cell.pages().tree,
             ports: cell.pages().ports,
         });
@@ -400,7 +400,7 @@ impl Table {
 
     /// Returns the number, the epoch and the time of the newest joints, which the cells are answering.
     #[must_use]
-    pub fn newest(&self) -> Option<(u64, Epoch, Micros)> {
+    pub fn newest_joints(&self) -> Option<(u64, Epoch, Micros)> {
         self.broadcast.as_ref().map(Broadcast::joints)
     }
 
@@ -408,12 +408,12 @@ impl Table {
     /// status at `now`.
     ///
     /// These words are for display. For comparisons, use [`Snapshot::sensors`], which has only words that are certain.
-    pub fn sensors(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
+    pub fn presumed_sensors(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, CellStatus)> {
         self.statuses(now).map(|(cell, status)| (cell.presumed_sensors(), status))
     }
 
     /// Returns each cell with its status at `now`.
-    pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&CellState, Status)> {
+    pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&CellState, CellStatus)> {
         let newest = self.broadcast.map(|broadcast| broadcast.number);
         self.cells.iter().map(move |cell| (cell, cell.status(now, newest)))
     }

@@ -22,7 +22,7 @@ pub(super) struct Outsiders {
 
 impl Outsiders {
     /// Records joints from another sender. Returns true if these joints prove another gateway.
-    pub(super) fn joints_at(&mut self, at: Micros) -> bool {
+    pub(super) fn record_joints(&mut self, at: Micros) -> bool {
         self.joints.rotate_right(1);
         if let Some(newest) = self.joints.first_mut() {
             *newest = Some(at);
@@ -39,7 +39,7 @@ mod tests {
     fn four_joints_within_a_second_are_of_a_gateway() {
         let of = |every_ms: u64| {
             let mut outsiders = Outsiders::default();
-            (0..5).map(|at| outsiders.joints_at(Micros(at * every_ms * 1_000))).collect::<Vec<_>>()
+            (0..5).map(|at| outsiders.record_joints(Micros(at * every_ms * 1_000))).collect::<Vec<_>>()
         };
         assert_eq!(of(333), [false, false, false, true, true]);
         assert_eq!(of(334), [false; 5]);

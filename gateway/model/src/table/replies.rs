@@ -40,7 +40,7 @@ impl Replies {
         all.sum()
     }
 
-    pub(super) fn miss(&mut self, count: u32, is_in_doubt: bool) {
+    pub(super) fn count_missing(&mut self, count: u32, is_in_doubt: bool) {
         self.missing += u64::from(count);
         self.in_doubt += if is_in_doubt { u64::from(count) } else { 0 };
     }
@@ -96,7 +96,7 @@ impl Outstanding {
     }
 
     /// Starts a broadcast, and drops all earlier outstanding replies.
-    pub(super) fn open_only(&mut self, due: bool, is_known: bool) {
+    pub(super) fn restart_with(&mut self, due: bool, is_known: bool) {
         (self.due, self.known) = (u8::from(due), u8::from(is_known));
     }
 

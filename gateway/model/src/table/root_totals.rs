@@ -100,12 +100,12 @@ struct OpenEpoch {
     /// The sum of all roots for each joint, in steps of Q7.8.
     sum: [i32; MAX_JOINTS],
     saturated: bool,
-    expected: Option<Expected>,
+    expected: Option<ExpectedSum>,
 }
 
 /// The sum that is expected by the central computation, in Nm.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Expected {
+pub(super) struct ExpectedSum {
     /// The torque of the whole bus, for each joint.
     pub(super) torque: [f64; MAX_JOINTS],
     /// Number of joints, counted from the base, that some cell in the sum loads.
@@ -114,7 +114,7 @@ pub(super) struct Expected {
     pub(super) constant: bool,
 }
 
-impl Expected {
+impl ExpectedSum {
     /// Adds the torque of a cell that sits on the joint `joint`.
     pub(super) fn add(&mut self, torque: [f64; MAX_JOINTS], joint: usize) {
         for (sum, torque) in self.torque.iter_mut().zip(torque) {
@@ -127,7 +127,7 @@ impl Expected {
 /// Errors of sums over consecutive epochs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct SumError {
-    pub(super) each: Errors,
+    pub(super) single: Errors,
     pub(super) averaged: Errors,
     /// Number of words that were skipped because they were saturated.
     pub(super) saturated: u64,
@@ -140,7 +140,7 @@ pub(super) struct SumError {
 
 impl SumError {
     /// Compares the sum of a complete epoch, in steps of Q7.8, with the expected one.
-    pub(super) fn take(&mut self, words: &[i32; MAX_JOINTS], saturated: bool, expected: &Expected) {
+    pub(super) fn compare(&mut self, words: &[i32; MAX_JOINTS], saturated: bool, expected: &ExpectedSum) {
         if !expected.constant {
             self.interrupt();
         }
@@ -152,7 +152,7 @@ impl SumError {
         let compared = errors.iter_mut().zip(words).zip(expected.torque).zip(&mut self.sum);
         for (((error, &word), torque), sum) in compared.take(expected.joints) {
             *error = f64::from(word) / 256.0 - torque;
-            self.each.add(*error);
+            self.single.add(*error);
             *sum += *error;
         }
         self.last = Some(errors);
@@ -194,7 +194,7 @@ pub(super) enum SumUse {
 impl RootTotals {
     /// Records a root's sum for the epoch `lag` before the newest; `best` is the root's sum with the most cells for
     /// that epoch so far.
-    pub(super) fn take(&mut self, lag: usize, best: &mut Option<Sum>, sum: Sum) -> SumUse {
+    pub(super) fn record_sum(&mut self, lag: usize, best: &mut Option<Sum>, sum: Sum) -> SumUse {
         let before = *best;
         match before {
             Some(_) => self.counts.resent += 1,
@@ -222,7 +222,7 @@ impl RootTotals {
 
     /// Starts an epoch in whose sum `due` cells should be. If `known`, no other cells can be in it. Ends the counting
     /// of the oldest epoch.
-    pub(super) fn open(&mut self, due: u32, known: bool, expected: Option<Expected>) {
+    pub(super) fn open(&mut self, due: u32, known: bool, expected: Option<ExpectedSum>) {
         self.epochs.rotate_right(1);
         if let Some(oldest) = self.epochs.first_mut() {
             let settled = oldest.replace(OpenEpoch {
@@ -250,7 +250,7 @@ impl RootTotals {
             && open.received_cells == open.due
             && let Some(expected) = &open.expected
         {
-            self.error.take(&open.sum, open.saturated, expected);
+            self.error.compare(&open.sum, open.saturated, expected);
         } else {
             self.error.interrupt();
         }

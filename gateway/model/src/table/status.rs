@@ -2,7 +2,7 @@
 
 /// The status of a cell.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
-pub enum Status {
+pub enum CellStatus {
     /// No packet has arrived from the cell yet.
     Unknown,
     /// The cell is alive and not in contact.
@@ -15,7 +15,7 @@ pub enum Status {
     Dead,
 }
 
-impl Status {
+impl CellStatus {
     /// Returns the name of the status in tables and summaries.
     #[must_use]
     pub const fn name(self) -> &'static str {

@@ -38,60 +38,60 @@ pub(super) struct StuckDetector {
 struct WordRun {
     sent: Option<[i16; MAX_JOINTS]>,
     /// Number of words in a row that are equal to `sent`.
-    equal: u64,
+    run_length: u64,
     /// The expected words after their last counted change.
-    right: [i16; MAX_JOINTS],
+    expected: [i16; MAX_JOINTS],
     changes: u32,
     /// The longest run of equal words for which the cell counted as stuck.
-    longest: u64,
+    longest_run: u64,
 }
 
 impl WordRun {
-    fn take(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
+    fn compare(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
         if self.sent.replace(sent) != Some(sent) {
-            (self.equal, self.right, self.changes) = (1, right, 0);
+            (self.run_length, self.expected, self.changes) = (1, right, 0);
             return;
         }
-        self.equal += 1;
-        let mut both = self.right.iter().zip(&right);
+        self.run_length += 1;
+        let mut both = self.expected.iter().zip(&right);
         if both.any(|(before, now)| before.abs_diff(*now) >= MIN_CHANGE_STEPS) {
-            self.right = right;
+            self.expected = right;
             self.changes += 1;
         }
         if self.is_stuck() {
-            self.longest = self.longest.max(self.equal);
+            self.longest_run = self.longest_run.max(self.run_length);
         }
     }
 
     const fn is_stuck(&self) -> bool {
-        self.equal >= STUCK_RUN && self.changes >= MIN_EXPECTED_CHANGES
+        self.run_length >= STUCK_RUN && self.changes >= MIN_EXPECTED_CHANGES
     }
 }
 
 impl StuckDetector {
     /// Compares a torque that was due with the central torque `right`.
-    pub(super) fn take_torque(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
-        self.torque.take(sent, right);
+    pub(super) fn compare_torque(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
+        self.torque.compare(sent, right);
     }
 
     /// Compares a sensors page of the cell with the page `right` that stimuli set. Pages of different kinds are not
     /// compared.
-    pub(super) fn take_page(&mut self, sent: &SensorPage, right: &SensorPage) {
+    pub(super) fn compare_page(&mut self, sent: &SensorPage, right: &SensorPage) {
         let page = sent.simulated().filter(|page| right.simulated() == Some(*page));
         if let Some(words) = page.and_then(|page| self.pages.get_mut(page)) {
-            words.take(padded(&sent.words()), padded(&right.words()));
+            words.compare(padded(&sent.words()), padded(&right.words()));
         }
     }
 
     /// Returns true if the cell counts as stuck now.
-    pub(super) fn is_now(&self) -> bool {
+    pub(super) fn is_stuck(&self) -> bool {
         self.torque.is_stuck() || self.pages.iter().any(WordRun::is_stuck)
     }
 
     /// Returns the kinds of words that were stuck, each with its longest run in words.
     pub(super) fn longest(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        let pages = SensorPage::SIMULATED.into_iter().zip(self.pages.map(|words| words.longest));
-        let all = [(TORQUE, self.torque.longest)].into_iter().chain(pages);
+        let pages = SensorPage::SIMULATED.into_iter().zip(self.pages.map(|words| words.longest_run));
+        let all = [(TORQUE, self.torque.longest_run)].into_iter().chain(pages);
         all.filter(|(_, longest)| *longest > 0)
     }
 }
@@ -108,8 +108,8 @@ mod tests {
     /// Returns the longest run of stuck words, for pairs of sent and expected words.
     fn longest(words: impl Iterator<Item = (i16, i16)>) -> u64 {
         let mut all = WordRun::default();
-        words.for_each(|(sent, right)| all.take(padded(&[0, sent]), padded(&[0, right])));
-        all.longest
+        words.for_each(|(sent, right)| all.compare(padded(&[0, sent]), padded(&[0, right])));
+        all.longest_run
     }
 
     #[test]
@@ -134,10 +134,10 @@ mod tests {
     #[test]
     fn words_that_change_again_end_it_and_it_is_remembered() {
         let mut stuck = StuckDetector::default();
-        (0..40).for_each(|n| stuck.take_torque(padded(&[9]), padded(&[n * MANY])));
-        assert!(stuck.is_now());
-        stuck.take_torque(padded(&[10]), padded(&[10]));
-        assert!(!stuck.is_now());
+        (0..40).for_each(|n| stuck.compare_torque(padded(&[9]), padded(&[n * MANY])));
+        assert!(stuck.is_stuck());
+        stuck.compare_torque(padded(&[10]), padded(&[10]));
+        assert!(!stuck.is_stuck());
         assert_eq!(stuck.longest().collect::<Vec<_>>(), [("torque", 40)]);
     }
 
@@ -151,9 +151,9 @@ mod tests {
         };
         let mut stuck = StuckDetector::default();
         for n in 0..40 {
-            stuck.take_page(&skin(0), &acceleration(n * MANY));
-            stuck.take_page(&acceleration(n), &acceleration(n));
-            stuck.take_page(&skin(64), &skin(n * MANY));
+            stuck.compare_page(&skin(0), &acceleration(n * MANY));
+            stuck.compare_page(&acceleration(n), &acceleration(n));
+            stuck.compare_page(&skin(64), &skin(n * MANY));
         }
         assert_eq!(stuck.longest().collect::<Vec<_>>(), [("skin", 40)]);
     }

@@ -19,7 +19,7 @@ pub(super) struct SwitchStates {
     target: [Switch; SWITCHES],
     confirmed: [bool; SWITCHES],
     /// True if the cell has a baseline, so that it subtracts a zero from its force sensor.
-    pub(super) subtracts: bool,
+    pub(super) subtracts_baseline: bool,
 }
 
 impl SwitchStates {
@@ -30,7 +30,7 @@ impl SwitchStates {
             (Parameter::Sensing.number(), sensing.words()),
             (Parameter::Baseline.number(), baseline.words()),
         ];
-        let mut switched = Self { target, confirmed: [false; SWITCHES], subtracts: false };
+        let mut switched = Self { target, confirmed: [false; SWITCHES], subtracts_baseline: false };
         switched.restart();
         switched
     }
@@ -41,7 +41,7 @@ impl SwitchStates {
         for ((confirmed, (_, target)), start) in self.confirmed.iter_mut().zip(self.target).zip(start) {
             *confirmed = target == start;
         }
-        self.subtracts = false;
+        self.subtracts_baseline = false;
     }
 
     /// Records the answer to a write. A refused write is not repeated.
@@ -49,11 +49,11 @@ impl SwitchStates {
         let (of, words) = match *answer {
             Answer::Value { number, written: true, words } => (number, Some(words)),
             // A cell without the option can only have zeros.
-            Answer::Refused { number, reason: Answer::UNKNOWN | Answer::INVALID } => (number, None),
+            Answer::Refused { number, reason: Answer::UNKNOWN_PARAMETER | Answer::INVALID } => (number, None),
             Answer::Value { .. } | Answer::Refused { .. } => return,
         };
         if let (Some(words), true) = (words, of == Parameter::Baseline.number()) {
-            self.subtracts = words != Baseline::Off.words();
+            self.subtracts_baseline = words != Baseline::Off.words();
         }
         for ((number, target), confirmed) in self.target.iter_mut().zip(&mut self.confirmed) {
             if *number == of {
@@ -96,7 +96,7 @@ mod tests {
         assert_eq!(lacks(&switched), [8, MODE], "it was only read");
         switched.record_answer(&Answer::Value { number, written: true, words });
         assert_eq!(lacks(&switched), [8]);
-        switched.record_answer(&Answer::Refused { number: 8, reason: Answer::UNKNOWN });
+        switched.record_answer(&Answer::Refused { number: 8, reason: Answer::UNKNOWN_PARAMETER });
         assert_eq!(lacks(&switched), [0_u8; 0], "an unknown parameter");
         switched.restart();
         assert_eq!(lacks(&switched), [8, MODE]);
@@ -113,11 +113,11 @@ mod tests {
         };
         let mut switched = SwitchStates::new(Events::default(), Sensing::Off, Baseline::On(rule));
         let (number, words) = switched.unconfirmed()[2].unwrap();
-        assert!(!switched.subtracts);
+        assert!(!switched.subtracts_baseline);
         switched.record_answer(&Answer::Value { number, written: true, words });
-        assert!(switched.subtracts && lacks(&switched).is_empty());
+        assert!(switched.subtracts_baseline && lacks(&switched).is_empty());
         switched.restart();
-        assert!(!switched.subtracts && lacks(&switched) == [11]);
+        assert!(!switched.subtracts_baseline && lacks(&switched) == [11]);
     }
 
     #[test]

@@ -243,7 +243,7 @@ fn heartbeats_say_for_how_long_joints_were_not_taken() {
         for frame in message.encode().frames(Format::Fd) {
             table.handle_frame(Micros(at_ms * 1_000), own, &frame, &mut |_| None);
         }
-        let delays = table.delays().of_joints_not_taken();
+        let delays = table.delays().pending_joints();
         // A histogram has three significant digits.
         (delays.len(), delays.max() / 1_000)
     };
@@ -277,9 +277,9 @@ fn a_cell_is_active_stale_or_quiet_by_the_torque_that_is_held() {
         Message::Joints { epoch: Epoch(epoch), joints }
     };
     let torque = |epoch, word| Message::Torque { from: cell, epoch: Epoch(epoch), torque: [word; 6].into() };
-    assert_eq!(hear(joints(1)), Status::Unknown);
+    assert_eq!(hear(joints(1)), CellStatus::Unknown);
     let said = [torque(1, 100), joints(2), joints(3), torque(3, 100)];
-    let [active, stale, quiet] = [Status::Active, Status::Stale, Status::Quiet];
+    let [active, stale, quiet] = [CellStatus::Active, CellStatus::Stale, CellStatus::Quiet];
     assert_eq!(said.map(&mut hear), [active, active, stale, active]);
     let said = [joints(4), torque(4, 0), joints(5), joints(6)];
     assert_eq!(said.map(&mut hear), [active, quiet, quiet, quiet]);

@@ -183,7 +183,7 @@ fn a_restarted_root_keeps_its_childrens_torque() {
     let last =
         (1..=1 + all.hold_epochs + all.decay_epochs).map(|epoch| bench.joints(u8::try_from(epoch).unwrap()));
     assert_eq!(first(&last.last().unwrap()), (0.0, 0), "yet it decays");
-    assert_eq!(first(&bench.sum(1, bench.table.newest().unwrap().1.0, 1, 9)), (9.0, 1));
+    assert_eq!(first(&bench.sum(1, bench.table.newest_joints().unwrap().1.0, 1, 9)), (9.0, 1));
     // The sum of a silent root is released at once.
     bench.table.handle_time(Micros(bench.at) + DEAD_AFTER + Span(1));
     assert_eq!(first(&bench.table.snapshot().sums), (0.0, 0));
@@ -291,7 +291,7 @@ fn sums_that_may_contain_a_cell_of_unknown_contact_are_not_compared() {
 #[test]
 fn packets_that_the_gateway_does_not_receive_are_counted_by_their_sender() {
     let mut bench = Bench::new(&[]);
-    bench.table.hear_sums_of_roots_only();
+    bench.table.receive_root_sums_only();
     let tree = |sent| NetworkPage::Tree(Tree { sent, ..Tree::default() });
     let page = |bench: &mut Bench, sent| {
         let from = Node::Cell(cell(3));
@@ -320,7 +320,7 @@ fn the_network_is_of_all_cells_that_are_described_or_heard() {
         let of = |seen: ObservedCell| {
             (seen.node, seen.serial.is_some(), seen.heartbeat.is_some(), seen.alive, seen.tree)
         };
-        bench.table.network(at).map(of).collect::<Vec<_>>()
+        bench.table.observed_cells(at).map(of).collect::<Vec<_>>()
     };
     let expected = |alive| {
         let described = |node| (cell(node), true, true, alive, Some(tree).filter(|_| node == 3));

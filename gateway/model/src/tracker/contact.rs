@@ -19,8 +19,8 @@ pub const MAX_PENDING_STIMULI: usize = 8;
 /// The contact state of one cell, from its stimuli and its own pages. The caller attaches a `T` to each stimulus, such
 /// as its time or its frames.
 #[derive(Clone, Debug)]
-pub struct Contact<T> {
-    waiting: Vec<(AppliesFrom, SensorPage, T)>,
+pub struct ContactState<T> {
+    pending: Vec<(AppliesFrom, SensorPage, T)>,
     skin: Option<(SkinSensors, T)>,
     /// The other pages, by [`SensorPage::simulated`].
     others: [Option<(SensorPage, T)>; SensorPage::SIMULATED.len()],
@@ -31,9 +31,9 @@ pub struct Contact<T> {
     /// Number of stimuli that arrived here; `None` once their effect on the cell is uncertain.
     received_stimuli: Option<u16>,
     /// True if the cell has counted more stimuli than arrived here.
-    is_short: bool,
+    has_missed_stimuli: bool,
     /// True if the mode was written and the cell has not confirmed the write.
-    clears: bool,
+    mode_pending: bool,
 }
 
 /// Stimuli from before the reader started that may be pending in the cell.
@@ -48,47 +48,47 @@ enum UnseenStimuli {
 }
 
 /// Half of the 256 epochs: a stimulus is pending for at most this many.
-const HALF: u8 = 1 << 7;
+const HALF_OF_EPOCHS: u8 = 1 << 7;
 
 impl UnseenStimuli {
     /// Removes the stimuli that the joints of an epoch latch: for this epoch, and for the half of all epochs before it.
     fn latch(&mut self, epoch: Epoch) {
         *self = match *self {
             Self::None => Self::None,
-            Self::Any => Self::Ahead { last: epoch, ahead: HALF },
+            Self::Any => Self::Ahead { last: epoch, ahead: HALF_OF_EPOCHS },
             Self::Ahead { last, ahead } => {
                 match u8::try_from(i32::from(ahead) - i32::from(epoch.epochs_since(last))).unwrap_or(0) {
                     0 => Self::None,
-                    ahead => Self::Ahead { last: epoch, ahead: ahead.min(HALF) },
+                    ahead => Self::Ahead { last: epoch, ahead: ahead.min(HALF_OF_EPOCHS) },
                 }
             }
         };
     }
 }
 
-impl<T> Default for Contact<T> {
+impl<T> Default for ContactState<T> {
     fn default() -> Self {
         Self {
-            waiting: Vec::new(),
+            pending: Vec::new(),
             skin: None,
             others: [const { None }; SensorPage::SIMULATED.len()],
             obeys: None,
             is_known: false,
             unseen: UnseenStimuli::Any,
             received_stimuli: Some(0),
-            is_short: false,
-            clears: false,
+            has_missed_stimuli: false,
+            mode_pending: false,
         }
     }
 }
 
-impl<T> Contact<T> {
+impl<T> ContactState<T> {
     /// Adds a stimulus to the pending ones, unless the cell measures or has too many pending; `last` is the epoch of
     /// the last joints.
     pub fn push(&mut self, from: AppliesFrom, page: SensorPage, tag: T, last: Option<Epoch>) {
         self.received_stimuli = self.received_stimuli.map(|came| came.wrapping_add(1));
-        if self.obeys != Some(false) && self.waiting.len() < MAX_PENDING_STIMULI {
-            self.waiting.push((if is_late(from, last) { AppliesFrom::Next } else { from }, page, tag));
+        if self.obeys != Some(false) && self.pending.len() < MAX_PENDING_STIMULI {
+            self.pending.push((if is_late(from, last) { AppliesFrom::Next } else { from }, page, tag));
         }
     }
 
@@ -96,12 +96,12 @@ impl<T> Contact<T> {
     /// the same page, the newest counts.
     pub fn latch(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
         self.unseen.latch(epoch);
-        self.is_short &= self.unseen != UnseenStimuli::None;
+        self.has_missed_stimuli &= self.unseen != UnseenStimuli::None;
         let is_due = move |(from, _, _): &mut (AppliesFrom, SensorPage, T)| match from {
             AppliesFrom::Next => true,
             AppliesFrom::Epoch(first) => epoch.epochs_since(*first) >= 0,
         };
-        for (_, page, mut tag) in self.waiting.extract_if(.., is_due) {
+        for (_, page, mut tag) in self.pending.extract_if(.., is_due) {
             latched(&mut tag);
             if let SensorPage::Skin(skin) = page {
                 self.skin = Some((skin, tag));
@@ -119,7 +119,7 @@ impl<T> Contact<T> {
         if let SensorPage::Skin(skin) = page {
             if !self.is_known && self.unseen == UnseenStimuli::None {
                 (self.skin, self.is_known) = (Some((skin, tag)), true);
-            } else if !self.is_short {
+            } else if !self.has_missed_stimuli {
                 self.skin.get_or_insert((skin, tag));
             }
         } else if let Some(other) = other(&mut self.others, &page) {
@@ -129,38 +129,39 @@ impl<T> Contact<T> {
 
     /// Compares the number of stimuli that the cell has counted since its start with those received here. If they are
     /// equal, there are no others.
-    pub fn count(&mut self, stimuli: u16, tag: T) {
+    pub fn compare_count(&mut self, stimuli: u16, tag: T) {
         if self.received_stimuli == Some(stimuli) {
-            self.settle(tag);
+            self.mark_known(tag);
         } else if self.received_stimuli.is_some() {
-            self.is_short = self.unseen != UnseenStimuli::None;
+            self.has_missed_stimuli = self.unseen != UnseenStimuli::None;
         }
     }
 
     /// Records a start of the cell: it is not in contact, and has no pending stimulus.
     pub fn start(&mut self, tag: T) {
         self.reset();
-        self.settle(tag);
+        self.mark_known(tag);
     }
 
     /// Records a write of the mode. Once the cell has received it, the cell has no contact state and no pending
     /// stimuli.
     pub fn write_mode(&mut self) {
         self.reset();
-        self.clears = true;
+        self.mode_pending = true;
     }
 
     /// Records that the cell confirmed the write of its mode: all stimuli since then were received here.
     pub fn confirm_mode(&mut self, tag: T) {
-        if self.clears {
-            self.settle(tag);
+        if self.mode_pending {
+            self.mark_known(tag);
         }
     }
 
     /// Marks the state as known: all stimuli that matter were received here.
-    fn settle(&mut self, tag: T) {
+    fn mark_known(&mut self, tag: T) {
         self.skin.get_or_insert_with(|| (SkinSensors::default(), tag));
-        (self.is_known, self.unseen, self.is_short, self.clears) = (true, UnseenStimuli::None, false, false);
+        (self.is_known, self.unseen, self.has_missed_stimuli, self.mode_pending) =
+            (true, UnseenStimuli::None, false, false);
     }
 
     /// Returns the skin sensors of the cell if they are certain.
@@ -192,16 +193,16 @@ impl<T> Contact<T> {
 
     /// Returns the pending stimuli in order, each with the joints at which the cell latches it.
     #[must_use]
-    pub fn waiting(&self) -> &[(AppliesFrom, SensorPage, T)] {
-        &self.waiting
+    pub fn pending(&self) -> &[(AppliesFrom, SensorPage, T)] {
+        &self.pending
     }
 
     /// Forgets the contact state and the pending stimuli: stimuli may have been lost, or sent by others.
     pub fn reset(&mut self) {
-        self.waiting.clear();
+        self.pending.clear();
         (self.skin, self.others) = (None, [const { None }; SensorPage::SIMULATED.len()]);
         (self.is_known, self.unseen, self.received_stimuli) = (false, UnseenStimuli::Any, None);
-        (self.is_short, self.clears) = (false, false);
+        (self.has_missed_stimuli, self.mode_pending) = (false, false);
     }
 
     /// Marks the contact state as unknown until the next stimulus; stimuli stay pending in the cell.
@@ -247,14 +248,14 @@ mod tests {
         SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() })
     }
 
-    fn latch(contact: &mut Contact<u64>, epoch: u8) -> Option<(f64, u64)> {
+    fn latch(contact: &mut ContactState<u64>, epoch: u8) -> Option<(f64, u64)> {
         contact.latch(Epoch(epoch), |_| {});
         contact.skin().map(|(skin, tag)| (skin.contact[0].to_f64(), *tag))
     }
 
     #[test]
     fn stimuli_wait_for_their_epoch_and_late_ones_for_the_next() {
-        let mut contact = Contact::default();
+        let mut contact = ContactState::default();
         assert_eq!(latch(&mut contact, 253), None, "not known");
         contact.push(AppliesFrom::Epoch(Epoch(1)), press(2.0), 5, Some(Epoch(253)));
         contact.push(AppliesFrom::Epoch(Epoch(253)), press(1.0), 6, Some(Epoch(253)));
@@ -267,19 +268,19 @@ mod tests {
 
     #[test]
     fn the_ninth_waiting_stimulus_is_refused_whatever_its_page() {
-        let mut contact = Contact::default();
+        let mut contact = ContactState::default();
         for _ in 0..MAX_PENDING_STIMULI {
             contact.push(AppliesFrom::Next, SensorPage::Acceleration([Q3_12::ZERO; 3]), 0, None);
         }
         contact.push(AppliesFrom::Next, press(1.0), 0, None);
-        assert_eq!(contact.waiting().len(), MAX_PENDING_STIMULI);
+        assert_eq!(contact.pending().len(), MAX_PENDING_STIMULI);
         assert_eq!(latch(&mut contact, 0), None);
         assert_eq!(contact.latched().count(), 1);
     }
 
     #[test]
     fn the_cells_own_page_counts_only_while_nothing_else_is_known() {
-        let mut contact = Contact::default();
+        let mut contact = ContactState::default();
         contact.apply_reported_page(press(3.0), 1);
         assert_eq!(latch(&mut contact, 0), Some((3.0, 1)));
         contact.push(AppliesFrom::Next, press(1.0), 2, None);
@@ -288,22 +289,22 @@ mod tests {
         assert_eq!(latch(&mut contact, 2), Some((1.0, 2)), "an old page");
     }
 
-    fn known(contact: &Contact<u64>) -> Option<f64> {
+    fn known(contact: &ContactState<u64>) -> Option<f64> {
         contact.known().map(|(skin, _)| skin.contact[0].to_f64())
     }
 
     #[test]
     fn a_contact_is_known_from_a_start_a_confirmed_mode_or_equal_counts_on() {
-        let mut contact = Contact::default();
+        let mut contact = ContactState::default();
         contact.apply_reported_page(press(3.0), 1);
         contact.push(AppliesFrom::Next, press(1.0), 1, None);
         assert_eq!((latch(&mut contact, 1), known(&contact)), (Some((1.0, 1)), None), "others may wait");
-        contact.count(2, 1);
+        contact.compare_count(2, 1);
         assert_eq!(known(&contact), None, "it has taken one that did not come here");
-        contact.count(1, 1);
+        contact.compare_count(1, 1);
         assert_eq!(known(&contact), Some(1.0));
         contact.reset();
-        contact.count(1, 1);
+        contact.compare_count(1, 1);
         assert_eq!(known(&contact), None, "the count is of stimuli that are forgotten");
         contact.start(1);
         assert_eq!(known(&contact), Some(0.0));
@@ -327,7 +328,7 @@ mod tests {
     #[test]
     fn no_stimulus_from_before_waits_when_a_page_is_believed_whatever_epochs_come() {
         for steps in [&[1_u8][..], &[127], &[3, 1, 255, 1], &[200, 100], &[1, 1, 100], &[254, 7]] {
-            let mut contact = Contact::<u64>::default();
+            let mut contact = ContactState::<u64>::default();
             let mut waiting: Vec<u8> = (0..=255).collect();
             let (mut epoch, mut joints) = (77_u8, 0);
             while contact.unseen != UnseenStimuli::None {
@@ -352,8 +353,8 @@ mod tests {
 
     #[test]
     fn a_page_of_a_cell_that_counted_other_stimuli_tells_nothing() {
-        let mut contact = Contact::default();
-        contact.count(1, 1);
+        let mut contact = ContactState::default();
+        contact.compare_count(1, 1);
         contact.apply_reported_page(press(0.0), 1);
         assert_eq!(latch(&mut contact, 1), None, "the other one may wait");
         contact.push(AppliesFrom::Next, press(1.0), 2, None);
@@ -362,7 +363,7 @@ mod tests {
 
     #[test]
     fn a_cell_that_measures_takes_no_stimuli() {
-        let mut contact = Contact::default();
+        let mut contact = ContactState::default();
         assert_eq!(contact.obeys(), None);
         contact.set_obeys(false);
         assert_eq!(contact.obeys(), Some(false));

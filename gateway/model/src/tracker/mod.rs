@@ -21,9 +21,9 @@ use protocol::message::{Message, NetworkPage, NetworkPages};
 use protocol::time::{Micros, Span};
 
 pub use claim::{AddressClaim, HeartbeatKind};
-pub use contact::{Contact, MAX_PENDING_STIMULI, is_late};
+pub use contact::{ContactState, MAX_PENDING_STIMULI, is_late};
 pub use per_cell::PerCell;
-pub use uplink::{Account, Uplink};
+pub use uplink::{Uplink, UplinkAccount};
 
 /// The time of silence after which a cell counts as dead: two periods of its heartbeat plus the jitter of a busy
 /// machine, so that one lost frame is tolerated.
@@ -49,7 +49,7 @@ pub struct Update {
 #[derive(Clone, Debug, Default)]
 pub struct CellTracker {
     /// Counts of packets that the cell sent and that arrived.
-    pub account: Account,
+    pub account: UplinkAccount,
     claim: AddressClaim,
     pages: NetworkPages,
     last_packet: Option<Micros>,
@@ -61,7 +61,7 @@ impl CellTracker {
     pub fn receive(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> Update {
         let is_first = self.last_packet.replace(at).is_none();
         let revived = core::mem::take(&mut self.dead);
-        self.account.arrive();
+        self.account.count_packet();
         let Message::Network { page, .. } = message else { return Update { revived, ..Update::default() } };
         let NetworkPage::Heartbeat(heartbeat) = page else {
             self.pages.record(page);
@@ -80,7 +80,7 @@ impl CellTracker {
         }
         let mut taken_back = false;
         match word {
-            HeartbeatKind::Known => self.account.settle(heartbeat.sent),
+            HeartbeatKind::Continued => self.account.settle(heartbeat.sent),
             HeartbeatKind::First => self.account.begin(heartbeat.sent, false),
             HeartbeatKind::Shared => {
                 taken_back = self.account.take_back(heartbeat.sent);
@@ -91,14 +91,14 @@ impl CellTracker {
                 self.account.begin(heartbeat.sent, again);
                 self.pages = NetworkPages::default();
             }
-            HeartbeatKind::Overtaken => self.account.pass_over(),
+            HeartbeatKind::Overtaken => self.account.count_overtaken(),
             HeartbeatKind::Claimant | HeartbeatKind::Outsider => self.account.count_outsider(),
         }
         self.account.heartbeat_at(joints);
         let returned = away
             && matches!(
                 word,
-                HeartbeatKind::First | HeartbeatKind::Known | HeartbeatKind::Started { again: false }
+                HeartbeatKind::First | HeartbeatKind::Continued | HeartbeatKind::Started { again: false }
             );
         Update { word: Some(word), revived, returned, taken_back }
     }
@@ -122,7 +122,7 @@ impl CellTracker {
     }
 
     /// Handles the timeout of a silent cell. Returns true if the cell counts as dead from this call on.
-    pub fn falls_silent(&mut self, now: Micros) -> bool {
+    pub fn handle_timeout(&mut self, now: Micros) -> bool {
         let silent = self.is_silent(now);
         let falls = silent && !self.dead;
         self.dead |= silent;

@@ -25,7 +25,7 @@ impl<T> PerCell<T> {
     }
 
     /// Returns the values of the cells that an addressee stands for: one cell, or all.
-    pub fn named(&mut self, to: Node) -> &mut [T] {
+    pub fn addressed_mut(&mut self, to: Node) -> &mut [T] {
         let places = match to {
             Node::Gateway => 0..0,
             Node::Cell(cell) => cell.index()..cell.index() + 1,
@@ -53,9 +53,9 @@ mod tests {
     fn addressees_name_one_all_or_none() {
         let mut numbers = PerCell::<u8>::default();
         let five = CellId::new(5).unwrap();
-        numbers.named(Node::Cell(five)).iter_mut().for_each(|number| *number += 1);
-        numbers.named(Node::Everyone).iter_mut().for_each(|number| *number += 1);
-        assert!(numbers.named(Node::Gateway).is_empty());
+        numbers.addressed_mut(Node::Cell(five)).iter_mut().for_each(|number| *number += 1);
+        numbers.addressed_mut(Node::Everyone).iter_mut().for_each(|number| *number += 1);
+        assert!(numbers.addressed_mut(Node::Gateway).is_empty());
         let twice: Vec<_> =
             numbers.iter().filter(|(_, number)| **number == 2).map(|(cell, _)| cell).collect();
         assert_eq!((twice, numbers.iter().count()), (vec![five], CellId::COUNT));

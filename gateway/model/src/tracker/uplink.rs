@@ -36,7 +36,7 @@ pub struct Uplink {
 /// A heartbeat contains the number of packets that the cell sent before it. A bus keeps the order of each sender, so
 /// packets that are missing by then are lost.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Account {
+pub struct UplinkAccount {
     now: Counts,
     /// The counts before the cell's last start; [`Account::take_back`] restores them.
     before: Option<Counts>,
@@ -71,7 +71,7 @@ struct UnreceivedSums {
     heartbeat_at: Option<u64>,
 }
 
-impl Account {
+impl UplinkAccount {
     /// Returns the counts so far.
     #[must_use]
     pub const fn uplink(&self) -> Uplink {
@@ -90,7 +90,7 @@ impl Account {
     }
 
     /// Counts a packet that arrived.
-    pub(super) fn arrive(&mut self) {
+    pub(super) fn count_packet(&mut self) {
         self.each(|counts| counts.arrived += 1);
     }
 
@@ -103,7 +103,7 @@ impl Account {
     }
 
     /// Declares that the gateway does not receive this cell's sums.
-    pub fn without_sums(&mut self) {
+    pub fn exclude_sums(&mut self) {
         self.each(|counts| _ = counts.sums.get_or_insert_default());
     }
 
@@ -142,7 +142,7 @@ impl Account {
     }
 
     /// Records a heartbeat that is older than the last one, since the cell's last start.
-    pub(super) fn pass_over(&mut self) {
+    pub(super) fn count_overtaken(&mut self) {
         self.before.iter_mut().for_each(Counts::count_outsider);
     }
 
@@ -249,20 +249,20 @@ mod tests {
 
     #[test]
     fn packets_that_did_not_arrive_by_the_next_heartbeat_are_lost() {
-        let mut account = Account::default();
-        account.arrive();
+        let mut account = UplinkAccount::default();
+        account.count_packet();
         account.begin(65_534, false);
-        account.arrive();
+        account.count_packet();
         account.reject();
-        account.arrive();
+        account.count_packet();
         account.count_outsider();
-        account.arrive(); // the heartbeat itself
+        account.count_packet(); // the heartbeat itself
         account.settle(3); // four were sent in between, and this one
         let uplink = account.uplink();
         assert_eq!((uplink.sent, uplink.delivered, uplink.rejected, uplink.lost), (6, 4, 1, 2));
         assert_eq!(uplink.surplus, 1, "the claim of another cell");
-        account.arrive(); // a last packet
-        account.arrive(); // the claim after its restart
+        account.count_packet(); // a last packet
+        account.count_packet(); // the claim after its restart
         account.begin(0, true);
         let uplink = account.uplink();
         assert_eq!((uplink.sent, uplink.lost, uplink.in_doubt), (7, 2, 1));
@@ -271,38 +271,38 @@ mod tests {
 
     #[test]
     fn packets_lost_in_an_outage_are_counted_as_such() {
-        let mut account = Account::default();
+        let mut account = UplinkAccount::default();
         account.begin(0, false);
         account.interrupt();
-        account.arrive();
+        account.count_packet();
         account.settle(5);
         let lost =
-            |account: &Account| (account.uplink().sent, account.uplink().lost, account.uplink().outage);
+            |account: &UplinkAccount| (account.uplink().sent, account.uplink().lost, account.uplink().outage);
         assert_eq!(lost(&account), (6, 4, 4));
-        account.arrive();
+        account.count_packet();
         account.settle(8);
         assert_eq!(lost(&account), (9, 6, 4), "the bus is back");
         account.interrupt();
-        account.arrive();
+        account.count_packet();
         account.begin(0, true);
-        account.arrive();
+        account.count_packet();
         account.settle(2);
         assert_eq!(lost(&account), (12, 7, 4), "a restart begins a new account");
     }
 
     #[test]
     fn a_start_that_was_none_is_taken_back_with_all_that_came_since() {
-        let mut account = Account::default();
-        account.arrive();
+        let mut account = UplinkAccount::default();
+        account.count_packet();
         account.begin(900, false);
-        account.arrive(); // a torque
-        account.arrive();
+        account.count_packet(); // a torque
+        account.count_packet();
         account.begin(100, true); // an old heartbeat again
-        account.arrive(); // a torque
-        account.arrive();
+        account.count_packet(); // a torque
+        account.count_packet();
         account.settle(104); // another old one
         assert_eq!(account.uplink().restarts, 1);
-        account.arrive();
+        account.count_packet();
         account.take_back(904); // the cell's own: it sent three torques before it
         let uplink = account.uplink();
         assert_eq!((uplink.restarts, uplink.in_doubt, uplink.unsettled), (0, 0, 0));
@@ -313,12 +313,12 @@ mod tests {
     proptest! {
         #[test]
         fn an_account_always_adds_up(said in proptest::collection::vec((any::<u16>(), 0_u64..9, 0_u64..9, 0_u8..3, any::<Option<(u16, Option<u64>)>>()), 0..20), takes_sums: bool) {
-            let mut account = Account::default();
-            if !takes_sums { account.without_sums(); }
+            let mut account = UplinkAccount::default();
+            if !takes_sums { account.exclude_sums(); }
             for (said, arrived, rejected, what, sums) in said {
-                for _ in 0..arrived { account.arrive(); }
+                for _ in 0..arrived { account.count_packet(); }
                 for _ in 0..rejected { account.reject(); }
-                account.arrive();
+                account.count_packet();
                 match what {
                     0 => account.begin(said, true),
                     1 => account.settle(said),

@@ -7,10 +7,10 @@ use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table, num
 /// The limits for the verdicts: the time to start in s, the gateway's memory in MB, and the time of a tick with the
 /// most cells. The latter is relative to a tick with the fewest cells, on their own buses and on as many as the most
 /// cells need.
-const START_S: f64 = 10.0;
-const MEMORY_MB: f64 = 200.0;
-const TICK: f64 = 4.0;
-const TICK_ON_AS_MANY: f64 = 1.2;
+const MAX_START_S: f64 = 10.0;
+const MAX_MEMORY_MB: f64 = 200.0;
+const MAX_TICK_RATIO: f64 = 4.0;
+const MAX_TICK_RATIO_SAME_BUSES: f64 = 1.2;
 
 /// Writes the section with figures, findings and a table.
 #[must_use]
@@ -103,7 +103,7 @@ fn of_benches(sizes: &[SizeFigures]) -> [Figure; 7] {
         ),
         drawn(
             ("replies", "Replies in time, 5 % active, at the highest rate that holds"),
-            Axis::new("replies in time", "%").between(0.0, 100.0),
+            Axis::new("replies in time", "%").with_ends(0.0, 100.0),
             sizes,
             [("", |size| size.active.share() * 100.0)],
         ),
@@ -134,14 +134,14 @@ fn of_most(size: &SizeFigures) -> Vec<Finding> {
     let at = format!("replies in time at {} Hz, 5 % active", number(*hz));
     let bar = format!("at least {} %, none unknown", MIN_IN_TIME_SHARE * 100.0);
     vec![
-        Finding::stated(of("from the start to the first joints"), (*start_s, "s")).at_most(START_S),
-        Finding::stated(of(&at), (active.share() * 100.0, "%")).must(bar, *holds),
+        Finding::stated(of("from the start to the first joints"), (*start_s, "s")).at_most(MAX_START_S),
+        Finding::stated(of(&at), (active.share() * 100.0, "%")).with_requirement(bar, *holds),
         Finding::stated(
             of("replies and packets missing for no known reason"),
             active.unknown + quiet.unknown,
         )
         .at_most(0.0),
-        Finding::stated(of("private memory of the gateway"), (memory_mb[0], "MB")).at_most(MEMORY_MB),
+        Finding::stated(of("private memory of the gateway"), (memory_mb[0], "MB")).at_most(MAX_MEMORY_MB),
         Finding::stated(of("processor, none active"), (quiet.cores.iter().sum::<f64>(), "cores")),
         Finding::stated(of("processor, 5 % active"), (active.cores.iter().sum::<f64>(), "cores")),
     ]
@@ -153,9 +153,9 @@ fn of_ticks(sizes: &[SizeFigures], [few, few_on_as_many, most]: &[f64; 3]) -> Ve
     let (cells, buses, fewest_cells) = (largest.cells, largest.buses, fewest.cells);
     let beside = |what: &str| format!("distributed tick of {cells} cells by that of {fewest_cells}{what}");
     vec![
-        Finding::stated(beside(", without threads, all active"), most / few).at_most(TICK),
+        Finding::stated(beside(", without threads, all active"), most / few).at_most(MAX_TICK_RATIO),
         Finding::stated(beside(&format!(" on {buses} buses too, the same way")), most / few_on_as_many)
-            .at_most(TICK_ON_AS_MANY),
+            .at_most(MAX_TICK_RATIO_SAME_BUSES),
         Finding::stated(
             beside(", medians of benches, 5 % active"),
             largest.active.tick_us / fewest.active.tick_us,

@@ -5,20 +5,20 @@ use std::cell::Cell;
 use super::*;
 use crate::arm::Reply;
 use crate::moving::Run;
-use analysis::report::figure::Verdict;
+use analysis::report::figure::FindingVerdict;
 use model::scenario::Scenario;
 use protocol::skin::Skin;
 use serde_json::json;
 
 /// A lab that makes up the results of benches: up to a number of replies per second, all are in time. It stores which
 /// benches were requested.
-struct Made {
+struct FakeLab {
     most: f64,
     ran: Vec<ScaleBench>,
     clock: Cell<u64>,
 }
 
-impl Lab for Made {
+impl Lab for FakeLab {
     type Error = &'static str;
 
     fn now(&self) -> u64 {
@@ -35,14 +35,14 @@ impl Lab for Made {
         Ok(summary(bench, bench.hz * count(bench.cells) <= self.most))
     }
 
-    fn go_on(&mut self) -> Result<(), &'static str> {
+    fn check_stopped(&mut self) -> Result<(), &'static str> {
         Ok(())
     }
 }
 
 /// Returns the summary of a bench. If `in_time` is false, half of the replies are late.
 pub(crate) fn summary(bench: &ScaleBench, in_time: bool) -> Value {
-    let due = if bench.active { count(share(bench.cells)) * bench.hz } else { 0.0 };
+    let due = if bench.active { count(touched_cells(bench.cells)) * bench.hz } else { 0.0 };
     let bus = json!({
         "replies": { "due": due / 2.0, "in_time": if in_time { due / 2.0 } else { due / 4.0 }, "unknown": 0 },
         "uplink": { "unknown": 0 },
@@ -57,8 +57,8 @@ pub(crate) fn summary(bench: &ScaleBench, in_time: bool) -> Value {
     })
 }
 
-fn made(most: f64) -> Made {
-    Made { most, ran: Vec::new(), clock: Cell::new(0) }
+fn made(most: f64) -> FakeLab {
+    FakeLab { most, ran: Vec::new(), clock: Cell::new(0) }
 }
 
 #[test]
@@ -77,7 +77,7 @@ fn every_bench_has_a_skin_and_a_scenario_that_fits_it_and_a_name_of_its_own() {
 #[test]
 fn rates_are_tried_from_the_highest_until_one_holds() {
     let mut lab = made(500.0 * 62.5);
-    let found = |lab: &mut Made, cells| size(lab, cells, FULL).unwrap();
+    let found = |lab: &mut FakeLab, cells| size(lab, cells, FULL).unwrap();
     let small = found(&mut lab, 253);
     assert_eq!((small.buses, small.hz.to_string(), small.holds), (1, "62.5".to_owned(), true));
     assert_eq!(lab.ran.len(), 2, "one active and one quiet");
@@ -111,11 +111,11 @@ fn bars_are_rated_by_what_was_measured() {
         let found = section.findings.iter().find(|finding| finding.what.contains(what)).unwrap();
         (found.ours.value, found.verdict)
     };
-    assert_eq!(rated(&measured, "to the first joints"), (1.5, Verdict::Better));
-    assert_eq!(rated(&measured, "private memory").1, Verdict::Better);
+    assert_eq!(rated(&measured, "to the first joints"), (1.5, FindingVerdict::Better));
+    assert_eq!(rated(&measured, "private memory").1, FindingVerdict::Better);
     measured.beside = [1.0, 4.0, 4.5];
-    assert_eq!(rated(&measured, "without threads").1, Verdict::Worse);
-    assert_eq!(rated(&measured, "buses too").1, Verdict::Better);
+    assert_eq!(rated(&measured, "without threads").1, FindingVerdict::Worse);
+    assert_eq!(rated(&measured, "buses too").1, FindingVerdict::Better);
     measured.sizes[1].active.memory_mb[0] = 201.0;
-    assert_eq!(rated(&measured, "private memory").1, Verdict::Worse);
+    assert_eq!(rated(&measured, "private memory").1, FindingVerdict::Worse);
 }

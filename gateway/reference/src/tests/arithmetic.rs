@@ -26,7 +26,7 @@ fn words<const N: usize>(value: &Value) -> [i16; N] {
 }
 
 /// Returns the Jacobian and the force.
-fn pressed(of: &Value) -> ([Q1_14; WORDS], Force) {
+fn jacobian_and_force(of: &Value) -> ([Q1_14; WORDS], Force) {
     (words(&of["jacobian"]).map(Q1_14::from_bits), Force::from_steps(of["force"].as_i64().unwrap()))
 }
 
@@ -41,7 +41,7 @@ fn forces_and_torques_are_those_of_the_other_program() {
         let force =
             Force::fuse([c1, c2, c3].map(Q::from_bits), Q1_14::from_bits(proximity), &rule.contact).steps();
         assert_eq!(Some(i64::from(force)), row["force"].as_i64(), "{row}");
-        let (jacobian, force) = pressed(&row);
+        let (jacobian, force) = jacobian_and_force(&row);
         let torque = Torque::new(&jacobian, force);
         assert_eq!(torque.words(TorqueFormat::Q3_12)[..6], words::<6>(&row["torque"]), "{row}");
     }
@@ -68,7 +68,7 @@ fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
                 children: (1 << children.len()) - 1,
             };
             let own = step["own"].as_object().map(|_| {
-                let (jacobian, force) = pressed(&step["own"]);
+                let (jacobian, force) = jacobian_and_force(&step["own"]);
                 Torque::new(&jacobian, force).exact()
             });
             sum.begin(&begin, own.as_ref());

@@ -9,7 +9,7 @@
 
 mod arm;
 
-use arm::Case;
+use arm::ArmCase;
 use model::decode::{Decoder, json};
 use protocol::can::Format;
 use protocol::candump::{self, CandumpLine, Record};
@@ -34,7 +34,7 @@ const WIRE: &str = include_str!("../../../../protocol/tests/golden/wire.log");
 const ARITHMETIC: &str = include_str!("../../../../protocol/tests/golden/arithmetic.json");
 
 /// Converts each frame of a log, with its JSON description, by `tell`.
-fn said<T>(log: &str, tell: impl Fn(&Record<'_>, Map<String, Value>) -> T) -> Vec<T> {
+fn convert_log<T>(log: &str, tell: impl Fn(&Record<'_>, Map<String, Value>) -> T) -> Vec<T> {
     let mut all = Vec::new();
     for line in log.lines() {
         if let CandumpLine::Frame(record) = candump::parse(line).unwrap() {
@@ -130,7 +130,7 @@ fn arithmetic(section: &str) -> Vec<Value> {
 }
 
 fn torques() -> Vec<Value> {
-    let row = |case: Case| {
+    let row = |case: ArmCase| {
         let (jacobian, torque) = case.answer();
         json!({
             "joint": case.parameters.joint,
@@ -161,11 +161,11 @@ fn file() -> String {
                  2, 3, joints, sensors page 0, and what the cell of this project answers; another cell's jacobian may differ from \
                  jacobian_exact as J-3 allows, and its torque accordingly.";
     let parts = [
-        ("packets", PACKETS.iter().flat_map(|log| said(log, packet)).collect()),
-        ("refused", said(REFUSED, refused)),
+        ("packets", PACKETS.iter().flat_map(|log| convert_log(log, packet)).collect()),
+        ("refused", convert_log(REFUSED, refused)),
         ("reassembly", reassembly()),
-        ("session", said(SESSION, session)),
-        ("refusals", said(REFUSALS, session)),
+        ("session", convert_log(SESSION, session)),
+        ("refusals", convert_log(REFUSALS, session)),
         ("exchanges", exchanges()),
         ("wires", wires()),
         ("forces", arithmetic("forces")),
@@ -201,7 +201,7 @@ fn the_torques_are_those_of_equation_8() {
         let (real, (_, words)) = (case.real(), case.answer());
         assert!(words.iter().skip(real.len()).all(|&word| word == 0), "joints beyond the cell's");
         for (real, word) in real.iter().zip(words) {
-            let word = case.parameters.torque_format.real(word);
+            let word = case.parameters.torque_format.to_real(word);
             assert!((real - word).abs() < 4e-3, "{case:?}: {real} and {word}");
             loaded += u32::from(real.abs() > 0.1);
         }

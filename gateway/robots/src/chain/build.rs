@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Isometry3, Point3};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
-use protocol::skin::{REACH, reach};
+use protocol::skin::{MAX_REACH, reach};
 
-use super::path::{CarriedLink, behind, moves, path};
+use super::path::{CarriedLink, frames_after_joints, motion_kind, path};
 use super::{ChainJoint, LinkFrame, NotCarried, UrdfChain};
 use crate::error::{RobotError, RobotProblem};
 use crate::residual::{self, Residual};
@@ -38,12 +38,12 @@ fn with_rows(
     row_cost: f64,
 ) -> Result<UrdfChain, RobotError> {
     let root_name = urdf.link_name(root).to_owned();
-    let (base, rows) = table(urdf, path, joints, tip, row_cost)?;
+    let (base, rows) = rows_of_path(urdf, path, joints, tip, row_cost)?;
 
-    let (hanging, apart) = hanging(urdf, root, path);
+    let (hanging, apart) = carried_links(urdf, root, path);
     let at_zero = frames(&base, &rows, &[]);
-    let behind = behind(path, &[]);
-    let carried = hanging.iter().map(|it| (it.link.clone(), carrier(&rows, &at_zero, &behind, it)));
+    let behind = frames_after_joints(path, &[]);
+    let carried = hanging.iter().map(|it| (it.link.clone(), link_frame(&rows, &at_zero, &behind, it)));
     let carried: Vec<_> = carried.collect();
     let below = urdf.pose(&root_name, &|joint| urdf.rest(joint))?;
     let mut chain = UrdfChain {
@@ -62,7 +62,7 @@ fn with_rows(
     for (link, LinkFrame { row, frame, .. }) in &chain.carried {
         let reach = reach(rows.get(..*row).unwrap_or_default(), frame.translation.vector.into());
         // Links beside the path may have no cells, so only the path must be within reach.
-        if reach >= REACH && path.iter().any(|joint| urdf.link_name(joint.child) == link) {
+        if reach >= MAX_REACH && path.iter().any(|joint| urdf.link_name(joint.child) == link) {
             return Err(urdf.error(RobotProblem::Reach { link: link.clone(), reach }));
         }
     }
@@ -83,7 +83,7 @@ fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec
             let kind = if joint.kind == UrdfJointKind::Floating { "floating" } else { "planar" };
             return Err(urdf.error_at(joint, RobotProblem::Kind { joint: name, kind }));
         }
-        let Some(kind) = moves(joint) else { continue };
+        let Some(kind) = motion_kind(joint) else { continue };
         if let Some(mimic) = &joint.mimic {
             return Err(urdf.error_at(joint, RobotProblem::Mimic { joint: name, of: mimic.joint.clone() }));
         }
@@ -107,16 +107,16 @@ fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec
 }
 
 /// Returns frame 0 and the Denavit-Hartenberg rows of a path.
-fn table(
+fn rows_of_path(
     urdf: &Urdf,
     path: &[&UrdfJoint],
     joints: &[ChainJoint],
     tip: &str,
     row_cost: f64,
 ) -> Result<(Isometry3<f64>, Vec<DhRow>), RobotError> {
-    let moving = path.iter().filter_map(|joint| Some((joint, moves(joint)?)));
+    let moving = path.iter().filter_map(|joint| Some((joint, motion_kind(joint)?)));
     let axes: Vec<_> = moving
-        .zip(behind(path, &[]))
+        .zip(frames_after_joints(path, &[]))
         .map(|((joint, kind), pose)| {
             let point = pose.translation.vector.into();
             Axis { point, direction: pose * joint.axis.into_inner(), kind }
@@ -155,13 +155,17 @@ fn table(
 
 /// Returns the links that move with the chain, those of the path first. Also returns all other links, each with the
 /// reason why it does not.
-fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<CarriedLink>, Vec<(String, NotCarried)>) {
+fn carried_links(
+    urdf: &Urdf,
+    root: usize,
+    path: &[&UrdfJoint],
+) -> (Vec<CarriedLink>, Vec<(String, NotCarried)>) {
     // The values are the number of moving joints before the link, and its fixed transform after them.
     let (mut count, mut fixed) = (0, Isometry3::identity());
     let mut order = vec![root];
     let mut on_path = BTreeMap::from([(root, (count, fixed))]);
     for joint in path {
-        (count, fixed) = match moves(joint) {
+        (count, fixed) = match motion_kind(joint) {
             Some(_) => (count + 1, Isometry3::identity()),
             None => (count, fixed * joint.origin),
         };
@@ -178,7 +182,7 @@ fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<CarriedLink>, 
             if let Some(found) = on_path.get(&at) {
                 break Some(found);
             }
-            let Some(joint) = urdf.above(at).next() else { break None };
+            let Some(joint) = urdf.joints_above(at).next() else { break None };
             mover = mover.filter(|_| joint.kind == UrdfJointKind::Fixed).or_else(|| joint.moving_name());
             behind = joint.origin * behind;
             at = joint.parent;
@@ -196,7 +200,7 @@ fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<CarriedLink>, 
 }
 
 /// Returns the row that carries a link, and the transform from the frame of that row to the link.
-fn carrier(
+fn link_frame(
     rows: &[DhRow],
     at_zero: &[Isometry3<f64>],
     behind: &[Isometry3<f64>],

@@ -12,7 +12,7 @@ use crate::nearest::nearest;
 use crate::rows::{DhRow, frames};
 use crate::urdf::Urdf;
 
-pub(crate) use path::{CarriedLink, behind};
+pub(crate) use path::{CarriedLink, frames_after_joints};
 
 /// A chain: the joints between two links of a robot, with their Denavit-Hartenberg rows.
 #[derive(Clone, Debug, PartialEq)]

@@ -22,7 +22,7 @@ pub(super) fn path(urdf: &Urdf, root: usize, tip: usize) -> Result<Vec<&UrdfJoin
     if root == tip {
         return Ok(path);
     }
-    for joint in urdf.above(tip) {
+    for joint in urdf.joints_above(tip) {
         path.push(joint);
         if joint.parent == root {
             path.reverse();
@@ -36,7 +36,7 @@ pub(super) fn path(urdf: &Urdf, root: usize, tip: usize) -> Result<Vec<&UrdfJoin
 }
 
 /// Returns the kind of a joint on a path; `None` if the joint is fixed.
-pub(super) fn moves(joint: &UrdfJoint) -> Option<JointKind> {
+pub(super) fn motion_kind(joint: &UrdfJoint) -> Option<JointKind> {
     match joint.kind {
         UrdfJointKind::Revolute | UrdfJointKind::Continuous => Some(JointKind::Revolute),
         UrdfJointKind::Prismatic => Some(JointKind::Prismatic),
@@ -46,12 +46,12 @@ pub(super) fn moves(joint: &UrdfJoint) -> Option<JointKind> {
 
 /// Returns the frame of the link directly after each moving joint of the path, in the coordinates of the root. Joints
 /// without a value in `positions` are at zero.
-pub(crate) fn behind(path: &[&UrdfJoint], positions: &[f64]) -> Vec<Isometry3<f64>> {
+pub(crate) fn frames_after_joints(path: &[&UrdfJoint], positions: &[f64]) -> Vec<Isometry3<f64>> {
     let mut positions = positions.iter();
     let mut pose = Isometry3::identity();
     let mut all = Vec::new();
     for joint in path {
-        if moves(joint).is_some() {
+        if motion_kind(joint).is_some() {
             pose *= joint.transform(positions.next().copied().unwrap_or_default());
             all.push(pose);
         } else {

@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use protocol::skin::reach;
 
 use super::common::torques;
-use super::written::{FIVE_DIGITS, TWELVE_DIGITS, Written, robot};
+use super::written::{FIVE_DIGITS, TWELVE_DIGITS, TestJoint, robot};
 
 /// Maximum difference between rows and matrices, in m or rad, or in Nm for a force of 1 N.
 const ERROR: f64 = 5e-11;
@@ -38,7 +38,7 @@ fn length() -> impl Strategy<Value = f64> {
 }
 
 /// Generates joints, each with two positions as fractions of the range between its limits.
-fn written() -> impl Strategy<Value = (Written, [f64; 2])> {
+fn written() -> impl Strategy<Value = (TestJoint, [f64; 2])> {
     let kind = proptest::sample::select(vec!["revolute", "revolute", "continuous", "prismatic", "fixed"]);
     let place = ([length(), length(), length()], [angle(), angle(), angle()], axis());
     (kind, place, -3.0..0.5, 0.1..3.0, [0.0..1.0, 0.0..1.0]).prop_map(
@@ -48,17 +48,17 @@ fn written() -> impl Strategy<Value = (Written, [f64; 2])> {
             } else {
                 [lower, lower + span]
             };
-            (Written { kind, xyz, rpy, axis, limits }, way)
+            (TestJoint { kind, xyz, rpy, axis, limits }, way)
         },
     )
 }
 
-fn chains() -> impl Strategy<Value = Vec<(Written, [f64; 2])>> {
+fn chains() -> impl Strategy<Value = Vec<(TestJoint, [f64; 2])>> {
     proptest::collection::vec(written(), 1..=14)
 }
 
 /// Returns the transform from the parent of a joint to its child, with the joint at this position.
-fn step(joint: &Written, position: f64) -> Matrix4<f64> {
+fn step(joint: &TestJoint, position: f64) -> Matrix4<f64> {
     let [roll, pitch, yaw] = joint.rpy;
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw)
         * Rotation3::from_axis_angle(&Vector3::y_axis(), pitch)
@@ -91,7 +91,7 @@ proptest! {
         };
         prop_assert!(chain.residual < ERROR, "{}", chain.residual);
         prop_assert!(chain.rows.iter().all(|row| row.a.abs() <= 1.3 && row.d.abs() <= 1.3), "{:?}", chain.rows);
-        let moves = |joint: &Written| joint.kind != "fixed";
+        let moves = |joint: &TestJoint| joint.kind != "fixed";
         for end in 0..2 {
             let moving = joints.iter().filter(|(joint, _)| moves(joint)).zip(chain.limits());
             let q: Vec<_> = moving.map(|((_, way), [lower, upper])| lower + (upper - lower) * way[end]).collect();
@@ -136,7 +136,7 @@ proptest! {
     /// Any text is accepted, or refused in one line.
     #[test]
     fn any_text_is_refused_in_one_line(text in "[ -~]{0,40}", cut in 0_usize..600, put in "[ -~]{0,6}") {
-        let whole = robot(&[Written::hinge([0.1, 0.0, 0.0], [0.0; 3]), Written::slide([0.1, 0.0, 0.0], [0.0; 3])]);
+        let whole = robot(&[TestJoint::hinge([0.1, 0.0, 0.0], [0.0; 3]), TestJoint::slide([0.1, 0.0, 0.0], [0.0; 3])]);
         let at = cut.min(whole.len());
         let damaged = [&whole[..at], &put, whole.get(at + put.len()..).unwrap_or_default()].concat();
         for text in [text, damaged] {

@@ -2,7 +2,7 @@
 
 use crate::{CellOnLink, SkinImport, Urdf, UrdfChain};
 
-use super::written::{Written, robot, wrap};
+use super::written::{TestJoint, robot, wrap};
 
 fn parse(xml: &str) -> String {
     Urdf::parse("t.urdf", xml).unwrap_err().to_string()
@@ -178,7 +178,7 @@ fn joints_that_a_chain_cannot_have() {
 
 #[test]
 fn chains_that_are_not_there() {
-    let joints = vec![Written::hinge([0.1, 0.0, 0.0], [0.0; 3]); 15];
+    let joints = vec![TestJoint::hinge([0.1, 0.0, 0.0], [0.0; 3]); 15];
     let xml = robot(&joints);
     assert_eq!(
         chain(&xml, "l15"),
@@ -199,21 +199,23 @@ fn chains_that_are_not_there() {
 
 #[test]
 fn chains_that_are_too_long() {
-    let long = |x: f64| robot(&[Written::hinge([0.0; 3], [0.0; 3]), Written::hinge([x, 0.0, 0.0], [0.0; 3])]);
+    let long =
+        |x: f64| robot(&[TestJoint::hinge([0.0; 3], [0.0; 3]), TestJoint::hinge([x, 0.0, 0.0], [0.0; 3])]);
     assert_eq!(
         chain(&long(2.5), "l2"),
         "t.urdf: row 1, to joint \"j2\": a = 2.500 m; [-2, 2) m is possible: choose a tip nearer to the root"
     );
     assert_eq!(good(&long(1.99), "l2").rows.len(), 2);
-    let slide = |upper: f64| robot(&[Written { limits: [0.0, upper], ..Written::slide([0.0; 3], [0.0; 3]) }]);
+    let slide =
+        |upper: f64| robot(&[TestJoint { limits: [0.0, upper], ..TestJoint::slide([0.0; 3], [0.0; 3]) }]);
     assert_eq!(
         chain(&slide(2.25), "l1"),
         "t.urdf: row 1, to link \"l1\": d with the joint at its limit = 2.250 m; [-2, 2) m is possible: choose a root behind that joint, or narrow its limits"
     );
     assert_eq!(good(&slide(1.75), "l1").rows.len(), 1);
     let reaching = |x: f64| {
-        let hinge = Written::hinge([x, 0.0, 0.0], [0.0; 3]);
-        robot(&[hinge.clone(), hinge.clone(), hinge, Written::fixed([0.5, 0.0, 0.0], [0.0; 3])])
+        let hinge = TestJoint::hinge([x, 0.0, 0.0], [0.0; 3]);
+        robot(&[hinge.clone(), hinge.clone(), hinge, TestJoint::fixed([0.5, 0.0, 0.0], [0.0; 3])])
     };
     assert_eq!(
         chain(&reaching(0.8), "l4"),
@@ -225,7 +227,7 @@ fn chains_that_are_too_long() {
 
 #[test]
 fn what_the_skins_check_refuses_has_the_line_of_its_cell() {
-    let urdf = Urdf::parse("t.urdf", &robot(&[Written::hinge([0.0, 0.0, 0.1], [0.0; 3])])).unwrap();
+    let urdf = Urdf::parse("t.urdf", &robot(&[TestJoint::hinge([0.0, 0.0, 0.1], [0.0; 3])])).unwrap();
     let chains = [urdf.chain(None, "l1").unwrap()];
     let refused = |cells: &[CellOnLink]| {
         let import = SkinImport { name: "t", command: "", urdf: None, chains: &chains, cells };

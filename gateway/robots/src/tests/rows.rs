@@ -7,9 +7,9 @@ use nalgebra::{Isometry3, Point3};
 use protocol::skin::reach;
 
 use super::common::{difference, named};
-use super::written::{TWELVE_DIGITS, Written, robot};
+use super::written::{TWELVE_DIGITS, TestJoint, robot};
 
-fn chain(joints: &[Written]) -> UrdfChain {
+fn chain(joints: &[TestJoint]) -> UrdfChain {
     let chain = Urdf::parse("t.urdf", &robot(joints)).unwrap().chain(None, &format!("l{}", joints.len()));
     let chain = chain.unwrap();
     assert!(chain.residual < 1e-10, "{chain:?}");
@@ -37,13 +37,13 @@ fn assert_row(row: &DhRow, [a, alpha, d, theta_offset]: [f64; 4]) {
 #[test]
 fn a_known_table_comes_back() {
     let chain = chain(&[
-        Written::hinge([0.0, 0.0, 0.0892], [0.0; 3]),
-        Written::hinge([0.0; 3], [TWELVE_DIGITS, 0.0, 0.0]),
-        Written::hinge([-0.425, 0.0, 0.0], [0.0; 3]),
-        Written::hinge([-0.392, 0.0, 0.109], [0.0; 3]),
-        Written::hinge([0.0, -0.095, 0.0], [TWELVE_DIGITS, 0.0, 0.0]),
-        Written::hinge([0.0, 0.082, 0.0], [-TWELVE_DIGITS, 0.0, 0.0]),
-        Written::fixed([0.0, 0.0, 0.05], [0.0; 3]),
+        TestJoint::hinge([0.0, 0.0, 0.0892], [0.0; 3]),
+        TestJoint::hinge([0.0; 3], [TWELVE_DIGITS, 0.0, 0.0]),
+        TestJoint::hinge([-0.425, 0.0, 0.0], [0.0; 3]),
+        TestJoint::hinge([-0.392, 0.0, 0.109], [0.0; 3]),
+        TestJoint::hinge([0.0, -0.095, 0.0], [TWELVE_DIGITS, 0.0, 0.0]),
+        TestJoint::hinge([0.0, 0.082, 0.0], [-TWELVE_DIGITS, 0.0, 0.0]),
+        TestJoint::fixed([0.0, 0.0, 0.05], [0.0; 3]),
     ]);
     let expected = [
         [0.0, FRAC_PI_2, 0.0892, 0.0],
@@ -63,11 +63,12 @@ fn a_known_table_comes_back() {
 #[test]
 fn opposite_and_equal_axes_need_one_row() {
     let opposite =
-        chain(&[Written::hinge([0.0; 3], [0.0; 3]), Written::hinge([0.3, 0.0, 0.1], [PI, 0.0, 0.0])]);
+        chain(&[TestJoint::hinge([0.0; 3], [0.0; 3]), TestJoint::hinge([0.3, 0.0, 0.1], [PI, 0.0, 0.0])]);
     assert_row(&opposite.rows[0], [0.3, PI, 0.1, 0.0]);
-    let same = chain(&[Written::hinge([0.0; 3], [0.0; 3]), Written::hinge([0.0, 0.0, 0.2], [0.0, 0.0, 0.7])]);
+    let same =
+        chain(&[TestJoint::hinge([0.0; 3], [0.0; 3]), TestJoint::hinge([0.0, 0.0, 0.2], [0.0, 0.0, 0.7])]);
     assert_row(&same.rows[0], [0.0, 0.0, 0.2, 0.0]);
-    let beside = chain(&[Written::hinge([0.0; 3], [0.0; 3]), Written::hinge([0.0, 0.4, 0.0], [0.0; 3])]);
+    let beside = chain(&[TestJoint::hinge([0.0; 3], [0.0; 3]), TestJoint::hinge([0.0, 0.4, 0.0], [0.0; 3])]);
     assert_row(&beside.rows[0], [0.4, 0.0, 0.0, FRAC_PI_2]);
 }
 
@@ -79,9 +80,9 @@ fn a_tilt_of_any_size_keeps_rows_short() {
         let tilt = 10_f64.powi(-exponent);
         for turn in [0.0, PI] {
             let chain = chain(&[
-                Written::hinge([0.0, 0.0, 0.3], [0.0; 3]),
-                Written::hinge([0.5, 0.1, 0.2], [turn, tilt, 0.0]),
-                Written::hinge([0.4, 0.0, -0.1], [0.0, 0.0, 0.0]),
+                TestJoint::hinge([0.0, 0.0, 0.3], [0.0; 3]),
+                TestJoint::hinge([0.5, 0.1, 0.2], [turn, tilt, 0.0]),
+                TestJoint::hinge([0.4, 0.0, -0.1], [0.0, 0.0, 0.0]),
             ]);
             let needed = tilt > 1e-11 && 0.5 / tilt > 1.0;
             let inserted = kinds(&chain).iter().filter(|kind| **kind == RowKind::Fixed).count();
@@ -101,8 +102,10 @@ fn a_tilt_of_any_size_keeps_rows_short() {
 fn axes_that_meet_at_a_small_angle_lose_no_digits() {
     for exponent in 2..=9 {
         let tilt = 10_f64.powi(-exponent);
-        let joints =
-            [Written::hinge([0.0; 3], [0.0; 3]), Written::hinge([0.0, 0.0, 0.2], [tilt, 0.3 * tilt, 0.0])];
+        let joints = [
+            TestJoint::hinge([0.0; 3], [0.0; 3]),
+            TestJoint::hinge([0.0, 0.0, 0.2], [tilt, 0.3 * tilt, 0.0]),
+        ];
         let chain = chain(&joints);
         assert!(chain.residual < 1e-13, "{tilt}: {}", chain.residual);
     }
@@ -111,26 +114,26 @@ fn axes_that_meet_at_a_small_angle_lose_no_digits() {
 /// A common normal may be far away although the angle is large: here two axes in one plane meet 1.5 m farther out.
 #[test]
 fn a_far_foot_is_avoided() {
-    let meets = Written::hinge([0.4, 0.0, 0.0], [0.0, -(0.4_f64 / 1.5).atan(), 0.0]);
+    let meets = TestJoint::hinge([0.4, 0.0, 0.0], [0.0, -(0.4_f64 / 1.5).atan(), 0.0]);
     let chain =
-        chain(&[Written::hinge([0.0; 3], [0.0; 3]), meets, Written::hinge([0.2, 0.0, 0.0], [0.0; 3])]);
+        chain(&[TestJoint::hinge([0.0; 3], [0.0; 3]), meets, TestJoint::hinge([0.2, 0.0, 0.0], [0.0; 3])]);
     assert_eq!(kinds(&chain)[..2], [RowKind::Revolute, RowKind::Fixed]);
     assert!(chain.rows.iter().all(|row| row.a.abs() <= 0.5 && row.d.abs() <= 0.5), "{:?}", chain.rows);
 }
 
 /// Returns the waist and the left arm of a humanoid whose shoulder axis is tilted against the waist's by 16 degrees, so
 /// that their common normal is 0.9 m beside the robot. `forearm` is the distance of the tip from the elbow.
-fn tilted_shoulder(forearm: f64) -> Vec<Written> {
+fn tilted_shoulder(forearm: f64) -> Vec<TestJoint> {
     let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     vec![
-        Written::hinge([0.0; 3], [0.0; 3]).axis(z),
-        Written::hinge([-0.004, 0.0, 0.044], [0.0; 3]).axis(x),
-        Written::hinge([0.0; 3], [0.0; 3]).axis(y),
-        Written::hinge([0.004, 0.1002, 0.2478], [0.2793, 5.5e-5, -1.9e-4]).axis(y),
-        Written::hinge([0.0, 0.038, -0.0138], [-0.2793, 0.0, 0.0]).axis(x),
-        Written::hinge([0.0, 0.0062, -0.1032], [0.0; 3]).axis(z),
-        Written::hinge([0.0158, 0.0, -0.0805], [0.0; 3]).axis(y),
-        Written::fixed([forearm, 0.0, -0.01], [0.0; 3]),
+        TestJoint::hinge([0.0; 3], [0.0; 3]).axis(z),
+        TestJoint::hinge([-0.004, 0.0, 0.044], [0.0; 3]).axis(x),
+        TestJoint::hinge([0.0; 3], [0.0; 3]).axis(y),
+        TestJoint::hinge([0.004, 0.1002, 0.2478], [0.2793, 5.5e-5, -1.9e-4]).axis(y),
+        TestJoint::hinge([0.0, 0.038, -0.0138], [-0.2793, 0.0, 0.0]).axis(x),
+        TestJoint::hinge([0.0, 0.0062, -0.1032], [0.0; 3]).axis(z),
+        TestJoint::hinge([0.0158, 0.0, -0.0805], [0.0; 3]).axis(y),
+        TestJoint::fixed([forearm, 0.0, -0.01], [0.0; 3]),
     ]
 }
 
@@ -182,7 +185,9 @@ fn rows_are_no_longer_than_the_way_from_joint_to_joint() {
     for tilt in [1e-9, 1e-3, 0.03, 0.3, 3.0] {
         for _ in 0..40 {
             let joints: Vec<_> = (0..6)
-                .map(|_| Written::hinge([(); 3].map(|()| 0.4 * random()), [(); 3].map(|()| tilt * random())))
+                .map(|_| {
+                    TestJoint::hinge([(); 3].map(|()| 0.4 * random()), [(); 3].map(|()| tilt * random()))
+                })
                 .collect();
             let way: f64 = joints
                 .iter()
@@ -206,12 +211,12 @@ fn rows_are_no_longer_than_the_way_from_joint_to_joint() {
 #[test]
 fn slides_are_rows_of_their_own() {
     let chain = chain(&[
-        Written::slide([0.0, 0.1, 0.5], [0.0; 3]),
-        Written::hinge([0.1, 0.0, 0.2], [0.0; 3]),
-        Written::slide([0.3, 0.0, 0.0], [0.0, FRAC_PI_2, 0.0]),
-        Written::slide([0.0, 0.0, 0.2], [0.0; 3]),
-        Written::hinge([0.0, 0.1, 0.0], [0.3, 0.2, 0.1]),
-        Written::slide([0.1, 0.1, 0.1], [0.0, 0.4, 0.0]).axis([0.0, -3.0, 4.0]),
+        TestJoint::slide([0.0, 0.1, 0.5], [0.0; 3]),
+        TestJoint::hinge([0.1, 0.0, 0.2], [0.0; 3]),
+        TestJoint::slide([0.3, 0.0, 0.0], [0.0, FRAC_PI_2, 0.0]),
+        TestJoint::slide([0.0, 0.0, 0.2], [0.0; 3]),
+        TestJoint::hinge([0.0, 0.1, 0.0], [0.3, 0.2, 0.1]),
+        TestJoint::slide([0.1, 0.1, 0.1], [0.0, 0.4, 0.0]).axis([0.0, -3.0, 4.0]),
     ]);
     use RowKind::{Prismatic, Revolute};
     let moving: Vec<_> = kinds(&chain).into_iter().filter(|kind| *kind != RowKind::Fixed).collect();
@@ -223,7 +228,7 @@ fn slides_are_rows_of_their_own() {
 
 #[test]
 fn joints_say_what_the_file_says() {
-    let mut joints = vec![Written::hinge([0.1, 0.0, 0.0], [0.0; 3]); 3];
+    let mut joints = vec![TestJoint::hinge([0.1, 0.0, 0.0], [0.0; 3]); 3];
     joints[0].kind = "continuous";
     joints[1].limits = [-0.5, 7.0];
     joints[2].kind = "prismatic";
@@ -240,13 +245,13 @@ fn joints_say_what_the_file_says() {
 #[test]
 fn links_are_where_the_file_has_them() {
     let joints = [
-        Written::fixed([0.0, 0.1, 0.3], [0.1, 0.2, 0.3]),
-        Written::hinge([0.1, 0.0, 0.2], [0.0, 0.3, 0.0]),
-        Written::fixed([0.2, 0.0, 0.1], [0.0, 0.0, 0.4]),
-        Written::fixed([0.2, 0.0, 0.0], [1.0, 0.0, 0.4]),
-        Written::slide([0.1, 0.2, 0.0], [0.5, 0.0, 0.0]),
-        Written::hinge([0.0, 0.2, 0.1], [0.5, 0.0, 0.0]).axis([1.0, 1.0, 0.0]),
-        Written::fixed([0.0, 0.0, 0.1], [0.0, 0.5, 0.0]),
+        TestJoint::fixed([0.0, 0.1, 0.3], [0.1, 0.2, 0.3]),
+        TestJoint::hinge([0.1, 0.0, 0.2], [0.0, 0.3, 0.0]),
+        TestJoint::fixed([0.2, 0.0, 0.1], [0.0, 0.0, 0.4]),
+        TestJoint::fixed([0.2, 0.0, 0.0], [1.0, 0.0, 0.4]),
+        TestJoint::slide([0.1, 0.2, 0.0], [0.5, 0.0, 0.0]),
+        TestJoint::hinge([0.0, 0.2, 0.1], [0.5, 0.0, 0.0]).axis([1.0, 1.0, 0.0]),
+        TestJoint::fixed([0.0, 0.0, 0.1], [0.0, 0.5, 0.0]),
     ];
     let branch = r#"
 <link name="cover"/><joint name="to_cover" type="fixed"><parent link="l3"/><child link="cover"/><origin xyz="0 0.1 0"/></joint>
@@ -292,9 +297,9 @@ fn links_are_where_the_file_has_them() {
 #[test]
 fn the_nearest_row_carries_a_link() {
     let joints = [
-        Written::hinge([0.0; 3], [0.0; 3]),
-        Written::hinge([0.6, 0.0, 0.3], [1e-4, 0.0, 0.0]),
-        Written::fixed([0.0, 0.0, 0.1], [0.0; 3]),
+        TestJoint::hinge([0.0; 3], [0.0; 3]),
+        TestJoint::hinge([0.6, 0.0, 0.3], [1e-4, 0.0, 0.0]),
+        TestJoint::fixed([0.0, 0.0, 0.1], [0.0; 3]),
     ];
     let side = |name: &str, xyz: &str| {
         format!(

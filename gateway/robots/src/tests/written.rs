@@ -11,7 +11,7 @@ pub(crate) const FIVE_DIGITS: f64 = FRAC_PI_2 + 3.673_205e-6;
 
 /// A joint of a chain in a written URDF.
 #[derive(Clone, Debug)]
-pub(crate) struct Written {
+pub(crate) struct TestJoint {
     pub(crate) kind: &'static str,
     pub(crate) xyz: [f64; 3],
     pub(crate) rpy: [f64; 3],
@@ -19,7 +19,7 @@ pub(crate) struct Written {
     pub(crate) limits: [f64; 2],
 }
 
-impl Written {
+impl TestJoint {
     /// Returns a revolute joint about z with limits of -1 and 1 rad.
     pub(crate) fn hinge(xyz: [f64; 3], rpy: [f64; 3]) -> Self {
         Self { kind: "revolute", xyz, rpy, axis: [0.0, 0.0, 1.0], limits: [-1.0, 1.0] }
@@ -41,7 +41,7 @@ impl Written {
 }
 
 /// Returns a robot with these joints in a row: joint `j1` moves link `l1`, and so on, from link `l0`.
-pub(crate) fn robot(joints: &[Written]) -> String {
+pub(crate) fn robot(joints: &[TestJoint]) -> String {
     let mut inner = "<link name=\"l0\"/>\n".to_owned();
     for (index, joint) in joints.iter().enumerate() {
         let ([x, y, z], [roll, pitch, yaw], [u, v, w]) = (joint.xyz, joint.rpy, joint.axis);

@@ -1,6 +1,6 @@
 //! Tests that the URDF written for a skin has the same kinematics as the rows of the skin.
 
-use crate::{DhRow, Isometry3, SkinImport, Urdf, frames, pose_of, written};
+use crate::{DhRow, Isometry3, SkinImport, Urdf, frames, pose_of, write_urdf};
 use protocol::skin::Skin;
 
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples");
@@ -21,7 +21,7 @@ fn apart(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
 /// Writes the URDF of a skin and compares the poses of all its chains at several joint positions within the limits.
 /// Returns the URDF.
 fn check(skin: &Skin) -> Urdf {
-    let text = written(skin);
+    let text = write_urdf(skin);
     let urdf = Urdf::parse("robot.urdf", &text.xml).unwrap_or_else(|error| panic!("{error}\n{}", text.xml));
     for step in 0..20 {
         let part = |joint: usize| (f64::from(step) * 0.37 + joint as f64 * 0.61).fract();
@@ -61,7 +61,7 @@ fn a_written_urdf_moves_as_the_rows_do() {
 fn chains_share_the_links_that_they_begin_with() {
     let skin = imported("two-arms.urdf", &["left_palm", "right_palm"]);
     let urdf = check(&skin);
-    let text = written(&skin);
+    let text = write_urdf(&skin);
     let [left, right] = [&text.links[0], &text.links[1]];
     assert_eq!(left[..2], right[..2], "the waist");
     assert_ne!(left[2], right[2]);
@@ -107,7 +107,7 @@ normal = [0.0, 1.0, 0.0]
     )
     .unwrap();
     let urdf = check(&skin);
-    assert!(written(&skin).xml.contains("<mimic joint=\"a\"/>"));
+    assert!(write_urdf(&skin).xml.contains("<mimic joint=\"a\"/>"));
     assert_eq!(urdf.link_of("<b & c>"), Ok("one_link2"));
     let poses = urdf.link_poses(&["a", "<b & c>"]).unwrap();
     assert_eq!(poses.iter().filter(|pose| pose.moves()).count(), 3);
@@ -116,7 +116,7 @@ normal = [0.0, 1.0, 0.0]
     for (chain, name) in skin.robot.chains.iter_mut().zip(["le ft", "le_ft"]) {
         name.clone_into(&mut chain.name);
     }
-    let text = written(&skin);
+    let text = write_urdf(&skin);
     let named = Urdf::parse("robot.urdf", &text.xml).unwrap();
     assert_eq!((named.links().count(), text.links[1][0].as_str()), (urdf.links().count(), "le_ft_2_link1"));
     let error = urdf.link_poses(&["d"]).unwrap_err().to_string();

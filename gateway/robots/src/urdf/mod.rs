@@ -151,7 +151,7 @@ impl Urdf {
     #[must_use]
     pub fn parent(&self, link: &str) -> Option<&str> {
         let (index, _) = self.link(link).ok()?;
-        self.above(index).next().map(|joint| self.link_name(joint.parent))
+        self.joints_above(index).next().map(|joint| self.link_name(joint.parent))
     }
 
     /// Returns the rest position of a joint in rad or m: zero, or the middle of its limits if zero is not between them.
@@ -179,7 +179,7 @@ impl Urdf {
                 joint.transform(multiplier * position(of) + offset)
             }
         };
-        Ok(self.above(index).map(transform).fold(Isometry3::identity(), |pose, joint| joint * pose))
+        Ok(self.joints_above(index).map(transform).fold(Isometry3::identity(), |pose, joint| joint * pose))
     }
 
     /// Returns a link and its index, by its name.
@@ -209,7 +209,7 @@ impl Urdf {
     }
 
     /// Returns the joints between a link and the root, beginning with the joint that moves the link.
-    pub(crate) fn above(&self, link: usize) -> impl Iterator<Item = &UrdfJoint> {
+    pub(crate) fn joints_above(&self, link: usize) -> impl Iterator<Item = &UrdfJoint> {
         let up = move |link: usize| self.joints.get(self.links.get(link)?.parent?);
         core::iter::successors(up(link), move |joint| up(joint.parent))
     }

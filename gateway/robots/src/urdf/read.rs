@@ -9,7 +9,7 @@ use super::{Mimic, Shapes, Urdf, UrdfJoint, UrdfJointKind, UrdfLink, xml};
 use crate::error::{RobotError, RobotProblem};
 
 /// Minimum length of an axis vector. A shorter one has no direction.
-const SHORTEST_AXIS: f64 = 1e-6;
+const MIN_AXIS_LENGTH: f64 = 1e-6;
 
 /// Parses the text of a URDF file.
 pub(super) fn read(file: &str, xml: &str) -> Result<Urdf, RobotError> {
@@ -49,7 +49,7 @@ impl<'a> UrdfParser<'a> {
         let joints = self.children(robot, "joint").map(|node| self.joint(node));
         let joints = joints.collect::<Result<Vec<_>, _>>()?;
         let name = robot.attribute("name").unwrap_or_default().trim().to_owned();
-        tree::grow(self.file, name, links, joints)
+        tree::build_tree(self.file, name, links, joints)
     }
 
     /// Returns an error if the file contains elements or expressions that xacro should have replaced. Unused
@@ -188,7 +188,7 @@ impl<'a> UrdfParser<'a> {
         let allowed = "three numbers, not all zero";
         let axis = self.numbers(node, thing, "xyz", allowed)?.unwrap_or([1.0, 0.0, 0.0]);
         let axis = Vector3::from(axis);
-        Unit::try_new(axis, SHORTEST_AXIS)
+        Unit::try_new(axis, MIN_AXIS_LENGTH)
             .filter(|_| axis.norm().is_finite())
             .ok_or_else(|| self.value(node, thing, "xyz", node.attribute("xyz").unwrap_or_default(), allowed))
     }

@@ -20,7 +20,7 @@ pub(super) struct UnlinkedJoint {
 pub(super) type LinkWithLine = (UrdfLink, u32);
 
 /// Connects links by joints to a tree. Returns the checked URDF.
-pub(super) fn grow(
+pub(super) fn build_tree(
     file: &str,
     name: String,
     placed: Vec<LinkWithLine>,

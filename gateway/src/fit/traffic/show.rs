@@ -5,13 +5,13 @@ use std::io::{self, Write};
 use analysis::fit::traffic::BenchFrames;
 use analysis::fit::verdict::percent;
 use analysis::shadow::{
-    Answering, BusShadow, Delays, FrameTiming, Identifier, Loads, Peak, Replies, Report, Shadow, StartUp,
-    Stretches,
+    Answering, BusShadow, Delays, FrameTiming, Identifier, Loads, Peak, Replies, Shadow, ShadowReport,
+    StartUp, Stretches,
 };
 
 use trace::capture::seconds_since;
 
-use crate::print::{KeyValueTable, comma_separated, count, harmless, or_else_text};
+use crate::print::{KeyValueTable, comma_separated, count, escape_controls, or_else_text};
 
 /// Writes the frames whose sending the model has computed, one object per line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
@@ -29,7 +29,7 @@ fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming) -> io
     line.extend_from_slice(b"{\"time\":");
     seconds(line, Some(nanos));
     line.extend_from_slice(b",\"bus\":");
-    line.extend_from_slice(harmless(serde_json::to_string(&bus)?).as_bytes());
+    line.extend_from_slice(escape_controls(serde_json::to_string(&bus)?).as_bytes());
     write!(line, ",\"id\":\"{}\"", Identifier(id, extended))?;
     for (key, bits) in [("nominal", bits.map(|bits| bits.nominal)), ("data", bits.map(|bits| bits.data))] {
         write!(line, ",\"{key}_bits\":")?;
@@ -56,18 +56,18 @@ fn seconds(line: &mut Vec<u8>, nanos: Option<u64>) {
 }
 
 /// Formats the result for all buses as a table.
-pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> String {
+pub(super) fn text(name: &str, what: &str, missing: u64, report: &ShadowReport) -> String {
     let head = format!("{what}, {} frames", report.frames);
     let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
     let mut rows = KeyValueTable::new(name, head, beside).names_in_one_line();
     for bus in &report.buses {
-        one(&mut rows, bus, report);
+        bus_rows(&mut rows, bus, report);
     }
-    rows.any("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
+    rows.row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     rows.text()
 }
 
-fn one(rows: &mut KeyValueTable, bus: &BusShadow, report: &Report) {
+fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
     let bit_error_rate = report.bit_error_rate;
     let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
     let missing = if bus.counts.missing > 0 {
@@ -81,7 +81,7 @@ fn one(rows: &mut KeyValueTable, bus: &BusShadow, report: &Report) {
         operation(rows, bus);
     }
     if let Some(start_up) = &bus.start_up {
-        begin(rows, bus, start_up);
+        start_up_rows(rows, bus, start_up);
     }
     if bit_error_rate > 0.0 {
         let each = format!("of each bit {bit_error_rate:e}");
@@ -90,21 +90,25 @@ fn one(rows: &mut KeyValueTable, bus: &BusShadow, report: &Report) {
     bench(rows, bus);
     let of_all =
         |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
-    rows.any("left out: error frames", bus.counts.error_frames, "of a driver, never on a wire");
-    rows.any("out of order, and sorted", bus.counts.out_of_order, of_all(bus.counts.out_of_order));
-    rows.any("  too far for that", bus.counts.too_late_to_sort, "they count at a later time");
-    rows.any("never sent", bus.counts.no_room, "4 million frames waited already");
+    rows.row_unless_zero("left out: error frames", bus.counts.error_frames, "of a driver, never on a wire");
+    rows.row_unless_zero(
+        "out of order, and sorted",
+        bus.counts.out_of_order,
+        of_all(bus.counts.out_of_order),
+    );
+    rows.row_unless_zero("  too far for that", bus.counts.too_late_to_sort, "they count at a later time");
+    rows.row_unless_zero("never sent", bus.counts.no_room, "4 million frames waited already");
 }
 
 /// Adds rows on whether the traffic fits on the bus, in the worst case and in this run.
 fn fit(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
     match (&bus.worst_case, &bus.answering) {
-        (Some(worst), _) => rows.row(worst.case(), worst.value(), worst.cells),
+        (Some(worst), _) => rows.row(worst.case_name(), worst.table_value(), worst.cells),
         (None, Some(_)) => rows.row("worst case", "?", "needs a skin with this bus: --skin"),
         (None, None) => {}
     }
     match &bus.this_run {
-        Some(run) => rows.row(run.case(), run.value(), run.cells),
+        Some(run) => rows.row(run.case_name(), run.table_value(), run.cells),
         None if !has_times => rows.row("this run", "?", "its frames have no times"),
         None if bus.duration_s == 0.0 => rows.row("this run", "?", "its frames have one time"),
         None => rows.row("this run", "no joints in it", ""),
@@ -145,7 +149,7 @@ fn operation(rows: &mut KeyValueTable, bus: &BusShadow) {
 }
 
 /// Adds rows on the start-up, for which no limits apply.
-fn begin(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUp) {
+fn start_up_rows(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUp) {
     let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
     load(rows, bus, &start_up.load, ("start-up: average load", &beside));
     pauses(rows, bus, &start_up.stretches);

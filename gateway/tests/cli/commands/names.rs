@@ -100,7 +100,8 @@ impl Place {
     fn new() -> Self {
         let place = Self(tempfile::tempdir().unwrap());
         let skin =
-            model::generate::generate(&model::generate::Target { cells: 8, ..Default::default() }).unwrap();
+            model::generate::generate(&model::generate::SkinRequest { cells: 8, ..Default::default() })
+                .unwrap();
         fs::write(place.path("skin.toml"), &skin).unwrap();
         fs::write(place.path("scenario.toml"), "duration_s = 1\n").unwrap();
         fs::copy(golden("session.log"), place.path("c.log")).unwrap();

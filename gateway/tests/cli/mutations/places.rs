@@ -26,7 +26,7 @@ use super::seeds;
 /// Number of files of the quick test.
 const QUICK: u64 = 400;
 /// One of this many files goes through the commands.
-const OF_COMMANDS: u64 = 10;
+const COMMAND_INTERVAL: u64 = 10;
 
 /// A message: topic, sequence, time, bytes.
 type Message = (String, u32, u64, Vec<u8>);
@@ -258,7 +258,7 @@ fn messages(bytes: &[u8]) -> Vec<Message> {
 }
 
 /// Returns true if the damage is in a description that no checksum covers and that the file contains once.
-fn is_unsaid(seed: &Seed, place: &Range<usize>) -> bool {
+fn is_undetectable(seed: &Seed, place: &Range<usize>) -> bool {
     let has_end = seed.bytes.ends_with(mcap::MAGIC);
     let of_description = |part: &FileRecord| part.code == op::SCHEMA || part.code == op::CHANNEL;
     let is_there = |part: &FileRecord| part.bytes.start < place.end && place.start < part.bytes.end;
@@ -272,7 +272,7 @@ fn is_unsaid(seed: &Seed, place: &Range<usize>) -> bool {
 
 fn comes_back(seed: &Seed, what: &str, file: &[u8], place: &Range<usize>) {
     let expected: Vec<_> = seed.intact(place).flat_map(|part| part.messages.iter().cloned()).collect();
-    let is_unsaid = is_unsaid(seed, place);
+    let is_unsaid = is_undetectable(seed, place);
     let mut out = Vec::new();
     let said = match recover(Cursor::new(file), &mut out) {
         Ok(said) => said,
@@ -307,7 +307,7 @@ fn run(folder: &Path, words: &str) -> (Option<i32>, Vec<String>, String) {
 }
 
 /// Checks that each command returns the intact content, or ends with 1 and a reason.
-fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<usize>) {
+fn check_output(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<usize>) {
     let write = |name: &str, bytes: &[u8]| fs::write(folder.join(name), bytes).unwrap();
     write("seed.mcap", &seed.bytes);
     write("m.mcap", file);
@@ -393,8 +393,8 @@ fn wherever_a_place_is_damaged_all_else_comes_back() {
         let what = format!("{number}, {}, {how} at {place:?}", seed.name);
         let passed = catch_unwind(AssertUnwindSafe(|| {
             comes_back(seed, &what, &file, &place);
-            if number % OF_COMMANDS == 0 {
-                is_given(folder.path(), seed, &what, &file, &place);
+            if number % COMMAND_INTERVAL == 0 {
+                check_output(folder.path(), seed, &what, &file, &place);
             }
         }));
         if passed.is_err() {

@@ -26,7 +26,7 @@ impl<W: Write> CaptureWriter<W> {
     pub fn new(out: W, format: CaptureFormat, style: Style) -> io::Result<Self> {
         Ok(match format {
             CaptureFormat::Candump => Self(FormatWriter::Log(Box::new(LogWriter::new(out, style)))),
-            CaptureFormat::Mcap => Self::recording(out, Origin { of_log: true, file: None })?,
+            CaptureFormat::Mcap => Self::new_mcap(out, Origin { of_log: true, file: None })?,
         })
     }
 
@@ -34,7 +34,7 @@ impl<W: Write> CaptureWriter<W> {
     ///
     /// # Errors
     /// Returns an error if the head of the file cannot be written.
-    pub fn recording(out: W, origin: Origin<'_>) -> io::Result<Self> {
+    pub fn new_mcap(out: W, origin: Origin<'_>) -> io::Result<Self> {
         Ok(Self(FormatWriter::Mcap(Box::new(McapWriter::new(out, origin)?))))
     }
 

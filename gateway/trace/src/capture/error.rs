@@ -25,7 +25,7 @@ pub enum CaptureError {
     Parts(#[from] PartsError),
     /// The file begins with the magic bytes of another format.
     #[error("{name} is {what}, and no candump log or MCAP recording: {hint}")]
-    Other {
+    OtherFormat {
         /// The name of the capture.
         name: String,
         /// The format, such as `a gzip file`.

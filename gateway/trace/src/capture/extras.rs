@@ -26,12 +26,12 @@ pub struct RecordingExtras {
 /// The name of the metadata record that holds the time of a run's first tick.
 pub const RUN_METADATA: &str = "run";
 /// The key of the first tick's time in [`RUN`], in ns since 1970.
-const BEGAN: &str = "began_ns";
+const BEGAN_KEY: &str = "began_ns";
 
 /// Returns the contents of the metadata record [`RUN_METADATA`] for a first tick at `nanos` ns since 1970.
 #[must_use]
-pub fn facts_of_run(nanos: u64) -> BTreeMap<String, String> {
-    [(BEGAN.to_owned(), nanos.to_string())].into()
+pub fn run_metadata(nanos: u64) -> BTreeMap<String, String> {
+    [(BEGAN_KEY.to_owned(), nanos.to_string())].into()
 }
 
 /// Returns the time from `zero` to `nanos` in s, both given in ns since 1970. The result is negative if `nanos` is
@@ -57,7 +57,7 @@ impl RecordingExtras {
 
     /// Returns the value of `key` in the metadata record `record`.
     #[must_use]
-    pub fn fact(&self, record: &str, key: &str) -> Option<&str> {
+    pub fn metadata_value(&self, record: &str, key: &str) -> Option<&str> {
         let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
         facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }
@@ -67,7 +67,7 @@ impl RecordingExtras {
     /// can be read only once, such as a pipe, it is known only after the first frame has been read.
     #[must_use]
     pub fn run_began(&self) -> Option<u64> {
-        self.fact(RUN_METADATA, BEGAN)?.parse().ok()
+        self.metadata_value(RUN_METADATA, BEGAN_KEY)?.parse().ok()
     }
 
     /// Returns the attached skin; `None` if the recording has none.

@@ -7,10 +7,10 @@ use std::os::unix::fs::FileExt;
 use ::mcap::records::op;
 
 use super::text_kinds::ASC;
-use crate::container::{self, read_some};
+use crate::container::{self, read_uninterrupted};
 
 /// The number of bytes at a file's beginning within which the header record of a recording must end.
-const BEGINNING: usize = 4 << 10;
+const HEADER_SEARCH_BYTES: usize = 4 << 10;
 const UNPACK: &str = "unpack it first";
 const EXPORT: &str = "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)";
 
@@ -107,7 +107,7 @@ pub(super) fn detect_format(input: &mut impl Read) -> io::Result<(InputFormat, V
         if !open || free.is_empty() {
             return Ok((InputFormat::Text, head));
         }
-        let got = read_some(input, free)?;
+        let got = read_uninterrupted(input, free)?;
         if got == 0 {
             return Ok((InputFormat::Text, head));
         }
@@ -122,7 +122,7 @@ pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
         file.rewind()?;
         return Ok(true);
     }
-    let (mut first, mut last) = (vec![0; BEGINNING], [0; container::MAGIC.len()]);
+    let (mut first, mut last) = (vec![0; HEADER_SEARCH_BYTES], [0; container::MAGIC.len()]);
     let size = file.metadata()?.len();
     if kind == InputFormat::Text && size > 2 * container::MAGIC.len() as u64 {
         let came = file.read_at(&mut first, 0)?;
@@ -145,7 +145,7 @@ fn is_header(bytes: &[u8]) -> bool {
     else {
         return false;
     };
-    code == op::HEADER && container::own_length(code, body) == Some(u64::from_le_bytes(*length))
+    code == op::HEADER && container::length_by_fields(code, body) == Some(u64::from_le_bytes(*length))
 }
 
 #[cfg(test)]

@@ -96,7 +96,8 @@ pub struct RecordingPart {
 impl RecordingPart {
     /// Reads the identity of a part from the metadata of its file. Returns `None` if the file is not a part.
     fn of(path: &Path, extras: &RecordingExtras) -> Option<Self> {
-        let (began, number) = extras.fact("program", "began_ns").zip(extras.fact("part", "number"))?;
+        let (began, number) =
+            extras.metadata_value("program", "began_ns").zip(extras.metadata_value("part", "number"))?;
         Some(Self { path: path.to_owned(), began: began.to_owned(), number: number.parse().ok()? })
     }
 }
@@ -132,7 +133,7 @@ impl CaptureFile {
 ///
 /// # Errors
 /// Returns [`PartsError`] if the files are not one capture.
-pub(super) fn together(mut files: Vec<CaptureFile>) -> Result<Vec<PathBuf>, PartsError> {
+pub(super) fn in_reading_order(mut files: Vec<CaptureFile>) -> Result<Vec<PathBuf>, PartsError> {
     if let Some(text) = files.iter().find(|file| file.is_text) {
         return Err(PartsError::NoFrame(text.path.clone()));
     }

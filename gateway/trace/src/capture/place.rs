@@ -28,7 +28,7 @@ pub struct SeekIndex {
     /// in ns since 1970.
     pub(super) marks: Vec<(u64, SeekPoint)>,
     /// The minimum distance between two positions of a file, in bytes.
-    pub(super) piece: u64,
+    pub(super) min_distance: u64,
 }
 
 #[derive(Debug)]
@@ -47,7 +47,7 @@ impl SeekIndex {
 
     /// Returns the last indexed position before which all entries are earlier than `nanos`, in ns since 1970.
     #[must_use]
-    pub fn before(&self, nanos: u64) -> SeekPoint {
+    pub fn point_before(&self, nanos: u64) -> SeekPoint {
         let at = self.marks.partition_point(|(latest, _)| *latest < nanos);
         self.marks.get(at).or_else(|| self.marks.last()).map(|(_, place)| *place).unwrap_or_default()
     }
@@ -57,7 +57,7 @@ impl SeekIndex {
     }
 
     /// Returns the files after the one with the index `part`.
-    pub(super) fn behind(&self, part: usize) -> impl Iterator<Item = &PathBuf> {
+    pub(super) fn paths_after(&self, part: usize) -> impl Iterator<Item = &PathBuf> {
         self.parts.iter().skip(part + 1).map(|part| &part.path)
     }
 

@@ -17,15 +17,15 @@ use super::log::{LogReader, MAX_LINE_BYTES as LONGEST_LINE, known_time};
 use super::magic::is_mcap;
 use super::place::{IndexedFile, SeekIndex, SeekPoint};
 use super::{CaptureError, Entry, Reader};
-use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, find};
+use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, seek_record};
 use crate::order::WINDOW_NS;
 
 /// The minimum distance between two indexed positions of a file, in bytes.
 const MIN_DISTANCE_BYTES: u64 = 64 << 10;
 /// The maximum size of the schema and channel records that are stored for a part, in bytes.
-const DESCRIPTIONS: usize = 16 << 20;
+const MAX_PART_DESCRIPTIONS_BYTES: usize = 16 << 20;
 /// The number of bytes at the end of a log that are searched for its last frame.
-const END: u64 = 4 * LONGEST_LINE as u64;
+const LAST_FRAME_SEARCH_BYTES: u64 = 4 * LONGEST_LINE as u64;
 
 impl SeekIndex {
     /// Indexes one file, or the parts of one recording given in any order. Reads only the times of the entries.
@@ -33,12 +33,12 @@ impl SeekIndex {
     /// Returns [`CaptureError`] if a file cannot be read or is not seekable, or if the files are not parts of one
     /// recording.
     pub fn open(paths: &[PathBuf]) -> Result<Self, CaptureError> {
-        Self::apart(paths, MIN_DISTANCE_BYTES)
+        Self::with_min_distance(paths, MIN_DISTANCE_BYTES)
     }
 
     /// Indexes the files with one position at least every `piece` bytes.
-    fn apart(paths: &[PathBuf], piece: u64) -> Result<Self, CaptureError> {
-        let mut places = Self { parts: Vec::new(), marks: Vec::new(), piece };
+    fn with_min_distance(paths: &[PathBuf], piece: u64) -> Result<Self, CaptureError> {
+        let mut places = Self { parts: Vec::new(), marks: Vec::new(), min_distance: piece };
         for path in Reader::ordered(paths)? {
             let name = path.display().to_string();
             places.add(&path).map_err(|source| CaptureError::Io { name, source })?;
@@ -58,11 +58,11 @@ impl SeekIndex {
 
     /// Adds a position in the last part, unless it is too close to the one before. `latest` is the latest time of all
     /// entries before the next position.
-    fn mark(&mut self, place: SeekPoint, latest: u64) {
+    fn add_point(&mut self, place: SeekPoint, latest: u64) {
         let place = SeekPoint { part: self.parts.len() - 1, ..place };
         let latest = latest.max(self.latest());
         match self.marks.last_mut() {
-            Some((of, last)) if last.part == place.part && place.offset - last.offset < self.piece => {
+            Some((of, last)) if last.part == place.part && place.offset - last.offset < self.min_distance => {
                 *of = latest
             }
             _ => self.marks.push((latest, place)),
@@ -70,12 +70,12 @@ impl SeekIndex {
     }
 
     fn add_mcap(&mut self, file: File) -> io::Result<()> {
-        const TARGET: &[u8] = &[op::CHUNK, op::MESSAGE, op::SCHEMA, op::CHANNEL, op::FOOTER];
+        const INDEXED_RECORDS: &[u8] = &[op::CHUNK, op::MESSAGE, op::SCHEMA, op::CHANNEL, op::FOOTER];
         // A small buffer suffices, because most of the skipped records are longer than it.
         let mut from = BufReader::with_capacity(4 << 10, file);
         from.seek(SeekFrom::Start(MAGIC.len() as u64))?;
         let mut described = 0;
-        while let Some((opcode, length)) = find(&mut from, TARGET)? {
+        while let Some((opcode, length)) = seek_record(&mut from, INDEXED_RECORDS)? {
             let at = from.stream_position()? - 9;
             let mut head = Vec::new();
             let kept = match opcode {
@@ -94,11 +94,13 @@ impl SeekIndex {
                 bytes.map_or(0, u64::from_le_bytes)
             };
             match opcode {
-                op::CHUNK => self.mark(SeekPoint { offset: at, ..SeekPoint::default() }, time(8)),
-                op::MESSAGE => self.mark(SeekPoint { offset: at, ..SeekPoint::default() }, time(6)),
+                op::CHUNK => self.add_point(SeekPoint { offset: at, ..SeekPoint::default() }, time(8)),
+                op::MESSAGE => self.add_point(SeekPoint { offset: at, ..SeekPoint::default() }, time(6)),
                 _ => {
                     described += head.len();
-                    if let Some(part) = self.parts.last_mut().filter(|_| described <= DESCRIPTIONS) {
+                    if let Some(part) =
+                        self.parts.last_mut().filter(|_| described <= MAX_PART_DESCRIPTIONS_BYTES)
+                    {
                         part.descriptions.push((opcode, head));
                     }
                 }
@@ -117,18 +119,18 @@ impl SeekIndex {
             match line_at(&mut file, at)? {
                 Some((_, None)) => return self.add_by_reading(file),
                 Some((offset, Some(nanos))) if at > 0 => {
-                    self.mark(last, nanos.saturating_add(WINDOW_NS));
+                    self.add_point(last, nanos.saturating_add(WINDOW_NS));
                     last = SeekPoint { offset, ..SeekPoint::default() };
                 }
                 Some(_) | None => {}
             }
-            at += self.piece;
+            at += self.min_distance;
         }
         let mut end = Vec::new();
-        file.seek(SeekFrom::Start(length.saturating_sub(END)))?;
-        (&mut file).take(END).read_to_end(&mut end)?;
+        file.seek(SeekFrom::Start(length.saturating_sub(LAST_FRAME_SEARCH_BYTES)))?;
+        (&mut file).take(LAST_FRAME_SEARCH_BYTES).read_to_end(&mut end)?;
         let latest = end.split(|&byte| is_line_end(byte)).filter_map(|line| known_time(line)?).max();
-        self.mark(last, latest.unwrap_or(0));
+        self.add_point(last, latest.unwrap_or(0));
         Ok(())
     }
 
@@ -143,7 +145,7 @@ impl SeekIndex {
             match log.next()? {
                 Some(Entry::Frame(record)) => {
                     let place = SeekPoint { offset, line, clock, ..SeekPoint::default() };
-                    self.mark(place, record.time.nanos);
+                    self.add_point(place, record.time.nanos);
                 }
                 Some(Entry::Note(_)) => {}
                 None => return Ok(()),

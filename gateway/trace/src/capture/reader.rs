@@ -10,7 +10,7 @@ use protocol::input;
 
 use super::log::{Clock, LogReader, Remark};
 use super::magic::{self, InputFormat, is_mcap};
-use super::mcap::{ForeignBuses, McapReader, McapState, ORIGIN_METADATA, ReadFault, SOURCE, TopicSurvey};
+use super::mcap::{ForeignBuses, LOG_ORIGIN, McapReader, McapState, ORIGIN_METADATA, ReadFault, TopicSurvey};
 use super::parts::{self, CaptureFile, PartsError};
 use super::place::{SeekIndex, SeekPoint};
 use super::text_kinds::kind_of;
@@ -25,12 +25,12 @@ pub struct Reader {
     file: String,
     source: Source,
     /// True if messages of other topics are returned too, not only frames and notes.
-    others: bool,
+    all_topics: bool,
     entries: u64,
     /// The index of the file that is being read.
     part: usize,
     /// The files that follow.
-    rest: VecDeque<PathBuf>,
+    remaining: VecDeque<PathBuf>,
     through: FileWrapper,
     /// True if an earlier file has no end, because it was never finished.
     is_unfinished: bool,
@@ -80,7 +80,7 @@ impl Source {
             Ok((InputFormat::Text, head)) if file.is_some() => Ok(Self::mcap(&head, input, state, file)),
             Ok((InputFormat::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
             Ok((InputFormat::Mcap, head)) => Ok(Self::mcap(&head, input, state, file)),
-            Ok((InputFormat::Other(what, hint), _)) => Err(CaptureError::Other { name, what, hint }),
+            Ok((InputFormat::Other(what, hint), _)) => Err(CaptureError::OtherFormat { name, what, hint }),
             Err(source) => Err(CaptureError::Io { name, source }),
         }
     }
@@ -127,7 +127,7 @@ impl Reader {
     ) -> Result<Self, CaptureError> {
         let name = name.into();
         let source = Source::begin(&name, input, McapState::new(false, None), None)?;
-        Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), plain(), false))
+        Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), without_wrapper(), false))
     }
 
     /// Opens one or more files as one capture. The parts of a recording may be given in any order; other files are read
@@ -136,7 +136,7 @@ impl Reader {
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open`] does, and if several files are not one capture.
     pub fn open_all(paths: &[PathBuf]) -> Result<Self, CaptureError> {
-        Self::open_parts(paths, plain(), false)
+        Self::open_parts(paths, without_wrapper(), false)
     }
 
     /// Opens a capture like [`Reader::open_all`], with each file wrapped by `through`.
@@ -151,8 +151,8 @@ impl Reader {
     ///
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open_all`] does.
-    pub fn open_with_others(paths: &[PathBuf]) -> Result<Self, CaptureError> {
-        Self::open_parts(paths, plain(), true)
+    pub fn open_with_all_topics(paths: &[PathBuf]) -> Result<Self, CaptureError> {
+        Self::open_parts(paths, without_wrapper(), true)
     }
 
     fn open_parts(paths: &[PathBuf], through: FileWrapper, others: bool) -> Result<Self, CaptureError> {
@@ -188,7 +188,9 @@ impl Reader {
             return ForeignBuses::default();
         }
         let files = paths.filter_map(|path| recording(&path));
-        files.fold(ForeignBuses::default(), |known, file| survey.buses_of(Box::new(file), known)).settled()
+        files
+            .fold(ForeignBuses::default(), |known, file| survey.buses_of(Box::new(file), known))
+            .renamed_with_all_pairs()
     }
 
     /// Returns the files of one capture in the order in which they are read.
@@ -202,10 +204,10 @@ impl Reader {
                 let mut reader = Self::open(path)?;
                 // The part number is stored before the first frame, so it is known after this call.
                 let first = reader.first_time();
-                Ok(CaptureFile::new(path, reader.extras(), reader.format(), first, reader.lines()))
+                Ok(CaptureFile::new(path, reader.extras(), reader.format(), first, reader.line_count()))
             }
         };
-        Ok(parts::together(paths.iter().map(named).collect::<Result<_, CaptureError>>()?)?)
+        Ok(parts::in_reading_order(paths.iter().map(named).collect::<Result<_, CaptureError>>()?)?)
     }
 
     /// Reads up to the first frame and returns its time, in ns since 1970. Returns `None` if the capture has no
@@ -245,10 +247,10 @@ impl Reader {
             name,
             file,
             source,
-            others,
+            all_topics: others,
             entries: 0,
             part: 0,
-            rest,
+            remaining: rest,
             through,
             is_unfinished: false,
             buses: ForeignBuses::default(),
@@ -265,22 +267,22 @@ impl Reader {
     }
 
     /// Opens the next file of the capture. Returns false after the last one.
-    fn go_on(&mut self) -> Result<bool, CaptureError> {
-        let Some(path) = self.rest.pop_front() else { return Ok(false) };
+    fn open_next_part(&mut self) -> Result<bool, CaptureError> {
+        let Some(path) = self.remaining.pop_front() else { return Ok(false) };
         self.part += 1;
         self.before = Some(self.file.clone());
         self.remarks = self.log_remarks();
-        let lines = self.lines();
+        let lines = self.line_count();
         let mut before = self.extras().clone();
         if let Some(what) = before.unfinished.as_mut().filter(|_| !self.is_unfinished) {
             *what = format!("{}: {what}", self.file);
             self.is_unfinished = true;
         }
-        let state = McapState::new(self.others, Some(before)).with_buses(self.buses.clone());
+        let state = McapState::new(self.all_topics, Some(before)).with_buses(self.buses.clone());
         let source;
         (self.file, source) = Source::open(&path, &self.through, state)?;
         self.source = match source {
-            Source::Log(log) => Source::Log(log.behind(lines)),
+            Source::Log(log) => Source::Log(log.with_line_count(lines)),
             mcap @ Source::Mcap(_) => mcap,
         };
         Ok(true)
@@ -303,14 +305,14 @@ impl Reader {
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
-    pub fn go_to(&mut self, places: &SeekIndex, place: SeekPoint) -> Result<(), CaptureError> {
+    pub fn seek(&mut self, places: &SeekIndex, place: SeekPoint) -> Result<(), CaptureError> {
         let Some(path) = places.path(place.part) else { return Ok(()) };
         if self.part != place.part || place.offset == 0 {
             let before = (place.part > 0).then(|| self.extras().clone());
-            let state = McapState::new(self.others, before).with_buses(self.buses.clone());
+            let state = McapState::new(self.all_topics, before).with_buses(self.buses.clone());
             (self.file, self.source) = Source::open(path, &self.through, state)?;
             self.part = place.part;
-            self.rest = places.behind(place.part).cloned().collect();
+            self.remaining = places.paths_after(place.part).cloned().collect();
         }
         self.times = TimeChecks::default();
         let name = self.file.clone();
@@ -366,13 +368,13 @@ impl Reader {
     }
 
     /// Returns the next entry, in the order of the file, or `None` after the last one. Also returns messages of other
-    /// topics if the reader was opened by [`Reader::open_with_others`]. Never panics.
+    /// topics if the reader was opened by [`Reader::open_with_all_topics`]. Never panics.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
     pub fn next_item(&mut self) -> Result<Option<Item<'_>>, CaptureError> {
-        while !self.rest.is_empty() && self.source.is_at_its_end(&self.file, self.entries)? {
-            self.go_on()?;
+        while !self.remaining.is_empty() && self.source.is_at_its_end(&self.file, self.entries)? {
+            self.open_next_part()?;
         }
         let Self { file: name, source, entries, times, before, .. } = self;
         let next = match source {
@@ -383,7 +385,7 @@ impl Reader {
         *entries += u64::from(matches!(next, Some(Item::Entry(_))));
         if let Some(Item::Entry(Entry::Frame(record))) = &next {
             if let Some(before) = before.take().filter(|_| record.time.nanos < times.latest()) {
-                times.overlaps(name, &before);
+                times.record_overlap(name, &before);
             }
             times.check(record.interface, record.time.nanos);
         }
@@ -393,15 +395,16 @@ impl Reader {
     /// Returns true if the capture is a log, or a recording that was converted from one. Other recordings hold more,
     /// such as the direction of each frame.
     #[must_use]
-    pub fn is_of_a_log(&self) -> bool {
-        let (key, value) = SOURCE;
-        self.format() == CaptureFormat::Candump || self.extras().fact(ORIGIN_METADATA, key) == Some(value)
+    pub fn is_from_log(&self) -> bool {
+        let (key, value) = LOG_ORIGIN;
+        self.format() == CaptureFormat::Candump
+            || self.extras().metadata_value(ORIGIN_METADATA, key) == Some(value)
     }
 
     /// Returns the number of lines read so far from a log, which is the line number of the last entry. Returns 0 for an
     /// MCAP recording.
     #[must_use]
-    pub const fn lines(&self) -> u64 {
+    pub const fn line_count(&self) -> u64 {
         match &self.source {
             Source::Log(log) => log.lines(),
             Source::Mcap(_) => 0,
@@ -411,12 +414,12 @@ impl Reader {
     /// Returns remarks on the times, flags and buses of the frames read so far, one line each.
     #[must_use]
     pub fn remarks(&self) -> Vec<String> {
-        self.times.backwards().into_iter().chain(self.remarks_beside_order()).collect()
+        self.times.backwards().into_iter().chain(self.remarks_except_order()).collect()
     }
 
     /// Returns the remarks except the one on times that run backwards.
     #[must_use]
-    pub fn remarks_beside_order(&self) -> Vec<String> {
+    pub fn remarks_except_order(&self) -> Vec<String> {
         let shared = match &self.source {
             Source::Mcap(mcap) => mcap.buses().is_shared(),
             Source::Log(_) => false,
@@ -482,6 +485,6 @@ impl Reader {
 }
 
 /// Returns a wrapper that leaves files as they are.
-fn plain() -> FileWrapper {
+fn without_wrapper() -> FileWrapper {
     Box::new(|file| Box::new(file))
 }

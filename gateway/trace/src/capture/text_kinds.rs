@@ -8,7 +8,7 @@ pub(super) const ASC: (&str, &str) =
 /// The name of the kind for skin and scenario files.
 pub const SKIN_OR_SCENARIO: &str = "a skin or a scenario";
 /// Table headings that occur in skins and scenarios but rarely in other files.
-const TABLES: [&str; 7] =
+const SKIN_TABLES: [&str; 7] =
     ["[robot]", "[[chain]]", "[[bus]]", "[[cell]]", "[motion]", "[[touch]]", "[[fault]]"];
 
 /// Returns the kind of a text and advice to the user, or `None` if the kind is unknown.
@@ -22,7 +22,7 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
     let kinds: [(bool, (&'static str, &'static str)); 16] = [
         (begins_with("***BUSMASTER"), ("a BUSMASTER log", EXPORT)),
         (
-            any(&|line| TABLES.iter().any(|table| line.starts_with(table))),
+            any(&|line| SKIN_TABLES.iter().any(|table| line.starts_with(table))),
             (SKIN_OR_SCENARIO, "there are no frames in it: name a capture"),
         ),
         (

@@ -3,7 +3,7 @@
 use std::fmt;
 
 /// The maximum number of buses whose times are checked.
-const BUSES: usize = 64;
+const MAX_BUSES: usize = 64;
 /// The number of frames with the same time from which on this is no coincidence.
 const MIN_CONSTANT_FRAMES: u64 = 3;
 
@@ -40,7 +40,7 @@ impl TimeChecks {
         self.frames += 1;
         self.latest = self.latest.max(nanos);
         if self.buses.get(self.current).is_none_or(|current| current.name != bus) {
-            let Some(place) = self.place(bus, nanos) else { return };
+            let Some(place) = self.bus_index(bus, nanos) else { return };
             self.current = place;
         }
         let Some(bus) = self.buses.get_mut(self.current) else { return };
@@ -52,12 +52,12 @@ impl TimeChecks {
         bus.last = nanos;
     }
 
-    fn place(&mut self, bus: &str, nanos: u64) -> Option<usize> {
+    fn bus_index(&mut self, bus: &str, nanos: u64) -> Option<usize> {
         let known = self.buses.iter().position(|it| it.name == bus);
         known.or_else(|| {
             let new =
                 BusTimes { name: bus.to_owned(), first: nanos, last: nanos, frames: 0, has_several: false };
-            (self.buses.len() < BUSES).then(|| {
+            (self.buses.len() < MAX_BUSES).then(|| {
                 self.buses.push(new);
                 self.buses.len() - 1
             })
@@ -70,7 +70,7 @@ impl TimeChecks {
     }
 
     /// Records that `file` begins at an earlier time than that at which the file `before` it ends.
-    pub(super) fn overlaps(&mut self, file: &str, before: &str) {
+    pub(super) fn record_overlap(&mut self, file: &str, before: &str) {
         self.overlap.get_or_insert_with(|| (file.to_owned(), before.to_owned()));
     }
 

@@ -12,12 +12,12 @@ use super::{FormatError, MAX_RECORD_BYTES};
 /// The total size in bytes that the chunks of any file may decompress to, even if the file is short.
 const FREE_BYTES: u64 = 256 << 20;
 /// The number of decompressed bytes that are allowed for each byte of the file, in addition to [`FREE_BYTES`].
-const BYTES_A_BYTE: u64 = 1_000;
+const MAX_EXPANSION: u64 = 1_000;
 /// The total number of records that the chunks of any file may hold, even if the file is short.
 const FREE_RECORDS: u64 = 1 << 17;
 /// The number of records that are allowed for each byte of the file, in addition to [`FREE_RECORDS`]. A real recording
 /// has an index entry of 16 bytes for each record.
-const RECORDS_A_BYTE: u64 = 1;
+const MAX_RECORDS_PER_BYTE: u64 = 1;
 /// The length of a record's header in bytes: operation code and length.
 const RECORD_HEADER_BYTES: usize = 9;
 
@@ -67,7 +67,7 @@ impl Chunk {
         reason = "a record borrows from the chunk; an iterator's cannot"
     )]
     pub fn next(&mut self) -> Option<(u8, &[u8])> {
-        let (opcode, body, rest) = split(self.bytes.get(self.at..)?)?.ok()?;
+        let (opcode, body, rest) = split_record(self.bytes.get(self.at..)?)?.ok()?;
         (self.at, self.body) = (self.bytes.len() - rest, body.len());
         Some((opcode, body))
     }
@@ -99,13 +99,13 @@ impl Chunk {
         let packed = from.u64("compressed size")?;
         let packed = from.bytes(packed, "records")?;
         if claimed > MAX_RECORD_BYTES {
-            return Err(FormatError::Long {
+            return Err(FormatError::TooLong {
                 what: "chunk, unpacked,",
                 bytes: claimed,
                 limit: MAX_RECORD_BYTES,
             });
         }
-        let limit = FREE_BYTES.saturating_add(read.saturating_mul(BYTES_A_BYTE));
+        let limit = FREE_BYTES.saturating_add(read.saturating_mul(MAX_EXPANSION));
         self.total_bytes = self.total_bytes.saturating_add(claimed);
         if self.total_bytes > limit {
             return Err(FormatError::Bomb { read, limit, what: "bytes" });
@@ -129,12 +129,12 @@ impl Chunk {
             }
         }
         let mut rest = self.bytes.as_slice();
-        while let Some(record) = split(rest) {
+        while let Some(record) = split_record(rest) {
             let (_, _, leftover) = record?;
             rest = rest.get(rest.len() - leftover..).unwrap_or_default();
             self.total_records += 1;
         }
-        let limit = FREE_RECORDS.saturating_add(read.saturating_mul(RECORDS_A_BYTE));
+        let limit = FREE_RECORDS.saturating_add(read.saturating_mul(MAX_RECORDS_PER_BYTE));
         if self.total_records > limit {
             return Err(FormatError::Bomb { read, limit, what: "records" });
         }
@@ -182,10 +182,10 @@ impl Chunk {
 }
 
 /// A record's operation code, its contents, and the number of bytes after it.
-type First<'a> = (u8, &'a [u8], usize);
+type SplitRecord<'a> = (u8, &'a [u8], usize);
 
 /// Splits the first record off a sequence of records.
-fn split(records: &[u8]) -> Option<Result<First<'_>, FormatError>> {
+fn split_record(records: &[u8]) -> Option<Result<SplitRecord<'_>, FormatError>> {
     if records.is_empty() {
         return None;
     }
@@ -261,7 +261,8 @@ mod tests {
             Err(FormatError::Overrun { bytes: 9, leftover: 5 })
         );
         assert_eq!(unpacked(&chunk(11, 0, "", &one)), Err(FormatError::Unpacked { claimed: 11, found: 12 }));
-        let none = FormatError::Long { what: "chunk, unpacked,", bytes: u64::MAX, limit: MAX_RECORD_BYTES };
+        let none =
+            FormatError::TooLong { what: "chunk, unpacked,", bytes: u64::MAX, limit: MAX_RECORD_BYTES };
         assert_eq!(unpacked(&chunk(u64::MAX, 0, "zstd", &one)), Err(none));
         assert!(matches!(unpacked(&chunk(12, 0, "zstd", &one)), Err(FormatError::Unpack(_))));
         assert!(matches!(unpacked(&chunk(12, 0, "lz4", &one)), Err(FormatError::Unpack(_))));

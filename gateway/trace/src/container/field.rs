@@ -205,7 +205,7 @@ impl<'a> Fields<'a> {
 pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, FormatError> {
     let description = |record| match body.len() as u64 {
         bytes if body.len() > MAX_DESCRIPTION_BYTES => {
-            Err(FormatError::Long { what: record, bytes, limit: MAX_DESCRIPTION_BYTES as u64 })
+            Err(FormatError::TooLong { what: record, bytes, limit: MAX_DESCRIPTION_BYTES as u64 })
         }
         _ => Ok(Fields::new(record, body)),
     };

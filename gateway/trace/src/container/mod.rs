@@ -15,8 +15,8 @@ mod source;
 
 pub use chunk::Chunk;
 pub use field::{MetadataMap, NameBudget, Record, parse};
-pub use search::{RECORD_HEADER_BYTES, first_record, is_record, own_length};
-pub use source::{Framed, RecordReader, find};
+pub use search::{RECORD_HEADER_BYTES, first_record, is_record, length_by_fields};
+pub use source::{Framed, RecordReader, seek_record};
 
 use std::io::{self, Read};
 
@@ -33,7 +33,7 @@ pub const MAX_RECORD_BYTES: u64 = 128 << 20;
 pub const MAX_DESCRIPTION_BYTES: usize = 4 << 20;
 
 /// Reads the available bytes and retries if a signal interrupts the call.
-pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
+pub(crate) fn read_uninterrupted(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
     loop {
         match input.read(room) {
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
@@ -66,7 +66,7 @@ pub enum FormatError {
     },
     /// A record or chunk is too long to be read.
     #[error("a {what} of {bytes} bytes is too long: at most {limit} are read")]
-    Long {
+    TooLong {
         /// The kind of record.
         what: &'static str,
         /// Its length in bytes.
@@ -162,7 +162,7 @@ pub enum FormatError {
     Footer,
     /// Bytes follow the end of the recording.
     #[error("the file continues after its end")]
-    Behind,
+    TrailingData,
     /// The file holds another number of messages than its statistics record states.
     #[error("it has {found} messages, but its statistics say {stated}")]
     Messages {

@@ -9,16 +9,16 @@ use std::io::{self, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::Fields;
-use super::{MAGIC, MAX_RECORD_BYTES, read_some};
+use super::{MAGIC, MAX_RECORD_BYTES, read_uninterrupted};
 
 /// The length of a record's header in bytes: operation code and length.
 pub const RECORD_HEADER_BYTES: usize = 9;
 /// The number of bytes that are read and searched at once.
 const WINDOW: usize = 1 << 20;
 /// The maximum number of bytes at the beginning of a record by which it is identified.
-const BEGINNING: usize = 512;
+const MAX_PREFIX_BYTES: usize = 512;
 /// The number of consecutive records that are not considered a coincidence.
-const ROW: usize = 4;
+const MIN_ROW_RECORDS: usize = 4;
 /// The length in bytes of the fields of a message record before the message itself.
 const MESSAGE_HEAD: u64 = 22;
 
@@ -74,11 +74,11 @@ pub fn first_record(
     while from < until.min(size) {
         input.seek(SeekFrom::Start(from))?;
         window.clear();
-        input.by_ref().take((WINDOW + BEGINNING) as u64).read_to_end(&mut window)?;
+        input.by_ref().take((WINDOW + MAX_PREFIX_BYTES) as u64).read_to_end(&mut window)?;
         let starts = usize::try_from(until - from).unwrap_or(WINDOW).min(WINDOW).min(window.len());
         for start in 0..starts {
             let at = from + start as u64;
-            let bytes = window.get(start..(start + BEGINNING).min(window.len())).unwrap_or_default();
+            let bytes = window.get(start..(start + MAX_PREFIX_BYTES).min(window.len())).unwrap_or_default();
             if is_certain(bytes, size - at)
                 || (any && head(bytes, size - at).is_some() && is_row(input, at, size)?)
             {
@@ -105,13 +105,13 @@ fn is_certain(bytes: &[u8], leftover: u64) -> bool {
     let Some((opcode, length)) = head(bytes, leftover) else { return false };
     let body = bytes.get(RECORD_HEADER_BYTES..).unwrap_or_default();
     let is_of_two = opcode == op::ATTACHMENT || (opcode == op::CHUNK && length <= MAX_RECORD_BYTES);
-    is_of_two && own_length(opcode, body) == Some(length)
+    is_of_two && length_by_fields(opcode, body) == Some(length)
 }
 
 /// Returns the length of a record as computed from its own fields. Returns `None` for a kind of record whose length
 /// cannot be computed, or if the bytes end too early.
 #[must_use]
-pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {
+pub fn length_by_fields(opcode: u8, body: &[u8]) -> Option<u64> {
     match opcode {
         op::CHUNK => chunk(body),
         op::ATTACHMENT => attachment(body),
@@ -174,7 +174,7 @@ fn attachment(body: &[u8]) -> Option<u64> {
 #[must_use]
 pub(super) fn is_disguised(body: &[u8], length: u64) -> bool {
     let kinds = [op::CHUNK, op::ATTACHMENT, op::METADATA];
-    length > 8 && kinds.iter().any(|&code| own_length(code, body) == Some(length))
+    length > 8 && kinds.iter().any(|&code| length_by_fields(code, body) == Some(length))
 }
 
 /// Returns true if a message ends with several consecutive records. Its length field is then wrong and spans them.
@@ -191,14 +191,14 @@ pub(super) fn has_records(message: &[u8]) -> bool {
                 .and_then(|length| rest.get(RECORD_HEADER_BYTES + length..))
                 .unwrap_or_default();
         }
-        row >= ROW || (row > 0 && rest.is_empty())
+        row >= MIN_ROW_RECORDS || (row > 0 && rest.is_empty())
     })
 }
 
 /// Returns true if several consecutive records begin at `at`, or if records follow each other up to the end of the
 /// file.
 fn is_row(input: &mut (impl Read + Seek), mut at: u64, size: u64) -> io::Result<bool> {
-    for before in 0..ROW {
+    for before in 0..MIN_ROW_RECORDS {
         if before > 0 && at == size {
             return Ok(true);
         }
@@ -216,7 +216,7 @@ fn next(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<Option
     let mut bytes = [0; RECORD_HEADER_BYTES];
     input.seek(SeekFrom::Start(at))?;
     let mut read = 0;
-    while let came @ 1.. = read_some(input, bytes.get_mut(read..).unwrap_or_default())? {
+    while let came @ 1.. = read_uninterrupted(input, bytes.get_mut(read..).unwrap_or_default())? {
         read += came;
     }
     let there = bytes.get(..read).unwrap_or_default();

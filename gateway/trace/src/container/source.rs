@@ -5,13 +5,13 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::{Record, attachment_name, parse};
-use super::search::{RECORD_HEADER_BYTES, has_records, is_disguised, is_known, is_plain, own_length};
-use super::{FormatError, MAGIC, MAX_RECORD_BYTES, read_some};
+use super::search::{RECORD_HEADER_BYTES, has_records, is_disguised, is_known, is_plain, length_by_fields};
+use super::{FormatError, MAGIC, MAX_RECORD_BYTES, read_uninterrupted};
 
 /// The maximum number of bytes stored of a record that is too long for memory or that no reader needs.
-const BEGINNING: u64 = 64 << 10;
+const KEPT_PREFIX_BYTES: u64 = 64 << 10;
 /// The maximum number of bytes stored of a message index record, which no reader needs.
-const INDEX: u64 = 64;
+const KEPT_INDEX_BYTES: u64 = 64;
 
 /// The number of bytes at the beginning of a footer that its checksum covers.
 const FOOTER_CHECKED: usize = 16;
@@ -23,14 +23,14 @@ pub enum Framed {
     Record(u8),
     /// A skipped record with this operation code and length: an index, statistics, or a record of an application. Its
     /// beginning is in [`RecordReader::body`].
-    Passed(u8, u64),
+    Skipped(u8, u64),
     /// A record with this operation code and length that is too long for memory. Its beginning is in [`RecordReader::body`].
-    Long(u8, u64),
+    Oversized(u8, u64),
     /// A record with an operation code that the format does not define, and its length.
     Unknown(u8, u64),
     /// A record with this operation code and length that the input does not hold completely. The available beginning,
     /// up to a limit, is in [`RecordReader::body`].
-    Cut(u8, u64),
+    Truncated(u8, u64),
     /// The end of the input. The number counts the remaining bytes, which are too few for a record header; it is 0 if
     /// the file ends between two records.
     End(u64),
@@ -132,7 +132,7 @@ impl<R: Read> RecordReader<R> {
     /// that range that looks like a record belongs to the chunk.
     #[must_use]
     pub fn plain_chunk(&self) -> Option<u64> {
-        own_length(op::CHUNK, &self.body).filter(|_| self.code == op::CHUNK && is_plain(&self.body))
+        length_by_fields(op::CHUNK, &self.body).filter(|_| self.code == op::CHUNK && is_plain(&self.body))
     }
 
     /// Checks the record that was read last: its length against its own fields, and its operation code against its
@@ -145,9 +145,9 @@ impl<R: Read> RecordReader<R> {
             Framed::Unknown(code, _) => return Err(FormatError::Unknown(code)),
             Framed::End(_) => return Ok(()),
             Framed::Record(code) => (code, self.body.len() as u64),
-            Framed::Passed(code, bytes) | Framed::Long(code, bytes) | Framed::Cut(code, bytes) => {
-                (code, bytes)
-            }
+            Framed::Skipped(code, bytes)
+            | Framed::Oversized(code, bytes)
+            | Framed::Truncated(code, bytes) => (code, bytes),
         };
         let is_index = matches!(
             code,
@@ -156,13 +156,13 @@ impl<R: Read> RecordReader<R> {
         let is_elsewhere =
             (is_index && !self.in_summary) || (code == op::HEADER && self.began > MAGIC.len() as u64);
         // Messages stand in chunks or between schemas and channels. Message indexes follow chunks.
-        let is_of = |kind| own_length(kind, &self.body) == Some(bytes);
+        let is_of = |kind| length_by_fields(kind, &self.body) == Some(bytes);
         let is_other = code == op::MESSAGE
             && (is_of(op::SCHEMA) || is_of(op::CHANNEL) || (self.has_chunks && is_of(op::MESSAGE_INDEX)));
         if is_elsewhere || is_other || (code >= 0x80 && is_disguised(&self.body, bytes)) {
             return Err(FormatError::Code(code));
         }
-        match own_length(code, &self.body) {
+        match length_by_fields(code, &self.body) {
             Some(own) if own != bytes => Err(FormatError::Length { code, bytes, own }),
             _ if code == op::MESSAGE && has_records(&self.body) => Err(FormatError::Swallowed(bytes)),
             _ => Ok(()),
@@ -228,7 +228,7 @@ impl<R: Read> RecordReader<R> {
         }
         self.body.clear();
         let (limit, beginning) = match opcode {
-            op::ATTACHMENT => (self.attachments, BEGINNING),
+            op::ATTACHMENT => (self.attachments, KEPT_PREFIX_BYTES),
             op::HEADER
             | op::FOOTER
             | op::SCHEMA
@@ -236,9 +236,9 @@ impl<R: Read> RecordReader<R> {
             | op::MESSAGE
             | op::CHUNK
             | op::METADATA
-            | op::DATA_END => (MAX_RECORD_BYTES, BEGINNING),
-            op::MESSAGE_INDEX => (0, INDEX),
-            _ => (0, BEGINNING),
+            | op::DATA_END => (MAX_RECORD_BYTES, KEPT_PREFIX_BYTES),
+            op::MESSAGE_INDEX => (0, KEPT_INDEX_BYTES),
+            _ => (0, KEPT_PREFIX_BYTES),
         };
         let is_long = length > limit;
         let kept = if is_long { length.min(beginning) } else { length };
@@ -249,13 +249,13 @@ impl<R: Read> RecordReader<R> {
             _ => self.update(),
         }
         if is_long && there {
-            there = self.pass_over(length - kept)?;
+            there = self.skip(length - kept)?;
         }
         Ok(match limit {
             _ if !is_known(opcode) => Framed::Unknown(opcode, length),
-            _ if !there => Framed::Cut(opcode, length),
-            0 if opcode != op::ATTACHMENT => Framed::Passed(opcode, length),
-            _ if is_long => Framed::Long(opcode, length),
+            _ if !there => Framed::Truncated(opcode, length),
+            0 if opcode != op::ATTACHMENT => Framed::Skipped(opcode, length),
+            _ if is_long => Framed::Oversized(opcode, length),
             _ => Framed::Record(opcode),
         })
     }
@@ -266,7 +266,7 @@ impl<R: Read> RecordReader<R> {
         let came = (&mut self.input).take(bytes).read_to_end(&mut self.body)?;
         self.read += came as u64;
         let from = self.body.len().saturating_sub(came.min(MAGIC.len()));
-        remember(&mut self.last, self.body.get(from..).unwrap_or_default());
+        keep_last_bytes(&mut self.last, self.body.get(from..).unwrap_or_default());
         Ok(came as u64)
     }
 
@@ -281,18 +281,18 @@ impl<R: Read> RecordReader<R> {
     }
 
     /// Skips `bytes` bytes. Returns false if the input ended before.
-    fn pass_over(&mut self, bytes: u64) -> io::Result<bool> {
+    fn skip(&mut self, bytes: u64) -> io::Result<bool> {
         let mut leftover = bytes;
         let mut piece = [0; 8 << 10];
         while leftover > 0 {
             let most = usize::try_from(leftover).map_or(piece.len(), |leftover| leftover.min(piece.len()));
             let room = piece.get_mut(..most).unwrap_or_default();
-            let came = read_some(&mut self.input, room)?;
+            let came = read_uninterrupted(&mut self.input, room)?;
             let Some(came @ [_, ..]) = room.get(..came) else { return Ok(false) };
             if let Some(checksum) = &mut self.checksum {
                 checksum.update(came);
             }
-            remember(&mut self.last, came);
+            keep_last_bytes(&mut self.last, came);
             self.read += came.len() as u64;
             leftover -= came.len() as u64;
         }
@@ -321,7 +321,7 @@ impl<R: Read + Seek> RecordReader<R> {
     ///
     /// # Errors
     /// Returns an error if the input fails.
-    pub fn move_to(&mut self, place: u64) -> io::Result<()> {
+    pub fn seek(&mut self, place: u64) -> io::Result<()> {
         self.input.seek(SeekFrom::Start(place))?;
         if place != self.read {
             (self.read, self.began, self.checksum) = (place, place, None);
@@ -335,7 +335,7 @@ impl<R: Read + Seek> RecordReader<R> {
     /// # Errors
     /// Returns an error if the input fails.
     pub fn read_as(&mut self, began: u64, length: u64) -> io::Result<bool> {
-        self.move_to(began + RECORD_HEADER_BYTES as u64)?;
+        self.seek(began + RECORD_HEADER_BYTES as u64)?;
         self.began = began;
         self.body.clear();
         Ok(self.read_into_body(length)? == length)
@@ -343,7 +343,7 @@ impl<R: Read + Seek> RecordReader<R> {
 }
 
 /// Stores the last bytes of the input for [`Source::ends_with_magic`].
-fn remember(last: &mut [u8; MAGIC.len()], came: &[u8]) {
+fn keep_last_bytes(last: &mut [u8; MAGIC.len()], came: &[u8]) {
     let came = came.get(came.len().saturating_sub(last.len())..).unwrap_or_default();
     last.rotate_left(came.len());
     let from = last.len() - came.len();
@@ -357,7 +357,7 @@ fn remember(last: &mut [u8; MAGIC.len()], came: &[u8]) {
 ///
 /// # Errors
 /// Returns an error if the input fails.
-pub fn find<R: Read + Seek>(input: &mut BufReader<R>, target: &[u8]) -> io::Result<Option<(u8, u64)>> {
+pub fn seek_record<R: Read + Seek>(input: &mut BufReader<R>, target: &[u8]) -> io::Result<Option<(u8, u64)>> {
     loop {
         let mut head = [0; 9];
         match input.read_exact(&mut head) {

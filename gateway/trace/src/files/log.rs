@@ -5,13 +5,13 @@ use std::io::{self, BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use protocol::input::folder_of;
+use protocol::input::parent_folder;
 use protocol::stop::InterruptibleWriter;
 use rustix::fs::{Access, access};
 
 use super::target::{
-    OutputTarget, hold, identity, is_still, open_stream, open_unfollowed, or_exists, part_of, suffixed,
-    sync_folder, with_hint, write_all_patiently,
+    OutputTarget, identity, is_still, lock_exclusively, open_stream, open_unfollowed, suffixed, sync_folder,
+    temporary_name, with_exists_hint, with_hint, write_all_with_retries,
 };
 
 /// A log file. It has its name from the start and is locked against other writers. It always ends with a complete line.
@@ -28,9 +28,9 @@ pub struct LogFile {
 #[derive(Debug)]
 enum LogTarget {
     /// A regular file that this log has created.
-    Ours(File),
+    Opened(File),
     /// An existing file of the same name. It stays until the first line is written, and is locked until then.
-    Old(File),
+    ToReplace(File),
     /// A stream such as a terminal, which has no length and no lock.
     Stream(InterruptibleWriter<File>),
 }
@@ -45,21 +45,21 @@ impl LogFile {
             Ok(OutputTarget::Stream) => {
                 LogTarget::Stream(InterruptibleWriter::new(open_stream(path, stopped)?))
             }
-            Ok(OutputTarget::New) => LogTarget::Ours(begin(path)?),
-            Ok(OutputTarget::Old) => {
+            Ok(OutputTarget::New) => LogTarget::Opened(create_locked(path)?),
+            Ok(OutputTarget::Existing) => {
                 // If the file was replaced by a symlink meanwhile, the link is not followed.
                 let old = open_unfollowed(path).map_err(with_hint)?;
-                hold_log(&old)?;
+                lock_log(&old)?;
                 // Missing write access to the folder is reported now, not when the first line is written.
-                let writes = access(folder_of(path), Access::WRITE_OK | Access::EXEC_OK);
+                let writes = access(parent_folder(path), Access::WRITE_OK | Access::EXEC_OK);
                 writes.map_err(|errno| with_hint(errno.into()))?;
-                LogTarget::Old(old)
+                LogTarget::ToReplace(old)
             }
             Err(error) => {
                 // If another run writes the file, that is reported rather than that the file exists.
                 let about = fs::symlink_metadata(path);
                 if about.is_ok_and(|about| about.is_file()) {
-                    File::open(path).map_or(Ok(()), |old| hold_log(&old))?;
+                    File::open(path).map_or(Ok(()), |old| lock_log(&old))?;
                 }
                 return Err(error);
             }
@@ -113,23 +113,23 @@ impl LogFile {
         if lines.is_empty() {
             return Ok(());
         }
-        if let LogTarget::Old(_) = &self.state {
-            self.state = LogTarget::Ours(self.take_place()?);
+        if let LogTarget::ToReplace(_) = &self.state {
+            self.state = LogTarget::Opened(self.replace_old_file()?);
         }
         let written = match &mut self.state {
-            LogTarget::Ours(file) | LogTarget::Old(file) => write_all_patiently(file, lines),
+            LogTarget::Opened(file) | LogTarget::ToReplace(file) => write_all_with_retries(file, lines),
             LogTarget::Stream(stream) => stream.write_all(lines),
         };
         match &self.state {
             _ if written.is_ok() => self.bytes += lines.len() as u64,
             // The file must not end with an incomplete line. An error of truncating it cannot be handled.
-            LogTarget::Ours(file) => {
+            LogTarget::Opened(file) => {
                 // Truncation must not extend the file, which another program may have truncated further.
                 if file.metadata().is_ok_and(|about| about.len() > self.bytes) {
                     let _ = file.set_len(self.bytes);
                 }
             }
-            LogTarget::Old(_) | LogTarget::Stream(_) => {}
+            LogTarget::ToReplace(_) | LogTarget::Stream(_) => {}
         }
         written
     }
@@ -139,7 +139,7 @@ impl LogFile {
     /// # Errors
     /// Returns an error if another program has renamed, removed, truncated or written it.
     pub fn check(&self) -> io::Result<()> {
-        let LogTarget::Ours(file) = &self.state else { return Ok(()) };
+        let LogTarget::Opened(file) = &self.state else { return Ok(()) };
         // If the file cannot be queried, it is not known to have changed.
         let Ok(about) = file.metadata() else { return Ok(()) };
         let (bytes, written) = (about.len(), self.bytes);
@@ -162,7 +162,7 @@ impl LogFile {
     /// # Errors
     /// Returns an error if the file cannot be read.
     pub fn lines(&self, begin: &str) -> io::Result<Option<u64>> {
-        let LogTarget::Ours(file) = &self.state else { return Ok(None) };
+        let LogTarget::Opened(file) = &self.state else { return Ok(None) };
         let there = open_unfollowed(&self.path);
         let Some(there) = there.ok().filter(|there| is_same(there, file)) else { return Ok(None) };
         let mut lines = 0;
@@ -174,9 +174,9 @@ impl LogFile {
 
     /// Replaces the old file by a new, empty one. The old file remains available under other hard links and to programs
     /// that have it open.
-    fn take_place(&self) -> io::Result<File> {
-        let part = part_of(&self.path);
-        let file = begin(&part)?;
+    fn replace_old_file(&self) -> io::Result<File> {
+        let part = temporary_name(&self.path);
+        let file = create_locked(&part)?;
         fs::rename(&part, &self.path).inspect_err(|_| {
             let _ = fs::remove_file(&part);
         })?;
@@ -188,12 +188,12 @@ impl LogFile {
     /// # Errors
     /// Returns an error if the disk cannot store them.
     pub fn finish(mut self) -> io::Result<()> {
-        if let LogTarget::Old(_) = &self.state {
+        if let LogTarget::ToReplace(_) = &self.state {
             // An empty log also replaces the old file.
-            self.state = LogTarget::Ours(self.take_place()?);
+            self.state = LogTarget::Opened(self.replace_old_file()?);
         }
         self.ended = true;
-        let LogTarget::Ours(file) = &self.state else { return Ok(()) };
+        let LogTarget::Opened(file) = &self.state else { return Ok(()) };
         file.sync_data()?;
         sync_folder(&self.path);
         Ok(())
@@ -203,7 +203,7 @@ impl LogFile {
 impl Drop for LogFile {
     /// Removes the file if nothing was written and [`LogFile::finish`] was not called.
     fn drop(&mut self) {
-        let LogTarget::Ours(file) = &self.state else { return };
+        let LogTarget::Opened(file) = &self.state else { return };
         let is_there =
             file.metadata().is_ok_and(|about| is_still(&self.path, identity(&about)) == Some(true));
         if !self.ended && self.bytes == 0 && is_there {
@@ -219,16 +219,16 @@ fn is_same(one: &File, other: &File) -> bool {
 }
 
 /// Creates and locks a new file.
-fn begin(path: &Path) -> io::Result<File> {
+fn create_locked(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().append(true).create_new(true).open(path);
-    let file = file.map_err(|error| or_exists(with_hint(error)))?;
-    hold_log(&file)?;
+    let file = file.map_err(|error| with_exists_hint(with_hint(error)))?;
+    lock_log(&file)?;
     Ok(file)
 }
 
 /// Locks a log against other writers. Succeeds on file systems that do not support locks.
-fn hold_log(file: &File) -> io::Result<()> {
-    if hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
+fn lock_log(file: &File) -> io::Result<()> {
+    if lock_exclusively(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
         let why = "another run is writing it: name another file, or wait for that run's end";
         return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
     }

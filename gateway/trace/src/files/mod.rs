@@ -12,10 +12,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 pub use log::LogFile;
-pub use protocol::input::folder_of;
-use target::{OutputTarget, open_stream, or_exists, part_of};
+pub use protocol::input::parent_folder;
+use target::{OutputTarget, open_stream, temporary_name, with_exists_hint};
 pub use target::{STANDARD_OUTPUT, check, check_regular, rename, suffixed, sync_folder, with_hint};
-pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed, write_patiently};
+pub(crate) use target::{
+    identity, is_still, link, lock_exclusively, nameless, open_unfollowed, write_with_retries,
+};
 
 /// A file that gets its name only when it is complete. Until then it is unnamed, and so disappears if the program is
 /// killed. On a file system without unnamed files it is called `.NAME.PID.part`, and a run that fails removes it. Once
@@ -53,10 +55,10 @@ impl WholeFile {
             let file = open_stream(path, stopped).map_err(with_hint)?;
             return Ok((begun(None, false), file));
         }
-        if let Ok(file) = nameless(folder_of(path), 0o666) {
+        if let Ok(file) = nameless(parent_folder(path), 0o666) {
             return Ok((begun(Some(file.try_clone()?), false), file));
         }
-        let part = OpenOptions::new().write(true).create_new(true).open(part_of(path));
+        let part = OpenOptions::new().write(true).create_new(true).open(temporary_name(path));
         let file = part.map_err(with_hint)?;
         Ok((begun(Some(file.try_clone()?), true), file))
     }
@@ -83,12 +85,12 @@ impl WholeFile {
         if !self.is_part {
             // Linking fails if the name exists. To replace a file, the new one therefore gets a temporary name and is
             // renamed.
-            let name = if self.force { part_of(&self.path) } else { self.path.clone() };
-            link(file, &name).map_err(or_exists)?;
+            let name = if self.force { temporary_name(&self.path) } else { self.path.clone() };
+            link(file, &name).map_err(with_exists_hint)?;
             self.is_part = self.force;
         }
         if self.is_part {
-            rename(&part_of(&self.path), &self.path, self.force)?;
+            rename(&temporary_name(&self.path), &self.path, self.force)?;
             self.is_part = false;
         }
         sync_folder(&self.path);
@@ -100,7 +102,7 @@ impl Drop for WholeFile {
     fn drop(&mut self) {
         if self.is_part {
             // An error of removing the file cannot be handled here.
-            let _ = fs::remove_file(part_of(&self.path));
+            let _ = fs::remove_file(temporary_name(&self.path));
         }
     }
 }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use protocol::input::{folder_of, own_descriptor};
+use protocol::input::{own_descriptor, parent_folder};
 use rustix::fs::{
     AtFlags, CWD, FlockOperation, Mode, OFlags, RenameFlags, fcntl_getfl, fcntl_setfl, flock, linkat, open,
     renameat_with,
@@ -28,7 +28,7 @@ pub(super) enum OutputTarget {
     /// No file has this name.
     New,
     /// A regular file, which is to be overwritten.
-    Old,
+    Existing,
     /// A FIFO, a terminal, `/dev/stdout` or `-`, which is written directly.
     Stream,
 }
@@ -43,7 +43,7 @@ impl OutputTarget {
         let kind = match fs::symlink_metadata(path) {
             Ok(about) => about.file_type(),
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                return fs::metadata(folder_of(path)).map(|_| Self::New).map_err(with_hint);
+                return fs::metadata(parent_folder(path)).map(|_| Self::New).map_err(with_hint);
             }
             Err(error) => return Err(with_hint(error)),
         };
@@ -63,8 +63,8 @@ impl OutputTarget {
             _ if is_stream(kind) => Ok(Self::Stream),
             _ if kind.is_dir() => Err(with_hint(io::ErrorKind::IsADirectory.into())),
             _ if !kind.is_file() => Err(no_regular_file()),
-            _ if force => Ok(Self::Old),
-            _ => Err(exists()),
+            _ if force => Ok(Self::Existing),
+            _ => Err(exists_error()),
         }
     }
 }
@@ -83,7 +83,7 @@ pub fn check(path: &Path, force: bool) -> io::Result<()> {
 /// Returns an error, with advice to the user, if it may not.
 pub fn check_regular(path: &Path, force: bool) -> io::Result<()> {
     match OutputTarget::inspect(path, force)? {
-        OutputTarget::New | OutputTarget::Old => Ok(()),
+        OutputTarget::New | OutputTarget::Existing => Ok(()),
         OutputTarget::Stream => Err(no_regular_file()),
     }
 }
@@ -93,15 +93,15 @@ fn no_regular_file() -> io::Error {
 }
 
 /// Returns the error for an output file that exists already.
-pub(super) fn exists() -> io::Error {
+pub(super) fn exists_error() -> io::Error {
     let why = "it exists: name another file, or overwrite it with --overwrite";
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
 
 /// Replaces an error of the kind `AlreadyExists` by [`exists`], which has advice for the user. Returns other errors
 /// unchanged.
-pub(super) fn or_exists(error: io::Error) -> io::Error {
-    if error.kind() == io::ErrorKind::AlreadyExists { exists() } else { error }
+pub(super) fn with_exists_hint(error: io::Error) -> io::Error {
+    if error.kind() == io::ErrorKind::AlreadyExists { exists_error() } else { error }
 }
 
 fn is_stream(kind: FileType) -> bool {
@@ -135,7 +135,7 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
         }
     };
     if !is_stream(file.metadata()?.file_type()) && own_descriptor(path).is_none() {
-        return Err(exists());
+        return Err(exists_error());
     }
     fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
     Ok(file)
@@ -185,7 +185,7 @@ pub(crate) fn open_unfollowed(path: &Path) -> io::Result<File> {
 /// # Errors
 /// Returns an error of the kind [`io::ErrorKind::WouldBlock`] if another process holds the lock, or another error if
 /// the file system has no locks.
-pub(crate) fn hold(file: &File) -> io::Result<()> {
+pub(crate) fn lock_exclusively(file: &File) -> io::Result<()> {
     Ok(flock(file, FlockOperation::NonBlockingLockExclusive)?)
 }
 
@@ -216,7 +216,7 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(2);
 ///
 /// # Errors
 /// Returns the error if it persists.
-pub(crate) fn write_patiently(file: &mut impl Write, bytes: &[u8]) -> io::Result<usize> {
+pub(crate) fn write_with_retries(file: &mut impl Write, bytes: &[u8]) -> io::Result<usize> {
     let mut since = None;
     let mut is_second = false;
     loop {
@@ -239,9 +239,9 @@ pub(crate) fn write_patiently(file: &mut impl Write, bytes: &[u8]) -> io::Result
 ///
 /// # Errors
 /// Returns the error if it persists, and an error if the file accepts no bytes.
-pub(crate) fn write_all_patiently(file: &mut impl Write, mut bytes: &[u8]) -> io::Result<()> {
+pub(crate) fn write_all_with_retries(file: &mut impl Write, mut bytes: &[u8]) -> io::Result<()> {
     while !bytes.is_empty() {
-        match write_patiently(file, bytes)? {
+        match write_with_retries(file, bytes)? {
             0 => return Err(io::ErrorKind::WriteZero.into()),
             written => bytes = bytes.get(written..).unwrap_or_default(),
         }
@@ -250,7 +250,7 @@ pub(crate) fn write_all_patiently(file: &mut impl Write, mut bytes: &[u8]) -> io
 }
 
 /// Returns a temporary name in the folder of a file. The name contains the process id, so no other program uses it.
-pub(super) fn part_of(path: &Path) -> PathBuf {
+pub(super) fn temporary_name(path: &Path) -> PathBuf {
     let mut name = OsString::from(".");
     name.push(path.file_name().unwrap_or_default());
     name.push(format!(".{}.part", std::process::id()));
@@ -268,7 +268,7 @@ pub fn rename(from: &Path, to: &Path, force: bool) -> io::Result<()> {
     match renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE) {
         // The file system cannot rename without replacing, so the name is checked first.
         Err(Errno::INVAL | Errno::NOSYS) if fs::symlink_metadata(to).is_err() => fs::rename(from, to),
-        Err(Errno::EXIST | Errno::INVAL | Errno::NOSYS) => Err(exists()),
+        Err(Errno::EXIST | Errno::INVAL | Errno::NOSYS) => Err(exists_error()),
         renamed => Ok(renamed?),
     }
 }
@@ -276,7 +276,7 @@ pub fn rename(from: &Path, to: &Path, force: bool) -> io::Result<()> {
 /// Writes the folder of a file to the disk, so that the file's name survives a loss of power. Ignores errors of file
 /// systems that do not support this.
 pub fn sync_folder(path: &Path) {
-    let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
+    let _ = File::open(parent_folder(path)).and_then(|folder| folder.sync_all());
 }
 
 /// Adds advice to an error of creating a file, if the folder or the disk causes it.

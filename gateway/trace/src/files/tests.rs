@@ -103,7 +103,7 @@ fn a_name_that_another_program_took_meanwhile_is_left_to_it() {
     // A file with a temporary name must behave like one without a name.
     let nameless = begun();
     let mut part = begun();
-    let file = OpenOptions::new().write(true).create_new(true).open(part_of(&path)).unwrap();
+    let file = OpenOptions::new().write(true).create_new(true).open(temporary_name(&path)).unwrap();
     (part.file, part.is_part) = (Some(file), true);
     assert_eq!(names(folder.path()).len(), 1, "the part");
     fs::write(&path, "another's").unwrap();
@@ -264,11 +264,11 @@ fn what_interrupts_a_write_is_no_error_and_a_single_one_is_tried_again() {
         [vec![Interrupted; 5], vec![WouldBlock; 5], vec![Other, Interrupted, WouldBlock], vec![StorageFull]]
     {
         let mut file = Moody(moods, Vec::new());
-        target::write_all_patiently(&mut file, b"lines").unwrap();
+        target::write_all_with_retries(&mut file, b"lines").unwrap();
         assert_eq!(file.1, b"lines");
     }
     let mut file = Moody(vec![Other, Other], Vec::new());
-    assert_eq!(target::write_all_patiently(&mut file, b"lines").unwrap_err().kind(), Other);
+    assert_eq!(target::write_all_with_retries(&mut file, b"lines").unwrap_err().kind(), Other);
     assert_eq!(file.1, b"");
 }
 

@@ -47,7 +47,7 @@ fn options() -> WriteOptions {
 
 /// The name of the metadata record that stores the identity of the file. A copy of a recording has another identity
 /// than it stores.
-const MARK: &str = "recorder";
+const IDENTITY_METADATA: &str = "recorder";
 /// The key of the file's inode in [`MARK`].
 const INODE: &str = "inode";
 const BORN: &str = "born_ns";
@@ -69,7 +69,7 @@ fn identity(about: &fs::Metadata) -> BTreeMap<String, String> {
 ///
 /// # Errors
 /// Returns no error in practice, because it writes to memory.
-pub fn mark(about: &fs::Metadata) -> io::Result<Vec<u8>> {
+pub fn file_prefix(about: &fs::Metadata) -> io::Result<Vec<u8>> {
     let mut writer = FileWriter::in_file(Vec::new(), about)?;
     writer.flush()?;
     Ok(writer.into_inner())
@@ -80,7 +80,7 @@ pub fn mark(about: &fs::Metadata) -> io::Result<Vec<u8>> {
 ///
 /// # Errors
 /// Returns an error if the file cannot be read.
-pub fn is_marked(file: &mut File) -> io::Result<bool> {
+pub fn has_own_identity(file: &mut File) -> io::Result<bool> {
     let target = identity(&file.metadata()?);
     file.rewind()?;
     let mut from = RecordReader::new(file, 0);
@@ -93,7 +93,7 @@ pub fn is_marked(file: &mut File) -> io::Result<bool> {
         return Ok(false);
     }
     let Ok(Record::Metadata { name, facts }) = parse(op::METADATA, from.body()) else { return Ok(false) };
-    Ok(name == MARK && target.iter().all(|(key, value)| facts.get(key) == Some(value)))
+    Ok(name == IDENTITY_METADATA && target.iter().all(|(key, value)| facts.get(key) == Some(value)))
 }
 
 /// Converts an error of the crate `mcap` into an I/O error.
@@ -118,7 +118,7 @@ impl Channel {
 
     /// Counts a message of the channel. Returns the number of the channel, the sequence number of the message, and true
     /// if the channel holds frames.
-    pub(super) const fn next(&mut self) -> (u16, u32, bool) {
+    pub(super) const fn next_message(&mut self) -> (u16, u32, bool) {
         let sequence = self.sequence;
         self.sequence = sequence.wrapping_add(1);
         (self.id, sequence, self.is_frames)
@@ -139,7 +139,7 @@ pub struct FileWriter<W: Write> {
     /// The number of complete chunks.
     chunks: u64,
     /// The number of uncompressed bytes in the open chunk.
-    open: u64,
+    open_bytes: u64,
     /// The records of all schemas and channels so far, as they are repeated in the file.
     descriptions: Vec<u8>,
     /// The numbers of the schemas and of the channels in `descriptions`.
@@ -176,7 +176,7 @@ impl<W: Write> FileWriter<W> {
             output,
             buffer: Vec::new(),
             chunks: 0,
-            open: 0,
+            open_bytes: 0,
             descriptions: Vec::new(),
             described: (BTreeSet::new(), BTreeSet::new()),
             chunks_since_description: Some(0),
@@ -189,7 +189,7 @@ impl<W: Write> FileWriter<W> {
     /// Returns an error if the file cannot be written.
     pub fn in_file(out: W, about: &fs::Metadata) -> io::Result<Self> {
         let mut writer = Self::new(out)?;
-        writer.metadata(MARK, &identity(about))?;
+        writer.metadata(IDENTITY_METADATA, &identity(about))?;
         Ok(writer)
     }
 
@@ -269,7 +269,12 @@ impl<W: Write> FileWriter<W> {
         if !self.described.0.insert(id) {
             return;
         }
-        let body = [&id.to_le_bytes()[..], &text(name.as_bytes()), &text(encoding.as_bytes()), &text(data)];
+        let body = [
+            &id.to_le_bytes()[..],
+            &length_prefixed(name.as_bytes()),
+            &length_prefixed(encoding.as_bytes()),
+            &length_prefixed(data),
+        ];
         self.describe(op::SCHEMA, &body.concat());
     }
 
@@ -282,16 +287,18 @@ impl<W: Write> FileWriter<W> {
         if !self.described.1.insert(id) {
             return;
         }
-        let facts = facts.iter().flat_map(|(key, value)| [text(key.as_bytes()), text(value.as_bytes())]);
-        let facts = text(&facts.collect::<Vec<_>>().concat());
-        let (topic, encoding) = (text(topic.as_bytes()), text(encoding.as_bytes()));
+        let facts = facts
+            .iter()
+            .flat_map(|(key, value)| [length_prefixed(key.as_bytes()), length_prefixed(value.as_bytes())]);
+        let facts = length_prefixed(&facts.collect::<Vec<_>>().concat());
+        let (topic, encoding) = (length_prefixed(topic.as_bytes()), length_prefixed(encoding.as_bytes()));
         let body = [&id.to_le_bytes()[..], &schema.to_le_bytes(), &topic, &encoding, &facts];
         self.describe(op::CHANNEL, &body.concat());
     }
 
     fn describe(&mut self, opcode: u8, body: &[u8]) {
         // The crate writes the schema and the channel into the chunk too, so the chunk grows by them.
-        self.open += (HEAD_OF_RECORD + body.len()) as u64;
+        self.open_bytes += (RECORD_HEADER_BYTES + body.len()) as u64;
         self.descriptions.push(opcode);
         self.descriptions.extend((body.len() as u64).to_le_bytes());
         self.descriptions.extend(body);
@@ -305,41 +312,41 @@ impl<W: Write> FileWriter<W> {
     pub fn write<M: Message>(&mut self, channel: &mut Channel, nanos: u64, message: &M) -> io::Result<()> {
         let mut buffer = std::mem::take(&mut self.buffer);
         message.encode_into(&mut buffer);
-        let (id, sequence, _) = channel.next();
-        let put = self.put((id, sequence), (nanos, nanos), &buffer);
+        let (id, sequence, _) = channel.next_message();
+        let put = self.write_encoded((id, sequence), (nanos, nanos), &buffer);
         self.buffer = buffer;
         put
     }
 
     /// Writes a message that is already encoded, with its channel number, sequence number, log time and publish time.
-    pub(super) fn put(
+    pub(super) fn write_encoded(
         &mut self,
         (channel_id, sequence): (u16, u32),
         (log_time, publish_time): (u64, u64),
         data: &[u8],
     ) -> io::Result<()> {
-        if self.open > CHUNK_BYTES {
+        if self.open_bytes > CHUNK_BYTES {
             self.end_chunk()?;
         }
         let header = MessageHeader { channel_id, sequence, log_time, publish_time };
         self.writer.write_to_known_channel(&header, data).map_err(io_error)?;
-        self.open += MESSAGE_OVERHEAD + data.len() as u64;
+        self.open_bytes += MESSAGE_OVERHEAD + data.len() as u64;
         Ok(())
     }
 
     /// Ends the chunk. Writes all schemas and channels after it if one is new or [`DESCRIBED_EVERY`] chunks have
     /// passed.
     fn end_chunk(&mut self) -> io::Result<()> {
-        if self.open == 0 {
+        if self.open_bytes == 0 {
             return Ok(());
         }
         self.writer.flush().map_err(io_error)?;
-        self.open = 0;
+        self.open_bytes = 0;
         self.chunks += 1;
         self.chunks_since_description = match self.chunks_since_description {
             Some(since) if since + 1 < CHUNKS_PER_DESCRIPTION => Some(since + 1),
             Some(_) | None => {
-                self.output.records(&self.descriptions)?;
+                self.output.insert_records(&self.descriptions)?;
                 Some(0)
             }
         };
@@ -358,7 +365,7 @@ impl<W: Write> FileWriter<W> {
     /// Returns an error if the file cannot be written.
     pub fn flush(&mut self) -> io::Result<()> {
         self.end_chunk()?;
-        self.output.hand_on()
+        self.output.flush_through()
     }
 
     /// Ends the file with indexes and statistics, which readers need for seeking.
@@ -367,9 +374,9 @@ impl<W: Write> FileWriter<W> {
     /// Returns an error if the file cannot be written.
     pub fn finish(&mut self) -> io::Result<()> {
         self.end_chunk()?;
-        self.output.begin_end();
+        self.output.expect_data_end();
         self.writer.finish().map_err(io_error)?;
-        self.output.hand_on()
+        self.output.flush_through()
     }
 
     /// Returns the output. The file has no end unless [`FileWriter::finish`] wrote it.
@@ -384,9 +391,9 @@ impl<W: Write> FileWriter<W> {
 }
 
 /// The length of a record's header in bytes: operation code and length.
-const HEAD_OF_RECORD: usize = 9;
+const RECORD_HEADER_BYTES: usize = 9;
 
 /// Encodes a string as MCAP does: its length in 32 bits, then its bytes.
-fn text(bytes: &[u8]) -> Vec<u8> {
+fn length_prefixed(bytes: &[u8]) -> Vec<u8> {
     [&u32::try_from(bytes.len()).unwrap_or(u32::MAX).to_le_bytes()[..], bytes].concat()
 }

@@ -4,7 +4,7 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
 use model::central::Central;
-use robots::{UniqueNames, chain_words, word};
+use robots::{UniqueNames, chain_prefixes, sanitized};
 
 use super::robot::RecordedRobot;
 use super::{BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX};
@@ -12,7 +12,7 @@ use super::{BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX};
 /// The name of the frame in which positions are given if no robot description names one.
 const BASE: &str = "base";
 /// The maximum rate of point clouds of a patch, in Hz.
-const POINTS_HZ: f64 = 30.0;
+const MAX_CLOUD_HZ: f64 = 30.0;
 
 /// The cells of one bus on one link. The state of a patch has one topic.
 #[derive(Clone, Debug)]
@@ -59,8 +59,8 @@ impl Layout {
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let buses: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
-        let (chain_words, mut topics) = (chain_words(skin), UniqueNames::default());
-        let bus_words = UniqueNames::default().give(buses.iter().map(|bus| word(bus)).collect());
+        let (chain_words, mut topics) = (chain_prefixes(skin), UniqueNames::default());
+        let bus_words = UniqueNames::default().assign_all(buses.iter().map(|bus| sanitized(bus)).collect());
         let mut patches = Vec::new();
         for (index, chain) in skin.robot.chains.iter().enumerate() {
             let on_chain = |bus: &usize| skin.buses.get(*bus).is_some_and(|bus| bus.chain == index);
@@ -78,7 +78,7 @@ impl Layout {
                 let link = format!("{link}link{joint}");
                 patches.extend(parts.into_iter().map(|(bus, cells)| {
                     let name = bus_words.get(bus).filter(|_| several).map(|word| format!("_{word}"));
-                    let topic = topics.give_one(format!("/skin/{link}{}", name.unwrap_or_default()));
+                    let topic = topics.assign(format!("/skin/{link}{}", name.unwrap_or_default()));
                     Patch { topic, link: link.clone(), bus, joint: (index, joint), cells }
                 }));
             }
@@ -88,11 +88,11 @@ impl Layout {
             clippy::cast_sign_loss,
             reason = "1 Hz to 10 kHz: checked"
         )]
-        let epochs_per_cloud = (skin.timing.broadcast_hz() / POINTS_HZ).ceil().max(1.0) as u64;
+        let epochs_per_cloud = (skin.timing.broadcast_hz() / MAX_CLOUD_HZ).ceil().max(1.0) as u64;
         Self {
             central: (0..buses.len()).map(|bus| Central::new(&skin.with_cells_of_bus(bus))).collect(),
             buses,
-            arm: if skin.robot.name.is_empty() { "robot".to_owned() } else { word(&skin.robot.name) },
+            arm: if skin.robot.name.is_empty() { "robot".to_owned() } else { sanitized(&skin.robot.name) },
             joints: skin.robot.joints.iter().map(|joint| joint.name.clone()).collect(),
             chains: (0..skin.buses.len()).map(|bus| skin.chain(bus).joints.clone()).collect(),
             patches,
@@ -121,14 +121,14 @@ impl Layout {
     pub fn bus_topics(&self, others: impl Iterator<Item = String>) -> [Vec<String>; 2] {
         let mut taken = UniqueNames::default();
         let points = |Patch { topic, .. }: &Patch| [topic.clone(), format!("{topic}/points")];
-        taken.give(others.chain(self.patches.iter().flat_map(points)).collect());
+        taken.assign_all(others.chain(self.patches.iter().flat_map(points)).collect());
         [BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX]
-            .map(|before| taken.give(self.buses.iter().map(|bus| format!("{before}{bus}")).collect()))
+            .map(|before| taken.assign_all(self.buses.iter().map(|bus| format!("{before}{bus}")).collect()))
     }
 
     /// Returns true if the poses of links are recorded at this tick.
     #[must_use]
-    pub const fn poses_at(&self, tick: u64) -> bool {
+    pub const fn records_poses_at(&self, tick: u64) -> bool {
         self.robot.is_some() && tick.is_multiple_of(self.ticks_per_poses)
     }
 
@@ -175,7 +175,7 @@ mod tests {
         skin.cells.extend(cells);
         let topics: Vec<_> = Layout::new(&skin).patches.into_iter().map(|patch| patch.topic).collect();
         let first = layout.patches[0].link.clone();
-        assert_eq!(topics[0], format!("/skin/{first}_{}", word(&skin.buses[0].name)));
+        assert_eq!(topics[0], format!("/skin/{first}_{}", sanitized(&skin.buses[0].name)));
         assert_eq!(topics[1], format!("/skin/{first}_vcan_1"));
         // Names of buses that become the same word in a topic must stay distinct, and differ from all other topics.
         skin.buses[0].name = "notes".to_owned();

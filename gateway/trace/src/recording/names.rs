@@ -19,13 +19,14 @@ use thiserror::Error;
 
 use super::file;
 use crate::files::{
-    folder_of, hold, identity, is_still, link, nameless, open_unfollowed, rename, suffixed, with_hint,
+    identity, is_still, link, lock_exclusively, nameless, open_unfollowed, parent_folder, rename, suffixed,
+    with_hint,
 };
 
 /// The extension of a file that is not complete yet.
-const PART: &str = "part";
+const PART_EXTENSION: &str = "part";
 /// The extension of a recording.
-const MCAP: &str = "mcap";
+const MCAP_EXTENSION: &str = "mcap";
 
 /// A `.part` file that this process writes and has locked.
 #[derive(Debug)]
@@ -35,25 +36,29 @@ pub struct PartFile {
     /// The name that the file gets when it is complete.
     pub goal: PathBuf,
     /// The device and inode of the file, which identify it under any name.
-    is: (u64, u64),
+    identity: (u64, u64),
 }
 
 /// Returns the final name of a part file: its name without the extension `part`.
 #[must_use]
-pub fn goal_of(part: &Path) -> PathBuf {
-    if part.extension() == Some(OsStr::new(PART)) { part.with_extension("") } else { part.to_owned() }
+pub fn final_name(part: &Path) -> PathBuf {
+    if part.extension() == Some(OsStr::new(PART_EXTENSION)) {
+        part.with_extension("")
+    } else {
+        part.to_owned()
+    }
 }
 
 /// Returns the name of a file of a recording: `run.mcap` for number 0, `run-1.mcap` for number 1, and so on.
 #[must_use]
 pub fn numbered(path: &Path, number: u32) -> PathBuf {
-    if number == 0 { path.to_owned() } else { suffixed(path, format!("-{number}"), MCAP.as_ref()) }
+    if number == 0 { path.to_owned() } else { suffixed(path, format!("-{number}"), MCAP_EXTENSION.as_ref()) }
 }
 
 /// Returns a name for a recovered file that no other file has.
 #[must_use]
-pub fn recovered(goal: &Path) -> PathBuf {
-    let first = suffixed(goal, "-recovered", MCAP.as_ref());
+pub fn recovered_name(goal: &Path) -> PathBuf {
+    let first = suffixed(goal, "-recovered", MCAP_EXTENSION.as_ref());
     (0..).map(|number| numbered(&first, number)).find(|path| !exists(path)).unwrap_or_default()
 }
 
@@ -62,19 +67,19 @@ fn exists(path: &Path) -> bool {
 }
 
 /// The extension of a damaged file that is kept beside the file recovered from it.
-const DAMAGED: &str = "damaged";
+const DAMAGED_EXTENSION: &str = "damaged";
 
 /// Renames a part file to `run.mcap.damaged`, so that later runs do not try to repair it. Returns the new name.
 ///
 /// # Errors
 /// Returns an error if the name belongs to another file now, or if the file cannot be renamed.
 pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
-    is_its_own(part, from)?;
-    let goal = goal_of(part);
+    check_identity(part, from)?;
+    let goal = final_name(part);
     for number in 0_u32.. {
         let mut name = goal.file_name().unwrap_or_default().to_owned();
         name.push(".");
-        name.push(DAMAGED);
+        name.push(DAMAGED_EXTENSION);
         if number > 0 {
             name.push(format!("-{number}"));
         }
@@ -90,7 +95,7 @@ pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
 
 /// Returns the existing files of an earlier recording under this name: the first file and the numbered ones.
 #[must_use]
-pub fn series(path: &Path) -> Vec<PathBuf> {
+pub fn existing_files(path: &Path) -> Vec<PathBuf> {
     let from = |first: u32| -> Vec<_> {
         (first..).map(|number| numbered(path, number)).take_while(|path| exists(path)).collect()
     };
@@ -107,7 +112,7 @@ impl PartFile {
     pub fn create(goal: PathBuf) -> io::Result<(Self, File)> {
         let mut name = goal.file_name().unwrap_or_default().to_owned();
         name.push(".");
-        name.push(PART);
+        name.push(PART_EXTENSION);
         let path = goal.with_file_name(name);
         let taken = |error: io::Error| {
             if error.kind() == io::ErrorKind::AlreadyExists {
@@ -117,7 +122,7 @@ impl PartFile {
         };
         let file = unnamed(&path).unwrap_or_else(|| named(&path)).map_err(taken)?;
         let is = identity(&file.metadata()?);
-        Ok((Self { path, goal, is }, file))
+        Ok((Self { path, goal, identity: is }, file))
     }
 
     /// Gives the file its final name. Replaces another file only with `force`.
@@ -134,12 +139,12 @@ impl PartFile {
     /// Returns true if the file still has its temporary name, or if that cannot be queried.
     #[must_use]
     pub fn is_there(&self) -> bool {
-        is_still(&self.path, self.is) != Some(false)
+        is_still(&self.path, self.identity) != Some(false)
     }
 
     /// Removes the file, if it still has its temporary name.
     pub fn remove(&self) {
-        if is_still(&self.path, self.is) == Some(true) {
+        if is_still(&self.path, self.identity) == Some(true) {
             // If this fails, the next run removes the file.
             let _ = fs::remove_file(&self.path);
         }
@@ -151,7 +156,7 @@ impl PartFile {
     /// Returns an error if the file cannot be opened, or if its name belongs to another file now.
     pub fn open(&self) -> io::Result<File> {
         let file = open_unfollowed(&self.path)?;
-        if identity(&file.metadata()?) != self.is {
+        if identity(&file.metadata()?) != self.identity {
             return Err(io::Error::other("it is another file now"));
         }
         Ok(file)
@@ -171,7 +176,7 @@ fn why_taken(path: &Path) -> String {
         return format!("{name} exists and is not a regular file: move it away, or record to another name");
     }
     match open_unfollowed(path) {
-        Ok(file) if !is_held(&file) => format!(
+        Ok(file) if !is_locked(&file) => format!(
             "{name} exists, but was not left by a killed run: move it away, or record to another name"
         ),
         _ => format!("{name} exists: another run is recording to this name: record to another name"),
@@ -181,7 +186,7 @@ fn why_taken(path: &Path) -> String {
 /// Creates a file that gets its name only after it is locked and holds its identity. Returns `None` if the file system
 /// does not support files without a name.
 fn unnamed(path: &Path) -> Option<io::Result<File>> {
-    let mut file = nameless(folder_of(path), 0o666).ok()?;
+    let mut file = nameless(parent_folder(path), 0o666).ok()?;
     claim(&mut file).ok()?;
     match link(&file, path) {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists => None,
@@ -200,15 +205,15 @@ fn named(path: &Path) -> io::Result<File> {
 
 /// Locks a file and writes its identity into it.
 fn claim(file: &mut File) -> io::Result<()> {
-    hold(file)?;
+    lock_exclusively(file)?;
     let about = file.metadata()?;
-    file.write_all(&file::mark(&about)?)
+    file.write_all(&file::file_prefix(&about)?)
 }
 
 /// Returns true if another process holds the lock on the file.
 #[must_use]
-pub fn is_held(file: &File) -> bool {
-    hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
+pub fn is_locked(file: &File) -> bool {
+    lock_exclusively(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
 }
 
 /// The reason why a `.part` file is neither repaired nor removed.
@@ -240,17 +245,17 @@ pub enum PartFileError {
     Linked(u64),
     /// Another process holds the lock.
     #[error("another program is writing it")]
-    Held,
+    Locked,
     /// The file does not hold its own identity, so it may be a copy or a file of another program.
     #[error("no run of this program created it here")]
-    Unmarked,
+    ForeignIdentity,
 }
 
 impl PartFileError {
     /// Returns true if the file may be a recording, so that the user should be told of it.
     #[must_use]
     pub const fn may_be_recording(&self) -> bool {
-        matches!(self, Self::Owner { .. } | Self::Linked(_) | Self::Unmarked)
+        matches!(self, Self::Owner { .. } | Self::Linked(_) | Self::ForeignIdentity)
     }
 }
 
@@ -261,12 +266,12 @@ pub type Orphan = Result<File, PartFileError>;
 ///
 /// # Errors
 /// Returns an error if the folder cannot be read.
-pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
+pub fn find_part_files(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
     let mut found = Vec::new();
-    for entry in fs::read_dir(folder_of(path))? {
+    for entry in fs::read_dir(parent_folder(path))? {
         let path = path.with_file_name(entry?.file_name());
-        let is_part = path.extension() == Some(OsStr::new(PART))
-            && goal_of(&path).extension() == Some(OsStr::new(MCAP));
+        let is_part = path.extension() == Some(OsStr::new(PART_EXTENSION))
+            && final_name(&path).extension() == Some(OsStr::new(MCAP_EXTENSION));
         if is_part {
             let what = claim_orphan(&path);
             found.push((path, what));
@@ -298,13 +303,13 @@ fn claim_orphan(path: &Path) -> Orphan {
     if about.nlink() != 1 {
         return Err(PartFileError::Linked(about.nlink()));
     }
-    hold(&file).map_err(|error| {
-        if error.kind() == io::ErrorKind::WouldBlock { PartFileError::Held } else { error.into() }
+    lock_exclusively(&file).map_err(|error| {
+        if error.kind() == io::ErrorKind::WouldBlock { PartFileError::Locked } else { error.into() }
     })?;
-    if file::is_marked(&mut file).map_err(PartFileError::Unreadable)? {
+    if file::has_own_identity(&mut file).map_err(PartFileError::Unreadable)? {
         Ok(file)
     } else {
-        Err(PartFileError::Unmarked)
+        Err(PartFileError::ForeignIdentity)
     }
 }
 
@@ -313,12 +318,12 @@ fn claim_orphan(path: &Path) -> Orphan {
 /// # Errors
 /// Returns an error if the name belongs to another file now, or if the file cannot be removed.
 pub fn remove(path: &Path, file: &File) -> io::Result<()> {
-    is_its_own(path, file)?;
+    check_identity(path, file)?;
     fs::remove_file(path)
 }
 
 /// Checks that a name is still that of the given file.
-fn is_its_own(path: &Path, file: &File) -> io::Result<()> {
+fn check_identity(path: &Path, file: &File) -> io::Result<()> {
     if is_still(path, identity(&file.metadata()?)) == Some(true) {
         return Ok(());
     }
@@ -330,7 +335,7 @@ mod tests {
     use super::*;
 
     fn orphans(path: &Path) -> Vec<(PathBuf, Orphan)> {
-        let found = parts(path).unwrap().into_iter();
+        let found = find_part_files(path).unwrap().into_iter();
         found.filter(|(_, found)| found.is_ok()).collect()
     }
 
@@ -338,8 +343,8 @@ mod tests {
     fn files_are_numbered_from_the_second_on() {
         let name = |number| numbered(Path::new("there/run.mcap"), number).display().to_string();
         assert_eq!([0, 1, 12].map(name), ["there/run.mcap", "there/run-1.mcap", "there/run-12.mcap"]);
-        assert_eq!(goal_of(Path::new("a/run-1.mcap.part")), Path::new("a/run-1.mcap"));
-        assert_eq!(goal_of(Path::new("a/run.mcap")), Path::new("a/run.mcap"));
+        assert_eq!(final_name(Path::new("a/run-1.mcap.part")), Path::new("a/run-1.mcap"));
+        assert_eq!(final_name(Path::new("a/run.mcap")), Path::new("a/run.mcap"));
     }
 
     #[test]
@@ -369,14 +374,14 @@ mod tests {
         assert_eq!(fs::read_to_string(&goal).unwrap(), "somebody's");
         part.finish(true).unwrap();
         assert!(fs::read(&goal).unwrap().starts_with(crate::container::MAGIC));
-        assert_eq!(recovered(&goal), folder.path().join("run-recovered.mcap"));
+        assert_eq!(recovered_name(&goal), folder.path().join("run-recovered.mcap"));
         fs::write(folder.path().join("run-recovered.mcap"), "").unwrap();
-        assert_eq!(recovered(&goal), folder.path().join("run-recovered-1.mcap"));
+        assert_eq!(recovered_name(&goal), folder.path().join("run-recovered-1.mcap"));
         for number in 1..3 {
             fs::write(numbered(&goal, number), "").unwrap();
         }
-        assert_eq!(series(&goal).len(), 3);
+        assert_eq!(existing_files(&goal).len(), 3);
         fs::remove_file(&goal).unwrap();
-        assert_eq!(series(&goal).len(), 2);
+        assert_eq!(existing_files(&goal).len(), 2);
     }
 }

@@ -13,12 +13,12 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use mcap::records::op;
 
 /// The length in bytes of the record that ends the data section: a record header and the checksum of the section.
-const DATA_END: usize = 13;
+const DATA_END_BYTES: usize = 13;
 
 /// The state that all handles of an output share.
 struct Inner<W> {
     out: W,
-    place: u64,
+    offset: u64,
     /// The checksum of all bytes of the data section.
     checksum: crc32fast::Hasher,
     /// The bytes received so far of the record that ends the data section; `None` unless the crate is writing that
@@ -27,24 +27,24 @@ struct Inner<W> {
 }
 
 impl<W: Write> Inner<W> {
-    fn put(&mut self, bytes: &[u8]) -> io::Result<()> {
+    fn write_checked(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.out.write_all(bytes)?;
-        self.place += bytes.len() as u64;
+        self.offset += bytes.len() as u64;
         self.checksum.update(bytes);
         Ok(())
     }
 
     /// Receives the crate's bytes of the record that ends the data section. Once they are complete, writes the record
     /// with the checksum of all bytes instead. Returns the number of bytes that belonged to the record.
-    fn put_end(&mut self, bytes: &[u8]) -> io::Result<usize> {
+    fn replace_data_end(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let Some(end) = &mut self.end else { return Ok(0) };
-        let taken = bytes.get(..bytes.len().min(DATA_END - end.len())).unwrap_or_default();
+        let taken = bytes.get(..bytes.len().min(DATA_END_BYTES - end.len())).unwrap_or_default();
         end.extend_from_slice(taken);
-        if end.len() == DATA_END {
+        if end.len() == DATA_END_BYTES {
             let checksum = self.checksum.clone().finalize();
             let record = [&[op::DATA_END][..], &4_u64.to_le_bytes(), &checksum.to_le_bytes()].concat();
             self.end = None;
-            self.put(&record)?;
+            self.write_checked(&record)?;
         }
         Ok(taken.len())
     }
@@ -62,7 +62,7 @@ impl<W> Clone for SharedOutput<W> {
 impl<W: Write> SharedOutput<W> {
     pub(super) fn new(out: W) -> Self {
         let checksum = crc32fast::Hasher::new();
-        Self(Arc::new(Mutex::new(Inner { out, place: 0, checksum, end: None })))
+        Self(Arc::new(Mutex::new(Inner { out, offset: 0, checksum, end: None })))
     }
 
     fn inner(&self) -> MutexGuard<'_, Inner<W>> {
@@ -70,17 +70,17 @@ impl<W: Write> SharedOutput<W> {
     }
 
     /// Inserts complete records. The crate must be between two records.
-    pub(super) fn records(&self, records: &[u8]) -> io::Result<()> {
-        self.inner().put(records)
+    pub(super) fn insert_records(&self, records: &[u8]) -> io::Result<()> {
+        self.inner().write_checked(records)
     }
 
     /// Announces that the next bytes of the crate are the record that ends the data section.
-    pub(super) fn begin_end(&self) {
+    pub(super) fn expect_data_end(&self) {
         self.inner().end = Some(Vec::new());
     }
 
     /// Flushes the output.
-    pub(super) fn hand_on(&self) -> io::Result<()> {
+    pub(super) fn flush_through(&self) -> io::Result<()> {
         self.inner().out.flush()
     }
 
@@ -94,8 +94,8 @@ impl<W: Write> SharedOutput<W> {
 impl<W: Write> Write for SharedOutput<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let mut inner = self.inner();
-        match inner.put_end(bytes)? {
-            0 => inner.put(bytes).map(|()| bytes.len()),
+        match inner.replace_data_end(bytes)? {
+            0 => inner.write_checked(bytes).map(|()| bytes.len()),
             taken => Ok(taken),
         }
     }
@@ -109,7 +109,7 @@ impl<W: Write> Seek for SharedOutput<W> {
     /// Returns the current offset. No other seek is supported.
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         match to {
-            SeekFrom::Current(0) => Ok(self.inner().place),
+            SeekFrom::Current(0) => Ok(self.inner().offset),
             SeekFrom::Start(_) | SeekFrom::End(_) | SeekFrom::Current(_) => {
                 Err(io::ErrorKind::NotSeekable.into())
             }

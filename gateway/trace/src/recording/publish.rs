@@ -12,7 +12,7 @@ use crate::files::sync_folder;
 
 /// A finished file with its temporary name, and data for the caller that is returned with its final name.
 #[derive(Debug)]
-pub(super) struct Ended<T> {
+pub(super) struct CompleteFile<T> {
     /// The file, which stays locked until it is renamed.
     pub(super) file: File,
     pub(super) part: PartFile,
@@ -21,7 +21,7 @@ pub(super) struct Ended<T> {
 
 /// A file with its final name.
 #[derive(Debug)]
-pub(super) struct Published<T> {
+pub(super) struct PublishedFile<T> {
     /// The final name; `None` if another program renamed or removed the file.
     pub(super) path: Option<PathBuf>,
     pub(super) about: T,
@@ -33,9 +33,9 @@ pub(super) struct Published<T> {
 #[derive(Debug)]
 pub(super) struct Publisher<T> {
     force: bool,
-    running: Option<(Sender<Ended<T>>, JoinHandle<()>)>,
-    sender: Sender<Published<T>>,
-    published: Receiver<Published<T>>,
+    running: Option<(Sender<CompleteFile<T>>, JoinHandle<()>)>,
+    sender: Sender<PublishedFile<T>>,
+    published: Receiver<PublishedFile<T>>,
 }
 
 impl<T: Send + 'static> Publisher<T> {
@@ -46,7 +46,7 @@ impl<T: Send + 'static> Publisher<T> {
     }
 
     /// Passes a finished file to the thread.
-    pub(super) fn publish(&mut self, ended: Ended<T>) {
+    pub(super) fn publish(&mut self, ended: CompleteFile<T>) {
         if self.running.is_none() {
             self.running = self.start().ok();
         }
@@ -60,8 +60,8 @@ impl<T: Send + 'static> Publisher<T> {
         }
     }
 
-    fn start(&self) -> io::Result<(Sender<Ended<T>>, JoinHandle<()>)> {
-        let (sender, receiver) = mpsc::channel::<Ended<T>>();
+    fn start(&self) -> io::Result<(Sender<CompleteFile<T>>, JoinHandle<()>)> {
+        let (sender, receiver) = mpsc::channel::<CompleteFile<T>>();
         let (published, force) = (self.sender.clone(), self.force);
         let work = move || {
             for ended in receiver {
@@ -72,7 +72,7 @@ impl<T: Send + 'static> Publisher<T> {
     }
 
     /// Returns the files that were renamed since the last call.
-    pub(super) fn done(&self) -> impl Iterator<Item = Published<T>> {
+    pub(super) fn done(&self) -> impl Iterator<Item = PublishedFile<T>> {
         self.published.try_iter()
     }
 
@@ -88,12 +88,12 @@ impl<T: Send + 'static> Publisher<T> {
 
 /// Writes a file to the disk before it is renamed, so that a file with its final name is complete even after a loss of
 /// power.
-fn publish<T>(Ended { file, part, about }: Ended<T>, force: bool) -> Published<T> {
+fn publish<T>(CompleteFile { file, part, about }: CompleteFile<T>, force: bool) -> PublishedFile<T> {
     let named = file.sync_all().and_then(|()| part.finish(force));
     match named {
         Ok(()) => {
             sync_folder(&part.goal);
-            Published { path: Some(part.goal), about, error: None }
+            PublishedFile { path: Some(part.goal), about, error: None }
         }
         Err(error) => {
             let (goal, there) = (part.goal.display(), part.path.display());
@@ -102,7 +102,7 @@ fn publish<T>(Ended { file, part, about }: Ended<T>, force: bool) -> Published<T
                     "{there}: another program renamed, removed or replaced it while it was written; it is whole \
                      wherever it is now, and what is in it counts as lost"
                 );
-                return Published { path: None, about, error: Some(error) };
+                return PublishedFile { path: None, about, error: Some(error) };
             }
             let error = if error.kind() == io::ErrorKind::AlreadyExists {
                 names::taken_meanwhile(&part.goal)
@@ -110,7 +110,7 @@ fn publish<T>(Ended { file, part, about }: Ended<T>, force: bool) -> Published<T
                 format!("{goal}: {error}")
             };
             let error = Some(format!("{error}; {there} is the whole recording: rename it"));
-            Published { path: Some(part.path), about, error }
+            PublishedFile { path: Some(part.path), about, error }
         }
     }
 }
@@ -125,7 +125,7 @@ mod tests {
         let goal = folder.path().join("run.mcap");
         let (part, file) = PartFile::create(goal.clone()).unwrap();
         std::fs::write(&goal, "another program's").unwrap();
-        let published = publish(Ended { file, part, about: () }, false);
+        let published = publish(CompleteFile { file, part, about: () }, false);
         let error = published.error.unwrap();
         assert!(error.contains("run.mcap: another program made a file of this name meanwhile; "), "{error}");
         assert!(error.ends_with("run.mcap.part is the whole recording: rename it"), "{error}");

@@ -24,7 +24,7 @@ use super::file::FileWriter;
 use crate::container::{Chunk, FormatError, Framed, Record, RecordReader, parse};
 
 /// The longest attachment that is copied, in bytes.
-const LONGEST_ATTACHMENT: u64 = 1 << 30;
+const MAX_ATTACHMENT_BYTES: u64 = 1 << 30;
 
 /// The result of a recovery: what was kept and what was lost.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
@@ -36,7 +36,7 @@ pub struct RecoveryResult {
     /// The latest time of a message, in ns since 1970; 0 without messages.
     pub last_nanos: u64,
     /// Bytes at the end of the file that are not a complete record.
-    pub unfinished: u64,
+    pub unfinished_bytes: u64,
     /// The number of damaged places, and the bytes lost there.
     pub damaged: (u64, u64),
     /// Messages that were lost because their channel was described only in a damaged part of the file.
@@ -44,9 +44,9 @@ pub struct RecoveryResult {
     /// The number of messages according to the statistics of the file, if it has any.
     pub stated: Option<u64>,
     /// True if the file had a complete summary and footer.
-    pub whole: bool,
+    pub has_end: bool,
     /// True if the checksum of all data or of the summary is wrong.
-    pub checksum: bool,
+    pub is_checksum_wrong: bool,
 }
 
 impl RecoveryResult {
@@ -60,12 +60,12 @@ impl RecoveryResult {
     #[must_use]
     pub fn is_sound(&self) -> bool {
         let is_all = self.stated.is_none_or(|stated| stated == self.messages);
-        self.whole && self.unfinished == 0 && self.is_undamaged() && !self.checksum && is_all
+        self.has_end && self.unfinished_bytes == 0 && self.is_undamaged() && !self.is_checksum_wrong && is_all
     }
 
     /// Returns true if more messages were lost than kept. This can be determined only if the file states their number.
     #[must_use]
-    pub fn is_little(&self) -> bool {
+    pub fn lost_more_than_kept(&self) -> bool {
         let missing = self.stated.map_or(0, |stated| stated.saturating_sub(self.messages));
         missing.max(self.orphaned_messages) > self.messages
     }
@@ -80,7 +80,7 @@ impl fmt::Display for RecoveryResult {
         if self.messages > 0 {
             write!(f, ", the last at {}.{:06}", seconds.0, seconds.1)?;
         }
-        match self.unfinished {
+        match self.unfinished_bytes {
             0 => write!(f, "; nothing unfinished at the end")?,
             bytes => write!(f, "; {bytes} bytes of an unfinished record are lost")?,
         }
@@ -97,7 +97,7 @@ impl fmt::Display for RecoveryResult {
                 self.orphaned_messages
             )?;
         }
-        if self.checksum && self.is_undamaged() {
+        if self.is_checksum_wrong && self.is_undamaged() {
             write!(f, "; a checksum of the whole was wrong, and none of a part")?;
         }
         Ok(())
@@ -149,13 +149,13 @@ pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<RecoveryRe
     };
     let (writer, topics) = begin().map_err(RecoverError::Write)?;
     drop(described);
-    let mut copy = Copy { writer, topics, recovered };
-    let mut source = RecordReader::new(from, LONGEST_ATTACHMENT);
+    let mut copy = RecordCopier { writer, topics, recovered };
+    let mut source = RecordReader::new(from, MAX_ATTACHMENT_BYTES);
     let mut chunk = Chunk::default();
     for piece in pieces {
         match piece {
             IntactRange::Records { from, to } => {
-                source.move_to(from).map_err(RecoverError::Read)?;
+                source.seek(from).map_err(RecoverError::Read)?;
                 while source.read() < to {
                     let framed = source.next().map_err(RecoverError::Read)?;
                     if let Framed::Record(code) = framed {
@@ -173,14 +173,14 @@ pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<RecoveryRe
     Ok(copy.recovered)
 }
 
-struct Copy<W: Write> {
+struct RecordCopier<W: Write> {
     writer: FileWriter<W>,
     /// The channel numbers of the new file, each with true if its messages are frames.
     topics: BTreeMap<u16, bool>,
     recovered: RecoveryResult,
 }
 
-impl<W: Write> Copy<W> {
+impl<W: Write> RecordCopier<W> {
     /// Copies a record that the survey found intact. `read` is the number of bytes of the input read so far.
     fn copy_record(
         &mut self,
@@ -209,7 +209,7 @@ impl<W: Write> Copy<W> {
                     self.recovered.orphaned_messages += 1;
                     return Ok(());
                 };
-                self.writer.put((channel, sequence), (log_time, publish_time), data)?;
+                self.writer.write_encoded((channel, sequence), (log_time, publish_time), data)?;
                 let RecoveryResult { messages, frames, last_nanos, .. } = &mut self.recovered;
                 *messages += 1;
                 *frames += u64::from(*is_frame);

@@ -10,10 +10,10 @@ use rustix::fs::{Gid, fchown};
 use super::names::{self, PartFile};
 use super::recover::{RecoverError, RecoveryResult, recover};
 use super::sink::is_full;
-use crate::files::{WholeFile, folder_of, nameless};
+use crate::files::{WholeFile, nameless, parent_folder};
 
 /// The maximum number of names to try for a new file if other programs create files of the same names.
-const NAMES: u32 = 100;
+const MAX_ATTEMPTS: u32 = 100;
 
 /// The result of repairing a recording.
 #[derive(Clone, Debug)]
@@ -39,7 +39,13 @@ pub fn repair(
     force: bool,
 ) -> Result<Repaired, RecoverError> {
     let something = |recovered: &RecoveryResult| {
-        let RecoveryResult { messages, unfinished, damaged, orphaned_messages: homeless, .. } = *recovered;
+        let RecoveryResult {
+            messages,
+            unfinished_bytes: unfinished,
+            damaged,
+            orphaned_messages: homeless,
+            ..
+        } = *recovered;
         messages + unfinished + damaged.0 + homeless > 0
     };
     let mut attempts = 0;
@@ -48,7 +54,7 @@ pub fn repair(
         let path = goal();
         match copy(from, &path, force, something) {
             Err(RecoverError::Write(error))
-                if error.kind() == io::ErrorKind::AlreadyExists && attempts < NAMES => {}
+                if error.kind() == io::ErrorKind::AlreadyExists && attempts < MAX_ATTEMPTS => {}
             copied => {
                 let (recovered, bytes) = copied?;
                 break Repaired { recovered, new: bytes.map(|bytes| (path, bytes)), original: None };
@@ -101,7 +107,7 @@ fn copy(
     let mut from = from;
     // The file is read twice. A pipe can be read only once, so it is copied first.
     let kept = if from.rewind().is_err() {
-        Some(kept(from, folder_of(to)).map_err(RecoverError::Read)?)
+        Some(buffered_pipe(from, parent_folder(to)).map_err(RecoverError::Read)?)
     } else {
         None
     };
@@ -118,7 +124,7 @@ fn copy(
 }
 
 /// Copies the rest of a pipe into an unnamed file.
-fn kept(mut from: &File, folder: &Path) -> io::Result<File> {
+fn buffered_pipe(mut from: &File, folder: &Path) -> io::Result<File> {
     let mut file = nameless(folder, 0o600)?;
     io::copy(&mut from, &mut file)?;
     file.rewind()?;
@@ -141,9 +147,9 @@ fn as_private(from: &File, copy: &File) -> io::Result<()> {
 
 /// Repairs the files of killed runs in the folder of a recording. Reports each of them to `say` in a line, and also
 /// `.part` files of other programs.
-pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
+pub fn repair_orphans(path: &Path, mut say: impl FnMut(&str)) {
     // An unreadable folder is reported when the recording begins.
-    for (part, found) in names::parts(path).unwrap_or_default() {
+    for (part, found) in names::find_part_files(path).unwrap_or_default() {
         let name = part.display();
         let held = match found {
             Ok(held) => held,
@@ -158,7 +164,7 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
             }
         };
         let leftover = "was left by a run that was killed";
-        match repair(&part, &held, || names::recovered(&names::goal_of(&part)), false) {
+        match repair(&part, &held, || names::recovered_name(&names::final_name(&part)), false) {
             Ok(Repaired { recovered, new: Some((path, _)), original }) => {
                 let kept = original.map(|path| format!("; the damaged original is {}", path.display()));
                 let kept = kept.unwrap_or_default();

@@ -2,14 +2,14 @@
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Chain, Skin};
-use robots::{DhRow, LinkPose, RobotError, RobotProblem, Urdf, frames, pose_of, written};
+use robots::{DhRow, LinkPose, RobotError, RobotProblem, Urdf, frames, pose_of, write_urdf};
 
 use crate::ros2::robot::Transform;
 
 /// The maximum distance between a row of the skin and the link of the description that should match it, in m.
 const TOLERANCE_M: f64 = 1e-6;
 /// The distance by which each joint is moved to compare the skin with the description, in rad or m.
-const STEP: f64 = 0.3;
+const COMPARISON_STEP: f64 = 0.3;
 
 /// The robot as it is described in a recording.
 #[derive(Clone, Debug)]
@@ -25,7 +25,7 @@ pub struct RecordedRobot {
 }
 
 /// A URDF, the poses of its links, and the names of its links.
-struct Described {
+struct LinkedUrdf {
     urdf: Urdf,
     poses: Vec<LinkPose>,
     links: Vec<Vec<String>>,
@@ -38,8 +38,8 @@ impl RecordedRobot {
     /// Returns [`RobotError`] if the rows cannot be described, for example if chains share a joint that has different
     /// Returns [`RobotError`] if the rows cannot be described as a URDF, for example if two chains share a joint that
     /// has different
-    pub fn of_rows(skin: &Skin) -> Result<Self, RobotError> {
-        let written = written(skin);
+    pub fn from_rows(skin: &Skin) -> Result<Self, RobotError> {
+        let written = write_urdf(skin);
         let urdf = Urdf::parse("the skin's robot", &written.xml)?;
         Self::new(skin, urdf, written.xml, written.links)
     }
@@ -48,7 +48,7 @@ impl RecordedRobot {
     ///
     /// # Errors
     /// Returns [`RobotError`] if the URDF does not match the skin's rows.
-    pub fn of_urdf(skin: &Skin, urdf: Urdf, text: String) -> Result<Self, RobotError> {
+    pub fn from_urdf(skin: &Skin, urdf: Urdf, text: String) -> Result<Self, RobotError> {
         let link = |joint: &usize| {
             let name = skin.robot.joints.get(*joint).map_or("", |joint| &joint.name);
             urdf.link_of(name).map(str::to_owned)
@@ -67,9 +67,9 @@ impl RecordedRobot {
         let names: Vec<_> = skin.robot.joints.iter().map(|joint| joint.name.as_str()).collect();
         let poses = urdf.link_poses(&names)?;
         let base = urdf.root().to_owned();
-        let described = Described { urdf, poses, links };
+        let described = LinkedUrdf { urdf, poses, links };
         let cells = skin.cells.iter().map(|cell| described.cell(skin, cell)).collect::<Result<_, _>>()?;
-        let Described { poses, links, .. } = described;
+        let LinkedUrdf { poses, links, .. } = described;
         Ok(Self { description, base, poses, links, cells })
     }
 
@@ -87,21 +87,21 @@ impl RecordedRobot {
 
     /// Returns the poses of all links that joints move, for the joint positions `q` in rad or m.
     #[must_use]
-    pub fn moving(&self, q: &[f64]) -> Vec<Transform<'_>> {
+    pub fn moving_transforms(&self, q: &[f64]) -> Vec<Transform<'_>> {
         let moving = self.poses.iter().filter(|pose| pose.moves());
         moving.map(|pose| transform(&pose.parent, &pose.child, &pose.pose(q))).collect()
     }
 
     /// Returns the poses that never change: those of fixed links, and those of cells on their links.
     #[must_use]
-    pub fn still(&self) -> Vec<Transform<'_>> {
+    pub fn fixed_transforms(&self) -> Vec<Transform<'_>> {
         let links = self.poses.iter().filter(|pose| !pose.moves());
         let links = links.map(|pose| transform(&pose.parent, &pose.child, &pose.pose(&[])));
         links.chain(self.cells.iter().map(|(link, cell, pose)| transform(link, cell, pose))).collect()
     }
 }
 
-impl Described {
+impl LinkedUrdf {
     /// Returns the link that a cell is on, the name of the cell's own frame, and the pose of that frame on the link.
     fn cell(&self, skin: &Skin, cell: &Cell) -> Result<(String, String, Isometry3<f64>), RobotError> {
         let bus = skin.buses.get(cell.bus);
@@ -114,7 +114,7 @@ impl Described {
             joints.map(|joint| step.clamp(joint.limits[0], joint.limits[1])).collect()
         };
         let row = usize::from(cell.row);
-        let [one, other] = [0.0, STEP].map(|step| self.row_on(link, chain, row, &near(step)));
+        let [one, other] = [0.0, COMPARISON_STEP].map(|step| self.row_on(link, chain, row, &near(step)));
         let apart = (one.translation.vector - other.translation.vector).norm()
             + one.rotation.angle_to(&other.rotation);
         if apart.is_nan() || apart > TOLERANCE_M {

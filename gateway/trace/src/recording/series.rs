@@ -16,12 +16,12 @@ use rustix::fs::statvfs;
 use super::account::{MessageCount, WrittenFile};
 use super::file::FileWriter;
 use super::names::{self, PartFile};
-use super::publish::{Ended, Published, Publisher};
+use super::publish::{CompleteFile, PublishedFile, Publisher};
 use super::recover::RecoverError;
 use super::repair::{self, Repaired};
 use super::sink::{FileGauge, ReservedFile};
 use super::window::ReorderWindow;
-use crate::files::folder_of;
+use crate::files::parent_folder;
 
 /// The size of the write buffer in bytes. Chunks are larger and are written without it.
 const BUFFER: usize = 64 << 10;
@@ -96,15 +96,15 @@ pub enum RecordingEvent {
     /// A file could not be written further. The run continues.
     BrokeOff(String),
     /// Any other event, such as a finished file.
-    Else(String),
+    Other(String),
 }
 
 impl RecordingEvent {
     /// Returns the text of the event without its consequences, for the summary of the run.
     #[must_use]
-    pub fn what(&self) -> &str {
+    pub fn description(&self) -> &str {
         match self {
-            Self::BrokeOff(what) | Self::Else(what) => what,
+            Self::BrokeOff(what) | Self::Other(what) => what,
         }
     }
 }
@@ -115,9 +115,9 @@ impl core::fmt::Display for RecordingEvent {
             Self::BrokeOff(_) => {
                 ": the run goes on without it; what was recorded so far stays readable, what comes now is counted"
             }
-            Self::Else(_) => "",
+            Self::Other(_) => "",
         };
-        write!(f, "{}{more}", self.what())
+        write!(f, "{}{more}", self.description())
     }
 }
 
@@ -132,9 +132,9 @@ struct OpenFile<T> {
     head: u64,
     began: Instant,
     /// The time at which the name of the file was last checked.
-    looked: Instant,
+    name_checked: Instant,
     /// The time at which the file became large or old enough to end; `None` before.
-    enough: Option<Instant>,
+    due_since: Option<Instant>,
     /// The number of messages that were flushed to the file.
     kept: MessageCount,
     /// The number of messages written since the last flush.
@@ -179,7 +179,7 @@ pub struct SplitRecording<T> {
     /// The time of the last error.
     failed: Option<Instant>,
     /// The time at which a file was last begun directly after an error, and true if another file is to be begun now.
-    prompt: (Option<Instant>, bool),
+    immediate_retry: (Option<Instant>, bool),
     broken: Vec<BrokenFile>,
     /// Renames complete files. Each has its message counts and its length in bytes.
     publisher: Publisher<(MessageCount, u64)>,
@@ -195,7 +195,7 @@ impl<T> SplitRecording<T> {
     /// # Errors
     /// Returns an error if another program writes the file, or if it cannot be written.
     pub fn claim(path: &Path, force: bool, split: SplitLimits) -> io::Result<Self> {
-        let stale = names::series(path);
+        let stale = names::existing_files(path);
         if let Some(there) = stale.first().filter(|_| !force) {
             let why =
                 format!("{} exists: name another file, or overwrite it with --overwrite", there.display());
@@ -213,7 +213,7 @@ impl<T> SplitRecording<T> {
             open: None,
             window: ReorderWindow::default(),
             failed: None,
-            prompt: (None, false),
+            immediate_retry: (None, false),
             broken: Vec::new(),
             publisher: Publisher::new(force),
             written: Vec::new(),
@@ -233,7 +233,7 @@ impl<T> SplitRecording<T> {
     }
 
     /// Adds a metadata record to the open file and to all later ones.
-    pub fn add(&mut self, name: &'static str, facts: BTreeMap<String, String>) {
+    pub fn add_metadata(&mut self, name: &'static str, facts: BTreeMap<String, String>) {
         let written = self.open.as_mut().map_or(Ok(()), |open| open.writer.metadata(name, &facts));
         self.head.metadata.push((name, facts));
         if let Err(error) = written {
@@ -249,7 +249,7 @@ impl<T> SplitRecording<T> {
     ) -> io::Result<OpenFile<T>> {
         let begin = || {
             let about = file.metadata()?;
-            let (sink, gauge) = ReservedFile::new(file, folder_of(&part.path))?;
+            let (sink, gauge) = ReservedFile::new(file, parent_folder(&part.path))?;
             let mut writer = Writer::in_file(BufWriter::with_capacity(BUFFER, sink), &about)?;
             self.head.write(&mut writer, self.number)?;
             let topics = topics(&mut writer)?;
@@ -264,7 +264,18 @@ impl<T> SplitRecording<T> {
         self.window.begin(self.now);
         let (head, began) = (gauge.bytes(), Instant::now());
         let (kept, written) = (MessageCount::default(), MessageCount::default());
-        Ok(OpenFile { writer, topics, part, gauge, head, began, looked: began, enough: None, kept, written })
+        Ok(OpenFile {
+            writer,
+            topics,
+            part,
+            gauge,
+            head,
+            began,
+            name_checked: began,
+            due_since: None,
+            kept,
+            written,
+        })
     }
 
     /// Sets the time of the recorder, in ns since 1970.
@@ -287,7 +298,7 @@ impl<T> SplitRecording<T> {
     }
 
     /// Writes all waiting messages to the open file. Messages that are added later stand after them.
-    pub fn settle(&mut self) {
+    pub fn write_waiting(&mut self) {
         self.release(true);
     }
 
@@ -299,12 +310,12 @@ impl<T> SplitRecording<T> {
 
     /// Writes the messages that have waited long enough. Ends a file whose disk is full, or one that is large or old
     /// enough, the latter only if `holds` is false. Returns true if the caller should begin another file with
-    /// [`SplitRecording::next`].
+    /// [`SplitRecording::begin_next`].
     pub fn flush(&mut self, holds: bool) -> bool {
-        self.take_published();
+        self.collect_published();
         let Some(open) = &mut self.open else {
             let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY_INTERVAL);
-            let prompt = std::mem::replace(&mut self.prompt.1, false);
+            let prompt = std::mem::replace(&mut self.immediate_retry.1, false);
             return (due || prompt) && has_room(&self.path);
         };
         if let Err(error) = open.release(&mut self.window, false).and_then(|()| open.writer.flush()) {
@@ -312,8 +323,8 @@ impl<T> SplitRecording<T> {
             return false;
         }
         open.kept.add(std::mem::take(&mut open.written));
-        if open.looked.elapsed() >= NAME_CHECK_INTERVAL {
-            open.looked = Instant::now();
+        if open.name_checked.elapsed() >= NAME_CHECK_INTERVAL {
+            open.name_checked = Instant::now();
             if !open.part.is_there() {
                 self.end();
                 return true;
@@ -327,7 +338,7 @@ impl<T> SplitRecording<T> {
         }
         let enough =
             open.gauge.bytes() >= self.split.bytes + open.head || open.began.elapsed() >= self.split.age;
-        let since = enough.then(|| *open.enough.get_or_insert_with(Instant::now));
+        let since = enough.then(|| *open.due_since.get_or_insert_with(Instant::now));
         let enough = since.is_some_and(|since| !holds || since.elapsed() >= MAX_HOLD);
         if enough {
             self.end();
@@ -336,7 +347,7 @@ impl<T> SplitRecording<T> {
     }
 
     /// Begins another file. `topics` creates its channels. Returns true on success.
-    pub fn next(&mut self, topics: impl FnOnce(&mut Writer) -> io::Result<T>) -> bool {
+    pub fn begin_next(&mut self, topics: impl FnOnce(&mut Writer) -> io::Result<T>) -> bool {
         let number = self.number + 1;
         let goal = names::numbered(&self.path, number);
         let failed_before = self.failed;
@@ -345,7 +356,7 @@ impl<T> SplitRecording<T> {
             Ok(open) => {
                 if failed_before.is_some() {
                     let goal = open.part.goal.display();
-                    self.said.push(RecordingEvent::Else(format!("recording goes on in {goal}")));
+                    self.said.push(RecordingEvent::Other(format!("recording goes on in {goal}")));
                 }
                 (self.failed, self.open) = (None, Some(open));
                 true
@@ -397,13 +408,13 @@ impl<T> SplitRecording<T> {
         open.kept.add(open.written);
         let (sink, _) = open.writer.into_inner().into_parts();
         let about = (open.kept, open.gauge.bytes());
-        self.publisher.publish(Ended { file: sink.into_file(), part: open.part, about });
+        self.publisher.publish(CompleteFile { file: sink.into_file(), part: open.part, about });
     }
 
     /// Adds the files that were renamed since the last call to those of the recording.
-    fn take_published(&mut self) {
-        for Published { path, about: (kept, bytes), error } in self.publisher.done() {
-            self.said.extend(error.map(RecordingEvent::Else));
+    fn collect_published(&mut self) {
+        for PublishedFile { path, about: (kept, bytes), error } in self.publisher.done() {
+            self.said.extend(error.map(RecordingEvent::Other));
             match path {
                 Some(path) => self.written.push(kept.in_file(&path, bytes)),
                 // The file is complete, but its name is unknown.
@@ -425,7 +436,7 @@ impl<T> SplitRecording<T> {
 
     /// Handles an error. Requests another file at once, unless that was done a moment ago: the error then persists.
     fn fail(&mut self, error: &io::Error) {
-        let (last, prompt) = &mut self.prompt;
+        let (last, prompt) = &mut self.immediate_retry;
         if last.is_none_or(|at| at.elapsed() >= RETRY_INTERVAL) {
             (*last, *prompt) = (Some(Instant::now()), true);
         }
@@ -447,7 +458,7 @@ impl<T> SplitRecording<T> {
     pub fn finish(&mut self) -> (Vec<WrittenFile>, MessageCount) {
         self.end();
         self.publisher.finish();
-        self.take_published();
+        self.collect_published();
         for BrokenFile { part, file, kept } in std::mem::take(&mut self.broken) {
             let from = part.open().map_err(RecoverError::Read);
             let goal = || part.goal.clone();
@@ -462,7 +473,7 @@ impl<T> SplitRecording<T> {
                 }
                 Ok(Repaired { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
-                    self.said.push(RecordingEvent::Else(repair::unrepaired(&part, &error)));
+                    self.said.push(RecordingEvent::Other(repair::unrepaired(&part, &error)));
                     let bytes = file.metadata().map_or(0, |about| about.len());
                     self.written.push(kept.in_file(&part.path, bytes));
                 }
@@ -489,6 +500,6 @@ impl<T> Drop for SplitRecording<T> {
 }
 
 fn has_room(path: &Path) -> bool {
-    statvfs(folder_of(path))
+    statvfs(parent_folder(path))
         .is_ok_and(|about| about.f_bavail.saturating_mul(about.f_frsize) >= MIN_FREE_BYTES)
 }

@@ -9,12 +9,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rustix::fs::{FallocateFlags, fallocate};
 
-use crate::files::{nameless, write_patiently};
+use crate::files::{nameless, write_with_retries};
 
 /// The space in bytes that is reserved for the end of a file without chunks; half of it is for one pending chunk.
-const RESERVE: u64 = 512 << 10;
+const RESERVE_BYTES: u64 = 512 << 10;
 /// The space in bytes that is reserved for the index entry of each chunk, which the end of the file holds.
-const RESERVE_FOR_CHUNK: u64 = 400;
+const RESERVE_BYTES_PER_CHUNK: u64 = 400;
 
 /// The size and the reserve of a file, as seen by other objects than its writer.
 #[derive(Debug, Default)]
@@ -49,11 +49,11 @@ impl FileGauge {
         let mut held = self.reserve.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(reserve) = held.as_mut() else { return };
         // Half of the reserve is for the pending chunk.
-        let target = RESERVE / 2 + chunks * RESERVE_FOR_CHUNK;
+        let target = RESERVE_BYTES / 2 + chunks * RESERVE_BYTES_PER_CHUNK;
         if target <= reserve.bytes {
             return;
         }
-        let more = target.next_multiple_of(RESERVE);
+        let more = target.next_multiple_of(RESERVE_BYTES);
         // If the extension fails, the present reserve still helps; the extension is retried.
         if fallocate(&reserve.file, FallocateFlags::empty(), 0, more).is_ok() {
             reserve.bytes = more;
@@ -99,8 +99,8 @@ impl ReservedFile {
 /// Reserves disk space. Returns `None` if the file system does not support unnamed files or preallocation.
 fn reserve(folder: &Path) -> Option<Reserve> {
     let file = nameless(folder, 0o600).ok()?;
-    fallocate(&file, FallocateFlags::empty(), 0, RESERVE).ok()?;
-    Some(Reserve { file, bytes: RESERVE })
+    fallocate(&file, FallocateFlags::empty(), 0, RESERVE_BYTES).ok()?;
+    Some(Reserve { file, bytes: RESERVE_BYTES })
 }
 
 /// Returns true for errors that report a full disk or an exceeded quota.
@@ -117,9 +117,9 @@ impl Write for ReservedFile {
             self.gauge.bytes.fetch_add(there as u64, Ordering::Relaxed);
             return Ok(there);
         }
-        let written = match write_patiently(&mut self.file, bytes) {
+        let written = match write_with_retries(&mut self.file, bytes) {
             Err(error) if is_full(&error) && self.gauge.use_reserve() => {
-                write_patiently(&mut self.file, bytes)
+                write_with_retries(&mut self.file, bytes)
             }
             written => written,
         }?;

@@ -18,9 +18,9 @@ use crate::ros2::Message;
 /// The time for which a message waits for older ones, in ns.
 pub const WINDOW_NS: u64 = 40_000_000;
 /// The maximum number of waiting messages: those of three full buses in more than a second.
-const MESSAGES: usize = 65_536;
+const MAX_MESSAGES: usize = 65_536;
 /// The maximum size of waiting messages, in bytes.
-const BYTES: usize = 16 << 20;
+const MAX_BYTES: usize = 16 << 20;
 /// The initial size of each buffer, in bytes. A buffer that grew while the file was blocked is shrunk to it again.
 const INITIAL_BYTES: usize = 1 << 20;
 
@@ -119,7 +119,7 @@ impl ReorderWindow {
         let begin = self.bytes.len();
         self.bytes.extend_from_slice(&self.buffers.0);
         let end = self.bytes.len();
-        let (channel, sequence, is_frame) = channel.next();
+        let (channel, sequence, is_frame) = channel.next_message();
         self.waiting.push(WaitingMessage { log_nanos: at, nanos, begin, end, channel, sequence, is_frame });
     }
 
@@ -175,7 +175,7 @@ impl ReorderWindow {
     /// Returns true if the number or the size of the waiting messages has reached its limit.
     #[must_use]
     pub const fn is_full(&self) -> bool {
-        self.waiting.len() >= MESSAGES || self.bytes.len() >= BYTES
+        self.waiting.len() >= MAX_MESSAGES || self.bytes.len() >= MAX_BYTES
     }
 
     /// Writes all waiting messages. Returns their number.
@@ -200,7 +200,7 @@ impl ReorderWindow {
             *late += u64::from(it.log_nanos < *released);
             *released = it.log_nanos.max(*released);
             let data = bytes.get(it.begin..it.end).unwrap_or_default();
-            file.put((it.channel, it.sequence), (*released, it.nanos), data)?;
+            file.write_encoded((it.channel, it.sequence), (*released, it.nanos), data)?;
         }
         let written = count(written);
         waiting.drain(..due);

@@ -68,7 +68,7 @@ impl Decode<'_> for bool {
 
 impl Encode for str {
     fn encode(&self, out: &mut CdrWriter<'_>) {
-        out.count(self.len() + 1);
+        out.put_count(self.len() + 1);
         out.out.extend_from_slice(self.as_bytes());
         out.out.push(0);
     }
@@ -147,19 +147,19 @@ impl<'a> CdrWriter<'a> {
     ///
     /// # Panics
     /// Panics if there are more than 2^32 - 1 elements, which no message of skinbus has.
-    pub fn count(&mut self, count: usize) {
+    pub fn put_count(&mut self, count: usize) {
         self.put(u32::try_from(count).expect("a message has fewer than 2^32 elements"));
     }
 
     /// Appends a sequence of bytes.
     pub fn bytes(&mut self, bytes: &[u8]) {
-        self.count(bytes.len());
+        self.put_count(bytes.len());
         self.out.extend_from_slice(bytes);
     }
 
     /// Appends a sequence of elements.
     pub fn sequence(&mut self, elements: impl ExactSizeIterator<Item = impl Encode>) {
-        self.count(elements.len());
+        self.put_count(elements.len());
         elements.for_each(|element| self.put(element));
     }
 

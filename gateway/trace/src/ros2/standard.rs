@@ -80,7 +80,7 @@ impl Encode for PointCloud<'_> {
         out.sequence(fields.map(|field| (field, (Self::FLOAT32, 1_u32))));
         out.put(false);
         out.put((Self::STEP, Self::STEP * width));
-        out.count(self.points.len() * Self::STEP as usize);
+        out.put_count(self.points.len() * Self::STEP as usize);
         for &Point { position: [x, y, z], force } in self.points {
             for value in [x, y, z, force] {
                 out.put(value);

@@ -24,7 +24,7 @@ fn reader(bytes: &[u8]) -> Reader {
 fn converted(bytes: &[u8], format: CaptureFormat) -> (Vec<u8>, ConversionCounts) {
     let mut out = Vec::new();
     let mut from = reader(bytes);
-    let style = Style { directions: from.is_of_a_log(), ..Style::default() };
+    let style = Style { directions: from.is_from_log(), ..Style::default() };
     let mut to = CaptureWriter::new(&mut out, format, style).unwrap();
     let done = convert(&mut from, &mut to, |_, _| Ok(())).unwrap();
     to.finish().unwrap();

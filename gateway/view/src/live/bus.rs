@@ -3,8 +3,8 @@
 use analysis::fit::rates::RequestedRates;
 use bench::view::CellView;
 use model::central::Central;
-use model::decode::wired;
-use model::table::{CellState, Status, Table};
+use model::decode::wire_message;
+use model::table::{CellState, CellStatus, Table};
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::id::CellId;
@@ -77,7 +77,7 @@ impl LiveBus {
             joints: skin.joints_on_bus(bus).len(),
             last: vec![None; cells],
             dead_since: vec![None; cells],
-            rates: described.and_then(|bus| Some(RequestedRates::default().of_bus(bus).ok()?.rates)),
+            rates: described.and_then(|bus| Some(RequestedRates::default().for_bus(bus).ok()?.rates)),
             load: Load::default(),
             halted: false,
             is_up: false,
@@ -90,7 +90,7 @@ impl LiveBus {
     pub(super) fn apply_frame(&mut self, at: Micros, frame: &Frame) -> bool {
         let received = self.table.read(at, frame);
         let message = received.message().copied();
-        if wired(frame).is_none() && !matches!(message, Some(Message::Stimulus { .. })) {
+        if wire_message(frame).is_none() && !matches!(message, Some(Message::Stimulus { .. })) {
             // On a bench, wire states and stimuli are frames of the same bus, but a real bus would not carry them.
             let busy =
                 self.rates.zip(Bits::from_frame(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
@@ -105,7 +105,7 @@ impl LiveBus {
                 self.previous = self.current.replace(heard);
             }
             Some(Message::Torque { from, epoch, torque }) => {
-                let place = self.table.place(from);
+                let place = self.table.index_of(from);
                 if let Some(last) = place.and_then(|place| self.last.get_mut(place)) {
                     *last = Some((epoch, torque));
                 }
@@ -149,8 +149,10 @@ impl LiveBus {
         self.table.notices().for_each(drop);
         for ((_, status), since) in self.table.statuses(now).zip(&mut self.dead_since) {
             match status {
-                Status::Dead => _ = since.get_or_insert(now),
-                Status::Unknown | Status::Quiet | Status::Active | Status::Stale => *since = None,
+                CellStatus::Dead => _ = since.get_or_insert(now),
+                CellStatus::Unknown | CellStatus::Quiet | CellStatus::Active | CellStatus::Stale => {
+                    *since = None
+                }
             }
         }
         let since = *self.load.since.get_or_insert(now);
@@ -171,11 +173,11 @@ impl LiveBus {
     }
 
     pub(super) fn cell(&self, node: CellId) -> Option<&CellState> {
-        self.table.cells().get(self.table.place(node)?)
+        self.table.cells().get(self.table.index_of(node)?)
     }
 
     pub(super) fn sensors(&self, node: CellId, now: Micros) -> Option<SkinSensors> {
-        self.table.sensors(now).nth(self.table.place(node)?)?.0
+        self.table.presumed_sensors(now).nth(self.table.index_of(node)?)?.0
     }
 
     /// Returns the distributed and the central torque of each joint of the chain.
@@ -196,12 +198,12 @@ impl LiveBus {
 
     /// Encodes the state of each cell as a snapshot contains it.
     pub(super) fn encode_cells(&self, now: Micros) -> Vec<[u8; 8]> {
-        let cells = self.table.cells().iter().zip(self.table.sensors(now)).enumerate();
+        let cells = self.table.cells().iter().zip(self.table.presumed_sensors(now)).enumerate();
         let bytes = cells.map(|(place, (cell, (sensors, status)))| {
             let view = CellView::new(cell, status);
             let flags = [
                 (view.unconfigured, flag::UNCONFIGURED),
-                (view.seen && view.other, flag::OTHER_CONFIGURATION),
+                (view.seen && view.other_configuration, flag::OTHER_CONFIGURATION),
                 (view.measures, flag::MEASURES),
                 (view.halted, flag::HALTED),
                 (cell.is_stuck(), flag::STUCK),

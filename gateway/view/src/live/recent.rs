@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use analysis::explain::{CellExplained, RequestedJoints, Watch, explain};
+use analysis::explain::{CellExplained, JointsWatcher, RequestedJoints, explain};
 use model::decode::settle::Settler;
 use model::decode::{Decoded, Decoder};
 use model::latched::{LatchedPackets, ReceivedFrame};
@@ -151,14 +151,14 @@ impl RecentFrames {
         let Some(Message::Torque { from, epoch, .. }) = found else { return None };
         let first = self.frames.front()?.at;
         let from_ns = (asked.at.elapsed_since(first).0 * 1_000).saturating_sub(JOINTS_LOOKBACK_NS);
-        let mut watch = Watch::new(skin, RequestedJoints { epoch, from_ns, occurrence: 1 });
+        let mut watch = JointsWatcher::new(skin, RequestedJoints { epoch, from_ns, occurrence: 1 });
         let mut decoder = Decoder::new(None);
         let name = |bus: usize| skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
         for (bus, latched) in self.latched.iter().enumerate() {
             for seen in latched.frames() {
                 let at = Micros(seen.at_nanos / 1_000);
                 if let Decoded::Message(message) = decoder.decode(at, name(bus), &seen.frame) {
-                    watch.begin(seen.at_nanos, name(bus), &message);
+                    watch.receive_latched(seen.at_nanos, name(bus), &message);
                 }
             }
         }

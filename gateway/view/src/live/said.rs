@@ -1,7 +1,7 @@
 //! The status message to the page: values that change slowly, as JSON.
 
 use bench::remote::BenchState;
-use model::table::{Event, Status};
+use model::table::{CellStatus, Event};
 use protocol::fixed::is_saturated;
 use protocol::id::{CellId, Id, Kind};
 use protocol::message::{Readings, SensorPage};
@@ -208,8 +208,8 @@ impl Live {
         let (mut contacts, mut dead, mut dead_cells) = (0, 0, Vec::new());
         for bus in &self.buses {
             for ((cell, status), since) in bus.table.statuses(now).zip(&bus.dead_since) {
-                contacts += usize::from(matches!(status, Status::Active | Status::Stale));
-                dead += usize::from(status == Status::Dead);
+                contacts += usize::from(matches!(status, CellStatus::Active | CellStatus::Stale));
+                dead += usize::from(status == CellStatus::Dead);
                 if let Some(since) = since.filter(|_| dead_cells.len() < MAX_LISTED_DEAD_CELLS) {
                     let for_s = (self.seconds(now) - self.seconds(since)).max(0.0);
                     dead_cells.push(DeadCell { bus: bus.name.clone(), node: cell.node.get(), for_s });
@@ -235,9 +235,9 @@ impl Live {
         let SelectedCell { bus: index, node, frame } = chosen;
         let bus = self.buses.get(index)?;
         let id = CellId::new(node.into()).ok()?;
-        let place = bus.table.place(id)?;
+        let place = bus.table.index_of(id)?;
         let cell = bus.table.cells().get(place)?;
-        let (sensors, status) = bus.table.sensors(now).nth(place)?;
+        let (sensors, status) = bus.table.presumed_sensors(now).nth(place)?;
         let sensors = sensors.unwrap_or_default();
         let force_n = bus.central.force(place, &sensors);
         let torque = bus.last.get(place).copied().flatten().map(|(epoch, words)| {
@@ -251,7 +251,7 @@ impl Live {
             TorqueReply {
                 epoch: epoch.0,
                 words: words.iter().take(joints).copied().collect(),
-                distributed: words.iter().take(joints).map(|&word| bus.torque_format.real(word)).collect(),
+                distributed: words.iter().take(joints).map(|&word| bus.torque_format.to_real(word)).collect(),
                 central: at(force_n),
                 jacobian: at(1.0),
                 saturated: words.iter().any(|&word| is_saturated(word)),
@@ -310,7 +310,7 @@ impl LiveBus {
             error_nm: errors.mean(),
             tree: self.sums.then(|| {
                 let cells = self.table.statuses(now).map(|(cell, status)| {
-                    let sends = !matches!(status, Status::Dead | Status::Unknown);
+                    let sends = !matches!(status, CellStatus::Dead | CellStatus::Unknown);
                     let tree = cell.pages().tree.filter(|_| sends);
                     tree.map(|tree| TreePlace(tree.parent, tree.working_ports))
                 });

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::command::SelectedCell;
-use model::generate::{Reply, Target, generate};
+use model::generate::{Reply, SkinRequest, generate};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
 use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, State, Tree};
@@ -154,7 +154,7 @@ fn only_cells_of_the_skin_in_test_mode_may_be_pressed() {
 #[test]
 fn ten_thousand_cells_on_forty_buses_are_shown() {
     let (buses, each) = (40, 250);
-    let target = Target { cells: buses * each, buses, broadcast_hz: 20.0, ..Target::default() };
+    let target = SkinRequest { cells: buses * each, buses, broadcast_hz: 20.0, ..SkinRequest::default() };
     let skin = Skin::parse("large", &generate(&target).unwrap()).unwrap();
     let mut bench = Bench { live: Live::new(skin), now: Micros(1_000_000), bus: 0 };
     for bus in 0..buses {
@@ -190,7 +190,7 @@ fn ten_thousand_cells_on_forty_buses_are_shown() {
 
 #[test]
 fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
-    let target = Target { cells: 4, reply: Reply::Sum, ..Target::default() };
+    let target = SkinRequest { cells: 4, reply: Reply::Sum, ..SkinRequest::default() };
     let skin = Skin::parse("sums", &generate(&target).unwrap()).unwrap();
     let mut bench = Bench { live: Live::new(skin), now: Micros(1_000_000), bus: 0 };
     let places = |bench: &Bench| bench.live.status_message(bench.now).buses[0].tree.clone().unwrap();

@@ -106,11 +106,11 @@ pub(in crate::bus) fn closed_error(name: &str, directory: Option<&Path>) -> BusE
 
 /// Returns true if a server accepts clients of a bus. A client that it turns away for want of room counts as accepted.
 fn is_served(name: &str, directory: Option<&Path>) -> bool {
-    connect(name, directory).is_ok_and(|socket| is_kept(&socket))
+    connect(name, directory).is_ok_and(|socket| is_kept_open(&socket))
 }
 
 /// Returns true if a server keeps a new connection open. A server that is ending resets new connections.
-fn is_kept(socket: &OwnedFd) -> bool {
+fn is_kept_open(socket: &OwnedFd) -> bool {
     let wait = Timespec::try_from(RESET_TIMEOUT).unwrap_or_default();
     let mut polled = [PollFd::new(socket, PollFlags::IN)];
     let is_quiet = rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))) == Ok(0);

@@ -12,7 +12,7 @@ use rustix::net::SocketAddrUnix;
 use thiserror::Error;
 
 /// Name of the file that marks a directory as created by a program. Such a directory is removed with its last bus.
-pub const MARK: &str = ".skinbus";
+pub const MARKER_FILE: &str = ".skinbus";
 
 /// Returns the default directory of embedded buses: `$SKINBUS_DIR`, else `$XDG_RUNTIME_DIR/skinbus`, else
 /// `/tmp/skinbus-<user>`.
@@ -103,7 +103,7 @@ pub fn open_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     Ok(directory)
 }
 
-/// Creates the directory with mode 0700 and a [`MARK`] if it does not exist, then opens it.
+/// Creates the directory with mode 0700 and a [`MARKER_FILE`] if it does not exist, then opens it.
 ///
 /// # Errors
 /// Returns the errors of [`open_directory`], or an error if the directory cannot be created.
@@ -112,7 +112,7 @@ pub fn make_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     match DirBuilder::new().mode(0o700).create(path) {
         Ok(()) => {
             let directory = open_directory(path)?;
-            mark(&directory).map_err(|errno| io(errno.into()))?;
+            write_marker(&directory).map_err(|errno| io(errno.into()))?;
             Ok(directory)
         }
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => open_directory(path),
@@ -120,32 +120,32 @@ pub fn make_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     }
 }
 
-/// Writes the [`MARK`] into a new directory.
+/// Writes the [`MARKER_FILE`] into a new directory.
 ///
 /// # Errors
 /// Returns an error if the file cannot be written.
-pub fn mark(directory: impl AsFd) -> Result<(), Errno> {
+pub fn write_marker(directory: impl AsFd) -> Result<(), Errno> {
     let flags = OFlags::CREATE | OFlags::EXCL | OFlags::WRONLY | OFlags::CLOEXEC;
-    match rustix::fs::openat(directory, MARK, flags, Mode::RUSR | Mode::WUSR) {
+    match rustix::fs::openat(directory, MARKER_FILE, flags, Mode::RUSR | Mode::WUSR) {
         Ok(_) | Err(Errno::EXIST) => Ok(()),
         Err(errno) => Err(errno),
     }
 }
 
-/// Removes a directory that contains only the [`MARK`]. A directory that the user created has no mark and is not
+/// Removes a directory that contains only the [`MARKER_FILE`]. A directory that the user created has no mark and is not
 /// removed. The caller holds the lock on the directory.
 ///
 /// # Errors
 /// Returns an error if the directory contains other files, has no mark, or cannot be removed.
 pub fn remove_directory(directory: impl AsFd, path: &Path) -> Result<(), Errno> {
     for entry in rustix::fs::Dir::read_from(&directory)? {
-        if ![".", "..", MARK].map(str::as_bytes).contains(&entry?.file_name().to_bytes()) {
+        if ![".", "..", MARKER_FILE].map(str::as_bytes).contains(&entry?.file_name().to_bytes()) {
             return Err(Errno::NOTEMPTY);
         }
     }
-    rustix::fs::unlinkat(&directory, MARK, AtFlags::empty())?;
+    rustix::fs::unlinkat(&directory, MARKER_FILE, AtFlags::empty())?;
     // Another process may have added a file meanwhile; the directory is still one that was created here.
     rustix::fs::rmdir(path).inspect_err(|_| {
-        let _ = mark(&directory);
+        let _ = write_marker(&directory);
     })
 }

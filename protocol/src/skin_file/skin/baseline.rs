@@ -15,7 +15,7 @@ const DEFAULT: BaselineSettings = BaselineSettings {
 };
 
 /// Checks the table `[baseline]` of a skin and returns its settings.
-pub(super) fn skin_baseline(raw: Option<raw::Baseline>) -> Result<Baseline, DocumentFault> {
+pub(super) fn skin_baseline(raw: Option<raw::RawBaseline>) -> Result<Baseline, DocumentFault> {
     let Some(raw) = raw else { return Ok(Baseline::Off) };
     let at = KeyPath::top_level_key("baseline");
     let modes = [("off", None), ("hold", Some(false)), ("follow", Some(true))];

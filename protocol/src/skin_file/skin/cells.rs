@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use super::chains::normalized;
-use super::reach::{REACH, reach};
+use super::reach::{MAX_REACH, reach};
 use super::{Cell, Robot, SkinBus, baseline, raw};
 use crate::document::{Checked, KeyPath};
 use crate::fixed::Q;
@@ -107,11 +107,11 @@ fn cell(
     let chain = buses.get(bus).and_then(|bus| robot.chains.get(bus.chain));
     let rows = chain.and_then(|chain| chain.rows.get(..usize::from(row))).unwrap_or_default();
     let reach = reach(rows, raw.position);
-    if reach >= REACH {
+    if reach >= MAX_REACH {
         let [x, y, z] = raw.position;
         let why = format!(
-            "node {node} can come {reach:.3} m from a frame of its rows, {:.3} m more than the {REACH} m that Q1.14 holds",
-            reach - REACH
+            "node {node} can come {reach:.3} m from a frame of its rows, {:.3} m more than the {MAX_REACH} m that Q1.14 holds",
+            reach - MAX_REACH
         );
         return Err(at.key("position").fault(format_args!("[{x}, {y}, {z}]"), why));
     }
@@ -143,8 +143,9 @@ fn cell(
 }
 
 /// Returns `base` with the gains and thresholds that are given.
-pub(super) fn contact(at: &KeyPath, raw: raw::Contact, base: Contact) -> Checked<Contact> {
-    let raw::Contact { alpha_c, alpha_p, contact_threshold_n, proximity_threshold, force_threshold_n } = raw;
+pub(super) fn contact(at: &KeyPath, raw: raw::RawContact, base: Contact) -> Checked<Contact> {
+    let raw::RawContact { alpha_c, alpha_p, contact_threshold_n, proximity_threshold, force_threshold_n } =
+        raw;
     let mut to = base;
     at.key("alpha_c").set_word(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
     at.key("alpha_p").set_word(alpha_p, &mut to.alpha_p, Q::try_nearest)?;

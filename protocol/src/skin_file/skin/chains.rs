@@ -18,7 +18,7 @@ const MAX_BASE_COORDINATE: f64 = 100.0;
 const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// Checks the joints and chains of the robot.
-pub(super) fn robot(raw: raw::Robot) -> Checked<Robot> {
+pub(super) fn robot(raw: raw::RawRobot) -> Checked<Robot> {
     let at = KeyPath::top_level_key("robot");
     if raw.urdf.as_ref().is_some_and(String::is_empty) {
         return Err(at.key("urdf").fault("\"\"", "the path of a file, from the skin's file"));
@@ -64,7 +64,7 @@ fn serial_robot(
     let all = limits.unwrap_or_else(|| vec![[-TAU, TAU]; count]);
     check_length(&at.key("limits_rad"), all.len(), count)?;
     for (index, &limits) in all.iter().enumerate() {
-        self::limits(&at.key("limits_rad").element(index), limits, JointKind::Revolute)?;
+        check_limits(&at.key("limits_rad").element(index), limits, JointKind::Revolute)?;
     }
     let joint = |(index, &limits): (usize, &[f64; 2])| Joint {
         name: format!("joint{}", index + 1),
@@ -91,7 +91,7 @@ fn check_row(at: &KeyPath, row: &DenavitHartenberg) -> Checked<()> {
     Ok(())
 }
 
-fn limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<[f64; 2]> {
+fn check_limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<[f64; 2]> {
     let got = format!("[{min}, {max}]");
     // This form also refuses NaN.
     if !(min.is_finite() && max.is_finite() && min < max) {
@@ -106,7 +106,7 @@ fn limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<[f64; 
     Ok([min, max])
 }
 
-fn joints(at: &KeyPath, raw: &[raw::Joint]) -> Checked<Vec<Joint>> {
+fn joints(at: &KeyPath, raw: &[raw::RawJoint]) -> Checked<Vec<Joint>> {
     let count = raw.len();
     if count == 0 || count > MAX_ROBOT_JOINTS {
         let why = format!("a robot has 1 to {MAX_ROBOT_JOINTS} joints");
@@ -128,13 +128,13 @@ fn joints(at: &KeyPath, raw: &[raw::Joint]) -> Checked<Vec<Joint>> {
                 return Err(at.key("limits").fault("", "a prismatic joint needs them, in m"));
             }
         };
-        let limits = limits(&at.key("limits"), given, kind)?;
+        let limits = check_limits(&at.key("limits"), given, kind)?;
         joints.push(Joint { name: raw.name.clone(), kind, limits });
     }
     Ok(joints)
 }
 
-fn chains(at: &KeyPath, raw: &[raw::Chain], joints: &[Joint]) -> Checked<Vec<Chain>> {
+fn chains(at: &KeyPath, raw: &[raw::RawChain], joints: &[Joint]) -> Checked<Vec<Chain>> {
     if raw.is_empty() {
         return Err(at.key("chain").fault("[]", "at least one chain is needed"));
     }
@@ -155,7 +155,7 @@ fn chains(at: &KeyPath, raw: &[raw::Chain], joints: &[Joint]) -> Checked<Vec<Cha
     Ok(chains)
 }
 
-fn base(at: &KeyPath, raw: &raw::Base) -> Checked<ChainBase> {
+fn check_base(at: &KeyPath, raw: &raw::RawBase) -> Checked<ChainBase> {
     if let Some((index, value)) =
         raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > MAX_BASE_COORDINATE)
     {
@@ -171,7 +171,7 @@ fn base(at: &KeyPath, raw: &raw::Base) -> Checked<ChainBase> {
     })
 }
 
-fn chain(at: &KeyPath, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
+fn chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> {
     let count = raw.rows.len();
     if count > MAX_ROWS {
         let why = format!("a chain has at most {MAX_ROWS} rows");
@@ -179,7 +179,10 @@ fn chain(at: &KeyPath, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
     }
     let mut chain = Chain {
         name: raw.name.clone(),
-        base: raw.base.as_ref().map_or_else(|| Ok(ChainBase::default()), |raw| base(&at.key("base"), raw))?,
+        base: raw
+            .base
+            .as_ref()
+            .map_or_else(|| Ok(ChainBase::default()), |raw| check_base(&at.key("base"), raw))?,
         joints: Vec::new(),
         rows: Vec::with_capacity(raw.rows.len()),
     };

@@ -8,19 +8,19 @@ use crate::fixed::Q;
 use crate::parameters::Contact;
 
 /// Checks a whole skin.
-pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
+pub(super) fn skin(raw: raw::RawSkin) -> Checked<Skin> {
     names::check(&raw)?;
     check_skin(raw, |_| true)
 }
 
 /// Checks a whole skin from a recording. Unprintable characters in names are escaped instead of rejected.
-pub(super) fn recorded_skin(mut raw: raw::Skin) -> Checked<Skin> {
+pub(super) fn recorded_skin(mut raw: raw::RawSkin) -> Checked<Skin> {
     names::escape(&mut raw);
     check_skin(raw, |_| true)
 }
 
 /// Checks a skin that contains the cells of one bus only.
-pub(super) fn skin_on(raw: raw::Skin, bus: &str) -> Checked<Skin> {
+pub(super) fn skin_on(raw: raw::RawSkin, bus: &str) -> Checked<Skin> {
     let skin = check_skin(raw, |of| of.name == bus)?;
     let is_other = |cell: &Cell| skin.buses.get(cell.bus).is_some_and(|of| of.name != bus);
     match skin.cells.iter().position(is_other) {
@@ -32,7 +32,7 @@ pub(super) fn skin_on(raw: raw::Skin, bus: &str) -> Checked<Skin> {
 }
 
 /// Checks all values of a skin. `has_cells` returns true for each bus whose cells are part of `raw`.
-fn check_skin(raw: raw::Skin, has_cells: impl Fn(&SkinBus) -> bool) -> Checked<Skin> {
+fn check_skin(raw: raw::RawSkin, has_cells: impl Fn(&SkinBus) -> bool) -> Checked<Skin> {
     if raw.version != 1 {
         return Err(KeyPath::top_level_key("version").fault(raw.version, "this program reads version 1"));
     }
@@ -103,7 +103,7 @@ fn check_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checke
     Err(at.key("slot_us").fault(slot_us, why))
 }
 
-fn timing(raw: &raw::Timing) -> Checked<Timing> {
+fn timing(raw: &raw::RawTiming) -> Checked<Timing> {
     let at = KeyPath::top_level_key("timing");
     let control_hz = raw.control_hz;
     if !(1.0..=10_000.0).contains(&control_hz) {
@@ -124,7 +124,7 @@ fn timing(raw: &raw::Timing) -> Checked<Timing> {
     Ok(Timing { control_hz, ticks_per_broadcast })
 }
 
-fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
+fn controller(raw: raw::RawController, joints: usize) -> Checked<Controller> {
     let at = KeyPath::top_level_key("controller");
     let each_positive = |key, values: Vec<f64>| {
         let at = at.key(key);
@@ -172,7 +172,7 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
     Ok(Controller { kind, max_speed })
 }
 
-fn safety(raw: &raw::Safety) -> Checked<Safety> {
+fn safety(raw: &raw::RawSafety) -> Checked<Safety> {
     let at = KeyPath::top_level_key("safety");
     let lost_bus = [LostBus::Continue, LostBus::Halt].map(|lost_bus| (lost_bus.name(), lost_bus));
     let lost_bus = at.key("lost_bus").choose(&raw.lost_bus, &lost_bus)?;

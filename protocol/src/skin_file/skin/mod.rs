@@ -29,7 +29,7 @@ use crate::parameters::{Baseline, Contact, Events, Parameters, Pose, Row, Sensin
 use crate::time::Span;
 
 pub use cell_name::{CellName, split_bus};
-pub use reach::{REACH, reach};
+pub use reach::{MAX_REACH, reach};
 pub use robot::{Chain, ChainBase, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;
 

@@ -7,25 +7,25 @@ use crate::can::Format;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Skin {
+pub(super) struct RawSkin {
     #[serde(default = "version")]
     pub(super) version: i64,
     #[serde(default = "name")]
     pub(super) name: String,
-    pub(super) robot: Robot,
+    pub(super) robot: RawRobot,
     #[serde(default)]
-    pub(super) timing: Timing,
+    pub(super) timing: RawTiming,
     #[serde(default)]
-    pub(super) contact: Contact,
+    pub(super) contact: RawContact,
     #[serde(default)]
-    pub(super) events: Events,
-    pub(super) baseline: Option<Baseline>,
+    pub(super) events: RawEvents,
+    pub(super) baseline: Option<RawBaseline>,
     #[serde(default = "one_bus")]
     pub(super) bus: Vec<RawBus>,
     #[serde(default)]
-    pub(super) controller: Controller,
+    pub(super) controller: RawController,
     #[serde(default)]
-    pub(super) safety: Safety,
+    pub(super) safety: RawSafety,
     pub(super) cell: Vec<RawCell>,
 }
 
@@ -43,21 +43,21 @@ fn one_bus() -> Vec<RawBus> {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Robot {
+pub(super) struct RawRobot {
     #[serde(default = "robot")]
     pub(super) name: String,
     pub(super) urdf: Option<String>,
     pub(super) joints: Option<Vec<DenavitHartenberg>>,
     pub(super) limits_rad: Option<Vec<[f64; 2]>>,
     #[serde(default)]
-    pub(super) joint: Vec<Joint>,
+    pub(super) joint: Vec<RawJoint>,
     #[serde(default)]
-    pub(super) chain: Vec<Chain>,
+    pub(super) chain: Vec<RawChain>,
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Joint {
+pub(super) struct RawJoint {
     pub(super) name: String,
     #[serde(default = "revolute")]
     pub(super) kind: String,
@@ -70,16 +70,16 @@ fn revolute() -> String {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Chain {
+pub(super) struct RawChain {
     pub(super) name: String,
-    pub(super) base: Option<Base>,
-    pub(super) rows: Vec<Row>,
+    pub(super) base: Option<RawBase>,
+    pub(super) rows: Vec<RawRow>,
 }
 
 /// The pose of a chain's base relative to the robot's base.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Base {
+pub(super) struct RawBase {
     #[serde(default)]
     pub(super) position: [f64; 3],
     pub(super) orientation: Option<[f64; 4]>,
@@ -88,7 +88,7 @@ pub(super) struct Base {
 /// A row of a chain's table; a fixed row if it names no joint.
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Row {
+pub(super) struct RawRow {
     pub(super) joint: Option<String>,
     pub(super) a: f64,
     pub(super) alpha: f64,
@@ -102,12 +102,12 @@ fn robot() -> String {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Timing {
+pub(super) struct RawTiming {
     pub(super) control_hz: f64,
     pub(super) joint_broadcast_hz: f64,
 }
 
-impl Default for Timing {
+impl Default for RawTiming {
     /// Returns the rates that the paper uses.
     fn default() -> Self {
         Self { control_hz: 500.0, joint_broadcast_hz: 62.5 }
@@ -117,7 +117,7 @@ impl Default for Timing {
 /// Gains and thresholds. In the table of a cell they override those of the skin.
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Contact {
+pub(super) struct RawContact {
     pub(super) alpha_c: Option<f64>,
     pub(super) alpha_p: Option<f64>,
     pub(super) contact_threshold_n: Option<f64>,
@@ -162,7 +162,7 @@ impl Default for RawBus {
 /// The thresholds at which cells in event mode send measurements.
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Events {
+pub(super) struct RawEvents {
     pub(super) contact_n: Option<f64>,
     pub(super) proximity: Option<f64>,
     pub(super) temperature_c: Option<f64>,
@@ -173,7 +173,7 @@ pub(super) struct Events {
 /// The baseline settings of the force sensors.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Baseline {
+pub(super) struct RawBaseline {
     pub(super) mode: Option<String>,
     pub(super) threshold_n: Option<f64>,
     pub(super) hysteresis: Option<f64>,
@@ -184,7 +184,7 @@ pub(super) struct Baseline {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Controller {
+pub(super) struct RawController {
     pub(super) kind: String,
     pub(super) inertia: Option<Vec<f64>>,
     pub(super) damping: Option<Vec<f64>>,
@@ -194,7 +194,7 @@ pub(super) struct Controller {
     pub(super) start_s: Option<f64>,
 }
 
-impl Default for Controller {
+impl Default for RawController {
     fn default() -> Self {
         let kind = "kinesthetic".to_owned();
         Self {
@@ -211,14 +211,14 @@ impl Default for Controller {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Safety {
+pub(super) struct RawSafety {
     pub(super) hold_epochs: i64,
     pub(super) decay_epochs: i64,
     pub(super) bad_cycles: i64,
     pub(super) lost_bus: String,
 }
 
-impl Default for Safety {
+impl Default for RawSafety {
     /// Returns limits with which the torque is held for two missing replies and decays over four more, and 25 bad
     /// cycles (1/20 s) halt the robot.
     fn default() -> Self {
@@ -257,8 +257,8 @@ pub(super) struct RawCell {
 
 impl RawCell {
     /// Returns the gains and thresholds that the cell overrides.
-    pub(super) const fn contact(&self) -> Contact {
-        Contact {
+    pub(super) const fn contact(&self) -> RawContact {
+        RawContact {
             alpha_c: self.alpha_c,
             alpha_p: self.alpha_p,
             contact_threshold_n: self.contact_threshold_n,

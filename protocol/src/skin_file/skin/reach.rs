@@ -9,7 +9,7 @@ use super::robot::{ChainRow, DenavitHartenberg};
 use crate::parameters::RowKind;
 
 /// Maximum reach in m: the range of Q1.14, 2 m, less a margin for accumulated rounding.
-pub const REACH: f64 = 2.0 - 1e-3;
+pub const MAX_REACH: f64 = 2.0 - 1e-3;
 
 type Vector = [f64; 3];
 

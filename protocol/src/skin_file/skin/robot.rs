@@ -79,7 +79,7 @@ impl JointKind {
     /// Converts a position in rad or m to a Q1.14 word in quarter turns or m. Returns `None` if the position is not
     /// finite.
     #[must_use]
-    pub fn word(self, position: f64) -> Option<Q1_14> {
+    pub fn position_to_word(self, position: f64) -> Option<Q1_14> {
         match self {
             Self::Revolute => Q1_14::from_radians(position),
             Self::Prismatic => position.is_finite().then(|| Q1_14::nearest(position)),
@@ -88,7 +88,7 @@ impl JointKind {
 
     /// Converts a Q1.14 word in quarter turns or m to a position in rad or m.
     #[must_use]
-    pub fn position(self, word: Q1_14) -> f64 {
+    pub fn word_to_position(self, word: Q1_14) -> f64 {
         match self {
             Self::Revolute => word.to_radians(),
             Self::Prismatic => word.to_f64(),

@@ -52,7 +52,7 @@ pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, Do
 }
 
 /// Checks the thresholds of event mode. An omitted value is the default of a cell.
-pub(super) fn events(raw: raw::Events) -> Result<Events, DocumentFault> {
+pub(super) fn events(raw: raw::RawEvents) -> Result<Events, DocumentFault> {
     /// Rounds a threshold to a word. An error gives 0 as the lower limit, because a threshold is not negative.
     fn magnitude<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
         Q::try_nearest(value).map_err(|error| OutOfRange { min: 0.0, ..error })
@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn explicit_defaults_are_the_defaults() {
-        let explicit = raw::Events {
+        let explicit = raw::RawEvents {
             contact_n: Some(0.1),
             proximity: Some(0.05),
             temperature_c: Some(0.5),
@@ -99,6 +99,6 @@ mod tests {
             hysteresis: Some(0.5),
         };
         assert_eq!(events(explicit).unwrap(), Events::default());
-        assert_eq!(events(raw::Events::default()).unwrap(), Events::default());
+        assert_eq!(events(raw::RawEvents::default()).unwrap(), Events::default());
     }
 }

@@ -137,8 +137,12 @@ fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
     let compare = |coding, extended, len: usize, bytes, [min, max]: [u32; 2]| {
         let shape = Shape { coding, extended, len: u8::try_from(len).unwrap() };
         let plain = plain(extended, bytes);
-        assert_eq!((shape.best().nominal, shape.worst().nominal), (plain + min, plain + max), "{shape:?}");
-        assert_eq!((shape.best().data, shape.worst().data), (0, 0));
+        assert_eq!(
+            (shape.min_bits().nominal, shape.max_bits().nominal),
+            (plain + min, plain + max),
+            "{shape:?}"
+        );
+        assert_eq!((shape.min_bits().data, shape.max_bits().data), (0, 0));
     };
     let mut rest = of_the_crc();
     for ([remote, _], extended) in heads.iter().zip([false, true]) {
@@ -174,7 +178,7 @@ fn short_frames_one_by_one_are_within_the_bounds_and_reach_them() {
     let short = || (0..0x800_u32).flat_map(|id| (0..=u8::MAX).map(move |byte| (id, byte)));
     let classic = short().map(|(id, byte)| Frame::classic(id, &[byte]).unwrap());
     let shape = Shape { coding: Coding::Classic, extended: false, len: 1 };
-    assert_eq!(ends(classic), (shape.best(), shape.worst()));
+    assert_eq!(ends(classic), (shape.min_bits(), shape.max_bits()));
     for (coding, flags) in [Coding::Fd, Coding::FdSwitched].into_iter().zip(flags) {
         // The bits after BRS do not depend on the identifier, so vary the identifier first, then the content.
         let ids = (0..0x800).flat_map(|id| flags.map(|flags| Frame::fd(id, flags, &[0x55]).unwrap()));
@@ -190,7 +194,7 @@ fn short_frames_one_by_one_are_within_the_bounds_and_reach_them() {
                 flags.map(|flags| Frame::fd(id.unwrap(), flags, &bytes[..usize::from(len)]).unwrap())
             });
             let shape = Shape { coding, extended: false, len };
-            assert_eq!(ends(frames).1, shape.worst(), "{shape:?}");
+            assert_eq!(ends(frames).1, shape.max_bits(), "{shape:?}");
         }
     }
 }

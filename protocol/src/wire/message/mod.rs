@@ -105,7 +105,7 @@ impl Answer {
     /// Reason of a refusal: writing to flash failed.
     pub const FLASH_FAILED: i16 = 17;
     /// Reason of a refusal: the parameter does not exist.
-    pub const UNKNOWN: i16 = 18;
+    pub const UNKNOWN_PARAMETER: i16 = 18;
     /// Reason of a refusal: the words are invalid for this parameter, or `links_down` was written outside test mode.
     pub const INVALID: i16 = 19;
     /// Reason of a refusal: a tare was requested while the cell is touched, or before it has received joints.
@@ -276,13 +276,15 @@ impl Message {
                 return Err(MessageError::Count { kind, got: count, allowed: "1" });
             }
             Kind::Torque => Self::Torque { from: sender()?, epoch, torque: words },
-            Kind::Sensors => {
-                Self::Sensors { from: sender()?, epoch, page: SensorPage::decode(kind, count, words.six())? }
-            }
+            Kind::Sensors => Self::Sensors {
+                from: sender()?,
+                epoch,
+                page: SensorPage::decode(kind, count, words.first_six())?,
+            },
             Kind::Network => match Node::from_byte(node) {
                 Node::Everyone => return Err(MessageError::Sender { kind, node }),
                 from @ (Node::Gateway | Node::Cell(_)) => {
-                    Self::Network { from, epoch, page: NetworkPage::decode(count, words.six())? }
+                    Self::Network { from, epoch, page: NetworkPage::decode(count, words.first_six())? }
                 }
             },
             Kind::Configure => {
@@ -290,13 +292,13 @@ impl Message {
                 let request = if count & WRITE_FLAG == 0 {
                     Request::Read { number }
                 } else {
-                    Request::Write { number, words: words.six() }
+                    Request::Write { number, words: words.first_six() }
                 };
                 Self::Configure { to: addressee(kind, node)?, tag: epoch.0, request }
             }
             Kind::Configured => {
                 let number = count & !WRITE_FLAG;
-                let words = words.six();
+                let words = words.first_six();
                 let answer = match words {
                     [refused, reason, ..] if number == REFUSAL_NUMBER => {
                         Answer::Refused { number: refused.to_le_bytes()[0], reason }
@@ -308,7 +310,7 @@ impl Message {
             Kind::Stimulus => {
                 let from =
                     if count & FROM_NEXT_FLAG == 0 { AppliesFrom::Epoch(epoch) } else { AppliesFrom::Next };
-                let page = SensorPage::decode(kind, count & !FROM_NEXT_FLAG, words.six())?;
+                let page = SensorPage::decode(kind, count & !FROM_NEXT_FLAG, words.first_six())?;
                 Self::Stimulus { to: addressee(kind, node)?, from, page }
             }
         })

@@ -178,7 +178,7 @@ impl Words {
 
     /// Returns a copy with one word replaced. An index beyond the length changes nothing.
     #[must_use]
-    pub fn with(mut self, place: usize, word: i16) -> Self {
+    pub fn with_word(mut self, place: usize, word: i16) -> Self {
         if let Some(there) = self.words.get_mut(..self.length.words()).and_then(|words| words.get_mut(place))
         {
             *there = word;
@@ -188,7 +188,7 @@ impl Words {
 
     /// Returns the first six words, which are all words of a packet whose length does not depend on the chain.
     #[must_use]
-    pub const fn six(&self) -> [i16; WORDS] {
+    pub const fn first_six(&self) -> [i16; WORDS] {
         let [a, b, c, d, e, f, ..] = self.words;
         [a, b, c, d, e, f]
     }

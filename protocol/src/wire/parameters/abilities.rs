@@ -106,7 +106,7 @@ impl Abilities {
     /// Returns the first ability that `parameters` require and the cell lacks; `None` if it lacks none.
     #[must_use]
     pub fn first_missing(self, parameters: &Parameters) -> Option<MissingAbility> {
-        let (joints, table) = (usize::from(parameters.joints), parameters.table());
+        let (joints, table) = (usize::from(parameters.joints), parameters.all_rows());
         if joints > self.joints() {
             return Some(MissingAbility::Joints { needed: joints, most: self.joints() });
         }

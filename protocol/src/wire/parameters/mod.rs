@@ -84,10 +84,11 @@ pub enum Parameter {
 }
 
 /// The stored parameters other than rows. They are hashed in this order, before the rows.
-const STORED: [Parameter; 4] = [Parameter::Mount, Parameter::Pose, Parameter::Contact, Parameter::Timing];
+const STORED_BEFORE_ROWS: [Parameter; 4] =
+    [Parameter::Mount, Parameter::Pose, Parameter::Contact, Parameter::Timing];
 
 /// The number of every parameter other than the rows.
-const NUMBERS: [(Parameter, u8); 13] = [
+const PARAMETER_NUMBERS: [(Parameter, u8); 13] = [
     (Parameter::Identity, 0),
     (Parameter::Mount, 1),
     (Parameter::Pose, 2),
@@ -108,13 +109,13 @@ impl Parameter {
     /// hashed.
     pub fn stored(rows: usize) -> impl Iterator<Item = Self> {
         let rows = rows.clamp(IMAGE_ROWS, MAX_ROWS);
-        STORED.into_iter().chain((0..).take(rows).map(Self::Row))
+        STORED_BEFORE_ROWS.into_iter().chain((0..).take(rows).map(Self::Row))
     }
 
     /// Returns true if the cell keeps the parameter in flash.
     #[must_use]
     pub fn is_stored(self) -> bool {
-        matches!(self, Self::Row(_)) || STORED.contains(&self)
+        matches!(self, Self::Row(_)) || STORED_BEFORE_ROWS.contains(&self)
     }
 
     /// Returns the parameter with this number; `None` for other numbers.
@@ -123,7 +124,7 @@ impl Parameter {
         if (FIRST_ROW..END_ROW).contains(&number) {
             return Some(Self::Row(number - FIRST_ROW));
         }
-        NUMBERS.iter().find(|(_, known)| *known == number).map(|(parameter, _)| *parameter)
+        PARAMETER_NUMBERS.iter().find(|(_, known)| *known == number).map(|(parameter, _)| *parameter)
     }
 
     /// Returns the number of the parameter. For a row above the 32nd, returns the number of the commit.
@@ -134,7 +135,7 @@ impl Parameter {
         {
             return FIRST_ROW + row;
         }
-        NUMBERS.iter().find(|(known, _)| *known == self).map_or(127, |(_, number)| *number)
+        PARAMETER_NUMBERS.iter().find(|(known, _)| *known == self).map_or(127, |(_, number)| *number)
     }
 
     /// Returns true if a write of the parameter takes effect at once and is lost when the cell restarts.
@@ -248,9 +249,9 @@ impl Default for Parameters {
 }
 
 /// Size in bytes of the image for a chain with up to 6 rows.
-pub const IMAGE_BYTES: usize = (STORED.len() + IMAGE_ROWS) * WORDS * 2;
+pub const IMAGE_BYTES: usize = (STORED_BEFORE_ROWS.len() + IMAGE_ROWS) * WORDS * 2;
 /// Size in bytes of the image for a chain with 32 rows.
-pub const MAX_IMAGE_BYTES: usize = (STORED.len() + MAX_ROWS) * WORDS * 2;
+pub const MAX_IMAGE_BYTES: usize = (STORED_BEFORE_ROWS.len() + MAX_ROWS) * WORDS * 2;
 
 /// The stored parameters as bytes: [`IMAGE_BYTES`], and 12 more for each row after the sixth.
 pub type Image = heapless::Vec<u8, MAX_IMAGE_BYTES>;
@@ -373,11 +374,11 @@ impl Parameters {
     /// of joint k or a fixed row after it.
     fn check_rows(&self, joints: i16) -> Result<(), ParameterError> {
         let (row, rows) = (i16::from(self.row), i16::from(self.table_rows));
-        let moving = |rows: &[Row]| rows.iter().filter(|row| row.moves()).count();
-        let table = self.table();
+        let moving = |rows: &[Row]| rows.iter().filter(|row| row.has_joint()).count();
+        let table = self.all_rows();
         let is_short = self.table_rows == 0;
         let has_joints = moving(table) == usize::from(self.joints);
-        if usize::from(self.table_rows) > MAX_ROWS || !has_joints || is_short && !self.is_plain() {
+        if usize::from(self.table_rows) > MAX_ROWS || !has_joints || is_short && !self.is_all_revolute() {
             return Err(ParameterError::Rows { got: rows, joints });
         }
         if is_short && self.row == 0 {
@@ -391,13 +392,13 @@ impl Parameters {
     }
 
     /// Returns true if all rows of the chain are revolute.
-    fn is_plain(&self) -> bool {
-        self.table().iter().all(|row| row.kind == RowKind::Revolute)
+    fn is_all_revolute(&self) -> bool {
+        self.all_rows().iter().all(|row| row.kind == RowKind::Revolute)
     }
 
     /// Returns the rows of the whole chain, from base to tip.
     #[must_use]
-    pub fn table(&self) -> &[Row] {
+    pub fn all_rows(&self) -> &[Row] {
         let rows = if self.table_rows == 0 { self.joints } else { self.table_rows };
         self.rows.get(..usize::from(rows)).unwrap_or_default()
     }
@@ -414,7 +415,7 @@ impl Parameters {
     #[must_use]
     pub fn shortest_form(self) -> Self {
         let short = Self { row: 0, table_rows: 0, ..self };
-        if self.table_rows == self.joints && self.row == self.joint && short.is_plain() {
+        if self.table_rows == self.joints && self.row == self.joint && short.is_all_revolute() {
             short
         } else {
             self
@@ -429,7 +430,7 @@ impl Parameters {
 
     /// Returns [`Parameters::image`] in pieces of one parameter each, for callers with a small stack.
     pub fn image_parts(&self) -> impl Iterator<Item = [u8; WORDS * 2]> {
-        Parameter::stored(self.table().len()).map(|parameter| self.image_part(parameter))
+        Parameter::stored(self.all_rows().len()).map(|parameter| self.image_part(parameter))
     }
 
     /// Encodes one parameter.

@@ -59,7 +59,7 @@ impl Row {
 
     /// Returns true if the row has a joint.
     #[must_use]
-    pub fn moves(&self) -> bool {
+    pub fn has_joint(&self) -> bool {
         self.kind != RowKind::Fixed
     }
 

@@ -75,7 +75,7 @@ pub enum FieldRange {
 /// The representation in JSON of a field whose condition `when` is false.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq)]
 #[serde(rename_all = "snake_case")]
-pub enum Absent {
+pub enum WhenAbsent {
     /// The field is omitted.
     #[default]
     Omitted,
@@ -110,7 +110,7 @@ pub struct Field {
     /// Without bounds the field is always present.
     when: Option<[u16; 2]>,
     /// Representation of the field while the condition is false.
-    pub absent: Absent,
+    pub absent: WhenAbsent,
     /// True if the field may be omitted on the command line. The value is then 0.
     pub optional: bool,
     /// Description of further restrictions on the values.
@@ -193,7 +193,7 @@ impl Field {
 
     /// Returns the sum of the field's word and the two words after it.
     #[must_use]
-    pub fn total(&self, bytes: &[u8]) -> f64 {
+    pub fn sum_of_words(&self, bytes: &[u8]) -> f64 {
         (0..3).map(|element| self.real(self.raw(bytes, element))).sum()
     }
 

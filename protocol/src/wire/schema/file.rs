@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use serde::Deserialize;
 use serde::de::{Deserializer, Error};
 
-use super::ALWAYS;
+use super::ANY_NUMBER;
 use super::field::Field;
 use crate::id::{Command, Kind};
 
@@ -126,7 +126,7 @@ impl<'de> Deserialize<'de> for TextPart {
             Of(String, u16, u16, String),
         }
         let (when, of, text) = match RawPart::deserialize(deserializer)? {
-            RawPart::Always(text) => (ALWAYS, None, text),
+            RawPart::Always(text) => (ANY_NUMBER, None, text),
             RawPart::Within(min, max, text) => ([min, max], None, text),
             RawPart::Of(field, min, max, text) => ([min, max], Some(field), text),
         };

@@ -13,7 +13,7 @@ mod field;
 mod file;
 mod units;
 
-pub use field::{Absent, Field, FieldFormat, FieldRange};
+pub use field::{Field, FieldFormat, FieldRange, WhenAbsent};
 pub use file::{Layout, PacketSchema, TextPart, TextPiece, packets, parameters, reasons, wires};
 pub use units::Units;
 
@@ -23,7 +23,7 @@ use crate::packet::{Packet, WORDS};
 use crate::parameters::Parameter;
 
 /// Bounds that contain every 16-bit number.
-const ALWAYS: [u16; 2] = [0, u16::MAX];
+const ANY_NUMBER: [u16; 2] = [0, u16::MAX];
 
 impl PacketSchema {
     /// Returns the schema of packets with an identifier; `None` for an undefined command.
@@ -37,7 +37,7 @@ impl PacketSchema {
 
     /// Returns the fields of bytes 12 and 13 (epoch and count) that are defined for this layout.
     #[must_use]
-    pub fn end(&self, layout: &Layout) -> &[Field] {
+    pub fn trailing_fields(&self, layout: &Layout) -> &[Field] {
         if self.kind == Kind::Configured && layout.number == REFUSAL_NUMBER { &[] } else { &self.end }
     }
 }
@@ -56,7 +56,7 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     }
     let is_refusal = packet.id.kind == Kind::Configured && number == REFUSAL_NUMBER;
     if matches!(packet.id.kind, Kind::Configure | Kind::Configured) && !is_refusal {
-        return parameter_layout(number, packet.words.six());
+        return parameter_layout(number, packet.words.first_six());
     }
     let layouts = PacketSchema::for_id(packet.id).map_or(&[][..], |schema| &schema.layouts);
     layouts.iter().find(|layout| layout.number == number).unwrap_or_else(file::empty)

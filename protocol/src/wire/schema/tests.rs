@@ -98,7 +98,7 @@ fn a_refusal_has_no_tag_and_no_parameter_beside_its_layout() {
     let schema = |kind| packets().iter().find(|schema| schema.kind == kind).unwrap();
     let configured = schema(Kind::Configured);
     let refusal = configured.layouts.iter().find(|layout| layout.number == REFUSAL_NUMBER).unwrap();
-    assert_eq!(configured.end(refusal), []);
-    assert_eq!(configured.end(parameter_layout(5, [0; WORDS])), configured.end);
-    assert_eq!(schema(Kind::Configure).end(refusal), schema(Kind::Configure).end);
+    assert_eq!(configured.trailing_fields(refusal), []);
+    assert_eq!(configured.trailing_fields(parameter_layout(5, [0; WORDS])), configured.end);
+    assert_eq!(schema(Kind::Configure).trailing_fields(refusal), schema(Kind::Configure).end);
 }

@@ -34,20 +34,20 @@ impl Units {
     /// Returns the unit of a joint's torque: Nm, or N for a prismatic joint. `joint` is the index in the chain, from 0.
     #[must_use]
     pub const fn torque_unit(self, joint: usize) -> &'static str {
-        if self.slides(joint) {
+        if self.has_prismatic_joint(joint) {
             JointKind::Prismatic.torque_unit()
         } else {
             JointKind::Revolute.torque_unit()
         }
     }
 
-    const fn slides(self, joint: usize) -> bool {
+    const fn has_prismatic_joint(self, joint: usize) -> bool {
         joint < 16 && self.prismatic >> joint & 1 == 1
     }
 
     /// Returns true if the element of the field is the position or torque of a prismatic joint.
     fn is_prismatic(self, field: &Field, element: usize) -> bool {
-        field.varies_with_chain() && self.slides(element)
+        field.varies_with_chain() && self.has_prismatic_joint(element)
     }
 }
 

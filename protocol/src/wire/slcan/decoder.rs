@@ -99,13 +99,13 @@ pub struct Decoder {
     /// The reason for which the current line will be refused, if an error was found in it.
     fault: Option<Refusal>,
     refused: RejectedLines,
-    endings: Endings,
+    endings: EndDigitDetector,
 }
 
 /// Detects from earlier frames whether the adapter appends a digit for the sender's error state to each frame. Adapters
 /// do so for all frames or for none. A line that lost a byte is thus not mistaken for a line of the other form.
 #[derive(Clone, Debug, Default)]
-struct Endings {
+struct EndDigitDetector {
     has_state: bool,
     /// Number of consecutive frames of the same form.
     run_length: u8,
@@ -113,7 +113,7 @@ struct Endings {
     deviated: bool,
 }
 
-impl Endings {
+impl EndDigitDetector {
     /// Number of frames of one form after which a single frame of the other form is refused. Two in a row are accepted.
     const CONFIRMED_AFTER: u8 = 16;
 
@@ -146,7 +146,7 @@ impl Decoder {
             line: heapless::Vec::new(),
             fault: None,
             refused: RejectedLines { garbage: 0, long: 0, short: 0, dlc: 0, identifier: 0 },
-            endings: Endings::new(),
+            endings: EndDigitDetector::new(),
         }
     }
 
@@ -216,7 +216,7 @@ impl Decoder {
 }
 
 /// Decodes a line of printable characters, given without its line ending.
-fn decode_line(line: &[u8], endings: &mut Endings) -> SlcanLine {
+fn decode_line(line: &[u8], endings: &mut EndDigitDetector) -> SlcanLine {
     let [kind, rest @ ..] = line else { return SlcanLine::Done };
     let flags = match kind.to_ascii_lowercase() {
         b't' | b'r' => None,
@@ -244,7 +244,7 @@ fn frame(
     is_extended: bool,
     flags: Option<u8>,
     is_remote: bool,
-    endings: &mut Endings,
+    endings: &mut EndDigitDetector,
 ) -> Result<Frame, Refusal> {
     let (digits, flag, max) = if is_extended { (8, EXTENDED, EXTENDED_MASK) } else { (3, 0, STANDARD_MASK) };
     let (id, rest) = text.split_at_checked(digits).ok_or(Refusal::Short)?;

@@ -66,7 +66,7 @@ impl BusState {
     }
 
     /// Returns the controller bits of an error frame that reports this state for the transmitter, the receiver or both.
-    const fn bits(self, transmits: bool, receives: bool) -> u8 {
+    const fn controller_bits(self, transmits: bool, receives: bool) -> u8 {
         let (transmit, receive) = match self {
             Self::Active => (ERROR_ACTIVE, ERROR_ACTIVE),
             Self::Warning => (TRANSMIT_WARNING, RECEIVE_WARNING),
@@ -149,16 +149,16 @@ impl AdapterFault {
 
     /// Returns the class, and the controller, protocol and location bytes, of the error frame for this fault.
     const fn error(self) -> (u32, u8, u8, u8) {
-        const BUS: u32 = CLASS_PROTOCOL | CLASS_BUS_ERROR;
+        const BUS_CLASSES: u32 = CLASS_PROTOCOL | CLASS_BUS_ERROR;
         match self {
-            Self::Ack => (BUS | CLASS_ACK, 0, 0, AT_ACK),
-            Self::Bit0 => (BUS, 0, BIT_0, 0),
-            Self::Bit1 => (BUS, 0, BIT_1, 0),
-            Self::Crc => (BUS, 0, ONE_BIT, AT_CRC),
-            Self::Form => (BUS, 0, FORM, 0),
-            Self::Stuff => (BUS, 0, STUFF, 0),
-            Self::Bus | Self::ReceiveFailed => (BUS, 0, 0, 0),
-            Self::TransmitFailed => (BUS, 0, TRANSMITTING, 0),
+            Self::Ack => (BUS_CLASSES | CLASS_ACK, 0, 0, AT_ACK),
+            Self::Bit0 => (BUS_CLASSES, 0, BIT_0, 0),
+            Self::Bit1 => (BUS_CLASSES, 0, BIT_1, 0),
+            Self::Crc => (BUS_CLASSES, 0, ONE_BIT, AT_CRC),
+            Self::Form => (BUS_CLASSES, 0, FORM, 0),
+            Self::Stuff => (BUS_CLASSES, 0, STUFF, 0),
+            Self::Bus | Self::ReceiveFailed => (BUS_CLASSES, 0, 0, 0),
+            Self::TransmitFailed => (BUS_CLASSES, 0, TRANSMITTING, 0),
             Self::Arbitration => (CLASS_LOST_ARBITRATION, 0, 0, 0),
             Self::ReceiveOverrun => (CLASS_CONTROLLER, RECEIVE_OVERFLOW, 0, 0),
             Self::TransmitOverrun => (CLASS_CONTROLLER, TRANSMIT_OVERFLOW, 0, 0),
@@ -225,8 +225,8 @@ impl AdapterReport {
                 class |= CLASS_CONTROLLER;
                 // The side with more errors caused the state.
                 controller |= counters.map_or_else(
-                    || state.bits(true, true),
-                    |it| state.bits(it.transmit >= it.receive, it.receive >= it.transmit),
+                    || state.controller_bits(true, true),
+                    |it| state.controller_bits(it.transmit >= it.receive, it.receive >= it.transmit),
                 );
             }
         }

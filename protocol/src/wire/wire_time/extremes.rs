@@ -49,17 +49,17 @@ impl Shape {
 
     /// Returns the minimum number of bits of a frame of this shape.
     #[must_use]
-    pub fn best(self) -> Bits {
+    pub fn min_bits(self) -> Bits {
         self.bits(|range| range.0)
     }
 
     /// Returns the maximum number of bits of a frame of this shape.
     #[must_use]
-    pub fn worst(self) -> Bits {
+    pub fn max_bits(self) -> Bits {
         self.bits(|range| range.1)
     }
 
-    fn bits(self, pick: fn(Range) -> u32) -> Bits {
+    fn bits(self, pick: fn(BitRange) -> u32) -> Bits {
         match self.coding {
             Coding::Classic => self.classic(false, pick),
             Coding::Remote => self.classic(true, pick),
@@ -68,7 +68,7 @@ impl Shape {
         }
     }
 
-    fn classic(self, remote: bool, pick: fn(Range) -> u32) -> Bits {
+    fn classic(self, remote: bool, pick: fn(BitRange) -> u32) -> Bits {
         let table = match (remote, self.extended) {
             (false, false) => &CLASSIC,
             (false, true) => &CLASSIC_EXTENDED,
@@ -82,53 +82,53 @@ impl Shape {
         Bits { nominal: head + data + 15 + pick(stuffed) + CLASSIC_TAIL, data: 0 }
     }
 
-    fn fd(self, switched: bool, pick: fn(Range) -> u32) -> Bits {
+    fn fd(self, switched: bool, pick: fn(BitRange) -> u32) -> Bits {
         let len = fd_len(usize::from(self.len));
         // RRS 0, IDE 0, or RRS 0 alone; then FDF 1, res 0, BRS.
         let fdf_res_brs = 0b100 | u64::from(switched);
-        let sof_id = Ways::IDLE.fixed(0, 1).free(11);
+        let sof_id = StuffBits::IDLE.push_fixed(0, 1).push_any(11);
         let (ways, head) = if self.extended {
-            (sof_id.fixed(0b11, 2).free(18).fixed(fdf_res_brs, 4), 36)
+            (sof_id.push_fixed(0b11, 2).push_any(18).push_fixed(fdf_res_brs, 4), 36)
         } else {
-            (sof_id.fixed(fdf_res_brs, 5), 17)
+            (sof_id.push_fixed(fdf_res_brs, 5), 17)
         };
         // After BRS only one state is possible for every identifier, so the rest is independent of it.
-        let head = head + pick(ways.stuffed());
+        let head = head + pick(ways.total_range());
         let dlc = u64::from(fd_dlc(len));
-        let ways = ways.restarted().free(1);
+        let ways = ways.with_reset_counts().push_any(1);
         // A stuff bit after the last bit is the first fixed stuff bit, and is not counted here.
         let ways = match u32::try_from(len) {
-            Ok(0) | Err(_) => ways.fixed(dlc >> 1, 3),
-            Ok(len) => ways.fixed(dlc, 4).free(8 * len - 1),
+            Ok(0) | Err(_) => ways.push_fixed(dlc >> 1, 3),
+            Ok(len) => ways.push_fixed(dlc, 4).push_any(8 * len - 1),
         };
-        fd_bits(switched, head, len, pick(ways.stuffed()))
+        fd_bits(switched, head, len, pick(ways.total_range()))
     }
 }
 
 /// The minimum and maximum number of stuff bits.
-type Range = (u32, u32);
+type BitRange = (u32, u32);
 
 /// Ranges for classic data frames with 11-bit identifiers, by number of data bytes.
-const CLASSIC: [Range; 9] = [(1, 6), (1, 7), (1, 9), (1, 12), (0, 14), (0, 15), (0, 18), (0, 21), (0, 22)];
+const CLASSIC: [BitRange; 9] = [(1, 6), (1, 7), (1, 9), (1, 12), (0, 14), (0, 15), (0, 18), (0, 21), (0, 22)];
 /// Ranges for classic data frames with 29-bit identifiers, by number of data bytes.
-const CLASSIC_EXTENDED: [Range; 9] =
+const CLASSIC_EXTENDED: [BitRange; 9] =
     [(1, 11), (1, 13), (1, 15), (1, 17), (0, 19), (0, 21), (0, 23), (0, 25), (0, 27)];
 /// Ranges for remote frames with 11-bit identifiers, by requested number of bytes.
-const REMOTE: [Range; 9] = [(1, 5), (1, 6), (0, 5), (0, 6), (0, 4), (0, 4), (0, 4), (0, 5), (0, 5)];
+const REMOTE: [BitRange; 9] = [(1, 5), (1, 6), (0, 5), (0, 6), (0, 4), (0, 4), (0, 4), (0, 5), (0, 5)];
 /// Ranges for remote frames with 29-bit identifiers, by requested number of bytes.
-const REMOTE_EXTENDED: [Range; 9] =
+const REMOTE_EXTENDED: [BitRange; 9] =
     [(1, 10), (1, 11), (0, 10), (0, 11), (0, 10), (0, 10), (0, 9), (0, 10), (0, 10)];
 
 /// For each state of stuffing, the minimum and maximum number of stuff bits in any sequence of bits that ends in it.
 #[derive(Clone, Copy)]
-struct Ways([Option<Range>; stuffing::STATES]);
+struct StuffBits([Option<BitRange>; stuffing::STATES]);
 
-impl Ways {
+impl StuffBits {
     /// The idle bus before SOF: only state 4 is possible, as in [`stuffing::Run::IDLE`].
     const IDLE: Self = Self([None, None, None, None, Some((0, 0)), None, None, None]);
 
     /// Appends the lowest `count` bits of a word with their values.
-    fn fixed(self, word: u64, count: u32) -> Self {
+    fn push_fixed(self, word: u64, count: u32) -> Self {
         (0..count).rev().fold(self, |ways, place| {
             let bit = (word >> place) & 1 == 1;
             ways.step(!bit, bit)
@@ -136,18 +136,18 @@ impl Ways {
     }
 
     /// Appends `count` bits that can have any value.
-    fn free(self, count: u32) -> Self {
+    fn push_any(self, count: u32) -> Self {
         (0..count).fold(self, |ways, _| ways.step(true, true))
     }
 
     /// Keeps the reachable states but sets the numbers of stuff bits to 0.
-    fn restarted(self) -> Self {
+    fn with_reset_counts(self) -> Self {
         Self(self.0.map(|range| range.map(|_| (0, 0))))
     }
 
     /// Returns the minimum and maximum number of stuff bits over all states.
-    fn stuffed(self) -> Range {
-        self.0.into_iter().flatten().reduce(wider).unwrap_or((0, 0))
+    fn total_range(self) -> BitRange {
+        self.0.into_iter().flatten().reduce(hull).unwrap_or((0, 0))
     }
 
     fn step(self, zero: bool, one: bool) -> Self {
@@ -157,7 +157,7 @@ impl Ways {
                 let (next, more) = stuffing::next(state, bit);
                 let range = range.map(|(min, most)| (min + u32::from(more), most + u32::from(more)));
                 if let Some(slot) = then.get_mut(usize::from(next)) {
-                    *slot = slot.map_or(range, |old| Some(range.map_or(old, |new| wider(old, new))));
+                    *slot = slot.map_or(range, |old| Some(range.map_or(old, |new| hull(old, new))));
                 }
             }
         }
@@ -165,6 +165,6 @@ impl Ways {
     }
 }
 
-fn wider(a: Range, b: Range) -> Range {
+fn hull(a: BitRange, b: BitRange) -> BitRange {
     (a.0.min(b.0), a.1.max(b.1))
 }

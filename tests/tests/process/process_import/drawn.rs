@@ -32,8 +32,8 @@ fn floats(base64: &str) -> Vec<f32> {
 #[test]
 fn a_skin_is_drawn_on_one_page() {
     let place = arm();
-    run(&place, &format!("{COVER} -o skin.toml")).well();
-    let ended = run(&place, "skin show skin.toml --package arm_parts=parts -o skin.html").well();
+    run(&place, &format!("{COVER} -o skin.toml")).succeeded();
+    let ended = run(&place, "skin show skin.toml --package arm_parts=parts -o skin.html").succeeded();
     assert_eq!(ended.stderr, "");
     let page = place.read("skin.html");
     assert!(!page.contains("http:") && !page.contains("https:"), "it asks for nothing outside");
@@ -62,10 +62,10 @@ fn a_skin_is_drawn_on_one_page() {
     }
 
     // Without the mesh, the other parts; without the URDF, tubes.
-    let said = run(&place, "skin show skin.toml -o less.html").well().stderr;
+    let said = run(&place, "skin show skin.toml -o less.html").succeeded().stderr;
     assert!(said.starts_with("1 link not drawn: arm.urdf: link plate: mesh package://arm_parts/"), "{said}");
     fs::remove_file(place.path("arm.urdf")).unwrap();
-    let ended = run(&place, "skin show skin.toml").well();
+    let ended = run(&place, "skin show skin.toml").succeeded();
     assert!(ended.stderr.starts_with("the robot is not drawn: arm.urdf: No such file"), "{}", ended.stderr);
     let without = data(&ended.stdout);
     assert_eq!(without["scene"]["shells"], serde_json::json!([]));
@@ -73,7 +73,7 @@ fn a_skin_is_drawn_on_one_page() {
         assert_eq!(without["scene"][same], scene[same], "{same}");
     }
     let ur5 = example("ur5-253.toml").display().to_string();
-    let page = run(&place, &format!("skin show {ur5}")).well().stdout;
+    let page = run(&place, &format!("skin show {ur5}")).succeeded().stdout;
     assert_eq!(data(&page)["scene"]["cells"].as_array().unwrap().len(), 253);
     place.write("skin.html", "mine");
     refused(&place, &format!("skin show {ur5} -o skin.html"), "-o skin.html: ");

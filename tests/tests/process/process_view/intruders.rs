@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use rustix::process::{Resource, Rlimit, getrlimit, getuid, setrlimit};
 
 use skinbus_tests::process::page::{Address, Page, address};
-use skinbus_tests::process::{PRESSED, Place, Running, Summary, program, skin};
+use skinbus_tests::process::{PRESSED, Running, Summary, TestDir, program, skin};
 
 /// The kinds of attacks; each intruder repeats one of them.
 const KINDS: [&str; 6] = ["no token", "old token", "slow heads", "silence", "storm", "foreign host"];
@@ -156,7 +156,7 @@ struct Outcome {
 
 /// Runs for a number of seconds, and opens pages with the token as long as the run lasts.
 fn run(seconds: u64, with_intruders: bool) -> Outcome {
-    let place = Place::new();
+    let place = TestDir::new();
     // Intruders that take processor time must not halt the robot.
     place.write("skin.toml", &(skin(12) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(&PRESSED.replace("600.0", "3600.0"));
@@ -172,9 +172,11 @@ fn run(seconds: u64, with_intruders: bool) -> Outcome {
         let asked = Instant::now();
         let mut page = open(&address, &mut outcome);
         longest = longest.max(asked.elapsed());
-        page.sees("all cells pressed", |it| it.cells.iter().all(|cell| cell.0 == 2 && cell.2 > 0));
+        page.wait_for_snapshot("all cells pressed", |it| {
+            it.cells.iter().all(|cell| cell.0 == 2 && cell.2 > 0)
+        });
         let mut seen = 0;
-        page.sees("snapshots", |_| {
+        page.wait_for_snapshot("snapshots", |_| {
             seen += 1;
             seen > 10
         });
@@ -243,7 +245,7 @@ fn intruders_keep_nobody_out_and_are_not_obeyed() {
 
 #[test]
 fn a_page_that_may_open_few_files_still_lets_in_who_has_the_token() {
-    let place = Place::new();
+    let place = TestDir::new();
     place.skin(4);
     let mut command = place.command_of(Path::new("sh"), "-c");
     let gateway = program("skinbus");
@@ -257,11 +259,11 @@ fn a_page_that_may_open_few_files_still_lets_in_who_has_the_token() {
         hold(&address.host, &mut held, 200, b"GET / HTTP/1.1\r\nX: ", b"a");
     }
     let mut page = open(&address, &mut [0, 0]);
-    page.sees("a snapshot", |it| it.cells.len() == 4);
+    page.wait_for_snapshot("a snapshot", |it| it.cells.len() == 4);
     hold(&address.host, &mut held, 400, b"GET / HTTP/1.1\r\nX: ", b"a");
-    page.sees("another one", |it| it.cells.len() == 4);
+    page.wait_for_snapshot("another one", |it| it.cells.len() == 4);
     served.signal(rustix::process::Signal::INT);
-    served.end().well();
+    served.end().succeeded();
 }
 
 type Figure = fn(&Outcome) -> f64;

@@ -14,26 +14,26 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 /// The time between two frames on the bus.
-const FRAME: Span = Span(20);
+const FRAME_INTERVAL: Span = Span(20);
 /// The time that a cell needs for a frame or a timer.
 const THINKS: Span = Span(30);
 /// The time that the cell is off in a restart.
-const OFF: Span = Span::from_millis(40);
+const OFF_TIME: Span = Span::from_millis(40);
 
 /// A fault of a cell: it changes the cell's input and output.
 pub(crate) trait Mutant {
     /// Returns the frames that the cell receives instead of an arriving one, with their ages.
-    fn hears(&mut self, _now: Micros, age: Span, frame: Frame) -> Vec<(Span, Frame)> {
+    fn change_input(&mut self, _now: Micros, age: Span, frame: Frame) -> Vec<(Span, Frame)> {
         vec![(age, frame)]
     }
 
     /// Returns the packets that are sent instead of one of the cell's, with their delays.
-    fn says(&mut self, _now: Micros, packet: Packet) -> Vec<(Span, Packet)> {
+    fn change_output(&mut self, _now: Micros, packet: Packet) -> Vec<(Span, Packet)> {
         vec![(Span(0), packet)]
     }
 
     /// Returns additional packets, after each call of the cell.
-    fn adds(&mut self, _now: Micros) -> Vec<(Span, Packet)> {
+    fn additional_packets(&mut self, _now: Micros) -> Vec<(Span, Packet)> {
         Vec::new()
     }
 
@@ -64,9 +64,9 @@ pub(crate) trait Mutant {
 }
 
 /// A cell without a fault.
-pub(crate) struct Right;
+pub(crate) struct FaultlessCell;
 
-impl Mutant for Right {}
+impl Mutant for FaultlessCell {}
 
 /// A cell that sometimes has to wait for its processor.
 struct Starved {
@@ -79,7 +79,7 @@ struct Starved {
 }
 
 /// The bus.
-pub(crate) struct Virtual {
+pub(crate) struct VirtualBus {
     now: Micros,
     format: Format,
     identity: Identity,
@@ -121,7 +121,7 @@ struct Cuts {
     torn: usize,
 }
 
-impl Virtual {
+impl VirtualBus {
     pub(crate) fn new(format: Format, number: u8, mutant: Box<dyn Mutant>) -> Self {
         let identity =
             Identity { cell: CellId::new(number.into()).ok(), serial: 100_000 + u32::from(number) };
@@ -141,7 +141,7 @@ impl Virtual {
             restart: None,
             restarts: true,
             starved: None,
-            frame: FRAME,
+            frame: FRAME_INTERVAL,
             stores: Span(0),
             cuts: Cuts::default(),
         };
@@ -197,7 +197,7 @@ impl Virtual {
         self.later.clear();
         self.wire.retain(|seen| seen.own || seen.at <= at);
         self.cuts.torn += usize::from(self.wire.len() < before);
-        self.restart = Some(at + OFF);
+        self.restart = Some(at + OFF_TIME);
     }
 
     pub(crate) fn without_restart(mut self) -> Self {
@@ -225,9 +225,9 @@ impl Virtual {
         self.busy = self.busy.max(at);
         let mut out = Vec::new();
         while let Some(packet) = node.poll_transmit() {
-            out.extend(self.mutant.says(at, packet));
+            out.extend(self.mutant.change_output(at, packet));
         }
-        out.extend(self.mutant.adds(at));
+        out.extend(self.mutant.additional_packets(at));
         for (delay, packet) in out {
             let frames = self.mutant.frames(&packet, self.format);
             self.later.extend(frames.into_iter().map(|frame| (at + delay, frame)));
@@ -285,7 +285,7 @@ impl Virtual {
             Event::Hears => {
                 self.busy = at;
                 let Some((came, frame)) = self.inbox.pop_front() else { return };
-                for (age, frame) in self.mutant.hears(at, at.elapsed_since(came), frame) {
+                for (age, frame) in self.mutant.change_input(at, at.elapsed_since(came), frame) {
                     if let Some(node) = &mut self.node {
                         node.handle_frame(at, age, &frame);
                     }
@@ -305,7 +305,7 @@ enum Event {
     Ends,
 }
 
-impl TestBus for Virtual {
+impl TestBus for VirtualBus {
     fn now(&self) -> Micros {
         self.now
     }

@@ -3,12 +3,12 @@
 use protocol::can::Format;
 use protocol::message::{Answer, Message, Request, SensorPage};
 
-use crate::bench_conformance::wrong::{Memory, Wrong};
+use crate::bench_conformance::wrong::{FaultyCell, Memory};
 
 /// Its name, and the function that makes it from this project's cell.
-type Lesser = (&'static str, fn(&mut Wrong));
+type ReducedCase = (&'static str, fn(&mut FaultyCell));
 
-pub(crate) const ALL: &[Lesser] = &[
+pub(crate) const ALL: &[ReducedCase] = &[
     ("no sensor values without a request", |it| {
         it.say = |memory, message| vec![(0, without(memory, message, &[7, 8]))]
     }),
@@ -33,7 +33,7 @@ pub(crate) const ALL: &[Lesser] = &[
                 _ => 0,
             };
             let Message::Configured { from, tag, .. } = message else { return vec![(0, message)] };
-            let unknown = Answer::Refused { number: asked, reason: Answer::UNKNOWN };
+            let unknown = Answer::Refused { number: asked, reason: Answer::UNKNOWN_PARAMETER };
             let unknown = Message::Configured { from, tag, answer: unknown };
             vec![(0, if [11, 12].contains(&asked) { unknown } else { message })]
         }

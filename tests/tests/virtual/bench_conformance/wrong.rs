@@ -121,15 +121,15 @@ impl Memory {
     }
 }
 
-pub(crate) type Hear = fn(&mut Memory, Option<&Message>, Frame) -> Vec<Frame>;
-pub(crate) type Say = fn(&mut Memory, Message) -> Vec<(u64, Message)>;
-pub(crate) type Add = fn(&mut Memory) -> Vec<Message>;
+pub(crate) type InputChange = fn(&mut Memory, Option<&Message>, Frame) -> Vec<Frame>;
+pub(crate) type OutputChange = fn(&mut Memory, Message) -> Vec<(u64, Message)>;
+pub(crate) type Addition = fn(&mut Memory) -> Vec<Message>;
 
 /// A faulty cell.
-pub(crate) struct Wrong {
-    pub(crate) hear: Hear,
-    pub(crate) say: Say,
-    pub(crate) add: Add,
+pub(crate) struct FaultyCell {
+    pub(crate) hear: InputChange,
+    pub(crate) say: OutputChange,
+    pub(crate) add: Addition,
     pub(crate) put: fn(&mut Memory, &Packet, Format) -> Vec<Frame>,
     pub(crate) store: fn(&mut Memory, FlashState) -> FlashState,
     pub(crate) ages: bool,
@@ -139,7 +139,7 @@ pub(crate) struct Wrong {
     pub(crate) format: Format,
 }
 
-impl Wrong {
+impl FaultyCell {
     pub(crate) fn new(format: Format, number: u8) -> Self {
         Self {
             hear: |_, _, frame| vec![frame],
@@ -175,8 +175,8 @@ impl Wrong {
     }
 }
 
-impl Mutant for Wrong {
-    fn hears(&mut self, now: Micros, age: Span, frame: Frame) -> Vec<(Span, Frame)> {
+impl Mutant for FaultyCell {
+    fn change_input(&mut self, now: Micros, age: Span, frame: Frame) -> Vec<(Span, Frame)> {
         self.memory.now = now;
         let message = self.message(&frame);
         let frames = (self.hear)(&mut self.memory, message.as_ref(), frame);
@@ -188,7 +188,7 @@ impl Mutant for Wrong {
         frames.into_iter().map(|frame| (age, frame)).collect()
     }
 
-    fn says(&mut self, now: Micros, packet: Packet) -> Vec<(Span, Packet)> {
+    fn change_output(&mut self, now: Micros, packet: Packet) -> Vec<(Span, Packet)> {
         self.memory.now = now;
         let Ok(message) = Message::decode(&packet) else { return vec![(Span(0), packet)] };
         if let Message::Network { page: NetworkPage::Heartbeat(beat), .. } = message
@@ -211,7 +211,7 @@ impl Mutant for Wrong {
         all
     }
 
-    fn adds(&mut self, now: Micros) -> Vec<(Span, Packet)> {
+    fn additional_packets(&mut self, now: Micros) -> Vec<(Span, Packet)> {
         self.memory.now = now;
         let all = (self.add)(&mut self.memory);
         self.memory.heard = None;
@@ -248,7 +248,7 @@ impl Mutant for Wrong {
     }
 }
 
-impl Wrong {
+impl FaultyCell {
     fn counted(&mut self, mut message: Message) -> Packet {
         if let Message::Network { page: NetworkPage::Heartbeat(beat), .. } = &mut message {
             // The change that a mutant has made to it stays.

@@ -18,12 +18,12 @@ use crate::embedded::routing::ClientId;
 const BUFFER_MAX: usize = 64 << 20;
 
 /// The maximum number of clients accepted before frames are forwarded again.
-const ADMISSIONS: usize = 64;
+const MAX_ADMISSIONS: usize = 64;
 
 impl Server {
     /// Accepts waiting clients, at most [`ADMISSIONS`].
     pub(super) fn accept(&mut self) {
-        for _ in 0..ADMISSIONS {
+        for _ in 0..MAX_ADMISSIONS {
             match self.accepted() {
                 Ok(socket) => self.admit(socket),
                 Err(Errno::INTR | Errno::CONNABORTED) => {}
@@ -53,18 +53,18 @@ impl Server {
             let has_sent = hang_up(&socket);
             self.parting = (!has_sent).then_some(socket);
         } else {
-            self.part();
+            self.close_parting();
             accepted?;
         }
         if self.parting.is_some() {
             return Err(Errno::MFILE);
         }
-        self.part();
+        self.close_parting();
         Ok(())
     }
 
     /// Disconnects the client that uses the reserved file descriptor, and reserves the descriptor again.
-    pub(super) fn part(&mut self) {
+    pub(super) fn close_parting(&mut self) {
         if let Some(socket) = self.parting.take() {
             hang_up(&socket);
         }
@@ -98,15 +98,15 @@ impl Server {
         let mut bytes = [0; MAX_HELLO_BYTES + 1];
         let hello = match rustix::net::recv(&client.socket, &mut bytes, RecvFlags::DONTWAIT) {
             Err(Errno::AGAIN | Errno::INTR) => return,
-            Err(errno @ (Errno::NOMEM | Errno::NOBUFS)) => return self.fails(id, errno),
-            Ok((0, _)) | Err(_) => return self.forget(id),
+            Err(errno @ (Errno::NOMEM | Errno::NOBUFS)) => return self.handle_failure(id, errno),
+            Ok((0, _)) | Err(_) => return self.remove_client(id),
             Ok((len, _)) => ClientHello::decode(bytes.get(..len).unwrap_or_default()),
         };
         let Some(hello) = hello else {
             // The client may have closed its socket already, so an error is ignored.
             let _ = send_one(&client.socket, &HelloReply::Refused { version: VERSION }.encode());
             self.post.totals.refused += 1;
-            return self.forget(id);
+            return self.remove_client(id);
         };
         let target = usize::try_from(hello.buffer).unwrap_or(BUFFER_MAX).min(BUFFER_MAX);
         if sockopt::set_socket_send_buffer_size_force(&client.socket, target).is_err() {
@@ -117,7 +117,7 @@ impl Server {
         client.greeted = true;
         client.fd = hello.fd;
         if welcome(&client.socket, granted).is_err() {
-            return self.forget(id);
+            return self.remove_client(id);
         }
         self.post.totals.clients += 1;
         self.router.insert(id, &hello);

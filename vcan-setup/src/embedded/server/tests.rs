@@ -30,13 +30,13 @@ impl Receive for Faulty {
 }
 
 /// A bus that a thread of the test serves.
-struct Bench {
+struct TestServer {
     directory: TempDir,
     stop: UnixStream,
     thread: std::thread::JoinHandle<Result<BusTotals, ServeError>>,
 }
 
-impl Bench {
+impl TestServer {
     fn new(errors: &[Option<Errno>], last: Option<Errno>) -> Self {
         let directory = TempDir::new().unwrap();
         let server = Server::bind_in(&directory.path().join("skinbus"), "vcan0").unwrap();
@@ -87,7 +87,7 @@ fn arrivals(bus: &Bus, count: usize) -> Vec<(u64, u32)> {
 fn errors_of_a_reception_that_pass_cost_a_client_no_frame() {
     let errors = [Errno::NOMEM, Errno::NOBUFS, Errno::INTR, Errno::CONNRESET, Errno::AGAIN, Errno::IO];
     let errors: Vec<_> = (0..60).map(|at| (at % 3 == 0).then(|| errors[at / 3 % errors.len()])).collect();
-    let bench = Bench::new(&errors, None);
+    let bench = TestServer::new(&errors, None);
     let [sender, receiver] = [bench.open(), bench.open()];
     let frames: Vec<_> = (0..500).map(|id| Frame::classic(id, &[1]).unwrap()).collect();
     // The frames are sent in several batches, so that each error occurs at some of them.
@@ -103,7 +103,7 @@ fn errors_of_a_reception_that_pass_cost_a_client_no_frame() {
 
 #[test]
 fn time_stamps_of_a_process_with_two_sockets_are_in_the_order_of_the_bus() {
-    let bench = Bench::new(&[], None);
+    let bench = TestServer::new(&[], None);
     let open = |id| bench.open_with(vec![Filter { id, mask: STANDARD_MASK }]);
     // The server pairs the first two clients of a process, and the next two.
     let [sender, _idle, first, second] = [bench.open(), open(3), open(1), open(2)];
@@ -119,7 +119,7 @@ fn time_stamps_of_a_process_with_two_sockets_are_in_the_order_of_the_bus() {
 #[test]
 fn a_client_whose_socket_fails_for_good_is_hung_up_on_and_the_others_go_on() {
     // All receptions after the first one fail, so only the first client can send.
-    let bench = Bench::new(&[None], Some(Errno::BADF));
+    let bench = TestServer::new(&[None], Some(Errno::BADF));
     let [sender, receiver] = [bench.open(), bench.open()];
     sender.send(&[Frame::classic(1, &[1]).unwrap()]).unwrap();
     assert_eq!(receives(&receiver, 1), [1]);

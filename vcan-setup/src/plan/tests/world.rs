@@ -7,14 +7,14 @@ use crate::link::Peer;
 
 /// A simulation of the kernel's interfaces. A step on an interface that this program did not make fails the test.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub(super) struct World {
+pub(super) struct SimulatedKernel {
     pub(super) here: Vec<Interface>,
     pub(super) there: Vec<Interface>,
 }
 
 pub(super) const THERE: i32 = 7;
 
-impl World {
+impl SimulatedKernel {
     pub(super) fn of(here: Vec<Interface>) -> Self {
         Self { here, there: Vec::new() }
     }
@@ -100,7 +100,7 @@ fn number(index: u32) -> Peer {
 const NAMES: [&str; 5] = ["vcan0", "vcan1", "vcan2", "can0", "eth0"];
 
 /// Generates interfaces with distinct names, two of which may be the ends of a pair.
-fn any_world() -> impl Strategy<Value = World> {
+fn any_world() -> impl Strategy<Value = SimulatedKernel> {
     let one = (0..5_u8, any::<bool>(), any::<bool>(), any::<bool>(), 0..3_u32, 0..3_u32);
     (proptest::collection::vec(proptest::option::of(one), NAMES.len()), any::<bool>()).prop_map(
         |(given, pair)| {
@@ -124,7 +124,7 @@ fn any_world() -> impl Strategy<Value = World> {
                 let kinds = (InterfaceKind::Vxcan(Some(to(second))), InterfaceKind::Vxcan(Some(to(first))));
                 (first.kind, second.kind) = kinds;
             }
-            World::of(here)
+            SimulatedKernel::of(here)
         },
     )
 }

@@ -25,7 +25,7 @@ pub(super) enum Axis {
 
 /// The products needed to rotate two axes a and b to `c a + s b` and `c b - s a`, with cosine c and sine s.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Mix {
+pub(super) enum RotationProducts {
     /// No products: a and b are the first two axes of the base.
     Base,
     /// Axis b is (0, 0, 1).
@@ -44,13 +44,13 @@ pub(super) enum Mix {
 
 /// The known components of the axes x, y and z of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Frame {
+pub(super) struct AxisFrame {
     known: [Axis; 3],
     /// True if x and y are the axes of the base.
     base: bool,
 }
 
-impl Frame {
+impl AxisFrame {
     pub(super) const BASE: Self = Self { known: [Axis::Level, Axis::Level, Axis::Up], base: true };
 
     /// Returns the known components of the z axis.
@@ -60,16 +60,16 @@ impl Frame {
     }
 
     /// Returns the products needed to rotate x and y by a turn about z.
-    pub(super) fn turn(self) -> Mix {
+    pub(super) fn turn(self) -> RotationProducts {
         let [x, y, _] = self.known;
-        if self.base { Mix::Base } else { Mix::new(x, y) }
+        if self.base { RotationProducts::Base } else { RotationProducts::new(x, y) }
     }
 
     /// Returns the frame after a turn about z and a twist about the new x axis, and the products needed for the twist.
-    pub(super) fn after<N>(self, twist: Twist<N>) -> (Self, Mix) {
+    pub(super) fn after<N>(self, twist: Twist<N>) -> (Self, RotationProducts) {
         let (x, v) = self.turn().axes();
         let z = self.z();
-        let mix = Mix::new(v, z);
+        let mix = RotationProducts::new(v, z);
         let (y, z) = match twist {
             Twist::None => (v, z),
             Twist::Ahead => (z, v.opposite()),
@@ -96,7 +96,7 @@ impl Axis {
     }
 }
 
-impl Mix {
+impl RotationProducts {
     fn new(a: Axis, b: Axis) -> Self {
         match (a, b) {
             (Axis::Level, Axis::Up) => Self::Up,
@@ -152,7 +152,7 @@ pub(super) enum Height {
 impl ToBase {
     /// Creates the transform from a frame with these known components. `upright` is true if the third component is not
     /// needed.
-    pub(super) fn new(Frame { known, .. }: Frame, upright: bool) -> Self {
+    pub(super) fn new(AxisFrame { known, .. }: AxisFrame, upright: bool) -> Self {
         let [_, y, z] = known;
         let level = if y.is_upright() {
             Level::Xz
@@ -186,22 +186,32 @@ pub(super) struct Rotation<N>(pub(super) [N; 2]);
 impl<N: Number> Rotation<N> {
     /// Returns `c a + s b`, with cosine c and sine s.
     #[inline(always)]
-    pub(super) fn ahead(self, mix: Mix, &[a0, a1, a2]: &Vector<N>, &[b0, b1, b2]: &Vector<N>) -> Vector<N> {
+    pub(super) fn ahead(
+        self,
+        mix: RotationProducts,
+        &[a0, a1, a2]: &Vector<N>,
+        &[b0, b1, b2]: &Vector<N>,
+    ) -> Vector<N> {
         let Self([sine, cosine]) = self;
         match mix {
-            Mix::Base => [cosine, sine, N::zero()],
-            Mix::Up => [product(cosine, a0), product(cosine, a1), sine],
-            Mix::Down => [product(cosine, a0), product(cosine, a1), sine.bounded_negative()],
-            Mix::Level => [self.sum(a0, b0), self.sum(a1, b1), N::zero()],
-            Mix::Second => [self.sum(a0, b0), self.sum(a1, b1), product(sine, b2)],
-            Mix::First => [self.sum(a0, b0), self.sum(a1, b1), product(cosine, a2)],
-            Mix::Both => [self.sum(a0, b0), self.sum(a1, b1), self.sum(a2, b2)],
+            RotationProducts::Base => [cosine, sine, N::zero()],
+            RotationProducts::Up => [product(cosine, a0), product(cosine, a1), sine],
+            RotationProducts::Down => [product(cosine, a0), product(cosine, a1), sine.bounded_negative()],
+            RotationProducts::Level => [self.sum(a0, b0), self.sum(a1, b1), N::zero()],
+            RotationProducts::Second => [self.sum(a0, b0), self.sum(a1, b1), product(sine, b2)],
+            RotationProducts::First => [self.sum(a0, b0), self.sum(a1, b1), product(cosine, a2)],
+            RotationProducts::Both => [self.sum(a0, b0), self.sum(a1, b1), self.sum(a2, b2)],
         }
     }
 
     /// Replaces a by `c a + s b`, and b by `c b - s a`, with cosine c and sine s.
     #[inline(always)]
-    pub(super) fn both(self, mix: Mix, [a0, a1, a2]: &mut Vector<N>, [b0, b1, b2]: &mut Vector<N>) {
+    pub(super) fn both(
+        self,
+        mix: RotationProducts,
+        [a0, a1, a2]: &mut Vector<N>,
+        [b0, b1, b2]: &mut Vector<N>,
+    ) {
         let Self([sine, cosine]) = self;
         let turn = |a: &mut N, b: &mut N| (*a, *b) = (self.sum(*a, *b), self.difference(*b, *a));
         // The cases in which the component of b or of a is zero.
@@ -209,27 +219,33 @@ impl<N: Number> Rotation<N> {
             |a: &mut N, b: &mut N| (*a, *b) = (product(cosine, *a), product(sine.bounded_negative(), *a));
         let second = |a: &mut N, b: &mut N| (*a, *b) = (product(sine, *b), product(cosine, *b));
         match mix {
-            Mix::Base => {
+            RotationProducts::Base => {
                 (*a0, *a1) = (cosine, sine);
                 (*b0, *b1) = (sine.bounded_negative(), cosine);
             }
-            Mix::Up | Mix::Down => {
+            RotationProducts::Up | RotationProducts::Down => {
                 first(a0, b0);
                 first(a1, b1);
-                (*a2, *b2) = if mix == Mix::Up {
+                (*a2, *b2) = if mix == RotationProducts::Up {
                     (sine, cosine)
                 } else {
                     (sine.bounded_negative(), cosine.bounded_negative())
                 };
             }
-            Mix::Level | Mix::Second | Mix::First | Mix::Both => {
+            RotationProducts::Level
+            | RotationProducts::Second
+            | RotationProducts::First
+            | RotationProducts::Both => {
                 turn(a0, b0);
                 turn(a1, b1);
                 match mix {
-                    Mix::Second => second(a2, b2),
-                    Mix::First => first(a2, b2),
-                    Mix::Both => turn(a2, b2),
-                    Mix::Base | Mix::Up | Mix::Down | Mix::Level => {}
+                    RotationProducts::Second => second(a2, b2),
+                    RotationProducts::First => first(a2, b2),
+                    RotationProducts::Both => turn(a2, b2),
+                    RotationProducts::Base
+                    | RotationProducts::Up
+                    | RotationProducts::Down
+                    | RotationProducts::Level => {}
                 }
             }
         }

@@ -1,6 +1,6 @@
 //! Bounds for the projection kernel: the ranges of axes, force, position and moments.
 
-use super::{Link, Vector};
+use super::{ChainLink, Vector};
 use crate::kernel::Number;
 
 /// Returns true if no number can leave the range of a word between the cell and the base, for any joint
@@ -12,7 +12,7 @@ use crate::kernel::Number;
 /// components adds less than two. Multiplying a vector by the axes, or by an axis, increases its length by at
 /// most that norm times itself; and no component of an axis exceeds 1 plus that norm. For 32 rows this is
 /// still below 1.1.
-pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links: &[Link<N>]) -> bool {
+pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links: &[ChainLink<N>]) -> bool {
     let off = links.iter().fold(0, |off, _| further_off(further_off(off)));
     let axes = (1 << 14) + off;
     // Rounding adds less than one step to a vector, and so does this division.
@@ -65,7 +65,7 @@ mod tests {
         let position = [short(8), short(8), short(8)];
         let normal = [short(2), short(2), short(2)];
         let pose = Pose { position, normal };
-        let joint = parameters.rows.iter().take(rows).filter(|row| row.moves()).count();
+        let joint = parameters.rows.iter().take(rows).filter(|row| row.has_joint()).count();
         let [joint, row] = [joint, rows].map(|number| u8::try_from(number).unwrap());
         Parameters { joint, joints: joint, row, table_rows: row, pose, ..parameters }
     }

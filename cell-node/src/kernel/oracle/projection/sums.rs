@@ -4,7 +4,7 @@ use crate::kernel::Number;
 use crate::kernel::rounding::{Bounded, Rounding, Saturating};
 
 /// Roundings of sums that only the projection kernel needs, with saturation or without.
-pub(super) trait Sums: Rounding {
+pub(super) trait VectorSums: Rounding {
     /// Adds two products to a number, and rounds the result.
     fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N;
     /// Adds two products without rounding.
@@ -13,7 +13,7 @@ pub(super) trait Sums: Rounding {
     fn round<N: Number>(sum: N::Wide) -> N;
 }
 
-impl Sums for Saturating {
+impl VectorSums for Saturating {
     #[inline(always)]
     fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N {
         N::round(N::plus(N::plus(number.widen(), first), second))
@@ -30,7 +30,7 @@ impl Sums for Saturating {
     }
 }
 
-impl Sums for Bounded {
+impl VectorSums for Bounded {
     #[inline(always)]
     fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N {
         number.bounded_more(N::bounded_plus(first, second))

@@ -86,7 +86,7 @@ proptest! {
         prop_assume!(there.windows(2).all(|pair| pair[1] - pair[0] != 256));
         let (first, last) = (there[0], *there.last().unwrap());
         let (a, b) = (whole.frames(), harm.frames());
-        let options = Options { tolerance: 1, ..Options::default() };
+        let options = CompareOptions { tolerance: 1, ..CompareOptions::default() };
         let report = match swaps {
             false => compared(&skin, options, &a, &b),
             true => compared(&skin, options, &b, &a),

@@ -9,7 +9,7 @@ use protocol::wire_time::{Bits, Coding, Shape};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::{Answers, COMPUTATION_NS, Case};
+use super::{AnswerPlan, BusCase, COMPUTATION_NS};
 use bus_model::{BusModel, Priority, Request};
 
 /// The times that the cells need to compute their answers in an epoch.
@@ -76,7 +76,7 @@ impl Sent {
 
 /// A simulated bus with its cells.
 struct Bench<'a> {
-    case: &'a Case,
+    case: &'a BusCase,
     data: Data,
     /// The content of the longest frame.
     longest: Bits,
@@ -126,15 +126,15 @@ impl Bench<'_> {
 }
 
 /// Simulates a number of epochs of a bus whose cells are all in contact, and returns the longest times.
-fn simulate(case: &Case, epochs: u64, seed: u64, how: (Computation, Heartbeats, Data)) -> Longest {
+fn simulate(case: &BusCase, epochs: u64, seed: u64, how: (Computation, Heartbeats, Data)) -> Longest {
     let (computation, heartbeats, data) = how;
     let (cells, period) = (case.answers.cells(), case.period_ns);
     let mut bench = Bench {
         case,
         data,
         longest: match case.format {
-            Format::Fd => Shape { coding: Coding::FdSwitched, extended: false, len: 16 }.worst(),
-            Format::Classic => Shape { coding: Coding::Classic, extended: false, len: 8 }.worst(),
+            Format::Fd => Shape { coding: Coding::FdSwitched, extended: false, len: 16 }.max_bits(),
+            Format::Classic => Shape { coding: Coding::Classic, extended: false, len: 8 }.max_bits(),
         },
         dice: Pcg64Mcg::seed_from_u64(seed),
         bus: BusModel::new(case.rates),
@@ -213,25 +213,25 @@ fn simulate(case: &Case, epochs: u64, seed: u64, how: (Computation, Heartbeats, 
     longest
 }
 
-fn case(rates: &str, cells: u32) -> Case {
+fn case(rates: &str, cells: u32) -> BusCase {
     let (format, rates) = match rates.strip_prefix("classic ") {
         Some(rates) => (Format::Classic, rates),
         None => (Format::Fd, rates),
     };
-    Case {
+    BusCase {
         length: Length::Six,
         format,
         rates: rates.parse().unwrap(),
         period_ns: 16_000_000,
         computation_ns: COMPUTATION_NS,
         sensing: Sensing::Off,
-        answers: Answers::Torques { cells },
+        answers: AnswerPlan::Torques { cells },
     }
 }
 
 /// Simulates a bus with many seeds and varied scenarios, and asserts that no time exceeds a bound. Returns the share of
 /// the smaller bound that the slowest simulation reached.
-fn reached(case: &Case, data: &[Data], seeds: u64) -> f64 {
+fn reached(case: &BusCase, data: &[Data], seeds: u64) -> f64 {
     let times = case.times();
     let mut slowest_ns = 0;
     for seed in 0..seeds {
@@ -300,14 +300,14 @@ fn with_the_longest_frames_hardly_anything_is_left() {
 #[test]
 fn sensors_do_not_delay_answers_by_more_than_is_computed() {
     let sensing = Sensing::Continuous { period_ms: 20 };
-    let reached = reached(&Case { sensing, ..case("1M/5M", 85) }, REAL, 18);
+    let reached = reached(&BusCase { sensing, ..case("1M/5M", 85) }, REAL, 18);
     assert!(reached >= 0.85, "{reached}");
 }
 
 #[test]
 fn cells_that_take_longer_to_compute_are_waited_for() {
     for computation_ns in [0, 1_000, 2_000_000, 5_000_000] {
-        let reached = reached(&Case { computation_ns, ..case("1M/5M", 85) }, REAL, 18);
+        let reached = reached(&BusCase { computation_ns, ..case("1M/5M", 85) }, REAL, 18);
         assert!(reached >= 0.85, "{computation_ns} ns: {reached}");
     }
 }

@@ -63,7 +63,7 @@ pub(super) struct Lines {
 
 /// The effect of a frame on the series of a capture that has frames only, without the loop's topics.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Effect {
+pub(super) enum FrameEffect {
     /// New joint positions of the chain, in rad or m.
     Joints([f64; MAX_JOINTS]),
     /// True for a halt of the cells, false for a resume.
@@ -81,7 +81,7 @@ fn is_for_cells(frame: &Frame) -> bool {
 
 /// The table of a bus as far as its frames have been read.
 #[derive(Debug)]
-pub(super) struct Received {
+pub(super) struct FrameState {
     last_timeout_check: Micros,
     /// True for a capture without the direction of frames, in which the gateway's own frames are recognised by their
     /// identifiers.
@@ -104,10 +104,10 @@ pub(super) struct BusFigures {
     pub(super) touched: TouchHistory,
     pub(super) moments: Moments,
     /// Time in s and size in Nm of the largest error of the bus's torque.
-    pub(super) farthest: Option<(f64, f64)>,
+    pub(super) largest_error: Option<(f64, f64)>,
     /// True if cells answer with sums.
     pub(super) sums: bool,
-    pub(super) received: Received,
+    pub(super) received: FrameState,
     open: Option<OpenEpoch>,
     pub(super) lines: Lines,
     /// Reply times of each cell, by its index on the bus.
@@ -144,10 +144,10 @@ impl BusFigures {
             central: Central::new(&skin.with_cells_of_bus(bus)),
             touched: TouchHistory::new(skin, bus),
             moments: Moments::default(),
-            farthest: None,
+            largest_error: None,
             table,
             sums: described.is_some_and(|bus| bus.reply != SkinReply::Torque),
-            received: Received {
+            received: FrameState {
                 last_timeout_check: Micros(0),
                 is_of_frames_only,
                 before: BusTotals::default(),
@@ -169,25 +169,26 @@ impl BusFigures {
     }
 
     /// Handles a packet from before the start of the recording, which still has an effect.
-    pub(super) fn latched(&mut self, before: &LatchedFrame) {
+    pub(super) fn receive_latched(&mut self, before: &LatchedFrame) {
         self.table.handle_frame(Micros(before.nanos / 1_000), before.own, &before.frame, &mut |_| None);
     }
 
     /// Starts counting, after the packets from before the start.
     pub(super) fn begin(&mut self) {
         self.table.begin_accounts();
-        self.open = self.table.newest().map(|(number, _, _)| OpenEpoch { number, ..OpenEpoch::default() });
+        self.open =
+            self.table.newest_joints().map(|(number, _, _)| OpenEpoch { number, ..OpenEpoch::default() });
     }
 
     /// Handles the next frame, `at` seconds after the start of the recording.
-    pub(super) fn frame(&mut self, at: f64, record: &Record<'_>) -> Option<Effect> {
+    pub(super) fn frame(&mut self, at: f64, record: &Record<'_>) -> Option<FrameEffect> {
         let now = Micros(record.time.nanos / 1_000);
         self.frames += 1;
         if now.0 >= self.received.last_timeout_check.0 + TIMEOUT_INTERVAL_US {
             self.received.last_timeout_check = now;
             self.table.handle_time(now);
             for notice in self.table.notices() {
-                self.moments.notice(at, notice);
+                self.moments.record_notice(at, notice);
             }
         }
         let own = match self.received.is_of_frames_only {
@@ -197,40 +198,40 @@ impl BusFigures {
         let read = self.table.read(now, &record.frame);
         let message = read.message();
         if let Some(message) = message {
-            self.answer(now, message);
-            self.measure(message);
+            self.record_reply_time(now, message);
+            self.record_measured_force(message);
         }
         let seconds = Bits::from_frame(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
         self.load_of_all.add(at, seconds);
         let before = self.table.snapshot().sums;
         self.table.receive(now, own, &read, &mut |_| None);
-        let newest = self.table.newest().map(|(number, _, _)| number);
+        let newest = self.table.newest_joints().map(|(number, _, _)| number);
         let is_next = newest.is_some() && newest != self.open.map(|open| open.number);
         if is_next {
-            self.next(newest.unwrap_or(0), at);
+            self.open_epoch(newest.unwrap_or(0), at);
             self.received.before = before;
         }
         match message {
             Some(Message::Joints { joints, .. }) if is_next => {
-                Some(Effect::Joints(self.central.positions(&joints.positions)))
+                Some(FrameEffect::Joints(self.central.positions(&joints.positions)))
             }
-            Some(Message::Halt) => Some(Effect::Halted(true)),
-            Some(Message::Resume) => Some(Effect::Halted(false)),
+            Some(Message::Halt) => Some(FrameEffect::Halted(true)),
+            Some(Message::Resume) => Some(FrameEffect::Halted(false)),
             Some(_) | None => None,
         }
     }
 
     /// Adds the time that a frame takes on a real bus; zero for a frame that only a bench sends.
-    pub(super) fn carried(&mut self, at: f64, bits: Option<Bits>) {
+    pub(super) fn add_real_load(&mut self, at: f64, bits: Option<Bits>) {
         self.load.add(at, bits.map_or(0.0, |bits| bits.seconds(self.rates.rates)));
     }
 
     /// Records the reply time of a cell, if the message is its answer to the newest joints.
-    fn answer(&mut self, now: Micros, message: &Message) {
+    fn record_reply_time(&mut self, now: Micros, message: &Message) {
         let (Message::Torque { from, epoch, .. } | Message::Sum { from, epoch, .. }) = message else {
             return;
         };
-        let Some((_, newest, opened)) = self.table.newest() else { return };
+        let Some((_, newest, opened)) = self.table.newest_joints() else { return };
         let cell = self.table.cells().iter().position(|cell| cell.node == *from);
         let Some(latency) = cell.filter(|_| newest == *epoch).and_then(|cell| self.latency.get_mut(cell))
         else {
@@ -246,7 +247,7 @@ impl BusFigures {
     }
 
     /// Records the force that a cell measures, if the message is its sensors page.
-    fn measure(&mut self, message: &Message) {
+    fn record_measured_force(&mut self, message: &Message) {
         let Message::Sensors { from, page: SensorPage::Skin(skin), .. } = message else { return };
         let Some(place) = self.table.cells().iter().position(|cell| cell.node == *from) else { return };
         if let Some(measured) = self.measured.get_mut(place) {
@@ -255,10 +256,13 @@ impl BusFigures {
     }
 
     /// Updates the force on each cell for the newest joints, from the cell's stimuli or its own measurement.
-    fn forces(&mut self, at: f64) {
+    fn update_forces(&mut self, at: f64) {
         let (table, central, measured) = (&self.table, &self.central, &self.measured);
-        let sensors =
-            table.sensors(self.received.last_timeout_check).zip(table.cells()).zip(measured).enumerate();
+        let sensors = table
+            .presumed_sensors(self.received.last_timeout_check)
+            .zip(table.cells())
+            .zip(measured)
+            .enumerate();
         let mut in_contact = Some(0);
         let forces = sensors.map(|(place, (((sensors, _), cell), measured))| {
             let stimulated = sensors.map(|sensors| central.force(place, &sensors));
@@ -268,7 +272,7 @@ impl BusFigures {
             in_contact = in_contact.filter(|_| is_known).map(|count| count + u32::from(is_pressed));
             force
         });
-        self.touched.joints(at, forces);
+        self.touched.record_joints(at, forces);
         self.received.in_contact = in_contact;
     }
 
@@ -285,25 +289,25 @@ impl BusFigures {
     }
 
     /// Handles new joints on the bus: ends the epoch, and begins the next one.
-    fn next(&mut self, number: u64, at: f64) {
+    fn open_epoch(&mut self, number: u64, at: f64) {
         let (first, _, count) = self.joints.unwrap_or((at, at, 0));
         self.joints = Some((first, at, count + 1));
-        let (due, before, errors) = self.close();
+        let (due, before, errors) = self.close_epoch();
         let lost = self.table.uplink().lost;
         self.open = Some(OpenEpoch { number, at, due, before, errors, lost, slowest: None });
-        self.forces(at);
+        self.update_forces(at);
     }
 
     /// Ends the epoch. Returns the number of replies that were due in it, and the counts of replies and errors after
     /// it.
-    fn close(&mut self) -> (u64, Replies, (u64, f64)) {
+    fn close_epoch(&mut self) -> (u64, Replies, (u64, f64)) {
         let (account, errors) = (self.account(), self.errors());
         let Some(OpenEpoch { at, due, before, errors: errors_before, lost, slowest, .. }) = self.open.take()
         else {
             return (account.due, account, errors);
         };
         let packets = self.table.uplink().lost.saturating_sub(lost);
-        self.moments.epoch(at, &before, &account, packets);
+        self.moments.record_epoch(at, &before, &account, packets);
         let compared = errors.0.saturating_sub(errors_before.0);
         let error = (errors.1 - errors_before.1).max(0.0) / compared as f64;
         let lines = &mut self.lines;
@@ -315,8 +319,8 @@ impl BusFigures {
         lines.error.push(at, if compared > 0 { error } else { f64::NAN });
         let difference = self.table.difference();
         for error in difference.iter().flatten().map(|error| error.abs()) {
-            if error > self.farthest.map_or(0.0, |(_, farthest)| farthest) {
-                self.farthest = Some((at, error));
+            if error > self.largest_error.map_or(0.0, |(_, farthest)| farthest) {
+                self.largest_error = Some((at, error));
             }
         }
         for (joint, line) in lines.difference.iter_mut().enumerate() {
@@ -329,7 +333,7 @@ impl BusFigures {
     /// Ends the series after the last frame.
     pub(super) fn finish(&mut self) {
         self.table.finish();
-        self.close();
+        self.close_epoch();
         self.touched.finish();
     }
 }

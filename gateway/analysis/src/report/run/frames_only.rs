@@ -3,8 +3,8 @@
 
 use protocol::skin::Skin;
 
-use super::bus_figures::{BusFigures, Effect};
-use super::motion::Motion;
+use super::bus_figures::{BusFigures, FrameEffect};
+use super::motion::TickSeries;
 
 /// A capture with frames only, as far as it has been read.
 #[derive(Debug)]
@@ -35,16 +35,16 @@ impl FramesOnly {
     /// Handles a frame on one of the skin's buses; `effect` is its effect on the series.
     pub(super) fn receive(
         &mut self,
-        (at, bus, effect): (f64, usize, Option<Effect>),
+        (at, bus, effect): (f64, usize, Option<FrameEffect>),
         (skin, bus_figures): (&Skin, &[BusFigures]),
-        motion: &mut Motion,
+        motion: &mut TickSeries,
     ) {
         self.end = self.end.max(at);
         match effect {
-            Some(Effect::Joints(positions)) => {
+            Some(FrameEffect::Joints(positions)) => {
                 motion.first.get_or_insert(at);
                 if *self.clock.get_or_insert(bus) == bus {
-                    sums(at, skin, bus_figures, motion);
+                    add_bus_sums(at, skin, bus_figures, motion);
                 }
                 for ((joint, _), position) in skin.joints_on_bus(bus).zip(positions) {
                     // The buses of all its chains broadcast a joint of several chains.
@@ -57,23 +57,23 @@ impl FramesOnly {
                     }
                 }
             }
-            Some(Effect::Halted(is_halted))
+            Some(FrameEffect::Halted(is_halted))
                 if std::mem::replace(&mut self.is_halted, is_halted) != is_halted =>
             {
-                motion.turn(at, if is_halted { "halted" } else { "goes on" });
+                motion.record_change(at, if is_halted { "halted" } else { "goes on" });
             }
-            Some(Effect::Halted(_)) | None => {}
+            Some(FrameEffect::Halted(_)) | None => {}
         }
     }
 
     /// Ends the capture: sets the time that the series cover, from the first joints to the last frame.
-    pub(super) fn finish(&self, motion: &mut Motion) {
+    pub(super) fn finish(&self, motion: &mut TickSeries) {
         motion.first.get_or_insert(0.0);
         motion.last = self.end;
     }
 
     /// Returns the parts of the report that this capture cannot have, as list items.
-    pub(super) fn missing(&self, bus_figures: &[BusFigures], motion: &Motion) -> Vec<&'static str> {
+    pub(super) fn missing(&self, bus_figures: &[BusFigures], motion: &TickSeries) -> Vec<&'static str> {
         let has_joints = bus_figures.iter().any(|it| it.joints.is_some());
         let compared = bus_figures.iter().any(|it| {
             let accuracy = it.table.accuracy();
@@ -93,7 +93,7 @@ impl FramesOnly {
 }
 
 /// Adds to the series the sums of all buses from before the joints at `at`.
-fn sums(at: f64, skin: &Skin, bus_figures: &[BusFigures], motion: &mut Motion) {
+fn add_bus_sums(at: f64, skin: &Skin, bus_figures: &[BusFigures], motion: &mut TickSeries) {
     let mut torque = vec![0.0; motion.distributed.len()];
     let (mut contributing, mut active) = (0, Some(0));
     for (bus, figures) in bus_figures.iter().enumerate() {
@@ -117,13 +117,13 @@ mod tests {
     #[test]
     fn halts_are_turns_and_a_repeated_one_is_none() {
         let skin = model::testing::skin();
-        let mut motion = Motion::new(6);
+        let mut motion = TickSeries::new(6);
         let mut frames_only = FramesOnly::new(true, "skin.toml");
         for (at, is_halted) in [(1.0, true), (1.1, true), (2.0, false), (3.0, false)] {
-            frames_only.receive((at, 0, Some(Effect::Halted(is_halted))), (&skin, &[]), &mut motion);
+            frames_only.receive((at, 0, Some(FrameEffect::Halted(is_halted))), (&skin, &[]), &mut motion);
         }
         frames_only.finish(&mut motion);
-        assert_eq!(motion.turns, [(1.0, "halted"), (2.0, "goes on")]);
+        assert_eq!(motion.changes, [(1.0, "halted"), (2.0, "goes on")]);
         assert!((motion.seconds() - 3.0).abs() < 1e-9);
         let missing = frames_only.missing(&[], &motion);
         assert_eq!(missing.first(), Some(&"joints, and with them torques and replies"));

@@ -29,7 +29,7 @@ use crate::fit::rates::{ChosenRates, RequestedRates};
 use crate::shadow::{self, Shadow};
 use bus_figures::BusFigures;
 use frames_only::FramesOnly;
-use motion::Motion;
+use motion::TickSeries;
 use trace::capture::{
     CaptureError, CaptureFormat, Entry, Item, Note, NoteKind, OtherMessage, Reader, RecordingExtras,
     SKIN_ATTACHMENT, seconds_since,
@@ -105,7 +105,7 @@ pub enum ReportError {
 
 /// A report, with warnings about its recording.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Report {
+pub struct RunReport {
     /// Contents of the report.
     pub page: Page,
     /// A sentence about the missing end, if the recording is cut off or damaged.
@@ -120,7 +120,7 @@ pub struct Report {
 
 /// Options of a report.
 #[derive(Clone, Debug, Default)]
-pub struct Options {
+pub struct ReportOptions {
     /// The command, as shown on the page.
     pub command: String,
     /// Nominal bit rate of all buses in bit/s, replacing the skin's.
@@ -131,7 +131,7 @@ pub struct Options {
     pub skin: Option<(String, Skin)>,
 }
 
-impl Options {
+impl ReportOptions {
     /// Returns where the bit rates of a bus come from: the names of the options, or the key in the skin; `None` for
     /// defaults.
     fn origin(&self, bus: &SkinBus) -> Option<&'static str> {
@@ -146,7 +146,7 @@ impl Options {
 
     /// Returns the bit rates for which the load of a bus is computed.
     fn rates(&self, bus: &SkinBus) -> Result<ChosenRates, ReportError> {
-        let rates = RequestedRates { nominal: self.nominal, data: self.data }.of_bus(bus);
+        let rates = RequestedRates { nominal: self.nominal, data: self.data }.for_bus(bus);
         rates.map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
     }
 }
@@ -156,26 +156,26 @@ impl Options {
 /// # Errors
 /// Returns [`ReportError`] if the files are not a recording of a run, if they contain no run, or if CAN does not allow
 /// the bit rates.
-pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportError> {
+pub fn report(paths: &[PathBuf], options: &ReportOptions) -> Result<RunReport, ReportError> {
     let (run, broken, is_damaged) = read(paths, options)?;
     let missing = broken.map(|why| run.missing(&why));
     let page = page::page(&run, &options.command, missing.as_deref());
     let lacking = run.frames_only.as_ref().map(|it| format!("not in {}: {}", it.noun, run.missing_parts()));
     let remarks = lacking.into_iter().chain(run.remarks).collect();
-    Ok(Report { page, missing, is_damaged, name: run.name, remarks })
+    Ok(RunReport { page, missing, is_damaged, name: run.name, remarks })
 }
 
 /// Checks that the files are recordings, without reading them to the end.
 ///
 /// # Errors
 /// Returns [`ReportError`] if a file is not a recording, or cannot be opened.
-pub fn check(paths: &[PathBuf], options: &Options) -> Result<(), ReportError> {
+pub fn check(paths: &[PathBuf], options: &ReportOptions) -> Result<(), ReportError> {
     open(paths, options).map(drop)
 }
 
 /// Opens a recording. Also returns the size of its files in bytes, if known.
-fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), ReportError> {
-    let mut items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
+fn open(paths: &[PathBuf], options: &ReportOptions) -> Result<(Reader, Option<u64>), ReportError> {
+    let mut items = Reader::open_with_all_topics(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
     let bytes =
         |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());
@@ -200,11 +200,11 @@ fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), R
 }
 
 /// Reads the whole recording. Also returns the reason why it ends early, if it does, and true if that is damage.
-fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bool), ReportError> {
+fn read(paths: &[PathBuf], options: &ReportOptions) -> Result<(RunData, Option<String>, bool), ReportError> {
     let (mut items, bytes) = open(paths, options)?;
     let name = items.name().to_owned();
     // The header is known once the file is open, unless the file is damaged; then the damage is the reason.
-    let begun = Run::begin(&name, bytes.unwrap_or(0), (items.format(), items.extras()), options);
+    let begun = RunData::begin(&name, bytes.unwrap_or(0), (items.format(), items.extras()), options);
     while begun.is_err() && items.extras().skin().is_none() && items.next_item()?.is_some() {}
     let mut run = begun?;
     run.files = paths.iter().map(|path| path.display().to_string()).collect();
@@ -219,7 +219,7 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bo
     let unfinished = items.extras().unfinished.clone();
     if run.frames_only.is_some() {
         run.remarks = items.remarks();
-        if let Some(what) = run.unusable(&items).filter(|_| damaged.is_none()) {
+        if let Some(what) = run.unusable_reason(&items).filter(|_| damaged.is_none()) {
             return Err(ReportError::Frames { name, what });
         }
     }
@@ -242,14 +242,18 @@ fn shadow(skin: &Skin, bus_figures: &[BusFigures]) -> Shadow {
     let rates = RequestedRates::default().rates().expect("the default rates are valid");
     let of_bus =
         bus_figures.iter().map(|bus_figures| (bus_figures.name.clone(), bus_figures.rates.rates)).collect();
-    let options =
-        shadow::Options { of_bus, each_frame: true, skin: Some(skin.clone()), ..shadow::Options::new(rates) };
+    let options = shadow::ShadowOptions {
+        rates_by_bus: of_bus,
+        each_frame: true,
+        skin: Some(skin.clone()),
+        ..shadow::ShadowOptions::new(rates)
+    };
     Shadow::new(options).expect("a bit-error rate of 0 is valid")
 }
 
 /// The content of a recording, as far as it has been read.
 #[derive(Debug)]
-struct Run {
+struct RunData {
     skin: Skin,
     /// Path of the recording; the next field is the size of its files in bytes.
     name: String,
@@ -267,7 +271,7 @@ struct Run {
     zero: Option<f64>,
     /// Start of the loop, in ns since 1970, if the recording has it.
     run_began: Option<u64>,
-    motion: Motion,
+    motion: TickSeries,
     bus_figures: Vec<BusFigures>,
     shadow: Shadow,
     /// Number of packets, of any network, that the kernel dropped before they reached their sockets.
@@ -283,12 +287,12 @@ struct Run {
     remarks: Vec<String>,
 }
 
-impl Run {
+impl RunData {
     fn begin(
         name: &str,
         bytes: u64,
         (format, extras): (CaptureFormat, &RecordingExtras),
-        options: &Options,
+        options: &ReportOptions,
     ) -> Result<Self, ReportError> {
         let has_skin = options.skin.is_some();
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what, has_skin };
@@ -318,15 +322,15 @@ impl Run {
         let mut bus_figures = bus_figures.collect::<Result<Vec<_>, ReportError>>()?;
         let mut shadow = shadow(&skin, &bus_figures);
         for before in &extras.latched {
-            shadow.latched(&before.bus, before.nanos, &before.frame);
+            shadow.receive_latched(&before.bus, before.nanos, &before.frame);
             if let Some(bus_figures) = skin.bus_named(&before.bus).and_then(|bus| bus_figures.get_mut(bus)) {
-                bus_figures.latched(before);
+                bus_figures.receive_latched(before);
             }
         }
         bus_figures.iter_mut().for_each(BusFigures::begin);
         Ok(Self {
             topics: ["joint_states", "torques"].map(|topic| format!("/{}/{topic}", layout.arm)),
-            motion: Motion::new(layout.joints.len()),
+            motion: TickSeries::new(layout.joints.len()),
             name: name.to_owned(),
             bytes,
             metadata: extras.metadata.clone(),
@@ -361,8 +365,8 @@ impl Run {
                             let so_far = (&self.skin, self.bus_figures.as_slice());
                             frames_only.receive((at, bus, effect), so_far, &mut self.motion);
                         }
-                        self.shadow.frame(record.interface, record.time.nanos, &record.frame);
-                        self.carried();
+                        self.shadow.receive(record.interface, record.time.nanos, &record.frame);
+                        self.add_real_load();
                     }
                     None => {
                         self.others += 1;
@@ -411,19 +415,19 @@ impl Run {
     }
 
     /// Adds the frames whose load on the real bus the timing model has computed.
-    fn carried(&mut self) {
+    fn add_real_load(&mut self) {
         while let Some(frame) = self.shadow.poll() {
             let at = self.seconds(frame.nanos);
             let bus = frame.bus.and_then(|bus| self.skin.bus_named(self.shadow.bus(bus)));
             let bus_figures = bus.and_then(|bus| self.bus_figures.get_mut(bus));
-            bus_figures.into_iter().for_each(|bus_figures| bus_figures.carried(at, frame.bits));
+            bus_figures.into_iter().for_each(|bus_figures| bus_figures.add_real_load(at, frame.bits));
         }
     }
 
     fn finish(&mut self) {
         self.bus_figures.iter_mut().for_each(BusFigures::finish);
         self.shadow.finish();
-        self.carried();
+        self.add_real_load();
         if let Some(frames_only) = &self.frames_only {
             frames_only.finish(&mut self.motion);
         }
@@ -442,7 +446,7 @@ impl Run {
 
     /// Returns the reason why a capture with frames only cannot be reported, as the rest of a sentence; `None` if it
     /// can.
-    fn unusable(&self, items: &Reader) -> Option<String> {
+    fn unusable_reason(&self, items: &Reader) -> Option<String> {
         if !items.has_times() {
             return Some(
                 "has lines without times: a report needs them, as `candump -L` writes them".to_owned(),

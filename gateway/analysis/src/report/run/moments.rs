@@ -41,7 +41,7 @@ pub(super) struct Moments {
 impl Moments {
     /// Records the end of an epoch that began at `at`. The counts of replies before and after it show how many became
     /// late or missing, and `packets` is the number of packets found lost.
-    pub(super) fn epoch(&mut self, at: f64, before: &Replies, now: &Replies, packets: u64) {
+    pub(super) fn record_epoch(&mut self, at: f64, before: &Replies, now: &Replies, packets: u64) {
         self.opened.push_front(at);
         self.opened.truncate(MAX_LATE_EPOCHS + 1);
         let late = now.late.saturating_sub(before.late);
@@ -66,7 +66,7 @@ impl Moments {
     }
 
     /// Records a notice of the bus's table, such as a silent cell.
-    pub(super) fn notice(&mut self, at: f64, notice: Notice) {
+    pub(super) fn record_notice(&mut self, at: f64, notice: Notice) {
         if self.notices.len() < MAX_KEPT {
             self.notices.push((at, notice));
         } else {
@@ -75,7 +75,7 @@ impl Moments {
     }
 
     /// Returns the loss for which `of` returns the highest count.
-    pub(super) fn worst(&self, of: impl Fn(&Loss) -> u64) -> Option<&Loss> {
+    pub(super) fn largest_loss(&self, of: impl Fn(&Loss) -> u64) -> Option<&Loss> {
         self.losses.iter().filter(|loss| of(loss) > 0).max_by_key(|loss| of(loss))
     }
 }
@@ -92,7 +92,7 @@ mod tests {
             let mut now = before;
             now.missing += u64::from((50..60).contains(&epoch)) * 2;
             now.late += u64::from(epoch == 150);
-            moments.epoch(f64::from(epoch) * 0.016, &before, &now, u64::from(epoch == 61));
+            moments.record_epoch(f64::from(epoch) * 0.016, &before, &now, u64::from(epoch == 61));
             before = now;
         }
         let [first, second] = moments.losses.as_slice() else { panic!("{:?}", moments.losses) };
@@ -100,7 +100,7 @@ mod tests {
         assert!((first.seconds.0 - 47.0 * 0.016).abs() < 1e-9, "three epochs before it was settled");
         assert!((first.seconds.1 - 61.0 * 0.016).abs() < 1e-9, "{first:?}");
         assert!((second.seconds.0 - 149.0 * 0.016).abs() < 1e-9 && second.late == 1, "{second:?}");
-        assert_eq!(moments.worst(|loss| loss.late), Some(second));
-        assert_eq!(moments.worst(Loss::total), Some(first));
+        assert_eq!(moments.largest_loss(|loss| loss.late), Some(second));
+        assert_eq!(moments.largest_loss(Loss::total), Some(first));
     }
 }

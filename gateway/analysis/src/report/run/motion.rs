@@ -10,19 +10,19 @@ const MAX_CHANGES: usize = 12;
 
 /// The series and counts of all ticks.
 #[derive(Debug, Default)]
-pub(super) struct Motion {
+pub(super) struct TickSeries {
     pub(super) position: Vec<ThinnedLine>,
     pub(super) velocity: Vec<ThinnedLine>,
     pub(super) distributed: Vec<ThinnedLine>,
     pub(super) central: Vec<ThinnedLine>,
     pub(super) active: ThinnedLine,
     pub(super) contributing: ThinnedLine,
-    pub(super) late: Timed,
-    pub(super) took: Timed,
-    pub(super) central_took: Timed,
+    pub(super) late: TickDurations,
+    pub(super) took: TickDurations,
+    pub(super) central_took: TickDurations,
     /// Durations of ticks without a central computation.
     pub(super) plain: Times,
-    pub(super) counts: Counts,
+    pub(super) counts: TickCounts,
     /// Sum of active cells over all ticks with a central computation, and the number of these ticks.
     pub(super) active_sum: (u64, u64),
     /// The first and the last tick in s; for frames only, the first joints and the last frame.
@@ -31,7 +31,7 @@ pub(super) struct Motion {
     /// Time in s and size of the largest number of skipped ticks.
     pub(super) skip: Option<(f64, u64)>,
     /// Changes of the control loop's state, with their times in s.
-    pub(super) turns: Vec<(f64, &'static str)>,
+    pub(super) changes: Vec<(f64, &'static str)>,
     number: Option<u64>,
     comparing: Option<bool>,
     halt: u8,
@@ -39,7 +39,7 @@ pub(super) struct Motion {
 
 /// Counts of ticks.
 #[derive(Debug, Default)]
-pub(super) struct Counts {
+pub(super) struct TickCounts {
     pub(super) ticks: u64,
     pub(super) skipped: u64,
     /// Ticks that were run, by their numbers, but are missing from the recording.
@@ -51,19 +51,19 @@ pub(super) struct Counts {
 
 /// The duration of a part of each tick: as a series in µs, and as a histogram.
 #[derive(Debug, Default)]
-pub(super) struct Timed {
+pub(super) struct TickDurations {
     pub(super) line: ThinnedLine,
     pub(super) times: Times,
 }
 
-impl Timed {
+impl TickDurations {
     fn push(&mut self, at: f64, micros: f64) {
         self.line.push(at, micros);
         self.times.record(nanos(micros));
     }
 }
 
-impl Motion {
+impl TickSeries {
     pub(super) fn new(joints: usize) -> Self {
         let each = || vec![ThinnedLine::default(); joints];
         Self { position: each(), velocity: each(), distributed: each(), central: each(), ..Self::default() }
@@ -84,7 +84,10 @@ impl Motion {
             self.active_sum = (self.active_sum.0 + u64::from(torques.active), self.active_sum.1 + 1);
         }
         if self.comparing.is_some_and(|before| before != compared) {
-            self.turn(at, if compared { "central computation on" } else { "central computation off" });
+            self.record_change(
+                at,
+                if compared { "central computation on" } else { "central computation off" },
+            );
         }
         self.comparing = Some(compared);
     }
@@ -92,7 +95,7 @@ impl Motion {
     pub(super) fn timing(&mut self, at: f64, timing: &LoopTiming) {
         self.first.get_or_insert(at);
         self.last = self.last.max(at);
-        self.counts.take(timing, self.number.replace(timing.tick));
+        self.counts.record(timing, self.number.replace(timing.tick));
         if timing.skipped > self.skip.map_or(0, |(_, skipped)| skipped) {
             self.skip = Some((at, timing.skipped));
         }
@@ -107,13 +110,13 @@ impl Motion {
         }
         if timing.halted != self.halt {
             self.halt = timing.halted;
-            self.turn(at, if timing.halted == 0 { "goes on" } else { "halted" });
+            self.record_change(at, if timing.halted == 0 { "goes on" } else { "halted" });
         }
     }
 
-    pub(super) fn turn(&mut self, at: f64, what: &'static str) {
-        if self.turns.len() < MAX_CHANGES {
-            self.turns.push((at, what));
+    pub(super) fn record_change(&mut self, at: f64, what: &'static str) {
+        if self.changes.len() < MAX_CHANGES {
+            self.changes.push((at, what));
         }
     }
 
@@ -123,9 +126,9 @@ impl Motion {
     }
 }
 
-impl Counts {
+impl TickCounts {
     /// Counts a tick, and the skipped or unrecorded ones since the tick with the number `before`.
-    fn take(&mut self, timing: &LoopTiming, before: Option<u64>) {
+    fn record(&mut self, timing: &LoopTiming, before: Option<u64>) {
         self.ticks += 1;
         self.skipped = self.skipped.saturating_add(timing.skipped);
         if let Some(before) = before {
@@ -157,7 +160,7 @@ mod tests {
 
     #[test]
     fn numbers_of_ticks_that_cannot_be_are_counted_as_far_as_a_count_goes() {
-        let mut motion = Motion::new(1);
+        let mut motion = TickSeries::new(1);
         for tick in [u64::MAX - 1, 0, u64::MAX] {
             motion.timing(0.0, &LoopTiming { tick, skipped: u64::MAX, ..LoopTiming::default() });
         }

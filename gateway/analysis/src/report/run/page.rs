@@ -7,7 +7,7 @@ mod formats;
 mod moments;
 mod skin;
 
-use super::Run;
+use super::RunData;
 use super::bus_figures::BusFigures;
 use super::frames_only::FramesOnly;
 use super::moments::Loss;
@@ -27,14 +27,14 @@ const PAPER_CENTRAL_US: [f64; 3] = [0.798, 0.827, 10.7];
 const MAX_LISTED_CELLS: usize = 10;
 
 /// The inputs of a page.
-struct Draft<'a> {
-    run: &'a Run,
+struct PageDraft<'a> {
+    run: &'a RunData,
     /// Start of the loop, or of the joints in a capture with frames only, in s after the recording's first message.
     zero: f64,
 }
 
-pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
-    let draft = Draft { run, zero: run.motion.first.unwrap_or(0.0) };
+pub(super) fn page(run: &RunData, command: &str, missing: Option<&str>) -> Page {
+    let draft = PageDraft { run, zero: run.motion.first.unwrap_or(0.0) };
     let mut intro = match &run.frames_only {
         Some(frames_only) => intro_of_frames(run, frames_only),
         None => intro_of_run(run),
@@ -52,23 +52,23 @@ pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
     Page { title: format!("{}: report on {of}", run.skin.name), intro, facts, sections }
 }
 
-fn intro_of_run(run: &Run) -> String {
+fn intro_of_run(run: &RunData) -> String {
     format!(
         "A run of {} on {} and {} of its {} control loop, from the recording {}. Times count from the first tick.",
         cells_of(run),
-        several(run.skin.buses.len(), "bus", "buses"),
+        count_text(run.skin.buses.len(), "bus", "buses"),
         hundredths(run.motion.seconds()),
         quantity(run.skin.timing.control_hz, "Hz"),
         run.name,
     )
 }
 
-fn intro_of_frames(run: &Run, frames_only: &FramesOnly) -> String {
+fn intro_of_frames(run: &RunData, frames_only: &FramesOnly) -> String {
     let remarks: String = run.remarks.iter().map(|remark| format!(" {remark}.")).collect();
     format!(
         "Frames of {} on {} during {}, from the {} {}. Times count from the first joints. Not in {}: {}.{remarks}",
         cells_of(run),
-        several(run.skin.buses.len(), "bus", "buses"),
+        count_text(run.skin.buses.len(), "bus", "buses"),
         hundredths(run.motion.seconds()),
         frames_only.format,
         run.name,
@@ -77,7 +77,7 @@ fn intro_of_frames(run: &Run, frames_only: &FramesOnly) -> String {
     )
 }
 
-fn cells_of(run: &Run) -> String {
+fn cells_of(run: &RunData) -> String {
     format!("{} with {} cells", run.skin.name, run.skin.cells.len())
 }
 
@@ -85,7 +85,7 @@ fn hundredths(seconds: f64) -> String {
     quantity((seconds * 100.0).round() / 100.0, "s")
 }
 
-impl Draft<'_> {
+impl PageDraft<'_> {
     fn points(&self, thinned: &ThinnedLine) -> Vec<(f64, f64)> {
         thinned.points().into_iter().map(|(x, y)| (x - self.zero, y)).collect()
     }
@@ -102,14 +102,14 @@ impl Draft<'_> {
     fn time(&self) -> Axis {
         let axis = Axis::new("time", "s");
         let seconds = self.run.motion.seconds();
-        if seconds > 0.0 { axis.between(0.0, seconds) } else { axis }
+        if seconds > 0.0 { axis.with_ends(0.0, seconds) } else { axis }
     }
 
     fn marks(&self) -> Vec<Mark> {
-        self.run.motion.turns.iter().map(|&(at, what)| Mark::x(at - self.zero, what)).collect()
+        self.run.motion.changes.iter().map(|&(at, what)| Mark::x(at - self.zero, what)).collect()
     }
 
-    fn named(&self, bus_figures: &BusFigures) -> String {
+    fn bus_caption(&self, bus_figures: &BusFigures) -> String {
         if self.run.bus_figures.len() > 1 { bus_figures.name.clone() } else { String::new() }
     }
 
@@ -124,7 +124,7 @@ impl Draft<'_> {
             .map(|bus_figures| bus_figures.table.accuracy())
             .reduce(Accuracy::with);
         let accuracy = accuracy.unwrap_or_default();
-        let farthest = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.farthest);
+        let farthest = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.largest_error);
         let farthest =
             farthest.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(at, _)| self.view_command(at));
         for (what, theirs, errors, is_whole) in [
@@ -153,22 +153,22 @@ impl Draft<'_> {
             );
             findings.push(Finding::less_is_better(what, law, (median, "µs")));
         }
-        findings.push(Finding::stated("cells", skin.cells.len() as f64).beside(PAPER_CELLS));
+        findings.push(Finding::stated("cells", skin.cells.len() as f64).with_paper_value(PAPER_CELLS));
         if motion.seconds() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
             if motion.counts.ticks > 0 {
                 let ticks = motion.counts.ticks.saturating_add(motion.counts.unrecorded);
                 let loop_hz = hertz(ticks, motion.seconds());
-                findings.push(Finding::stated("control loop", loop_hz).beside(PAPER_CONTROL_HZ));
+                findings.push(Finding::stated("control loop", loop_hz).with_paper_value(PAPER_CONTROL_HZ));
             }
             let joints = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.joints);
             let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
             if let Some((first, last, count)) = most {
                 let finding = Finding::stated("joints", hertz(count, last - first));
-                findings.push(finding.beside(PAPER_BROADCAST_HZ));
+                findings.push(finding.with_paper_value(PAPER_BROADCAST_HZ));
             }
             if motion.counts.ticks > 0 {
-                let skipped = none("ticks skipped".to_owned(), motion.counts.skipped);
+                let skipped = zero_required("ticks skipped".to_owned(), motion.counts.skipped);
                 findings.push(skipped.with_command(motion.skip.map(|(at, _)| self.view_command(at))));
             }
         }
@@ -179,14 +179,14 @@ impl Draft<'_> {
             let period = 1.0 / skin.timing.broadcast_hz();
             let bar = format!("none after {}", quantity(period, "s"));
             let late = due - in_time;
-            let finding = Finding::stated(what, late as f64).must(bar, late == 0);
+            let finding = Finding::stated(what, late as f64).with_requirement(bar, late == 0);
             let worst = self.worst_loss(|loss| loss.late + loss.missing);
-            findings.push(finding.from("skin: joint_broadcast_hz").with_command(worst));
+            findings.push(finding.with_origin("skin: joint_broadcast_hz").with_command(worst));
         }
         findings.extend(self.beyond_range());
-        findings.extend(self.fits());
+        findings.extend(self.fit_findings());
         let uplink: Uplink = self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
-        let lost = none("packets of cells lost, by their own count".to_owned(), uplink.lost);
+        let lost = zero_required("packets of cells lost, by their own count".to_owned(), uplink.lost);
         findings.push(lost.with_command(self.worst_loss(|loss| loss.packets)));
         findings.extend(self.stuck());
         Section::new("summary", "In numbers").findings(findings).text(
@@ -213,7 +213,7 @@ impl Draft<'_> {
             "stuck cells, which sent constant words while the expected words changed ({}{more})",
             named.join("; ")
         );
-        (!cells.is_empty()).then(|| none(what, cells.len() as u64))
+        (!cells.is_empty()).then(|| zero_required(what, cells.len() as u64))
     }
 
     /// Returns a sentence about a part that only a recording of a run has; `None` for such a recording.
@@ -224,22 +224,22 @@ impl Draft<'_> {
 
     /// Returns the command that shows the loss with the highest count.
     fn worst_loss(&self, of: impl Fn(&Loss) -> u64) -> Option<String> {
-        let all = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.moments.worst(&of));
+        let all = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.moments.largest_loss(&of));
         all.max_by_key(|loss| of(loss)).map(|loss| self.view_command(loss.seconds.0))
     }
 }
 
 /// Removes series without points; returns `None` if nothing is left.
-fn shown(mut figure: Figure) -> Option<Figure> {
+fn without_empty_series(mut figure: Figure) -> Option<Figure> {
     figure.series.retain(|series| series.points.iter().any(|(x, y)| x.is_finite() && y.is_finite()));
     (!figure.series.is_empty()).then_some(figure)
 }
 
 /// Creates a finding whose count must be zero.
-fn none(what: String, count: u64) -> Finding {
-    Finding::stated(what, count as f64).must("none", count == 0).from("default")
+fn zero_required(what: String, count: u64) -> Finding {
+    Finding::stated(what, count as f64).with_requirement("none", count == 0).with_origin("default")
 }
 
-fn several(count: usize, one: &str, more: &str) -> String {
+fn count_text(count: usize, one: &str, more: &str) -> String {
     format!("{count} {}", if count == 1 { one } else { more })
 }

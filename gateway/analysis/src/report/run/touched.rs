@@ -7,7 +7,7 @@ use protocol::skin::Skin;
 
 /// Maximum number of bins, and their initial width in s.
 const MAX_BINS: usize = 600;
-const BIN_S: f64 = 0.016;
+const INITIAL_BIN_S: f64 = 0.016;
 /// Maximum number of touches that are kept with their details.
 const MAX_TOUCHES: usize = 2_000;
 
@@ -48,7 +48,7 @@ impl TouchHistory {
     pub(super) fn new(skin: &Skin, bus: usize) -> Self {
         let rows: Vec<_> = skin.cells_on_bus(bus).map(|cell| cell.row).collect();
         Self {
-            width: BIN_S,
+            width: INITIAL_BIN_S,
             bins: BTreeMap::new(),
             max: vec![None; rows.len()],
             now: vec![0.0; rows.len()],
@@ -61,8 +61,8 @@ impl TouchHistory {
     }
 
     /// Records new joints on the bus at `at` in s, with the force on each cell since these joints in N, where known.
-    pub(super) fn joints(&mut self, at: f64, forces: impl Iterator<Item = Option<f64>>) {
-        self.until(at);
+    pub(super) fn record_joints(&mut self, at: f64, forces: impl Iterator<Item = Option<f64>>) {
+        self.extend_to(at);
         self.at = Some(at);
         for (place, force) in forces.enumerate().take(self.rows.len()) {
             if let (Some(max), Some(force)) = (self.max.get_mut(place), force) {
@@ -80,7 +80,7 @@ impl TouchHistory {
         for row in rows {
             let mut cells = self.rows.iter().zip(&self.now).filter(|(of, _)| **of == row);
             if cells.all(|(_, force)| *force <= 0.0) {
-                self.end(row, at);
+                self.end_touch(row, at);
             }
         }
     }
@@ -101,7 +101,7 @@ impl TouchHistory {
         }
     }
 
-    fn end(&mut self, row: u8, at: f64) {
+    fn end_touch(&mut self, row: u8, at: f64) {
         let Some(mut touch) = self.open.remove(&row) else { return };
         touch.seconds.1 = at;
         if self.touches.len() < MAX_TOUCHES {
@@ -117,7 +117,7 @@ impl TouchHistory {
         clippy::cast_sign_loss,
         reason = "not negative; wide bins are few"
     )]
-    fn until(&mut self, at: f64) {
+    fn extend_to(&mut self, at: f64) {
         let Some(from) = self.at.map(|from| from.max(0.0)).filter(|from| at > *from) else { return };
         while at / self.width >= MAX_BINS as f64 {
             self.width *= 2.0;
@@ -141,7 +141,7 @@ impl TouchHistory {
     pub(super) fn finish(&mut self) {
         let Some(at) = self.at else { return };
         let rows: Vec<_> = self.open.keys().copied().collect();
-        rows.into_iter().for_each(|row| self.end(row, at));
+        rows.into_iter().for_each(|row| self.end_touch(row, at));
     }
 
     /// Returns for each touched cell its index, and the bins: start and end in s, and the largest force in N.
@@ -157,11 +157,12 @@ impl TouchHistory {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use model::generate::{Target, generate};
+    use model::generate::{SkinRequest, generate};
 
     fn touched() -> TouchHistory {
         let skin =
-            Skin::parse("skin", &generate(&Target { cells: 40, ..Target::default() }).unwrap()).unwrap();
+            Skin::parse("skin", &generate(&SkinRequest { cells: 40, ..SkinRequest::default() }).unwrap())
+                .unwrap();
         TouchHistory::new(&skin, 0)
     }
 
@@ -169,7 +170,7 @@ mod tests {
     fn joints(touched: &mut TouchHistory, at: f64, forces: &[(usize, f64)]) {
         let cells = touched.rows.len();
         let force = |place| forces.iter().find(|(of, _)| *of == place).map_or(0.0, |(_, force)| *force);
-        touched.joints(at, (0..cells).map(|place| Some(force(place))));
+        touched.record_joints(at, (0..cells).map(|place| Some(force(place))));
     }
 
     #[test]

@@ -4,21 +4,21 @@ use std::fmt::Write as _;
 
 use protocol::xml::escaped;
 
-use super::super::figure::{Axis, Drawing, Legend, Map, Panel, Size, Strip, quantity};
-use super::super::scale::Span;
+use super::super::figure::{Axis, Drawing, FigureWidth, Legend, Map, Panel, Strip, quantity};
+use super::super::scale::AxisSpan;
 use super::colour::{LEVELS, TRACK, colours, level};
-use super::{FAINT, INK, LETTERS, dark, natural};
+use super::{FAINT, INK, LETTER_SIZE, dark_rules, natural_size};
 
 /// Mean width of a letter, in pixels.
-const LETTER: f64 = 0.56 * LETTERS;
+const LETTER_WIDTH: f64 = 0.56 * LETTER_SIZE;
 /// Margin of a drawing, in pixels.
 const MARGIN: f64 = 12.0;
 /// Height of the legend with the space below it, in pixels.
-const LEGEND: f64 = 52.0;
+const LEGEND_HEIGHT: f64 = 52.0;
 /// Height of the heading of a panel or group, in pixels.
-const HEADING: f64 = 24.0;
+const HEADING_HEIGHT: f64 = 24.0;
 /// Maximum distance between the centres of adjacent cells, in pixels.
-const PITCH: f64 = 18.0;
+const MAX_PITCH: f64 = 18.0;
 /// Overlap of adjacent areas in pixels, so that no seams are visible.
 const SEAM: f64 = 0.3;
 /// Distance between cells in m that is assumed for a link with a single cell.
@@ -27,14 +27,14 @@ const SINGLE_CELL_PITCH_M: f64 = 0.028;
 /// Draws a standalone SVG file.
 #[must_use]
 pub fn draw(drawing: &Drawing) -> String {
-    let style = format!("<style>{}</style>\n", dark());
-    let (width, _) = natural(Size::Wide);
+    let style = format!("<style>{}</style>\n", dark_rules());
+    let (width, _) = natural_size(FigureWidth::Wide);
     let (height, body) = body(drawing, width.into());
     let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
     document(drawing, (width.into(), height), &attributes, &format!("{style}{body}"))
 }
 
-/// Draws cells as an element of a page that contains the CSS rules of [`dark()`]; `width` is the width in pixels before
+/// Draws cells as an element of a page that contains the CSS rules of [`dark_rules`](super::dark_rules); `width` is the width in pixels before
 /// scaling.
 #[must_use]
 pub fn inline(drawing: &Drawing, width: u32, class: &str) -> String {
@@ -46,7 +46,7 @@ fn document(drawing: &Drawing, (width, height): (f64, f64), attributes: &str, bo
     let title = escaped(drawing.title());
     format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" role=\"img\" {attributes} \
-         font-size=\"{LETTERS}\">\n<title>{title}</title>\n{body}</svg>\n"
+         font-size=\"{LETTER_SIZE}\">\n<title>{title}</title>\n{body}</svg>\n"
     )
 }
 
@@ -68,7 +68,7 @@ enum Anchor {
     End,
 }
 
-fn words(out: &mut String, (x, y): (f64, f64), anchor: Anchor, is_faint: bool, text: &str) {
+fn write_text(out: &mut String, (x, y): (f64, f64), anchor: Anchor, is_faint: bool, text: &str) {
     let (colour, class) = if is_faint { (FAINT, "faint-f") } else { (INK, "ink-f") };
     let anchor = match anchor {
         Anchor::Start => "",
@@ -101,7 +101,7 @@ fn track(out: &mut String, path: &str) {
 struct Levels([String; LEVELS]);
 
 impl Levels {
-    fn of(&mut self, value: f64, max: f64) -> Option<&mut String> {
+    fn path_of_value(&mut self, value: f64, max: f64) -> Option<&mut String> {
         self.0.get_mut(level(value, max))
     }
 
@@ -120,18 +120,18 @@ fn rectangle(path: &mut String, (x, y): (f64, f64), (width, height): (f64, f64))
 /// Draws the legend of the colours at the top.
 fn legend(out: &mut String, legend: &Legend, width: f64) {
     let bar = (width * 0.4).min(260.0);
-    let left = MARGIN + LETTER * legend.caption.chars().count() as f64 + 14.0;
-    words(out, (MARGIN, 23.0), Anchor::Start, false, &legend.caption);
+    let left = MARGIN + LETTER_WIDTH * legend.caption.chars().count() as f64 + 14.0;
+    write_text(out, (MARGIN, 23.0), Anchor::Start, false, &legend.caption);
     let mut levels = Levels::default();
     for at in 0..LEVELS {
         let part = bar / LEVELS as f64;
-        let path = levels.of((at as f64 + 0.5) / LEVELS as f64, 1.0);
+        let path = levels.path_of_value((at as f64 + 0.5) / LEVELS as f64, 1.0);
         path.into_iter()
             .for_each(|path| rectangle(path, (left + part * at as f64, 12.0), (part + SEAM, 14.0)));
     }
     levels.write(out);
     for (part, anchor) in [(0.0, Anchor::Middle), (0.5, Anchor::Middle), (1.0, Anchor::Middle)] {
-        words(out, (left + part * bar, 42.0), anchor, true, &quantity(part * legend.max, &legend.unit));
+        write_text(out, (left + part * bar, 42.0), anchor, true, &quantity(part * legend.max, &legend.unit));
     }
 }
 
@@ -140,21 +140,21 @@ fn strip_of(out: &mut String, strip: &Strip, width: f64) -> f64 {
     let rows: usize = strip.groups.iter().map(|group| group.rows.len()).sum();
     let row = if rows > 20 { 14.0 } else { 18.0 };
     let captions = strip.groups.iter().flat_map(|group| &group.rows).map(|row| row.caption.chars().count());
-    let left = MARGIN + LETTER * captions.max().unwrap_or(0) as f64 + 10.0;
+    let left = MARGIN + LETTER_WIDTH * captions.max().unwrap_or(0) as f64 + 10.0;
     let right = width - 24.0;
-    let time = Axis::new("time", "s").between(strip.seconds.0, strip.seconds.1);
-    let span = Span::new(&time, [].into_iter(), 0.0);
-    let place = |seconds: f64| left + span.place(seconds).clamp(0.0, 1.0) * (right - left);
-    let (mut tracks, mut levels, mut y) = (String::new(), Levels::default(), LEGEND);
+    let time = Axis::new("time", "s").with_ends(strip.seconds.0, strip.seconds.1);
+    let span = AxisSpan::new(&time, [].into_iter(), 0.0);
+    let place = |seconds: f64| left + span.position(seconds).clamp(0.0, 1.0) * (right - left);
+    let (mut tracks, mut levels, mut y) = (String::new(), Levels::default(), LEGEND_HEIGHT);
     for group in &strip.groups {
-        words(out, (MARGIN, y + 16.0), Anchor::Start, false, &group.title);
-        y += HEADING;
+        write_text(out, (MARGIN, y + 16.0), Anchor::Start, false, &group.title);
+        y += HEADING_HEIGHT;
         for of_cell in &group.rows {
-            words(out, (left - 8.0, y + row * 0.5 + 4.5), Anchor::End, true, &of_cell.caption);
+            write_text(out, (left - 8.0, y + row * 0.5 + 4.5), Anchor::End, true, &of_cell.caption);
             rectangle(&mut tracks, (left, y), (right - left, row - 2.0));
             for (from, to, value) in &of_cell.values {
                 let (from, to) = (place(*from), place(*to));
-                let path = levels.of(*value, strip.legend.max);
+                let path = levels.path_of_value(*value, strip.legend.max);
                 path.into_iter()
                     .for_each(|path| rectangle(path, (from, y), ((to - from).max(0.5) + SEAM, row - 2.0)));
             }
@@ -169,15 +169,15 @@ fn strip_of(out: &mut String, strip: &Strip, width: f64) -> f64 {
     for tick in span.ticks(most) {
         let x = place(tick);
         let _ = write!(axis, "M{x:.1} {y:.1}v5");
-        words(out, (x, y + 19.0), Anchor::Middle, false, &span.caption(tick, most));
+        write_text(out, (x, y + 19.0), Anchor::Middle, false, &span.caption(tick, most));
     }
     line(out, &axis);
-    words(out, ((left + right) / 2.0, y + 38.0), Anchor::Middle, false, &span.title(&time));
+    write_text(out, ((left + right) / 2.0, y + 38.0), Anchor::Middle, false, &span.title(&time));
     y + 46.0
 }
 
 /// The cells of one panel, and the area that they cover in m.
-struct Sheet<'a> {
+struct PanelLayout<'a> {
     panel: &'a Panel,
     /// The smallest coordinates of the area in m; in the next field, its width and height.
     from: [f64; 2],
@@ -188,7 +188,7 @@ struct Sheet<'a> {
     turn: f64,
 }
 
-impl<'a> Sheet<'a> {
+impl<'a> PanelLayout<'a> {
     fn new(panel: &'a Panel) -> Self {
         let nearest = panel.cells.iter().filter_map(|cell| {
             let [x, y] = cell.at;
@@ -219,14 +219,15 @@ impl<'a> Sheet<'a> {
 
 fn map_of(out: &mut String, map: &Map, width: f64) -> f64 {
     legend(out, &map.legend, width);
-    let sheets: Vec<_> = map.panels.iter().filter(|panel| !panel.cells.is_empty()).map(Sheet::new).collect();
-    let max = |of: &dyn Fn(&Sheet<'_>) -> f64| sheets.iter().map(of).fold(f64::MIN_POSITIVE, f64::max);
+    let sheets: Vec<_> =
+        map.panels.iter().filter(|panel| !panel.cells.is_empty()).map(PanelLayout::new).collect();
+    let max = |of: &dyn Fn(&PanelLayout<'_>) -> f64| sheets.iter().map(of).fold(f64::MIN_POSITIVE, f64::max);
     let pitch = sheets.iter().map(|sheet| sheet.pitch).fold(f64::INFINITY, f64::min);
     // Scale in pixels per metre, the same for all links.
-    let scale = (PITCH / pitch).min((width - 2.0 * MARGIN - 50.0) / max(&|sheet| sheet.size[0]));
-    let (mut x, mut y, mut height) = (MARGIN, LEGEND, 0.0_f64);
+    let scale = (MAX_PITCH / pitch).min((width - 2.0 * MARGIN - 50.0) / max(&|sheet| sheet.size[0]));
+    let (mut x, mut y, mut height) = (MARGIN, LEGEND_HEIGHT, 0.0_f64);
     for sheet in &sheets {
-        let title = LETTER * sheet.panel.title.chars().count() as f64;
+        let title = LETTER_WIDTH * sheet.panel.title.chars().count() as f64;
         let wide = (sheet.size[0] * scale + 50.0).max(title);
         if x > MARGIN && x + wide > width - MARGIN {
             (x, y, height) = (MARGIN, y + height, 0.0);
@@ -238,9 +239,15 @@ fn map_of(out: &mut String, map: &Map, width: f64) -> f64 {
 }
 
 /// Draws one link, and returns its height in pixels, including heading and axis.
-fn panel_of(out: &mut String, sheet: &Sheet<'_>, legend: &Legend, (x, y): (f64, f64), scale: f64) -> f64 {
-    words(out, (x, y + 14.0), Anchor::Start, false, &sheet.panel.title);
-    let (left, top) = (x + 44.0, y + HEADING);
+fn panel_of(
+    out: &mut String,
+    sheet: &PanelLayout<'_>,
+    legend: &Legend,
+    (x, y): (f64, f64),
+    scale: f64,
+) -> f64 {
+    write_text(out, (x, y + 14.0), Anchor::Start, false, &sheet.panel.title);
+    let (left, top) = (x + 44.0, y + HEADING_HEIGHT);
     let [wide, high] = sheet.size.map(|size| size * scale);
     let mut ground = String::new();
     rectangle(&mut ground, (left, top), (wide, high));
@@ -271,7 +278,7 @@ fn panel_of(out: &mut String, sheet: &Sheet<'_>, legend: &Legend, (x, y): (f64, 
         let y = top + (first + along - sheet.from[1]) * scale;
         let _ = write!(axis, "M{left:.1} {y:.1}h-5");
         let text = if at == 0 { "0 cm".to_owned() } else { format!("{:.0}", along * 100.0) };
-        words(out, (left - 7.0, y + 4.5), Anchor::End, true, &text);
+        write_text(out, (left - 7.0, y + 4.5), Anchor::End, true, &text);
     }
     let bottom = top + high;
     if sheet.panel.radius.is_some() {
@@ -281,14 +288,14 @@ fn panel_of(out: &mut String, sheet: &Sheet<'_>, legend: &Legend, (x, y): (f64, 
             let x = left + inner + part * (wide - 2.0 * inner);
             let _ = write!(axis, "M{x:.1} {bottom:.1}v5");
             if wide > 200.0 || at % 2 == 0 {
-                words(out, (x, bottom + 18.0), Anchor::Middle, true, degrees);
+                write_text(out, (x, bottom + 18.0), Anchor::Middle, true, degrees);
             }
         }
     } else {
-        words(out, (left, bottom + 18.0), Anchor::Start, true, "flat");
+        write_text(out, (left, bottom + 18.0), Anchor::Start, true, "flat");
     }
     line(out, &axis);
-    HEADING + high + 24.0
+    HEADING_HEIGHT + high + 24.0
 }
 
 fn hexagon(out: &mut String, value: Option<f64>, legend: &Legend, caption: &str, path: &str) {

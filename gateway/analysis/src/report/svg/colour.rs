@@ -52,7 +52,7 @@ pub(super) fn level(value: f64, max: f64) -> usize {
 }
 
 /// Adds the CSS rules with which a dark screen replaces the colours.
-pub(super) fn dark(rules: &mut String) {
+pub(super) fn add_dark_rules(rules: &mut String) {
     let [_, track] = TRACK;
     let _ = write!(rules, ".track{{fill:{track}}}");
     for level in 0..LEVELS {

@@ -3,7 +3,8 @@ use crate::report::figure::{Axis, LowerDiagram};
 use roxmltree::{Document, Node};
 
 fn figure(series: Vec<Series>) -> Figure {
-    let (x, y) = (Axis::new("time", "s").between(0.0, 10.0), Axis::new("torque", "Nm").between(-1.0, 1.0));
+    let (x, y) =
+        (Axis::new("time", "s").with_ends(0.0, 10.0), Axis::new("torque", "Nm").with_ends(-1.0, 1.0));
     Figure {
         name: "figure".to_owned(),
         title: "A <title> & more".to_owned(),
@@ -41,17 +42,17 @@ fn values_stand_where_the_axes_say() {
     let [(left, bottom), (middle, half), (right, top)] = places[0][..] else { panic!("{places:?}") };
     assert!(left < right && top < bottom, "to the right and upwards: {places:?}");
     assert!(((left + right) / 2.0 - middle).abs() <= 1.0 && ((top + bottom) / 2.0 - half).abs() <= 1.0);
-    let (width, height) = natural(Size::Wide);
-    assert!(left > 0.0 && right < f64::from(width) * f64::from(UNIT));
-    assert!(top > 0.0 && bottom < f64::from(height) * f64::from(UNIT));
+    let (width, height) = natural_size(FigureWidth::Wide);
+    assert!(left > 0.0 && right < f64::from(width) * f64::from(UNITS_PER_PIXEL));
+    assert!(top > 0.0 && bottom < f64::from(height) * f64::from(UNITS_PER_PIXEL));
     // The label of a tick is at its value.
     let words: Vec<_> = document.descendants().filter(|node| node.has_tag_name((SVG, "text"))).collect();
     let at = |word: &str, axis: &str| {
         let node = words.iter().find(|node| node.text().unwrap().trim() == word).unwrap();
         node.attribute(axis).unwrap().parse::<f64>().unwrap()
     };
-    assert!((at("5", "x") - middle).abs() <= f64::from(UNIT), "{} {middle}", at("5", "x"));
-    assert!((at("0.0", "y") - half).abs() <= f64::from(UNIT), "{} {half}", at("0.0", "y"));
+    assert!((at("5", "x") - middle).abs() <= f64::from(UNITS_PER_PIXEL), "{} {middle}", at("5", "x"));
+    assert!((at("0.0", "y") - half).abs() <= f64::from(UNITS_PER_PIXEL), "{} {half}", at("0.0", "y"));
     for word in ["time (s)", "torque (Nm)", "a \"line\" & more"] {
         assert!(words.iter().any(|node| node.text().unwrap().trim() == word), "{word} in {text}");
     }
@@ -117,7 +118,7 @@ fn an_hour_at_500_hz_is_a_small_drawing() {
 
 #[test]
 fn every_colour_has_another_one_on_a_dark_screen() {
-    let rules = dark();
+    let rules = dark_rules();
     for (_, class, colour) in CLASSES {
         assert!(rules.contains(&format!(".{class}-s{{stroke:{colour}}}")));
     }
@@ -139,11 +140,11 @@ fn a_diagram_below_has_its_own_scale_and_the_same_time() {
     let upper = [(0.0, -100_000.0), (10.0, 100_000.0)];
     let lower = Series::new("", Shape::Line, vec![(0.0, -1e-4), (10.0, 1e-4)]);
     let below = LowerDiagram {
-        y: Axis::new("difference", "Nm").between(-1e-4, 1e-4),
+        y: Axis::new("difference", "Nm").with_ends(-1e-4, 1e-4),
         series: vec![lower],
         marks: Vec::new(),
     };
-    let upper = Figure { y: Axis::new("torque", "Nm").between(-1e5, 1e5), ..figure(vec![line(&upper)]) };
+    let upper = Figure { y: Axis::new("torque", "Nm").with_ends(-1e5, 1e5), ..figure(vec![line(&upper)]) };
     let text = draw(&upper.below(below));
     let document = Document::parse(&text).unwrap();
     let places = lines(&document, "c0-s");
@@ -153,8 +154,8 @@ fn a_diagram_below_has_its_own_scale_and_the_same_time() {
     };
     assert_eq!((left, right), (from, to), "one time axis, whatever the widths of the numbers");
     assert!(top < bottom && bottom < highest && highest < lowest, "{places:?}");
-    let (_, height) = natural(Size::Wide);
-    assert!(*lowest < f64::from(height + BELOW) * f64::from(UNIT), "inside");
+    let (_, height) = natural_size(FigureWidth::Wide);
+    assert!(*lowest < f64::from(height + LOWER_DIAGRAM_HEIGHT) * f64::from(UNITS_PER_PIXEL), "inside");
     let words: Vec<_> = document
         .descendants()
         .filter(|node| node.has_tag_name((SVG, "text")))

@@ -2,8 +2,8 @@
 
 use super::super::*;
 use crate::fit::traffic::BenchFrames;
-use crate::fit::verdict::Verdict;
-use model::generate::{Target, generate};
+use crate::fit::verdict::FitVerdict;
+use model::generate::{SkinRequest, generate};
 use protocol::can::{BIT_RATE_SWITCH, FD_FORMAT, Format};
 use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
@@ -116,16 +116,16 @@ impl Run {
         (1..=cells).for_each(|node| self.say(&heartbeat(node, State::CONFIGURED)));
     }
 
-    fn shadow(&self, options: Options) -> BusShadow {
+    fn shadow(&self, options: ShadowOptions) -> BusShadow {
         let mut shadow = Shadow::new(options).unwrap();
-        self.frames.iter().for_each(|(at, frame)| shadow.frame("vcan0", *at, frame));
+        self.frames.iter().for_each(|(at, frame)| shadow.receive("vcan0", *at, frame));
         shadow.finish();
         shadow.report().buses.remove(0)
     }
 }
 
-fn options() -> Options {
-    Options::new("1M/5M".parse().unwrap())
+fn options() -> ShadowOptions {
+    ShadowOptions::new("1M/5M".parse().unwrap())
 }
 
 #[test]
@@ -155,7 +155,7 @@ fn with_what_only_a_bench_sends_it_is_as_without_unless_it_is_requested_for() {
         assert_eq!((&with.this_run, with.stretches), (&plain.this_run, plain.stretches));
         assert_eq!(with.delay_us, plain.delay_us);
         assert_eq!(with.answering, plain.answering);
-        let all = bench.shadow(Options { bench_traffic: true, ..options() });
+        let all = bench.shadow(ShadowOptions { bench_traffic: true, ..options() });
         assert!(!all.counts.bench_omitted && with.counts.bench_omitted);
         assert_eq!(all.counts.bench, with.counts.bench, "they are counted all the same");
         assert_eq!(all.counts.sent, with.counts.sent + all.counts.bench.total());
@@ -177,7 +177,7 @@ fn start_up_stands_apart_and_what_follows_is_as_in_a_capture_that_begins_in_the_
         // 21 packets in 16 ms.
         let run = shadow.this_run.as_ref().unwrap();
         assert!(run.load < 0.36 && shadow.load.worst_16_ms.value < 0.36, "{:?}", shadow.load);
-        assert_eq!(run.verdict, Verdict::Fits);
+        assert_eq!(run.verdict, FitVerdict::Fits);
         assert_eq!(shadow.stretches.count, 0);
         let answering = shadow.answering.unwrap();
         assert_eq!((answering.epochs, answering.most, answering.cells), (130, 20, 100));
@@ -201,8 +201,8 @@ fn a_second_part_of_a_recording_has_no_start_up_even_if_joints_come_late() {
     let mut first = Run::new(Format::Fd);
     first.epoch(0);
     let mut shadow = Shadow::new(options()).unwrap();
-    shadow.latched("vcan0", BEGIN - 9 * MS, &first.frames[0].1);
-    run.frames.iter().for_each(|(at, frame)| shadow.frame("vcan0", *at, frame));
+    shadow.receive_latched("vcan0", BEGIN - 9 * MS, &first.frames[0].1);
+    run.frames.iter().for_each(|(at, frame)| shadow.receive("vcan0", *at, frame));
     shadow.finish();
     assert!(shadow.report().buses[0].start_up.is_none());
 }
@@ -249,12 +249,12 @@ fn while_cells_are_halted_nobody_is_expected_to_answer() {
 
 #[test]
 fn beside_the_run_stands_the_worst_case_of_the_skin_at_the_same_rates() {
-    let text = generate(&Target { cells: 253, ..Target::default() }).unwrap();
+    let text = generate(&SkinRequest { cells: 253, ..SkinRequest::default() }).unwrap();
     let skin = Skin::parse("skin.toml", &text).unwrap();
     let mut run = Run::new(Format::Fd);
     run.start(253);
     run.operate(130, 120);
-    let shadow = run.shadow(Options { skin: Some(skin), ..options() });
+    let shadow = run.shadow(ShadowOptions { skin: Some(skin), ..options() });
     assert_eq!(
         shadow.worst_case.unwrap().to_string(),
         "worst case: 118.9 % of 1M/5M: does not fit: bandwidth (all 253 cells answer)"
@@ -288,8 +288,8 @@ fn an_answer_that_was_ready_too_late_for_any_bus_does_not_count_for_the_verdict(
         let replies = shadow.replies.unwrap();
         (replies.late > 0, replies.late == replies.late_when_ready, shadow.this_run.unwrap().verdict)
     };
-    assert_eq!(verdict(15_900_000), (true, true, Verdict::Fits));
-    assert_eq!(verdict(13_000_000), (true, false, Verdict::Deadline));
+    assert_eq!(verdict(15_900_000), (true, true, FitVerdict::Fits));
+    assert_eq!(verdict(13_000_000), (true, false, FitVerdict::Deadline));
 }
 
 #[test]
@@ -312,7 +312,7 @@ fn another_protocol_is_counted_in_full_whatever_it_looks_like() {
         (shadow.counts.sent, shadow.counts.bench.total(), shadow.start_up.is_none()),
         (3_012, 0, true)
     );
-    assert_eq!(shadow.this_run.unwrap().case(), "this capture");
+    assert_eq!(shadow.this_run.unwrap().case_name(), "this capture");
     // Classic frames as in a car.
     let mut run = Run::new(Format::Classic);
     for step in 0..3_000_u32 {

@@ -12,8 +12,8 @@ use protocol::packet::{Epoch, Words};
 use protocol::schema::Units;
 use protocol::time::Micros;
 
-use super::WINDOW;
-use super::states::contact::{Contact, End};
+use super::REPLY_WINDOW;
+use super::states::contact::{EndNow, RecordedContact};
 use super::states::first_joints::{self, FirstJoints};
 use super::states::line::{self, BusCondition};
 use super::states::pass::{self, Pass};
@@ -24,13 +24,13 @@ use super::tally::Uncompared;
 use crate::replay::difference::ReplyKind;
 use crate::replay::survey::SurveyedCell as Surveyed;
 use model::latched::KnownContacts;
-use model::latched::State;
+use model::latched::LatchedState;
 
 /// Maximum number of remembered unanswered requests per cell.
-const ANNOUNCED: usize = 256;
+const MAX_PENDING_REQUESTS: usize = 256;
 /// Number of the last joint broadcasts of the recording within which a request may lack its answer because the
 /// recording ended.
-const AT_THE_END: u64 = 8;
+const FINAL_JOINTS: u64 = 8;
 
 /// A cell on the bus now.
 #[derive(Clone, Copy, Debug, Default)]
@@ -90,17 +90,17 @@ pub(super) struct Round {
 impl Round {
     /// Returns true if sums of this epoch answer the last sending of these joints, not an earlier one.
     pub(super) fn has_sums_of(&self, epoch: Epoch) -> bool {
-        self.sending.under().unwrap_or(self.epoch) == epoch
+        self.sending.sent_epoch().unwrap_or(self.epoch) == epoch
     }
 
     /// Returns true if a stimulus touches the cell at these joints, or `None` if unknown.
     pub(super) fn is_touched(&self, cell: CellId) -> Option<bool> {
-        self.touched.last().and_then(|touched| touched.is(cell))
+        self.touched.last().and_then(|touched| touched.in_contact(cell))
     }
 
     /// Returns true if a cell that receives these joints replies: with a torque, or with the end of its contact.
     pub(super) fn may_answer(&self, cell: CellId) -> bool {
-        self.touched.iter().any(|touched| touched.is(cell) == Some(true))
+        self.touched.iter().any(|touched| touched.in_contact(cell) == Some(true))
     }
 }
 
@@ -109,30 +109,30 @@ impl Round {
 pub(super) struct KnownCell {
     pub(super) cell: Surveyed,
     /// State of the cell's contact in the recording.
-    pub(super) contact: Contact,
+    pub(super) contact: RecordedContact,
     /// End of the cell's contact in this replay, compared with the recording.
-    pub(super) end: End,
+    pub(super) end: EndNow,
 }
 
 impl KnownCell {
     pub(super) fn new(cell: Surveyed) -> Self {
-        Self { cell, contact: Contact::default(), end: End::default() }
+        Self { cell, contact: RecordedContact::default(), end: EndNow::default() }
     }
 }
 
 /// Answers to `configure` that have not been compared: those of the recording and those of this replay.
 #[derive(Debug, Default)]
-pub(super) struct Answers {
+pub(super) struct PendingAnswers {
     /// Number of rounds before each answer, the tag of the answer, and the answer.
     pub(super) recorded: VecDeque<(u64, u8, Answer)>,
     /// Recorded requests for which no answer has been read yet.
-    announced: VecDeque<Question>,
+    announced: VecDeque<PendingRequest>,
     pub(super) now: VecDeque<(u8, Answer)>,
 }
 
 /// A recorded `configure` request.
 #[derive(Clone, Copy, Debug)]
-struct Question {
+struct PendingRequest {
     tag: u8,
     /// Number of rounds before the request, and the time of the last of them.
     round: u64,
@@ -144,7 +144,7 @@ struct Question {
 struct Reading {
     pass: Pass,
     /// State at the last recorded joints, and the cells touched at them.
-    state: State,
+    state: LatchedState,
     touched: KnownContacts,
     /// Number of the first round of the pass.
     first_round: u64,
@@ -171,17 +171,17 @@ pub(super) struct BusComparator {
     /// Latest announced joints of each epoch.
     pub(super) announced: Vec<Option<Announced>>,
     /// Round of the latest recorded joints of each epoch.
-    pub(super) recorded: Vec<Option<u64>>,
+    pub(super) recorded_rounds: Vec<Option<u64>>,
     /// Number of the first element of `rounds`.
     pub(super) base: u64,
     pub(super) rounds: VecDeque<Round>,
     /// Trees of the cells, recorded and now.
     pub(super) trees: Both<Trees>,
-    pub(super) answers: BTreeMap<CellId, Answers>,
+    pub(super) answers: BTreeMap<CellId, PendingAnswers>,
     /// Cells whose last recorded sum did not end a contact. Each must send another sum, or the end of the contact.
-    pub(super) speaking: BTreeSet<CellId>,
+    pub(super) contributing: BTreeSet<CellId>,
     /// True if cells were configured to send sensor frames without request, which arrive at times of their own.
-    pub(super) senses: bool,
+    pub(super) sends_unrequested_sensors: bool,
     /// State of each cell's first joints since its start, in the recording and in this replay.
     pub(super) first_joints: Both<PerCell<FirstJoints>>,
     reading: Reading,
@@ -194,7 +194,7 @@ pub(super) struct BusComparator {
 
 impl BusComparator {
     /// Returns the name of the bus and the units of its torques.
-    pub(super) fn called(&self) -> (&str, Units) {
+    pub(super) fn name_and_units(&self) -> (&str, Units) {
         (&self.name, self.units)
     }
 
@@ -204,7 +204,7 @@ impl BusComparator {
             name,
             known: cells.into_iter().map(known_cell).collect(),
             announced: vec![None; 256],
-            recorded: vec![None; 256],
+            recorded_rounds: vec![None; 256],
             ..Self::default()
         }
     }
@@ -219,7 +219,7 @@ impl BusComparator {
     }
 
     /// Handles an event of the bus.
-    pub(super) const fn line(&mut self, input: line::Input) {
+    pub(super) const fn handle_bus_event(&mut self, input: line::Input) {
         self.line = self.line.next(input);
     }
 
@@ -230,7 +230,7 @@ impl BusComparator {
 
     /// Returns the round of the latest recorded joints of an epoch.
     pub(super) fn recorded_round(&mut self, epoch: Epoch) -> Option<&mut Round> {
-        let number = self.recorded.get(usize::from(epoch.0)).copied().flatten()?;
+        let number = self.recorded_rounds.get(usize::from(epoch.0)).copied().flatten()?;
         self.round(number)
     }
 
@@ -283,7 +283,7 @@ impl BusComparator {
 
     /// Drops recorded replies to messages that were not sent. Replies to messages after the last joints are not
     /// expected either, because it is unknown whether those messages were sent.
-    pub(super) fn forget_the_unsent(&mut self) {
+    pub(super) fn drop_unsent(&mut self) {
         let sent = self.sent;
         for answers in self.answers.values_mut() {
             answers.recorded.retain(|(rounds, ..)| *rounds < sent);
@@ -295,7 +295,7 @@ impl BusComparator {
 
     /// Starts another pass over the capture.
     pub(super) fn begin(&mut self) {
-        self.recorded.fill(None);
+        self.recorded_rounds.fill(None);
         let mut reading = Reading { first_round: self.rounds_so_far(), ..Reading::default() };
         reading.next(pass::Input::Begins);
         self.reading = reading;
@@ -311,17 +311,17 @@ impl BusComparator {
         let last = self.reading.state.last_epoch();
         let input = if is_sent { pass::Input::Joints { last } } else { pass::Input::NotSent };
         let is_first = self.reading.next(input);
-        let before = self.take_joints(epoch);
+        let before = self.apply_joints(epoch);
         if is_sent {
             let touched = [before, self.reading.touched];
             self.rounds.push_back(Round { epoch, nanos, touched, is_first, ..Round::default() });
         }
         let round = is_sent.then_some(number);
-        *self.recorded.get_mut(usize::from(epoch.0))? = round;
+        *self.recorded_rounds.get_mut(usize::from(epoch.0))? = round;
         round
     }
 
-    fn take_joints(&mut self, epoch: Epoch) -> KnownContacts {
+    fn apply_joints(&mut self, epoch: Epoch) -> KnownContacts {
         self.reading.state.apply(&Message::Joints { epoch, joints: Joints::default() });
         std::mem::replace(&mut self.reading.touched, self.reading.state.touched())
     }
@@ -332,7 +332,7 @@ impl BusComparator {
             self.reading.next(pass::Input::NotSent);
         }
         if let Message::Joints { epoch, .. } = *message {
-            self.take_joints(epoch);
+            self.apply_joints(epoch);
         } else {
             self.reading.state.apply(message);
         }
@@ -341,10 +341,10 @@ impl BusComparator {
             let nanos = self.rounds.back().map_or(0, |round| round.nanos);
             for cell in self.known.keys().filter(|cell| to.addresses(**cell)) {
                 let announced = &mut self.answers.entry(*cell).or_default().announced;
-                if announced.len() == ANNOUNCED {
+                if announced.len() == MAX_PENDING_REQUESTS {
                     announced.pop_front();
                 }
-                announced.push_back(Question { tag, round, nanos });
+                announced.push_back(PendingRequest { tag, round, nanos });
             }
         }
     }
@@ -358,8 +358,8 @@ impl BusComparator {
     /// the part have had this epoch yet.
     fn is_earlier(&self, epoch: Epoch) -> bool {
         let Reading { pass, state, first_round, .. } = &self.reading;
-        let last = pass.earlier(state.last_epoch());
-        self.rounds_so_far() - first_round < WINDOW
+        let last = pass.earlier_epoch(state.last_epoch());
+        self.rounds_so_far() - first_round < REPLY_WINDOW
             && last.is_some_and(|last| (0..100).contains(&last.epochs_since(epoch)))
     }
 
@@ -380,12 +380,12 @@ impl BusComparator {
     /// its sums go to that parent from the next joints on.
     pub(super) fn record_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let next = self.base + self.rounds.len() as u64;
-        let last = self.recorded.get(usize::from(epoch.0)).copied().flatten();
+        let last = self.recorded_rounds.get(usize::from(epoch.0)).copied().flatten();
         self.trees.recorded.set_parent(cell, parent, last.map_or(next, |last| last + 1));
     }
 
     /// Adds the parent that a cell reports in this replay.
-    fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
+    fn note_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let last = self.announced(epoch).and_then(|announced| announced.round);
         self.trees.now.set_parent(cell, parent, last.map_or(self.sent, |last| last + 1));
     }
@@ -408,23 +408,23 @@ impl BusComparator {
                 progress::Input::ReportsOther
             });
             if !present.claim.is_settled() {
-                self.hear_parent(cell, epoch, None);
+                self.note_parent(cell, epoch, None);
             }
         } else if let NetworkPage::Received(counts) = *page {
             let first = present.counters.map_or(counts, |(first, _)| first);
             present.counters = Some((first, counts));
         } else if let NetworkPage::Tree(tree) = page {
-            self.hear_parent(cell, epoch, tree.parent);
+            self.note_parent(cell, epoch, tree.parent);
         }
     }
 
     /// Returns the cells for which the next joints wait.
-    pub(super) fn undone(&self) -> impl Iterator<Item = CellId> {
+    pub(super) fn awaited_cells(&self) -> impl Iterator<Item = CellId> {
         self.present.iter().filter(|(_, present)| present.is_awaited()).map(|(cell, _)| *cell)
     }
 }
 
-impl Answers {
+impl PendingAnswers {
     /// Returns true if the recording explains why it lacks the answer of this tag, and counts the reason. `rounds` is
     /// the total number of rounds.
     pub(super) fn explain_extra(
@@ -440,10 +440,10 @@ impl Answers {
             return true;
         };
         let Some(at) = self.announced.iter().position(|announced| announced.tag == tag) else { return false };
-        let Some(Question { round, nanos, .. }) = self.announced.remove(at) else { return false };
+        let Some(PendingRequest { round, nanos, .. }) = self.announced.remove(at) else { return false };
         if cell.is_silent_at(nanos) {
             lacking.silent += 1;
-        } else if round + AT_THE_END >= rounds {
+        } else if round + FINAL_JOINTS >= rounds {
             lacking.ended += 1;
         } else if !cell.is_counted_at(nanos) {
             lacking.uncounted += 1;
@@ -458,7 +458,7 @@ impl Answers {
 }
 
 /// Updates the state of the message's sender: whether it has received joints since its start.
-pub(super) fn take_first_joints(cells: &mut PerCell<FirstJoints>, message: &Message) {
+pub(super) fn update_first_joints(cells: &mut PerCell<FirstJoints>, message: &Message) {
     let Some((cell, input)) = first_joints::Input::from_message(message) else { return };
     if let Some(place) = cells.get_mut(cell) {
         *place = place.next(input);

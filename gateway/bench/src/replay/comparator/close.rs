@@ -6,10 +6,10 @@ use protocol::id::CellId;
 use protocol::packet::Words;
 
 use super::bus_comparator::{Both, BusComparator, KnownCell, Round};
-use super::states::contact::{self, End};
+use super::states::contact::{self, EndNow};
 use super::sums::{EpochSums, OmitReason, ROUNDING, SumComparison, compare};
 use super::tally::Uncompared;
-use super::{Comparator, First, Tally};
+use super::{Comparator, FirstDifference, Tally};
 use crate::replay::difference::{DifferenceKind, ReplyKind, SentValue};
 
 impl Comparator {
@@ -22,7 +22,7 @@ impl Comparator {
         let Some(tolerance) = tolerance.filter(|_| round.sending.is_announced()) else { return };
         if round.is_first {
             for known_cell in bus_comparator.known.values_mut() {
-                known_cell.contact = known_cell.contact.next(contact::Recorded::PassBegins);
+                known_cell.contact = known_cell.contact.next(contact::RecordedTorque::PassBegins);
             }
         }
         let at = Some((number, round.epoch, round.nanos));
@@ -32,7 +32,7 @@ impl Comparator {
             {
                 tally.count(how, round.sending.is_unsent());
                 let said = [pair.recorded, pair.now].map(|words| Some(SentValue::Words(what, words?)));
-                first.note(how, bus_comparator.called(), cell, at, said);
+                first.keep_first(how, bus_comparator.name_and_units(), cell, at, said);
             }
         }
         if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
@@ -59,14 +59,14 @@ impl BusComparator {
         let contact = known_cell.as_ref().map(|known_cell| known_cell.contact).unwrap_or_default();
         if let (Some(known_cell), Some(recorded), true) = (&mut known_cell, recorded, is_torque) {
             let is_end = recorded.is_zero();
-            let input = if is_end { contact::Recorded::End } else { contact::Recorded::Torque };
+            let input = if is_end { contact::RecordedTorque::End } else { contact::RecordedTorque::Torque };
             known_cell.contact = contact.next(input);
         }
         match (recorded, now) {
             (None, None) => None,
             (Some(recorded), Some(now)) => {
                 if let Some(known_cell) = known_cell.filter(|_| is_torque) {
-                    known_cell.end = known_cell.end.next(contact::Round::Both);
+                    known_cell.end = known_cell.end.next(contact::RoundTorques::Both);
                 }
                 let is_equal = match what {
                     ReplyKind::Torque => tally.compare_torque(&recorded, &now, tolerance),
@@ -75,7 +75,7 @@ impl BusComparator {
                 tally.equal += u64::from(is_equal);
                 (!is_equal).then_some(DifferenceKind::Different)
             }
-            (Some(_), None) if !is_torque && self.senses => {
+            (Some(_), None) if !is_torque && self.sends_unrequested_sensors => {
                 tally.lacking.sensed_otherwise += 1;
                 None
             }
@@ -86,12 +86,12 @@ impl BusComparator {
                 let was_over = contact.was_over(begins_later, round.may_answer(cell));
                 let is_later = |known_cell: &&mut KnownCell| {
                     let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
-                    is_end && (known_cell.end == End::Earlier || was_over)
+                    is_end && (known_cell.end == EndNow::Earlier || was_over)
                 };
                 let Some(known_cell) = known_cell.filter(is_later) else {
                     return Some(DifferenceKind::Missing);
                 };
-                known_cell.end = known_cell.end.next(contact::Round::LateEnd);
+                known_cell.end = known_cell.end.next(contact::RoundTorques::LateEnd);
                 tally.lacking.said_later += 1;
                 None
             }
@@ -110,7 +110,7 @@ impl BusComparator {
         number: u64,
         round: &Round,
         (tally, tolerance): (&mut Tally, u16),
-        first: &mut First,
+        first: &mut FirstDifference,
     ) {
         let then = EpochSums::new(&round.sums.recorded, &self.trees.recorded, number);
         let now = EpochSums::new(&round.sums.now, &self.trees.now, number);
@@ -160,7 +160,7 @@ impl BusComparator {
                 SumComparison::Different => DifferenceKind::Different,
                 SumComparison::Missing => DifferenceKind::Missing,
                 // The cell had to send again or end its contact then, but missed its slot.
-                SumComparison::Extra if self.speaking.contains(&cell) => {
+                SumComparison::Extra if self.contributing.contains(&cell) => {
                     lacking.slot_skipped += 1;
                     continue;
                 }
@@ -172,19 +172,25 @@ impl BusComparator {
             };
             tally.count(how, round.sending.is_unsent());
             let said = owns.map(|own| own.map(SentValue::Sum));
-            first.note(how, self.called(), cell, Some((number, round.epoch, round.nanos)), said);
+            first.keep_first(
+                how,
+                self.name_and_units(),
+                cell,
+                Some((number, round.epoch, round.nanos)),
+                said,
+            );
         }
         for (cell, count) in round.sums.recorded.counts() {
             if count > 0 {
-                self.speaking.insert(cell);
+                self.contributing.insert(cell);
             } else {
-                self.speaking.remove(&cell);
+                self.contributing.remove(&cell);
             }
         }
     }
 
     /// Compares the answers to `configure` with the recorded ones, in order.
-    pub(super) fn close_answers(&mut self, tally: &mut Tally, first: &mut First) {
+    pub(super) fn close_answers(&mut self, tally: &mut Tally, first: &mut FirstDifference) {
         for (cell, mut answers) in std::mem::take(&mut self.answers) {
             loop {
                 let known_cell = self.known.get_mut(&cell);
@@ -210,7 +216,7 @@ impl BusComparator {
                 tally.count(how, false);
                 let said =
                     [recorded, now].map(|said| said.map(|(tag, answer)| SentValue::Answer(tag, answer)));
-                first.note(how, self.called(), cell, None, said);
+                first.keep_first(how, self.name_and_units(), cell, None, said);
             }
         }
     }
@@ -225,7 +231,7 @@ fn explain_extra(
     is_end: bool,
 ) -> bool {
     // After an apparent restart, the cell's contact state is unknown: the contact may continue.
-    let is_free = round.touched.iter().all(|touched| touched.is(cell) == Some(false));
+    let is_free = round.touched.iter().all(|touched| touched.in_contact(cell) == Some(false));
     let Some(known_cell) = known_cell else {
         // The recording lacks this cell altogether.
         lacking.silent += 1;
@@ -254,6 +260,6 @@ fn explain_extra(
         return false;
     }
     // Counters show how many messages are missing, but not which: the end may have been sent later.
-    known_cell.end = known_cell.end.next(contact::Round::Extra { is_end });
+    known_cell.end = known_cell.end.next(contact::RoundTorques::Extra { is_end });
     true
 }

@@ -26,32 +26,32 @@ use protocol::schema::Units;
 use protocol::skin::Skin;
 
 pub use bus_comparator::PresentCell;
-use bus_comparator::{Announced, Both, BusComparator, take_first_joints};
+use bus_comparator::{Announced, Both, BusComparator, update_first_joints};
 use states::first_joints::FirstJoints;
 use states::progress::Progress;
 use states::{line, sending};
 pub use sums::OwnTerm;
 use sums::{CellSum, EpochSums};
-pub use tally::{Steps, Tally, Uncompared};
+pub use tally::{StepHistogram, Tally, Uncompared};
 
 use super::difference::{Difference, DifferenceKind, Position, ReplyKind, SentValue};
 use super::survey::SurveyedCell as Surveyed;
 
 /// Maximum number of joint broadcasts between the joints that a reply answers and the arrival of the reply. It is far
 /// below the number of epochs, 256.
-const WINDOW: u64 = 100;
+const REPLY_WINDOW: u64 = 100;
 
 /// The first difference found.
 #[derive(Debug)]
-struct First {
+struct FirstDifference {
     /// Start of the capture in ns since 1970.
     nanos: u64,
     difference: Option<Difference>,
 }
 
-impl First {
+impl FirstDifference {
     /// Keeps the first difference, with the number, the epoch and the time of the joints that the reply answers.
-    fn note(
+    fn keep_first(
         &mut self,
         how: DifferenceKind,
         (bus, units): (&str, Units),
@@ -80,7 +80,7 @@ pub struct Comparator {
     /// True while a state is restored: replies then differ from the capture's.
     is_muted: bool,
     tally: Tally,
-    first: First,
+    first: FirstDifference,
     other_gateway: Option<usize>,
 }
 
@@ -100,13 +100,13 @@ impl Comparator {
             tolerance,
             is_muted: true,
             tally: Tally::default(),
-            first: First { nanos: first_nanos, difference: None },
+            first: FirstDifference { nanos: first_nanos, difference: None },
             other_gateway: None,
         }
     }
 
     /// Sets the units of the buses that the skin describes, by name.
-    pub fn describe(&mut self, skin: &Skin) {
+    pub fn set_units(&mut self, skin: &Skin) {
         for bus in &mut self.buses {
             if let Some(index) = skin.bus_named(&bus.name) {
                 bus.units = Units::for_bus(skin, index);
@@ -153,10 +153,11 @@ impl Comparator {
         } else if let Message::Configure { request: Request::Write { number, words }, .. } = *message {
             let is_sensing = number == Parameter::Sensing.number();
             let sensing = Sensing::from_words(words).filter(|_| is_sensing);
-            bus_comparator.senses |= sensing.is_some_and(|sensing| sensing != Sensing::Off);
+            bus_comparator.sends_unrequested_sensors |=
+                sensing.is_some_and(|sensing| sensing != Sensing::Off);
         }
-        take_first_joints(&mut bus_comparator.first_joints.recorded, message);
-        let Some((cell, epoch, what, words)) = reply(message) else { return };
+        update_first_joints(&mut bus_comparator.first_joints.recorded, message);
+        let Some((cell, epoch, what, words)) = decode_reply(message) else { return };
         let untaken = FirstJoints::Awaited { epoch };
         if what != ReplyKind::Torque && bus_comparator.first_joints.recorded.get(cell) == Some(&untaken) {
             // The reply answers joints outside the replayed part, even if joints of its epoch were on the bus by then.
@@ -200,7 +201,11 @@ impl Comparator {
         let Some(number) = round else { return };
         it.sent = it.sent.max(number + 1);
         it.send(number, sending::Input::Sent { under: epoch });
-        while self.buses.get(bus_index).is_some_and(|bus_comparator| bus_comparator.base + WINDOW < number) {
+        while self
+            .buses
+            .get(bus_index)
+            .is_some_and(|bus_comparator| bus_comparator.base + REPLY_WINDOW < number)
+        {
             self.close_round(bus_index);
         }
     }
@@ -227,8 +232,8 @@ impl Comparator {
     /// Handles a message that another sender has sent on a bus.
     pub fn observe(&mut self, index: usize, message: &Message) {
         let Some(bus_comparator) = self.buses.get_mut(index) else { return };
-        bus_comparator.line(line::Input::Message);
-        take_first_joints(&mut bus_comparator.first_joints.now, message);
+        bus_comparator.handle_bus_event(line::Input::Message);
+        update_first_joints(&mut bus_comparator.first_joints.now, message);
         if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
             bus_comparator.network(cell, epoch, &page);
         } else if let Message::Joints { .. } | Message::Network { .. } = message {
@@ -247,7 +252,7 @@ impl Comparator {
         {
             round.sums.now.insert(from, CellSum { torque, count });
         }
-        let Some((cell, epoch, what, words)) = reply(message) else { return };
+        let Some((cell, epoch, what, words)) = decode_reply(message) else { return };
         let untaken = FirstJoints::Awaited { epoch };
         if what != ReplyKind::Torque && bus_comparator.first_joints.now.get(cell) == Some(&untaken) {
             return;
@@ -264,9 +269,9 @@ impl Comparator {
             Some(_) => {
                 self.tally.extra += 1;
                 let said = [None, Some(SentValue::Words(what, words))];
-                self.first.note(
+                self.first.keep_first(
                     DifferenceKind::Extra,
-                    bus_comparator.called(),
+                    bus_comparator.name_and_units(),
                     cell,
                     Some((number, epoch, nanos)),
                     said,
@@ -278,14 +283,14 @@ impl Comparator {
     /// Returns true if all awaited cells of a bus have processed the joints that were announced last.
     #[must_use]
     pub fn is_done(&self, bus_index: usize) -> bool {
-        self.buses
-            .get(bus_index)
-            .is_none_or(|bus_comparator| bus_comparator.is_down() || bus_comparator.undone().next().is_none())
+        self.buses.get(bus_index).is_none_or(|bus_comparator| {
+            bus_comparator.is_down() || bus_comparator.awaited_cells().next().is_none()
+        })
     }
 
     /// Returns the number of cells that have processed the joints announced last, to show progress.
     #[must_use]
-    pub fn done(&self, bus_index: usize) -> usize {
+    pub fn done_count(&self, bus_index: usize) -> usize {
         self.buses.get(bus_index).map_or(0, |bus_comparator| {
             bus_comparator.present.values().filter(|present| present.progress == Progress::Done).count()
         })
@@ -317,14 +322,14 @@ impl Comparator {
             return torques;
         }
         let then = EpochSums::new(then, &bus_comparator.trees.recorded, number);
-        let misses = |cell: &CellId| is_there(cell) && !now.has(*cell) && then.feels(*cell);
+        let misses = |cell: &CellId| is_there(cell) && !now.has(*cell) && then.is_in_contact(*cell);
         torques + round.sums.recorded.cells().filter(misses).count()
     }
 
     /// Marks a bus as down, so that its cells are not awaited until the next message arrives.
     pub fn mark_down(&mut self, bus_index: usize) {
         if let Some(bus_comparator) = self.buses.get_mut(bus_index) {
-            bus_comparator.line(line::Input::Lost);
+            bus_comparator.handle_bus_event(line::Input::Lost);
         }
     }
 
@@ -370,7 +375,7 @@ impl Comparator {
     pub fn finish(&mut self, is_whole: bool) {
         self.is_muted = true;
         for bus_comparator in self.buses.iter_mut().filter(|_| !is_whole) {
-            bus_comparator.forget_the_unsent();
+            bus_comparator.drop_unsent();
         }
         for bus_comparator in 0..self.buses.len() {
             while self
@@ -405,7 +410,7 @@ fn is_compared(answer: Answer) -> bool {
 }
 
 /// Decodes a reply that carries the epoch of the joints that it answers or follows.
-fn reply(message: &Message) -> Option<(CellId, Epoch, ReplyKind, Words)> {
+fn decode_reply(message: &Message) -> Option<(CellId, Epoch, ReplyKind, Words)> {
     let (from, epoch, what) = if let Message::Torque { from, epoch, .. } = *message {
         (from, epoch, ReplyKind::Torque)
     } else if let Message::Sensors { from, epoch, page } = *message {

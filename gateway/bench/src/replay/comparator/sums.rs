@@ -19,11 +19,11 @@ use protocol::parameters::MAX_JOINTS;
 
 /// The parent of each cell, as it changes from round to round.
 #[derive(Debug, Default)]
-pub(super) struct Trees(BTreeMap<CellId, VecDeque<Step>>);
+pub(super) struct Trees(BTreeMap<CellId, VecDeque<ParentChange>>);
 
 /// A change of a cell's parent.
 #[derive(Clone, Copy, Debug)]
-struct Step {
+struct ParentChange {
     since: u64,
     /// Node id of the parent; 0 for the gateway's side, or `None` if the cell is unreachable.
     parent: Option<u8>,
@@ -34,7 +34,7 @@ impl Trees {
     pub(super) fn set_parent(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
         let steps = self.0.entry(cell).or_default();
         if steps.back().is_none_or(|last| last.parent != parent) {
-            steps.push_back(Step { since, parent });
+            steps.push_back(ParentChange { since, parent });
         }
     }
 
@@ -145,7 +145,7 @@ pub struct OwnTerm {
 
 impl OwnTerm {
     /// Returns true if all unsaturated words are zero.
-    fn is_nothing(&self) -> bool {
+    fn is_zero(&self) -> bool {
         self.steps.iter().flatten().all(|step| *step == 0)
     }
 
@@ -214,12 +214,12 @@ impl<'a> EpochSums<'a> {
         let CellSum { torque: sum, count } = *self.sums.0.get(&cell)?;
         let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
         let (mut children, mut cells) = (Vec::new(), i32::from(count));
-        let mut steps = sum.padded().map(exact);
+        let mut steps = sum.padded().map(unsaturated);
         for (child, its) in below {
             children.push(child);
             cells -= i32::from(its.count);
             for (own, &word) in steps.iter_mut().zip(its.torque.as_slice()) {
-                *own = own.zip(exact(word)).map(|(own, word)| own - word);
+                *own = own.zip(unsaturated(word)).map(|(own, word)| own - word);
             }
         }
         Some(OwnTerm { sum, count, children, steps, cells })
@@ -230,41 +230,41 @@ impl<'a> EpochSums<'a> {
     /// sums of two sendings are mixed.
     pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
         self.own_term(cell).is_some_and(|own| {
-            let adds = own.cells == 0 && !own.is_nothing();
+            let adds = own.cells == 0 && !own.is_zero();
             is_touched.is_some_and(|is_touched| is_touched != (own.cells > 0)) || is_mixed && adds
         })
     }
 
     /// Returns true if the cell itself is in contact.
-    pub(super) fn feels(&self, cell: CellId) -> bool {
+    pub(super) fn is_in_contact(&self, cell: CellId) -> bool {
         self.own_term(cell).is_some_and(|own| own.cells > 0)
     }
 
     /// Returns true if a cell's sum contains the received sums of all its children. The sum minus those sums is then
     /// the cell's own contribution.
-    fn is_whole(&self, cell: CellId, other: &Self) -> bool {
+    fn contains_children(&self, cell: CellId, other: &Self) -> bool {
         let Some(own) = self.own_term(cell) else { return true };
         let adds_up = match own.cells {
             // The sum contains the cell's own contribution but lacks the sum of a child, which counts one cell.
-            0 => own.is_nothing() || !other.feels(cell),
+            0 => own.is_zero() || !other.is_in_contact(cell),
             1 => true,
             _ => false,
         };
         // If a child's sum was received on one side only, it is unknown whether this sum contains it.
-        let silent = |child: &CellId| !self.sums.has(*child) && other.feels(*child);
+        let silent = |child: &CellId| !self.sums.has(*child) && other.is_in_contact(*child);
         adds_up && !self.children(cell).iter().any(silent)
     }
 
     /// Returns true if a cell's sum exceeds that of the other side by the sum of a former or later child. By its page,
     /// that cell is not a child in this epoch, because a page follows the change that it reports. Its sum must not be
     /// contained in another parent's sum.
-    fn holds_a_mover(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
+    fn contains_moved_cell(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
         let own_of = |cell| Some((self.own_term(cell)?, other.own_term(cell)?));
         let Some((own, its)) = own_of(cell) else { return false };
         let adds = |sum: &CellSum| {
             let words = own.steps.iter().zip(&its.steps).zip(sum.torque.padded());
-            let mut words =
-                words.filter_map(|((own, its), word)| Some(own.as_ref()? - its.as_ref()? - exact(word)?));
+            let mut words = words
+                .filter_map(|((own, its), word)| Some(own.as_ref()? - its.as_ref()? - unsaturated(word)?));
             own.cells - its.cells == i32::from(sum.count) && words.all(|left| left.unsigned_abs() <= allowed)
         };
         let is_elsewhere = |mover: &CellId| {
@@ -281,7 +281,7 @@ impl<'a> EpochSums<'a> {
     }
 
     /// Returns the cells below a cell in the tree.
-    fn below(&self, cell: CellId) -> BTreeSet<CellId> {
+    fn subtree(&self, cell: CellId) -> BTreeSet<CellId> {
         let (mut all, mut next) = (BTreeSet::new(), vec![cell]);
         while let Some(cell) = next.pop() {
             if self.sums.has(cell) && all.insert(cell) {
@@ -292,7 +292,7 @@ impl<'a> EpochSums<'a> {
     }
 }
 
-fn exact(word: i16) -> Option<i32> {
+fn unsaturated(word: i16) -> Option<i32> {
     (!Q7_8::from_bits(word).is_saturated()).then(|| i32::from(word))
 }
 
@@ -312,7 +312,7 @@ pub(super) fn compare(
     if !recorded.is_known || !now.is_known {
         return SumComparison::Omitted(OmitReason::Unknown);
     }
-    if !recorded.is_whole(cell, now) || !now.is_whole(cell, recorded) {
+    if !recorded.contains_children(cell, now) || !now.contains_children(cell, recorded) {
         return SumComparison::Omitted(OmitReason::NotTaken);
     }
     let (then, today) = (recorded.own_term(cell), now.own_term(cell));
@@ -321,7 +321,8 @@ pub(super) fn compare(
             // A word can be saturated by the sum over a whole subtree, so in another tree other cells have saturated
             // words.
             let alike = |then: i16, today: i16| {
-                exact(then).is_none() == exact(today).is_none() || recorded.below(cell) != now.below(cell)
+                unsaturated(then).is_none() == unsaturated(today).is_none()
+                    || recorded.subtree(cell) != now.subtree(cell)
             };
             // A cell that only forwards others' sums has no torque that could differ.
             let finer = 1 << (format.fraction() - TorqueFormat::Q7_8.fraction());
@@ -339,7 +340,8 @@ pub(super) fn compare(
                 });
             if same {
                 SumComparison::Equal
-            } else if now.holds_a_mover(cell, recorded, allowed) || recorded.holds_a_mover(cell, now, allowed)
+            } else if now.contains_moved_cell(cell, recorded, allowed)
+                || recorded.contains_moved_cell(cell, now, allowed)
             {
                 SumComparison::Omitted(OmitReason::NotTaken)
             } else {
@@ -349,7 +351,7 @@ pub(super) fn compare(
         (Some(then), None) if then.cells > 0 => SumComparison::Missing,
         (None, Some(today)) if today.cells > 0 => SumComparison::Extra,
         // The tree decides whether a cell forwards sums of others, but forwarding adds no torque.
-        (Some(own), None) | (None, Some(own)) if !own.is_nothing() => SumComparison::Different,
+        (Some(own), None) | (None, Some(own)) if !own.is_zero() => SumComparison::Different,
         (Some(_), None) | (None, Some(_) | None) => SumComparison::Nothing,
     }
 }

@@ -24,24 +24,24 @@ pub struct Tally {
     pub tolerated: u64,
     /// Differences between words of torques, in steps of Q3.12 (2
     /// -12 Nm).
-    pub torque_words: Steps,
+    pub torque_words: StepHistogram,
     /// Differences between words of sums without the children's sums, in steps of Q7.8 (2
     /// -8 Nm).
-    pub sum_words: Steps,
+    pub sum_words: StepHistogram,
     /// Replies that have no recorded counterpart, or whose joints were not recorded.
     pub lacking: Uncompared,
 }
 
 /// Histogram of the differences between words in this replay and in the recording, in steps.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Steps {
+pub struct StepHistogram {
     /// Number of words that differ by 0, 1, ... steps; the last entry counts all larger differences too.
     pub by_steps: [u64; 9],
     /// Largest difference in steps.
     pub max: u32,
 }
 
-impl Steps {
+impl StepHistogram {
     /// Counts the differences between the words of one reply and the recorded ones. Returns the largest of them.
     pub(super) fn count(&mut self, differences: impl IntoIterator<Item = u32>) -> u32 {
         let mut max = 0;

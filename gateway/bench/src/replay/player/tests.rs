@@ -193,7 +193,7 @@ fn what_a_bus_does_not_take_is_counted_by_its_reason() {
         plain(5_000, 0, 7),
     ];
     let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
-    assert_eq!(played.bus_links, [BusLinkTally { sent: 2, refused: 1, lost: 3, outages: 2 }]);
+    assert_eq!(played.bus_links, [BusTally { sent: 2, refused: 1, lost: 3, outages: 2 }]);
     assert_eq!(stage.unsent, [(0, 0), (0, 1)]);
     assert_eq!(
         played.failure.map(|why| why.to_string()).as_deref(),

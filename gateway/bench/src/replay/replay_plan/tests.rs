@@ -157,10 +157,10 @@ fn wire_messages_are_never_sent() {
         let selection = Selection { only, destinations: vec![Some(0)], reads: true };
         let replay_plan = ReplayPlan::new(&survey, &selection);
         let frame = port::LinkId { wire: 9, back: false }.encode_frame(port::PortMessage::Join);
-        assert_eq!(replay_plan.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));
+        assert_eq!(replay_plan.skip_reason(0, &frame, &decoded(&frame)), Some(reason::WIRE));
         // A damaged frame does not show which protocol it belongs to, and counts as foreign.
         let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();
-        assert_ne!(replay_plan.unwanted(0, &other, &decoded(&other)), Some(reason::WIRE));
+        assert_ne!(replay_plan.skip_reason(0, &other, &decoded(&other)), Some(reason::WIRE));
     }
 }
 

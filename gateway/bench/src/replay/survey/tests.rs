@@ -6,7 +6,7 @@ use super::*;
 fn counters_that_cannot_be_of_one_life_account_for_no_joints() {
     let mut cell = SurveyedCell::new(0, None);
     let mut report = |joints, after, last| {
-        cell.report(ReceivedCounts { joints, ..ReceivedCounts::default() }, Some((after, last)));
+        cell.add_counters(ReceivedCounts { joints, ..ReceivedCounts::default() }, Some((after, last)));
         (cell.untaken, cell.accounted.clone())
     };
     assert_eq!(report(0, 100, 10), (0, vec![]));
@@ -38,9 +38,9 @@ fn a_part_has_counters_elsewhere_though_one_of_its_buses_began_lost() {
 }
 
 /// A bus on which one cell sends a page of counters after some joints, 16 ms apart.
-struct Counting(Survey, u64);
+struct CountingBus(Survey, u64);
 
-impl Counting {
+impl CountingBus {
     fn take(&mut self, message: &Message) {
         for frame in message.encode().frames(Format::Fd) {
             let time = Timestamp { nanos: self.1, nine_digits: true, min_digits: 0 };
@@ -71,7 +71,7 @@ impl Counting {
 
 #[test]
 fn a_page_counts_up_to_the_joints_that_it_names() {
-    let mut bus = Counting(Survey::new(TimeRange::default()), 0);
+    let mut bus = CountingBus(Survey::new(TimeRange::default()), 0);
     bus.joints(1..=10);
     assert_eq!(bus.heard(8, 700), 0);
     bus.joints(11..=20);
@@ -83,7 +83,7 @@ fn a_page_counts_up_to_the_joints_that_it_names() {
 
 #[test]
 fn a_cell_may_have_taken_joints_before_its_first_heartbeat() {
-    let mut bus = Counting(Survey::new(TimeRange::default()), 0);
+    let mut bus = CountingBus(Survey::new(TimeRange::default()), 0);
     let heartbeat = |sent, state| NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() });
     bus.joints(1..=10);
     bus.page(10, heartbeat(900, Flags::default()));

@@ -59,12 +59,12 @@ fn look_at(change: impl FnOnce(&mut Summary)) -> Vec<String> {
 fn a_run_without_any_fault_is_well() {
     assert_eq!(Verdict::new(&well()), Verdict { well: true, look_at: Vec::new() });
     let sums = "253 cells, 575 of 575 epochs complete, 17772 replies in time, error 6.2e-5 Nm";
-    assert_eq!(well().sums_of_all(), sums);
+    assert_eq!(well().totals_line(), sums);
     assert!(Verdict::new(&Summary { outcome: Outcome::Interrupted, ..well() }).well);
 
     assert!(Verdict::new(&well_in_sums()).well);
     let sums = "253 cells, 575 of 575 epochs complete, 900 cells due in sums in time, error 3.5e-3 Nm";
-    assert_eq!(well_in_sums().sums_of_all(), sums);
+    assert_eq!(well_in_sums().totals_line(), sums);
 
     let mut two = well();
     two.buses.push(BusSummary {
@@ -74,9 +74,9 @@ fn a_run_without_any_fault_is_well() {
         ..two.buses[0].clone()
     });
     assert!(
-        two.sums_of_all().contains("576 of 576 epochs complete on 2 buses, 35544 replies"),
+        two.totals_line().contains("576 of 576 epochs complete on 2 buses, 35544 replies"),
         "{}",
-        two.sums_of_all()
+        two.totals_line()
     );
 }
 

@@ -5,7 +5,7 @@
 
 use super::*;
 use model::accelerometer::RobotState;
-use model::generate::{Target, generate};
+use model::generate::{SkinRequest, generate};
 use protocol::fixed::{Q, Q1_14};
 use protocol::message::{Joints, Message, SensorPage};
 use protocol::packet::Epoch;
@@ -50,14 +50,14 @@ fn gaps(dice: &mut Pcg64Mcg, count: u64, longest_ms: u64, length_s: f64) -> Vec<
 /// or as soon after it as possible.
 fn messages(
     skin: &Skin,
-    motion: &Motion,
+    motion: &MotionPlan,
     sensors: &Accelerometers,
     gaps: &[(u64, u64)],
     measured: Clock,
 ) -> Vec<(usize, Micros, Message)> {
     let mut sent = Vec::new();
     let joints = skin.robot.joints.len();
-    let mut q = motion.at(0.0).position;
+    let mut q = motion.state_at(0.0).position;
     let (mut tick, mut paused, mut slot, mut epoch, mut count) = (0_u64, 0_u64, None, Epoch(0), 0_u64);
     let mut gaps = gaps.iter().copied().peekable();
     let mut dice = Pcg64Mcg::seed_from_u64(7);
@@ -66,7 +66,7 @@ fn messages(
             (tick, paused) = (tick + length, paused + length);
         }
         let clock = if measured == Clock::Paused { tick - paused } else { tick };
-        let goal = motion.at((clock + 1) as f64 * TICK).position;
+        let goal = motion.state_at((clock + 1) as f64 * TICK).position;
         for ((q, goal), speed) in q.iter_mut().zip(goal).zip(&skin.controller.max_speed).take(joints) {
             *q += ((goal - *q) / TICK).clamp(-speed, *speed) * TICK;
         }
@@ -79,7 +79,8 @@ fn messages(
             for bus in 0..skin.buses.len() {
                 let chain = &skin.chain(bus).joints;
                 let mut positions = [Q1_14::ZERO; MAX_JOINTS];
-                for (word, q) in positions.iter_mut().zip(state.of_chain(chain).position).take(chain.len()) {
+                for (word, q) in positions.iter_mut().zip(state.chain_state(chain).position).take(chain.len())
+                {
                     *word = Q1_14::from_radians(q).unwrap();
                 }
                 let joints = Joints { positions, in_use: chain.len() as u8 };
@@ -91,7 +92,7 @@ fn messages(
                 Clock::Paused => (tick - paused) as f64 * TICK,
             };
             let shown: Vec<_> =
-                sensors.readings(skin, |time| motion.at(time), now + TICK, |_, force| *force).collect();
+                sensors.readings(skin, |time| motion.state_at(time), now + TICK, |_, force| *force).collect();
             for (cell, shown) in skin.cells.iter().zip(shown) {
                 let words: [f64; 3] = shown.into();
                 let page = SensorPage::Acceleration(words.map(Q::nearest));
@@ -108,14 +109,14 @@ fn messages(
 /// Records the messages as observations.
 fn recording(
     skin: &Skin,
-    motion: &Motion,
+    motion: &MotionPlan,
     sensors: &Accelerometers,
     gaps: &[(u64, u64)],
     measured: Clock,
 ) -> Observations {
     let mut seen = Observations::new(skin);
     let sent = messages(skin, motion, sensors, gaps, measured);
-    sent.iter().for_each(|(bus, at, message)| seen.take(*bus, *at, message));
+    sent.iter().for_each(|(bus, at, message)| seen.record(*bus, *at, message));
     seen
 }
 
@@ -144,7 +145,7 @@ fn is_likely(part: f64, cells: usize) -> bool {
 }
 
 fn campaign(kind: &str, clocks: &[Clock], many: impl Fn(f64) -> (u64, u64), refusals: f64, rounds: u64) {
-    let text = generate(&Target { cells: 24, ..Target::default() }).unwrap();
+    let text = generate(&SkinRequest { cells: 24, ..SkinRequest::default() }).unwrap();
     let skin = Skin::parse("skin.toml", &text).unwrap();
     let sheet = DataSheet::default();
     let mut all: Vec<_> = DURATIONS.iter().map(|_| Tally::default()).collect();
@@ -152,9 +153,9 @@ fn campaign(kind: &str, clocks: &[Clock], many: impl Fn(f64) -> (u64, u64), refu
     for round in 0..rounds {
         let place = round as usize % DURATIONS.len();
         let settings = Settings {
-            bounds: Bounds { length_s: DURATIONS[place], ..Bounds::of(&skin) },
+            bounds: Bounds { length_s: DURATIONS[place], ..Bounds::from_skin(&skin) },
             threads: 2,
-            ..Settings::of(&skin)
+            ..Settings::from_skin(&skin)
         };
         let motion =
             motions.entry(place).or_insert_with(|| plan(&skin, &settings.bounds, &sheet, GRAVITY).unwrap());
@@ -177,9 +178,9 @@ fn campaign(kind: &str, clocks: &[Clock], many: impl Fn(f64) -> (u64, u64), refu
         let mut own = [0; 3];
         for (cell, result) in skin.cells.iter().zip(&calibration.cells) {
             tally.unsure +=
-                usize::from(result.troubles.iter().any(|it| matches!(it, Trouble::NotObservable { .. })));
+                usize::from(result.troubles.iter().any(|it| matches!(it, Diagnosis::NotObservable { .. })));
             tally.named +=
-                usize::from(result.troubles.iter().any(|it| !matches!(it, Trouble::NotObservable { .. })));
+                usize::from(result.troubles.iter().any(|it| !matches!(it, Diagnosis::NotObservable { .. })));
             let Some(found) = result.found.filter(|_| result.troubles.is_empty()) else { continue };
             let [x, y, z, w] = found.orientation;
             let turned = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
@@ -249,12 +250,13 @@ fn what_is_stated_holds_after_shifts_without_a_gap_or_is_refused() {
     campaign("shifts", &[Clock::Late], |length_s| ((length_s / 2.0) as u64, 4), 1.0, recordings().min(20));
 }
 
-fn small() -> (Skin, Settings, Motion) {
+fn small() -> (Skin, Settings, MotionPlan) {
     let skin =
-        Skin::parse("skin.toml", &generate(&Target { cells: 6, ..Target::default() }).unwrap()).unwrap();
-    let bounds = Bounds { length_s: 20.0, ..Bounds::of(&skin) };
+        Skin::parse("skin.toml", &generate(&SkinRequest { cells: 6, ..SkinRequest::default() }).unwrap())
+            .unwrap();
+    let bounds = Bounds { length_s: 20.0, ..Bounds::from_skin(&skin) };
     let motion = plan(&skin, &bounds, &DataSheet::default(), GRAVITY).unwrap();
-    let settings = Settings { bounds, ..Settings::of(&skin) };
+    let settings = Settings { bounds, ..Settings::from_skin(&skin) };
     (skin, settings, motion)
 }
 
@@ -278,7 +280,7 @@ fn joints_of_another_robot_or_at_another_rate_are_refused() {
     let sent = messages(&skin, &motion, &sensors, &[], Clock::Plan);
     let refused = |described: &Skin| {
         let mut heard = Observations::new(described);
-        sent.iter().for_each(|(bus, at, message)| heard.take(*bus, *at, message));
+        sent.iter().for_each(|(bus, at, message)| heard.record(*bus, *at, message));
         calibrate(described, &heard, &settings).unwrap_err()
     };
     let mut described = skin;

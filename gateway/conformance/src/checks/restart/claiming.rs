@@ -17,7 +17,7 @@ const ATTEMPTS: usize = 4;
 /// The maximum time that a cell which waits for a processor takes to process a frame; beyond it, the whole group is
 /// repeated.
 const MARGIN: Span = Span::from_millis(100);
-const LATE: &str = "the bench was late each time: the claim was over";
+const CLAIM_OVER: &str = "the bench was late each time: the claim was over";
 
 /// Returns the earliest end of a cell's claim, from the time of its first heartbeat.
 fn earliest_end(session: &Session<'_>, claimed: Micros) -> Micros {
@@ -36,7 +36,7 @@ pub(super) fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -
             return Ok(());
         }
     }
-    session.findings.not_tested("CLAIM-2", LATE);
+    session.findings.not_tested("CLAIM-2", CLAIM_OVER);
     session.idle(claim(session))?;
     session.known.may_be_silent = false;
     session.extend_life();
@@ -257,7 +257,7 @@ pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) 
             return is_silent(session, claimed, what);
         }
     }
-    session.findings.not_tested("CLAIM-3", LATE);
+    session.findings.not_tested("CLAIM-3", CLAIM_OVER);
     Ok(())
 }
 

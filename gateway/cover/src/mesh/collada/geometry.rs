@@ -49,7 +49,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             let Some(kind) = kinds.into_iter().find(|kind| element.has_tag_name_of(kind)) else { continue };
             let corners = self.corners(element, kind)?;
             match kind {
-                "triangles" => self.plain(element, &corners, &mut filled)?,
+                "triangles" => self.read_triangles(element, &corners, &mut filled)?,
                 "polylist" => self.polylist(element, &corners, &mut filled)?,
                 "polygons" => self.polygons(element, &corners, &mut filled)?,
                 _ => {
@@ -71,7 +71,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     }
 
     /// Reads a primitive of triangles, each with three corners.
-    fn plain(
+    fn read_triangles(
         &self,
         element: Node<'a, 'i>,
         corners: &Corners,
@@ -86,7 +86,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             }
             triangles.extend_from_slice(all);
         }
-        self.counted(element, "triangles", triangles.len() - before)
+        self.check_count(element, "triangles", triangles.len() - before)
     }
 
     /// Reads a primitive of polygons whose corners are in one list.
@@ -105,7 +105,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             let got = points.len();
             return Err(self.error(&format!("a polylist has {got} corners, but its vcount {announced}")));
         }
-        self.counted(element, "polygons", sizes.len())?;
+        self.check_count(element, "polygons", sizes.len())?;
         let mut rest = points.as_slice();
         for size in sizes {
             let Some((outline, after)) = rest.split_at_checked(size) else { break };
@@ -136,11 +136,11 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             filled.add(&self.points(outline, corners)?, &holes);
             count += 1;
         }
-        self.counted(element, "polygons", count)
+        self.check_count(element, "polygons", count)
     }
 
     /// Checks that an element has as many primitives as it states, if it states a number.
-    fn counted(&self, element: Node<'_, '_>, what: &str, got: usize) -> Result<(), MeshError> {
+    fn check_count(&self, element: Node<'_, '_>, what: &str, got: usize) -> Result<(), MeshError> {
         match element.attribute("count").map(|count| count.trim().parse::<usize>()) {
             Some(Ok(count)) if count != got => {
                 Err(self.error(&format!("{got} {what} are there, but {count} are announced")))
@@ -173,7 +173,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
 
     /// Returns the element of this kind to which an input of the mesh refers. It is an element within the mesh, or else
     /// the only one with this id in the file.
-    fn referred(&self, kind: &'static str, input: Node<'_, '_>) -> Result<Node<'a, 'i>, MeshError> {
+    fn resolve(&self, kind: &'static str, input: Node<'_, '_>) -> Result<Node<'a, 'i>, MeshError> {
         let source = input.attribute("source").unwrap_or_default();
         let own = self.own.find(kind, source)?;
         let found = own.map_or_else(|| self.all.find(kind, source), |own| Ok(Some(own)))?;
@@ -192,14 +192,14 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             })?;
             stride = stride.max(offset + 1);
             if input.attribute("semantic") == Some("VERTEX") {
-                vertex = Some((offset, self.referred("vertices", input)?));
+                vertex = Some((offset, self.resolve("vertices", input)?));
             }
         }
         let (offset, vertices) = vertex.ok_or_else(|| self.error("a geometry has no vertices"))?;
         let position = |input: &Node<'_, '_>| input.attribute("semantic") == Some("POSITION");
         let position = children(vertices, "input").find(position);
         let position = position.ok_or_else(|| self.error("vertices have no position"))?;
-        let points = self.positions(self.referred("source", position)?)?;
+        let points = self.positions(self.resolve("source", position)?)?;
         Ok(Corners { kind, offset, stride, points })
     }
 
@@ -211,12 +211,12 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         let named = accessor.filter(|accessor| accessor.has_attribute("source")).map(|accessor| {
             let reference = accessor.attribute("source").unwrap_or_default();
             let near = within.find("float_array", reference)?;
-            near.map_or_else(|| self.referred("float_array", accessor), Ok)
+            near.map_or_else(|| self.resolve("float_array", accessor), Ok)
         });
         let array = named.or_else(|| child(source, "float_array").map(Ok));
         let array = array.ok_or_else(|| self.error("a source has no numbers"))??;
         let values = floats(self.name, array)?;
-        self.counted(array, "numbers of a source", values.len())?;
+        self.check_count(array, "numbers of a source", values.len())?;
         let values = values.get(number("offset").unwrap_or(0)..).unwrap_or_default();
         let stride = number("stride").unwrap_or(3);
         if stride < 3 {

@@ -42,7 +42,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
     }
     let names = ElementIds::from_nodes(name, root.descendants());
     let mut reader = SceneReader { name, names, geometry: HashMap::new(), visited: 0, triangles: Vec::new() };
-    let outer = outer(name, root, up)?;
+    let outer = asset_transform(name, root, up)?;
     let scene = child(root, "scene").and_then(|scene| child(scene, "instance_visual_scene"));
     let scene = scene.map(|instance| reader.referred(instance, "visual_scene")).transpose()?;
     let scene = scene.or_else(|| child(child(root, "library_visual_scenes")?, "visual_scene"));
@@ -82,7 +82,7 @@ fn child<'a, 'i>(node: Node<'a, 'i>, name: &'static str) -> Option<Node<'a, 'i>>
 }
 
 /// Returns the transform from the unit and axes of the file to m and z up.
-fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError> {
+fn asset_transform(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError> {
     let asset = child(root, "asset");
     let meter = asset.and_then(|asset| child(asset, "unit")?.attribute("meter"));
     let scale = match meter {

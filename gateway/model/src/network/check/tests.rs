@@ -364,7 +364,7 @@ fn exchanged_cells_and_cells_without_a_node_id_are_named() {
 
 #[test]
 fn a_wire_that_works_in_one_direction_says_which() {
-    let ends = |carries: WorkingDirection| carries.between(cell(2), cell(5));
+    let ends = |carries: WorkingDirection| carries.describe(cell(2), cell(5));
     assert_eq!(ends(WorkingDirection::Nothing), "does not work");
     assert_eq!(ends(WorkingDirection::There), "works only from cell 2 to cell 5");
     assert_eq!(ends(WorkingDirection::Back), "works only from cell 5 to cell 2");

@@ -62,7 +62,7 @@ fn motion_modes_and_faults_do_not_begin_again() {
         let [speed, highest] = [(state.position[0] - before.position[0]) / 1e-3, 0.5 * TAU / 4.0];
         assert!(speed.abs() <= highest + 1e-9, "{at_s}: {speed}");
     }
-    assert_eq!(repeating.mode_at(Micros(10_000_000)), Mode::Distributed);
+    assert_eq!(repeating.mode_at(Micros(10_000_000)), TorqueSource::Distributed);
     let touches = Touches::new(&repeating, &three());
     assert!((force(&touches, 2, 625) - 0.1).abs() < 1e-3, "10 s of drift");
 }

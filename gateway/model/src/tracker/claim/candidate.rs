@@ -26,23 +26,24 @@ const MIN_HEARTBEAT_INTERVAL: Span = Span::from_millis(100);
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct Candidate {
     last: Incarnation,
-    shown: u8,
+    consecutive: u8,
 }
 
 impl Candidate {
     /// Returns the candidate after a heartbeat that is not the owner's; `before` is the candidate before it.
     pub(super) fn next(before: Option<Self>, new: Incarnation) -> Self {
         let goes_on = |it: &Self| {
-            it.last.sent(&new).is_some() && new.at.elapsed_since(it.last.at) >= MIN_HEARTBEAT_INTERVAL
+            it.last.packets_until(&new).is_some()
+                && new.at.elapsed_since(it.last.at) >= MIN_HEARTBEAT_INTERVAL
         };
-        let shown = before.filter(goes_on).map_or(1, |it| it.shown.saturating_add(1));
-        Self { last: new, shown }
+        let shown = before.filter(goes_on).map_or(1, |it| it.consecutive.saturating_add(1));
+        Self { last: new, consecutive: shown }
     }
 
     /// Returns true if the candidate owns the node id from its last heartbeat on; `owner` is the owner so far.
     pub(super) fn succeeds(&self, owner: Option<&Incarnation>) -> bool {
         let is_silent = owner.is_none_or(|owner| !owner.is_alive(self.last.at));
-        is_silent && (self.last.has_just_started() || self.shown >= PROVING_HEARTBEATS)
+        is_silent && (self.last.has_just_started() || self.consecutive >= PROVING_HEARTBEATS)
     }
 }
 
@@ -67,20 +68,20 @@ mod tests {
 
     #[test]
     fn none_then_any() {
-        assert_eq!(after(&[(0, 7, 10)]).shown, 1);
+        assert_eq!(after(&[(0, 7, 10)]).consecutive, 1);
     }
 
     #[test]
     fn a_counter_that_goes_on_100_ms_later() {
-        assert_eq!(after(&[(0, 7, 10), (100, 7, 11)]).shown, 2);
-        assert_eq!(after(&[(0, 7, 10), (100, 7, 11), (200, 7, 11 + 2_048)]).shown, 3);
+        assert_eq!(after(&[(0, 7, 10), (100, 7, 11)]).consecutive, 2);
+        assert_eq!(after(&[(0, 7, 10), (100, 7, 11), (200, 7, 11 + 2_048)]).consecutive, 3);
     }
 
     #[test]
     fn a_counter_that_comes_sooner_or_is_another() {
         for (ms, serial, sent) in [(99, 7, 11), (100, 7, 10), (100, 7, 9), (100, 8, 11), (100, 7, 11 + 2_048)]
         {
-            assert_eq!(after(&[(0, 7, 10), (ms, serial, sent)]).shown, 1, "{ms} {serial} {sent}");
+            assert_eq!(after(&[(0, 7, 10), (ms, serial, sent)]).consecutive, 1, "{ms} {serial} {sent}");
         }
     }
 

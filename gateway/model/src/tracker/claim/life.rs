@@ -67,14 +67,14 @@ impl Incarnation {
     }
 
     /// Returns how far the counter of `other` is behind this one, modulo 2^16.
-    pub(super) const fn back(&self, other: &Self) -> u16 {
+    pub(super) const fn distance_behind(&self, other: &Self) -> u16 {
         self.heartbeat.sent.wrapping_sub(other.heartbeat.sent)
     }
 
     /// Returns the number of packets that the cell sent between its last heartbeat and `next`; `None` if `next` cannot
     /// be its next heartbeat.
-    pub(super) fn sent(&self, next: &Self) -> Option<u16> {
-        let sent = next.back(self);
+    pub(super) fn packets_until(&self, next: &Self) -> Option<u16> {
+        let sent = next.distance_behind(self);
         let is_next = self.is_same_cell(next) && self.may_go_on(next.at) && sent.cast_signed() > 0;
         (is_next && self.has_time_for(next.at, sent)).then_some(sent)
     }
@@ -86,8 +86,8 @@ impl Incarnation {
     }
 
     /// Returns true if a heartbeat is an old one of this life, or a copy of its last one.
-    pub(super) fn is_past(&self, old: &Self) -> bool {
-        let back = self.back(old);
+    pub(super) fn is_own_past(&self, old: &Self) -> bool {
+        let back = self.distance_behind(old);
         self.is_same_cell(old) && (back == 0 || back <= MAX_OVERTAKEN && old.heartbeat.sent > 1)
     }
 

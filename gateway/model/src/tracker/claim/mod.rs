@@ -29,7 +29,7 @@ pub enum HeartbeatKind {
     /// The first heartbeat of the owner, whose start was not observed.
     First,
     /// A further heartbeat of the owner.
-    Known,
+    Continued,
     /// An old heartbeat of the owner, or a copy of its last one; it contains nothing new.
     Overtaken,
     /// The first heartbeat since the cell started.
@@ -80,7 +80,7 @@ impl AddressClaim {
         match word {
             HeartbeatKind::Overtaken | HeartbeatKind::Outsider | HeartbeatKind::Claimant => {}
             HeartbeatKind::First
-            | HeartbeatKind::Known
+            | HeartbeatKind::Continued
             | HeartbeatKind::Started { .. }
             | HeartbeatKind::Shared => {
                 self.candidate = None;

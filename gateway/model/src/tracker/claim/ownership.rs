@@ -124,7 +124,7 @@ impl Ownership {
     }
 
     /// Returns the state after the owner's next heartbeat.
-    fn with_last(self, last: Incarnation) -> Self {
+    fn with_last_heartbeat(self, last: Incarnation) -> Self {
         self.owner().map_or(self, |owner| self.with_owner(owner.with_last(last)))
     }
 
@@ -133,7 +133,7 @@ impl Ownership {
         let Some(owner) = self.owner() else {
             return if new.is_settled() { Evidence::Settles } else { Evidence::Claims };
         };
-        let of_former = self.former().and_then(|former| former.sent(new));
+        let of_former = self.former().and_then(|former| former.packets_until(new));
         if !owner.is_same_cell(new) {
             return match (owner.is_settled(), new.is_settled()) {
                 (_, false) => Evidence::Claims,
@@ -146,18 +146,18 @@ impl Ownership {
             return Evidence::Starts;
         }
         let is_old_of_former =
-            || self.former().is_some_and(|former| former.is_alive(new.at) && former.is_past(new));
-        if owner.is_past(new) || owner.claimed.is_none() && is_old_of_former() {
+            || self.former().is_some_and(|former| former.is_alive(new.at) && former.is_own_past(new));
+        if owner.is_own_past(new) || owner.claimed.is_none() && is_old_of_former() {
             return Evidence::Repeats;
         }
-        match (owner.sent(new), of_former) {
+        match (owner.packets_until(new), of_former) {
             (Some(_), Some(_)) if owner.claims_until(new) => Evidence::FormerContinues,
-            (Some(own), Some(its)) if owner.claimed.is_none() && self.is_formers(new, own, its) => {
+            (Some(own), Some(its)) if owner.claimed.is_none() && self.fits_former_better(new, own, its) => {
                 Evidence::FormerContinues
             }
             (Some(_), _) => Evidence::Continues,
             (None, Some(_)) => Evidence::FormerContinues,
-            (None, None) if owner.back(new).cast_signed() < 0 && !owner.may_go_on(new.at) => {
+            (None, None) if owner.distance_behind(new).cast_signed() < 0 && !owner.may_go_on(new.at) => {
                 Evidence::Returns
             }
             (None, None) if !owner.has_time_for(new.at, new.heartbeat.sent) => Evidence::Exceeds,
@@ -167,7 +167,7 @@ impl Ownership {
 
     /// Returns true if a heartbeat that continues both counters more likely belongs to the former life. Its counter is
     /// `own` ahead of the owner's and `its` ahead of the former's.
-    fn is_formers(&self, new: &Incarnation, own: u16, its: u16) -> bool {
+    fn fits_former_better(&self, new: &Incarnation, own: u16, its: u16) -> bool {
         let is_alive = self.former().is_some_and(|former| former.is_alive(new.at));
         its < own && (is_alive || own > MAX_PACKETS_PER_HEARTBEAT && its < own / 8)
     }
@@ -205,7 +205,7 @@ impl Ownership {
                 E::Continues,
             )
             | (Self::Sole { .. } | Self::Doubted { .. }, E::Returns) => {
-                (self.with_last(new), HeartbeatKind::Known)
+                (self.with_last_heartbeat(new), HeartbeatKind::Continued)
             }
             // start
             (Self::Sole { owner }, E::Intrudes | E::Starts | E::Jumps | E::Succeeds) => {

@@ -33,7 +33,7 @@ fn two_old_heartbeats_in_order_are_no_life() {
         let of = |&(ms, sent): &(u64, u16)| (ms, 7, sent + more, State::default());
         words_at(heard.iter().map(of))
     };
-    let known = HeartbeatKind::Known;
+    let known = HeartbeatKind::Continued;
     let (old, outsider) = (HeartbeatKind::Overtaken, HeartbeatKind::Outsider);
     assert_eq!(
         words(0),
@@ -52,7 +52,7 @@ fn old_heartbeats_in_order_do_not_take_the_id_of_a_cell_that_hangs() {
     let words = words_at(heard.map(|(ms, sent)| (ms, 7, sent, State::default())));
     let count = |of: HeartbeatKind| words.iter().filter(|word| **word == of).count();
     assert_eq!(
-        (count(HeartbeatKind::First), count(HeartbeatKind::Known), count(HeartbeatKind::Outsider)),
+        (count(HeartbeatKind::First), count(HeartbeatKind::Continued), count(HeartbeatKind::Outsider)),
         (1, 6, 11),
         "{words:?}"
     );
@@ -63,7 +63,10 @@ fn a_restart_is_a_claim_or_a_counter_that_falls_back() {
     let (claims, settled) = (State::CLAIMING, State::default());
     let life = [(7, 0, claims), (7, 1, settled), (7, 65_535, settled), (7, 2, settled)];
     let started = HeartbeatKind::Started { again: false };
-    assert_eq!(words(&life), [started, HeartbeatKind::Known, HeartbeatKind::Overtaken, HeartbeatKind::Known]);
+    assert_eq!(
+        words(&life),
+        [started, HeartbeatKind::Continued, HeartbeatKind::Overtaken, HeartbeatKind::Continued]
+    );
     assert_eq!(words(&[(7, 900, settled), (7, 0, claims)]), [HeartbeatKind::First, AGAIN]);
     assert_eq!(
         words(&[(7, 900, settled), (7, 1, settled)]),
@@ -76,7 +79,7 @@ fn a_restart_is_a_claim_or_a_counter_that_falls_back() {
         [HeartbeatKind::First, HeartbeatKind::Overtaken]
     );
     // A cell that wins against another claimant sends a heartbeat while still claiming.
-    assert_eq!(words(&[(7, 0, claims), (7, 1, claims)]), [started, HeartbeatKind::Known]);
+    assert_eq!(words(&[(7, 0, claims), (7, 1, claims)]), [started, HeartbeatKind::Continued]);
 }
 
 #[test]
@@ -85,12 +88,18 @@ fn a_claimed_id_keeps_its_owner_until_the_claimant_settles() {
     let said = [(7, 9, settled), (8, 0, claims), (7, 10, settled), (8, 1, settled), (8, 2, settled)];
     assert_eq!(
         words(&said),
-        [HeartbeatKind::First, HeartbeatKind::Claimant, HeartbeatKind::Known, AGAIN, HeartbeatKind::Known]
+        [
+            HeartbeatKind::First,
+            HeartbeatKind::Claimant,
+            HeartbeatKind::Continued,
+            AGAIN,
+            HeartbeatKind::Continued
+        ]
     );
     let said = [(8, 0, claims), (7, 10, settled), (7, 11, settled)];
     assert_eq!(
         words(&said),
-        [HeartbeatKind::Started { again: false }, HeartbeatKind::First, HeartbeatKind::Known],
+        [HeartbeatKind::Started { again: false }, HeartbeatKind::First, HeartbeatKind::Continued],
         "it gave up the claim"
     );
 }
@@ -114,7 +123,8 @@ fn two_cells_that_use_one_id_in_turn_do_not_restart_each_time() {
 #[test]
 fn old_heartbeats_that_are_sent_again_take_a_living_cells_id_once_at_most() {
     let (claims, settled) = (State::CLAIMING, State::default());
-    let (shared, outsider, known) = (HeartbeatKind::Shared, HeartbeatKind::Outsider, HeartbeatKind::Known);
+    let (shared, outsider, known) =
+        (HeartbeatKind::Shared, HeartbeatKind::Outsider, HeartbeatKind::Continued);
     // Its own counter is at 900, an old one at 100.
     let said = [(0, 7, 900, settled), (50, 7, 100, settled), (250, 7, 916, settled), (300, 7, 116, settled)];
     assert_eq!(words_at(said), [HeartbeatKind::First, AGAIN, shared, outsider]);
@@ -145,7 +155,8 @@ fn old_heartbeats_that_are_sent_again_take_a_living_cells_id_once_at_most() {
 #[test]
 fn a_cell_whose_bus_was_lost_goes_on_whatever_is_sent_again_meanwhile() {
     let (claims, settled) = (State::CLAIMING, State::default());
-    let (shared, outsider, known) = (HeartbeatKind::Shared, HeartbeatKind::Outsider, HeartbeatKind::Known);
+    let (shared, outsider, known) =
+        (HeartbeatKind::Shared, HeartbeatKind::Outsider, HeartbeatKind::Continued);
     // The id was shared before the bus was lost, or was not.
     let said = [(0, 7, 916, settled), (10, 7, 100, settled), (250, 7, 932, settled)];
     let meanwhile = [(1_200, 7, 100, settled), (1_250, 7, 116, settled), (1_300, 7, 100, settled)];
@@ -170,14 +181,14 @@ fn a_quick_restart_is_not_taken_for_an_old_heartbeat() {
             [(0, 7, sent, settled), (100, 7, 0, claims), (360, 7, 1, settled), (610, 7, sent + 1, settled)];
         assert_eq!(
             words_at(said),
-            [HeartbeatKind::First, AGAIN, HeartbeatKind::Known, HeartbeatKind::Known],
+            [HeartbeatKind::First, AGAIN, HeartbeatKind::Continued, HeartbeatKind::Continued],
             "{sent}"
         );
     }
     // A cell that has been away for a long time.
     assert_eq!(
         words_at([(0, 7, 900, settled), (60_000, 7, 30_000, settled)]),
-        [HeartbeatKind::First, HeartbeatKind::Known]
+        [HeartbeatKind::First, HeartbeatKind::Continued]
     );
 }
 

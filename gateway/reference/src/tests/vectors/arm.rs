@@ -9,16 +9,16 @@ use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameter, Parameters,
 
 /// A configuration, joint positions and a touch.
 #[derive(Clone, Debug)]
-pub(crate) struct Case {
+pub(crate) struct ArmCase {
     pub(crate) parameters: Parameters,
     pub(crate) q: [Q1_14; MAX_JOINTS],
     contact: [Q5_10; 3],
 }
 
 /// A reproducible generator of numbers in [-1, 1) (Knuth's MMIX).
-struct Dice(u64);
+struct Generator(u64);
 
-impl Dice {
+impl Generator {
     fn real(&mut self) -> f64 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         f64::from(u32::try_from(self.0 >> 32).unwrap()) / f64::from(1_u32 << 31) - 1.0
@@ -30,8 +30,8 @@ impl Dice {
 }
 
 /// Returns arms of 1 to 6 joints, each with a cell on each of its links.
-pub(crate) fn cases() -> impl Iterator<Item = Case> {
-    let mut dice = Dice(1);
+pub(crate) fn cases() -> impl Iterator<Item = ArmCase> {
+    let mut dice = Generator(1);
     let sizes = (1..=6_u8).flat_map(|joints| (1..=joints).map(move |joint| (joint, joints)));
     sizes.map(move |(joint, joints)| {
         let mut rows = [Row::default(); MAX_ROWS];
@@ -48,7 +48,7 @@ pub(crate) fn cases() -> impl Iterator<Item = Case> {
         let mut q = [Q1_14::ZERO; MAX_JOINTS];
         q.iter_mut().take(usize::from(joints)).for_each(|q| *q = dice.within(2.0));
         let contact = core::array::from_fn(|_| Q5_10::nearest(1.0 + dice.real()));
-        Case {
+        ArmCase {
             parameters: Parameters {
                 joint,
                 joints,
@@ -64,7 +64,7 @@ pub(crate) fn cases() -> impl Iterator<Item = Case> {
     })
 }
 
-impl Case {
+impl ArmCase {
     /// Returns the parameter words of the rows in use.
     pub(crate) fn rows(&self) -> Vec<[i16; WORDS]> {
         (0..self.parameters.joints).map(|row| self.parameters.words(Parameter::Row(row))).collect()

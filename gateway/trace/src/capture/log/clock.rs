@@ -14,7 +14,7 @@ use crate::capture::last_times::LastTimes;
 /// The time between successive frames, in ns, that is assumed if the lines hold no times.
 const STEP_NS: u64 = 1_000;
 /// The maximum number of buses whose times are compared to find the reference.
-const BUSES: usize = 16;
+const MAX_BUSES: usize = 16;
 /// The number of comparisons after which the reference of relative times is decided.
 const MIN_COMPARISONS: u32 = 20;
 
@@ -54,7 +54,7 @@ impl fmt::Display for Remark {
 
 /// The reference of relative times: the first frame or the line before.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Relative {
+pub(super) enum TimeReference {
     First,
     Before,
 }
@@ -63,7 +63,7 @@ pub(super) enum Relative {
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(crate) struct Clock {
     /// The reference of relative times, once it is known.
-    relative: Option<Relative>,
+    relative: Option<TimeReference>,
     /// The time of the last frame, in ns.
     last: Option<u64>,
 }
@@ -82,7 +82,7 @@ impl Clock {
         self.relative.is_none()
     }
 
-    pub(super) const fn decide(&mut self, relative: Relative) {
+    pub(super) const fn decide(&mut self, relative: TimeReference) {
         self.relative = Some(relative);
     }
 
@@ -100,7 +100,7 @@ impl Clock {
             }
             Stamp::Absolute(time) => (time, None),
             Stamp::Local(time) => (time, Some(Remark::LocalTimes)),
-            Stamp::Relative(time) if self.relative == Some(Relative::Before) => {
+            Stamp::Relative(time) if self.relative == Some(TimeReference::Before) => {
                 let nanos = self.last().saturating_add(time.nanos);
                 (Timestamp { nanos, ..time }, Some(Remark::Differences))
             }
@@ -114,7 +114,7 @@ impl Clock {
 /// Compares the times of several lines to find out what they are relative to.
 #[derive(Debug, Default)]
 pub(super) struct Evidence {
-    last: LastTimes<BUSES>,
+    last: LastTimes<MAX_BUSES>,
     compared: u32,
     smaller: u32,
     same: u32,
@@ -134,11 +134,11 @@ impl Evidence {
 
     /// Returns the reference of the times. Times since the first frame grow on each bus, with few exceptions where the
     /// clock was set.
-    pub(super) const fn verdict(&self) -> Relative {
+    pub(super) const fn verdict(&self) -> TimeReference {
         if self.smaller * 8 > self.compared || self.same * 2 > self.compared {
-            Relative::Before
+            TimeReference::Before
         } else {
-            Relative::First
+            TimeReference::First
         }
     }
 }

@@ -8,7 +8,7 @@ use protocol::candump::{self, CandumpLine, Record};
 use super::clock::{Clock, Evidence, Remark};
 use super::console::{self, ConsoleFrame, ConsoleLine, Stamp};
 use crate::capture::{Entry, Note, NoteKind};
-use crate::container::read_some;
+use crate::container::read_uninterrupted;
 
 /// The maximum length of a line in bytes, with its line end: twice the longest CAN XL frame. Longer lines are cut.
 pub const MAX_LINE_BYTES: usize = 8_192;
@@ -16,7 +16,7 @@ pub const MAX_LINE_BYTES: usize = 8_192;
 const CHUNK: usize = 1 << 18;
 /// The maximum size in bytes of the sample of lines before the first frame. The kind of a text without frames is
 /// recognised from this sample.
-const SAMPLE: usize = 4_096;
+const MAX_SAMPLE_BYTES: usize = 4_096;
 /// The UTF-8 byte order mark, which some editors write at the beginning of a file.
 const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
@@ -54,7 +54,7 @@ impl LogReader {
     }
 
     /// Continues the line numbers of earlier logs that have `lines` lines in total.
-    pub(crate) fn behind(self, lines: u64) -> Self {
+    pub(crate) fn with_line_count(self, lines: u64) -> Self {
         Self { lines, ..self }
     }
 
@@ -105,7 +105,7 @@ impl LogReader {
         let Some((line, long)) = self.next_line()? else { return Ok(None) };
         if self.clock.is_open() && relative(self.buffer.get(line.clone()).unwrap_or_default()).is_some() {
             self.rest.start = line.start;
-            self.look_ahead()?;
+            self.detect_time_reference()?;
             return self.next();
         }
         self.lines += 1;
@@ -135,8 +135,8 @@ impl LogReader {
             }
             Some(Err(error)) => note.kind = NoteKind::Unreadable(error.to_string()),
         }
-        if !self.any_frame && self.sample.len() < SAMPLE {
-            self.sample.extend_from_slice(text.get(..SAMPLE).unwrap_or(text));
+        if !self.any_frame && self.sample.len() < MAX_SAMPLE_BYTES {
+            self.sample.extend_from_slice(text.get(..MAX_SAMPLE_BYTES).unwrap_or(text));
             self.sample.push(b'\n');
         }
         Ok(Some(Entry::Note(note)))
@@ -145,7 +145,7 @@ impl LogReader {
     /// Determines what relative times count from, by the lines that follow in the buffer. Reads as many lines as are
     /// needed and fit.
     #[cold]
-    fn look_ahead(&mut self) -> io::Result<()> {
+    fn detect_time_reference(&mut self) -> io::Result<()> {
         let mut evidence = Evidence::default();
         let mut seen = 0;
         while !evidence.is_enough() {
@@ -238,7 +238,7 @@ impl LogReader {
                 return Ok(0..kept);
             }
             let room = self.buffer.get_mut(kept..).unwrap_or_default();
-            let got = read_some(&mut self.input, room)?;
+            let got = read_uninterrupted(&mut self.input, room)?;
             rest = kept..kept + got;
             self.taken += got as u64;
             if got == 0 {
@@ -256,7 +256,7 @@ impl LogReader {
             self.rest = 0..self.rest.len();
         }
         let room = self.buffer.get_mut(self.rest.end..).unwrap_or_default();
-        let got = read_some(&mut self.input, room)?;
+        let got = read_uninterrupted(&mut self.input, room)?;
         self.rest.end += got;
         self.taken += got as u64;
         self.at_end = got == 0;

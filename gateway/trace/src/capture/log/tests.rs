@@ -111,7 +111,7 @@ fn no_more_of_a_pipe_is_waited_for_than_is_needed() {
 
 /// The options of candump that select the format of a printed line.
 #[derive(Clone, Copy, Debug)]
-struct Print {
+struct PrintStyle {
     /// The option that prints times: `-t a`, `z`, `d` or `A`, or a blank for none.
     time: char,
     nine_digits: bool,
@@ -125,12 +125,12 @@ struct Print {
     indented: bool,
 }
 
-fn print() -> impl Strategy<Value = Print> {
+fn print() -> impl Strategy<Value = PrintStyle> {
     let time = prop::sample::select(vec!['a', 'z', 'd', 'A', '-']);
     let flags = any::<[bool; 7]>();
     (time, flags, 0..4_u8).prop_map(|(time, flags, colour)| {
         let [nine_digits, marks, ascii, swapped, binary, dlc, indented] = flags;
-        Print { time, nine_digits, marks, ascii, swapped, binary, dlc, colour, indented }
+        PrintStyle { time, nine_digits, marks, ascii, swapped, binary, dlc, colour, indented }
     })
 }
 
@@ -153,7 +153,7 @@ fn frame() -> impl Strategy<Value = Frame> {
 
 /// Prints a frame as candump does. The function follows candump's source, so that the parser is not tested against
 /// itself.
-fn printed(print: Print, nanos: u64, step: u64, bus: &str, sent: bool, frame: &Frame) -> String {
+fn printed(print: PrintStyle, nanos: u64, step: u64, bus: &str, sent: bool, frame: &Frame) -> String {
     let mut line = " ".to_owned();
     let on = "\u{1b}[1m\u{1b}[34m";
     if print.colour > 2 {

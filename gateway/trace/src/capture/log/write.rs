@@ -13,7 +13,7 @@ use crate::capture::{Entry, Note, NoteKind};
 const WRITE_BYTES: usize = 1 << 16;
 /// The maximum size in bytes of lines that wait for the first frame. Nothing is written before the first frame, because
 /// a text without frames is not a log.
-const WAITING: usize = 1 << 20;
+const MAX_WAITING_BYTES: usize = 1 << 20;
 
 /// The number of decimals of a time in seconds.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -222,11 +222,11 @@ impl<W: Write> LogWriter<W> {
 
     fn end_line(&mut self) -> io::Result<()> {
         self.lines.0.push(b'\n');
-        let most = if self.any_frame { WRITE_BYTES } else { WAITING };
-        if self.lines.0.len() < most { Ok(()) } else { self.put() }
+        let most = if self.any_frame { WRITE_BYTES } else { MAX_WAITING_BYTES };
+        if self.lines.0.len() < most { Ok(()) } else { self.write_buffer() }
     }
 
-    fn put(&mut self) -> io::Result<()> {
+    fn write_buffer(&mut self) -> io::Result<()> {
         self.out.write_all(&self.lines.0)?;
         self.lines.0.clear();
         Ok(())
@@ -245,7 +245,7 @@ impl<W: Write> LogWriter<W> {
     /// # Errors
     /// Returns an error if `out` fails.
     pub fn flush(&mut self) -> io::Result<()> {
-        self.put()?;
+        self.write_buffer()?;
         self.out.flush()
     }
 }

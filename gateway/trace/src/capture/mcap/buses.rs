@@ -14,7 +14,7 @@
 use std::collections::{HashMap, HashSet};
 
 /// The maximum number of pairs of topic and `frame_id`. Frames of further pairs are named by their `frame_id`.
-const PAIRS: usize = 4_096;
+const MAX_PAIRS: usize = 4_096;
 /// The maximum length of a bus name made from a topic, in bytes.
 const MAX_NAME_BYTES: usize = 255;
 
@@ -35,7 +35,7 @@ impl ForeignBuses {
     /// Returns the name of the bus for a message with this topic and `frame_id`.
     pub(super) fn name<'a>(&'a mut self, topic: &str, frame_id: &'a str) -> &'a str {
         let is_known = self.names.get(topic).is_some_and(|names| names.contains_key(frame_id));
-        if !is_known && self.pairs.len() < PAIRS {
+        if !is_known && self.pairs.len() < MAX_PAIRS {
             self.topics.entry(frame_id.to_owned()).or_default().insert(topic.to_owned());
             self.pairs.push((topic.to_owned(), frame_id.to_owned()));
             self.assign(topic, frame_id);
@@ -45,7 +45,7 @@ impl ForeignBuses {
 
     /// Returns the names with all pairs taken into account: buses whose topics share a `frame_id` are named by their
     /// topics.
-    pub(crate) fn settled(self) -> Self {
+    pub(crate) fn renamed_with_all_pairs(self) -> Self {
         let mut all = Self { topics: self.topics, ..Self::default() };
         for (topic, frame_id) in &self.pairs {
             all.assign(topic, frame_id);
@@ -103,7 +103,7 @@ mod tests {
         let pairs = [("/can0/in", "can"), ("/can1/in", "can"), ("/can1/in", "other")];
         let mut buses = ForeignBuses::default();
         assert_eq!(named(&mut buses, &pairs), ["can", "/can1/in", "other"], "of a pipe");
-        let mut buses = buses.settled();
+        let mut buses = buses.renamed_with_all_pairs();
         assert_eq!(named(&mut buses, &pairs), ["/can0/in", "/can1/in", "other"], "of a file");
         assert!(buses.is_shared());
     }
@@ -117,7 +117,7 @@ mod tests {
             let mut buses = ForeignBuses::default();
             let mut names = named(&mut buses, &pairs);
             if settled {
-                buses = buses.settled();
+                buses = buses.renamed_with_all_pairs();
                 names = named(&mut buses, &pairs);
             }
             let different: HashSet<_> = pairs.iter().collect();

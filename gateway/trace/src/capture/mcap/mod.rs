@@ -12,7 +12,7 @@ pub(super) use buses::ForeignBuses;
 pub(super) use read::McapReader;
 pub(super) use state::McapState;
 pub(super) use survey::TopicSurvey;
-pub(super) use write::{McapWriter, SOURCE};
+pub(super) use write::{LOG_ORIGIN, McapWriter};
 pub use write::{ORIGIN_METADATA, Origin};
 
 use std::io;

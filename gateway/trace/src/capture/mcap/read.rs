@@ -44,7 +44,7 @@ enum Phase {
     Magic,
     Records,
     InChunk,
-    Over,
+    Finished,
 }
 
 impl McapReader {
@@ -145,12 +145,12 @@ impl McapReader {
 
     /// Reads up to the next requested message.
     fn advance(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
-        while self.place != Phase::Over {
+        while self.place != Phase::Finished {
             match self.step() {
                 Ok(None) => {}
                 Ok(target) => return Ok(target),
                 Err(fault) => {
-                    self.place = Phase::Over;
+                    self.place = Phase::Finished;
                     return Err(fault);
                 }
             }
@@ -169,10 +169,10 @@ impl McapReader {
             state.process(opcode, body, in_chunk)
         };
         match place {
-            Phase::Over => {}
+            Phase::Finished => {}
             Phase::Magic => {
                 *place = Phase::Records;
-                self.take_magic()?;
+                self.expect_magic()?;
             }
             Phase::InChunk => match chunk.next() {
                 Some((opcode @ (op::SCHEMA | op::CHANNEL | op::MESSAGE), body)) => {
@@ -194,13 +194,13 @@ impl McapReader {
                         source.begin_summary();
                     }
                     Framed::Record(op::FOOTER) => {
-                        *place = Phase::Over;
+                        *place = Phase::Finished;
                         // A damaged summary is ignored; the records after it are still read.
                         if source.check_section(op::FOOTER).is_err() {
                             self.stated = None;
                         }
-                        self.take_magic()?;
-                        self.end()?;
+                        self.expect_magic()?;
+                        self.check_end()?;
                     }
                     Framed::Record(opcode) => {
                         let target = take(opcode, source.body(), false)?;
@@ -209,18 +209,18 @@ impl McapReader {
                         }
                         return Ok(target);
                     }
-                    Framed::Passed(op::STATISTICS, _) => {
+                    Framed::Skipped(op::STATISTICS, _) => {
                         let count = source.body().first_chunk();
                         self.stated = count.map(|count| u64::from_le_bytes(*count));
                     }
-                    Framed::Passed(..) | Framed::Unknown(..) => {}
-                    Framed::Long(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
-                    Framed::Long(_, bytes) => {
+                    Framed::Skipped(..) | Framed::Unknown(..) => {}
+                    Framed::Oversized(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
+                    Framed::Oversized(_, bytes) => {
                         return Err(
-                            FormatError::Long { what: "record", bytes, limit: MAX_RECORD_BYTES }.into()
+                            FormatError::TooLong { what: "record", bytes, limit: MAX_RECORD_BYTES }.into()
                         );
                     }
-                    Framed::Cut(_, bytes) => self.truncated(bytes)?,
+                    Framed::Truncated(_, bytes) => self.truncated(bytes)?,
                     Framed::End(bytes) => self.truncated(bytes)?,
                 }
             }
@@ -229,7 +229,7 @@ impl McapReader {
     }
 
     /// Reads the magic bytes. Returns an error if other bytes are found.
-    fn take_magic(&mut self) -> Result<(), ReadFault> {
+    fn expect_magic(&mut self) -> Result<(), ReadFault> {
         if !self.source.magic()? {
             if !MAGIC.starts_with(self.source.body()) {
                 return Err(FormatError::Magic.into());
@@ -240,14 +240,16 @@ impl McapReader {
     }
 
     /// Checks that as many messages were read as the statistics state, and that the input ends here.
-    fn end(&self) -> Result<(), ReadFault> {
+    fn check_end(&self) -> Result<(), ReadFault> {
         if let (Some(found), Some(stated)) = (self.messages, self.stated)
             && found != stated
         {
             return Err(FormatError::Messages { found, stated }.into());
         }
         match &self.file {
-            Some(file) if file.metadata()?.len() > self.source.read() => Err(FormatError::Behind.into()),
+            Some(file) if file.metadata()?.len() > self.source.read() => {
+                Err(FormatError::TrailingData.into())
+            }
             _ => Ok(()),
         }
     }
@@ -255,7 +257,7 @@ impl McapReader {
     /// Handles an input that ends within a record, after `bytes` bytes of it. The recording was cut off, unless its end
     /// or other records follow the beginning of this record; then the length of the record is wrong.
     fn truncated(&mut self, bytes: u64) -> Result<(), ReadFault> {
-        self.place = Phase::Over;
+        self.place = Phase::Finished;
         if self.source.ends_with_magic() && self.source.read() > 2 * MAGIC.len() as u64 {
             let is_footer = bytes == MAGIC.len() as u64;
             return Err(if is_footer { FormatError::Footer } else { FormatError::Beyond { bytes } }.into());

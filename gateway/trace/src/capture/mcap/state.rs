@@ -13,7 +13,7 @@ use super::foreign::ForeignType;
 use super::write::{SECONDS_DIGITS, TIME_DIGITS};
 use crate::capture::log::MAX_LINE_BYTES as LONGEST_LINE;
 use crate::capture::{Entry, Item, LatchedFrame, Note, NoteKind, OtherMessage, RecordingExtras, Topic};
-use crate::container::{FormatError, MAGIC, MetadataMap, NameBudget, Record as Raw, find, parse};
+use crate::container::{FormatError, MAGIC, MetadataMap, NameBudget, Record as Raw, parse, seek_record};
 use crate::recording::STATE_TOPIC_PREFIX;
 use crate::ros2::cdr::CdrError;
 use crate::ros2::{Message, MessageError, messages};
@@ -21,11 +21,11 @@ use crate::ros2::{Message, MessageError, messages};
 /// The maximum size of the attachments, metadata and latched frames that are kept, in bytes.
 pub(super) const MAX_KEPT_BYTES: usize = 16 << 20;
 /// The memory overhead of an attachment, a metadata value or a frame, in bytes.
-const ENTRY: usize = NameBudget::ENTRY_OVERHEAD;
+const ENTRY_OVERHEAD: usize = NameBudget::ENTRY_OVERHEAD;
 /// The longest message that is decoded as a frame, in bytes.
-const LONGEST_FRAME: usize = 4 << 10;
+const MAX_FRAME_MESSAGE: usize = 4 << 10;
 /// The longest message that is decoded as a note, in bytes: a line and its position.
-const LONGEST_NOTE: usize = LONGEST_LINE + (1 << 10);
+const MAX_NOTE_MESSAGE: usize = LONGEST_LINE + (1 << 10);
 
 /// The part of a recording's contents that is needed to decode its messages: schemas, channels and bus names.
 pub(crate) struct McapState {
@@ -156,7 +156,9 @@ impl McapState {
         }
         let mut body = Vec::new();
         let mut footer = None;
-        while let Some((opcode, length)) = find(&mut from, &[op::ATTACHMENT, op::METADATA, op::FOOTER])? {
+        while let Some((opcode, length)) =
+            seek_record(&mut from, &[op::ATTACHMENT, op::METADATA, op::FOOTER])?
+        {
             if opcode == op::FOOTER {
                 footer = from.stream_position()?.checked_add(length);
                 break;
@@ -239,7 +241,7 @@ impl McapState {
                     latched(data).map_err(|source| FormatError::Message { topic: topic.clone(), source })?;
                 let (bus, own) = (record.interface, record.direction == Some(Direction::Sent));
                 let (frame, nanos) = (record.frame, record.time.nanos);
-                self.keep(bus.len() + ENTRY, |extras| {
+                self.keep(bus.len() + ENTRY_OVERHEAD, |extras| {
                     extras.latched.push(LatchedFrame { bus: bus.to_owned(), own, frame, nanos });
                 });
                 Ok(false)
@@ -257,16 +259,16 @@ impl McapState {
     }
 
     pub(super) fn attachment(&mut self, name: &str, data: &[u8]) {
-        let fits = self.kept.saturating_add(name.len() + ENTRY + data.len()) <= MAX_KEPT_BYTES;
+        let fits = self.kept.saturating_add(name.len() + ENTRY_OVERHEAD + data.len()) <= MAX_KEPT_BYTES;
         let data = if fits { data } else { &[] };
-        self.keep(name.len() + ENTRY + data.len(), |extras| {
+        self.keep(name.len() + ENTRY_OVERHEAD + data.len(), |extras| {
             extras.attachments.push((name.to_owned(), data.to_vec()));
         });
     }
 
     fn metadata(&mut self, name: &str, facts: &MetadataMap<'_>) {
-        let size = facts.iter().map(|(key, value)| key.len() + value.len() + ENTRY).sum::<usize>();
-        self.keep(name.len() + ENTRY + size, |extras| {
+        let size = facts.iter().map(|(key, value)| key.len() + value.len() + ENTRY_OVERHEAD).sum::<usize>();
+        self.keep(name.len() + ENTRY_OVERHEAD + size, |extras| {
             let facts = facts.iter().map(|(key, value)| (key.to_owned(), value.to_owned()));
             extras.metadata.push((name.to_owned(), facts.collect()));
         });
@@ -325,17 +327,17 @@ impl McapState {
             ChannelUsage::Latched => latched(message).map(Entry::Frame),
             ChannelUsage::Frames(form) => {
                 let time = Timestamp { nanos: published, ..form };
-                decode(message, LONGEST_FRAME, |message| messages::frame(message, time)).map(Entry::Frame)
+                decode(message, MAX_FRAME_MESSAGE, |message| messages::frame(message, time)).map(Entry::Frame)
             }
             ChannelUsage::Foreign(foreign) => {
-                let record = decode(message, LONGEST_FRAME, |message| foreign.decode(message, log_time));
+                let record = decode(message, MAX_FRAME_MESSAGE, |message| foreign.decode(message, log_time));
                 let buses = &mut self.buses;
                 record.map(|record| {
                     Entry::Frame(Record { interface: buses.name(topic, record.interface), ..record })
                 })
             }
             ChannelUsage::Notes => {
-                let note = decode(message, LONGEST_NOTE, |message| messages::note(message, published));
+                let note = decode(message, MAX_NOTE_MESSAGE, |message| messages::note(message, published));
                 note.map(|mut note| {
                     if note.line > 0 && !self.any_frame {
                         note.nanos = 0;
@@ -369,7 +371,7 @@ fn decode<'a, T>(
 
 /// Decodes a latched frame with the time at which it was on the bus.
 fn latched(message: &[u8]) -> Result<Record<'_>, MessageError> {
-    decode(message, LONGEST_FRAME, |message| {
+    decode(message, MAX_FRAME_MESSAGE, |message| {
         messages::frame(message, Timestamp::nine_digits(messages::stamp(message)?))
     })
 }

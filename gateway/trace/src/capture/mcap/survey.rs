@@ -10,17 +10,17 @@ use super::buses::ForeignBuses;
 use super::foreign::ForeignType;
 use super::read::McapReader;
 use super::state::McapState;
-use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, Record, find, parse};
+use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, Record, parse, seek_record};
 
 /// The maximum number of topics that are stored.
-const TOPICS: usize = 4_096;
+const MAX_TOPICS: usize = 4_096;
 
 /// The topics of one or more recordings that hold frames of other programs.
 #[derive(Debug, Default)]
 pub(crate) struct TopicSurvey {
     topics: HashSet<String>,
     /// True once a file had no channel records outside of its chunks, so that its topics are unknown.
-    is_silent: bool,
+    has_hidden_channels: bool,
 }
 
 impl TopicSurvey {
@@ -33,9 +33,9 @@ impl TopicSurvey {
         from.seek(SeekFrom::Start(MAGIC.len() as u64))?;
         let mut schemas = HashSet::new();
         let mut says = false;
-        while let Some((opcode, length)) = find(&mut from, &[op::SCHEMA, op::CHANNEL, op::FOOTER])? {
+        while let Some((opcode, length)) = seek_record(&mut from, &[op::SCHEMA, op::CHANNEL, op::FOOTER])? {
             if opcode == op::FOOTER {
-                self.is_silent |= !says;
+                self.has_hidden_channels |= !says;
                 return Ok(());
             }
             let mut body = Vec::new();
@@ -50,20 +50,20 @@ impl TopicSurvey {
                     let is_of = |name: &&(u16, String)| {
                         name.0 == schema && ForeignType::from_schema(encoding, &name.1).is_some()
                     };
-                    if self.topics.len() < TOPICS && schemas.iter().any(|name| is_of(&name)) {
+                    if self.topics.len() < MAX_TOPICS && schemas.iter().any(|name| is_of(&name)) {
                         self.topics.insert(topic.to_owned());
                     }
                 }
                 _ => {}
             }
         }
-        self.is_silent = true;
+        self.has_hidden_channels = true;
         Ok(())
     }
 
     /// Returns true if all messages must be read to find the bus names.
     pub(crate) fn is_needed(&self) -> bool {
-        self.is_silent || self.topics.len() > 1
+        self.has_hidden_channels || self.topics.len() > 1
     }
 
     /// Reads the frames of a recording and returns the `known` bus names with those of these frames.

@@ -13,22 +13,22 @@ use crate::recording::{BUS_TOPIC_PREFIX, NOTES_TOPIC};
 
 /// The maximum number of channels for frames. Each channel costs a reader memory, and a log may contain any number of
 /// buses.
-const CHANNELS: usize = 64;
+const MAX_CHANNELS: usize = 64;
 /// The topic for frames of all buses beyond [`CHANNELS`]. Each message holds the name of its bus.
-const FURTHER: &str = "/further";
+const FURTHER_BUSES_TOPIC: &str = "/further";
 /// The name of the metadata record that states what a recording was converted from.
 pub const ORIGIN_METADATA: &str = "capture";
 /// The entry of [`ORIGIN`] in a recording that was converted from a log.
-pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
+pub(crate) const LOG_ORIGIN: (&str, &str) = ("from", "candump log");
 /// The entry of [`ORIGIN`] in a recording that was converted from another recording.
-const OTHER_SOURCE: (&str, &str) = ("from", "MCAP recording");
+const RECORDING_ORIGIN: (&str, &str) = ("from", "MCAP recording");
 /// The metadata key of a channel for the number of decimals of its times: 6 or 9.
 pub(super) const TIME_DIGITS: &str = "time_digits";
 /// The metadata key of a channel for the number of digits to which seconds are padded. It is missing if they are not
 /// padded.
 pub(super) const SECONDS_DIGITS: &str = "seconds_digits";
 /// The maximum size of notes that wait for the first frame, in bytes.
-const WAITING: usize = 1 << 20;
+const MAX_WAITING_BYTES: usize = 1 << 20;
 
 /// Writes the entries of a capture as messages. Notes before the first frame are held back, because they get its time.
 #[derive(Debug)]
@@ -81,10 +81,10 @@ impl<W: Write> McapWriter<W> {
             Some(about) => FileWriter::in_file(out, about)?,
             None => FileWriter::new(out)?,
         };
-        let (key, value) = if origin.of_log { SOURCE } else { OTHER_SOURCE };
+        let (key, value) = if origin.of_log { LOG_ORIGIN } else { RECORDING_ORIGIN };
         file.metadata(ORIGIN_METADATA, &[(key.to_owned(), value.to_owned())].into())?;
         let mut taken = UniqueNames::default();
-        taken.give_one(NOTES_TOPIC.to_owned());
+        taken.assign(NOTES_TOPIC.to_owned());
         Ok(Self {
             file,
             channels: Vec::new(),
@@ -109,7 +109,7 @@ impl<W: Write> McapWriter<W> {
                 self.file.write(&mut bus.channel, record.time.nanos, record)
             }
             Entry::Note(note) => match &mut self.waiting {
-                Some(waiting) if note.line > 0 && self.bytes < WAITING => {
+                Some(waiting) if note.line > 0 && self.bytes < MAX_WAITING_BYTES => {
                     self.bytes += note.text.len() + size_of::<WaitingNote>();
                     let (kind, interface) = (note.kind.clone(), note.interface.to_owned());
                     waiting.push(WaitingNote { kind, interface, line: note.line, text: note.text.to_vec() });
@@ -150,15 +150,15 @@ impl<W: Write> McapWriter<W> {
         let find = |channels: &[BusChannel], name: &str| channels.iter().position(|bus| is(name, bus));
         let mut found = find(&self.channels, record.interface);
         let mut name = record.interface;
-        if found.is_none() && self.channels.len() >= CHANNELS {
-            name = FURTHER;
+        if found.is_none() && self.channels.len() >= MAX_CHANNELS {
+            name = FURTHER_BUSES_TOPIC;
             found = find(&self.channels, name);
         }
         self.last = if let Some(place) = found {
             place
         } else {
             let proposed = || format!("{BUS_TOPIC_PREFIX}{}", name.trim_start_matches('/'));
-            let topic = self.topics.entry(name.to_owned()).or_insert_with(|| self.taken.give_one(proposed()));
+            let topic = self.topics.entry(name.to_owned()).or_insert_with(|| self.taken.assign(proposed()));
             let padded = form.min_digits.to_string();
             let facts =
                 [(TIME_DIGITS, if form.nine_digits { "9" } else { "6" }), (SECONDS_DIGITS, padded.as_str())];

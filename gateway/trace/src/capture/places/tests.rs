@@ -57,15 +57,15 @@ fn a_reader_goes_on_where_it_was_and_no_moment_is_before_its_place() {
         assert_eq!(all.len(), COUNT as usize);
         assert!(places.latest() >= all.last().unwrap().1, "{format:?}");
         for from in (0..all.len()).step_by(997) {
-            reader.go_to(&places, here[from]).unwrap();
+            reader.seek(&places, here[from]).unwrap();
             let count = 900.min(all.len() - from);
             assert_eq!(next(&mut reader, count), all[from..from + count], "{format:?} {from}");
         }
-        reader.go_to(&places, here[COUNT as usize]).unwrap();
+        reader.seek(&places, here[COUNT as usize]).unwrap();
         assert_eq!(next(&mut reader, 1), []);
         for at in (0..all.len()).step_by(311) {
             let nanos = all[at].1;
-            reader.go_to(&places, places.before(nanos)).unwrap();
+            reader.seek(&places, places.point_before(nanos)).unwrap();
             let (first, _) = next(&mut reader, 1)[0];
             let earliest = all.iter().position(|(_, time)| *time >= nanos).unwrap();
             assert!(first as usize <= earliest, "{format:?}: {first} {earliest}");
@@ -95,7 +95,7 @@ fn in_console_text_whose_times_depend_on_other_lines_a_reader_goes_on_too() {
         assert_eq!(end, if stamp == "none" { 8_999_000 } else { 13_500 * MS }, "{stamp}");
         assert_eq!(places.latest(), end);
         for from in (0..all.len()).step_by(997) {
-            reader.go_to(&places, places.before(all[from].1)).unwrap();
+            reader.seek(&places, places.point_before(all[from].1)).unwrap();
             let (first, _) = next(&mut reader, 1)[0];
             assert!(first as usize <= from && from < first as usize + 3_000, "{stamp}: {first} {from}");
             let count = (from - first as usize).min(all.len() - 1);
@@ -123,11 +123,11 @@ fn messages_outside_chunks_and_files_without_an_end_have_places() {
         writer.write_to_known_channel(&header, &[0; 40]).unwrap();
     }
     drop(writer);
-    let whole = SeekIndex::apart(std::slice::from_ref(&path), 1_000).unwrap();
+    let whole = SeekIndex::with_min_distance(std::slice::from_ref(&path), 1_000).unwrap();
     assert!(whole.marks.len() > 100 && whole.latest() == 2_999);
     let bytes = std::fs::read(&path).unwrap();
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-    let cut = SeekIndex::apart(&[path], 1_000).unwrap();
+    let cut = SeekIndex::with_min_distance(&[path], 1_000).unwrap();
     assert!(cut.marks.len() > 40 && (1_000..2_000).contains(&cut.latest()), "{}", cut.latest());
 }
 
@@ -144,6 +144,6 @@ fn what_cannot_be_gone_back_in_is_named() {
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).unwrap();
         let places = SeekIndex::open(&[path]).unwrap();
-        assert_eq!((places.latest(), places.before(5).offset), (0, 0), "{name}");
+        assert_eq!((places.latest(), places.point_before(5).offset), (0, 0), "{name}");
     }
 }

@@ -19,14 +19,14 @@ pub(super) enum Trust {
     /// A correct checksum covers it.
     Certain,
     /// No checksum covers it.
-    Plain,
+    Unchecked,
     /// The checksum over it is wrong.
     Doubtful,
 }
 
 /// A description of a schema or channel, as its record stores it, and how often it occurs.
 #[derive(Debug)]
-struct Statement {
+struct Description {
     body: Vec<u8>,
     /// The number of occurrences that a correct checksum covers, and the number that no wrong checksum covers.
     certain: u32,
@@ -34,17 +34,17 @@ struct Statement {
 }
 
 /// All descriptions of each schema or channel, by its number.
-type Statements = BTreeMap<u16, Vec<Statement>>;
+type Descriptions = BTreeMap<u16, Vec<Description>>;
 
 /// The descriptions of all schemas and channels in a file.
 #[derive(Debug, Default)]
-pub(super) struct Described {
-    schemas: Statements,
-    channels: Statements,
+pub(super) struct DescriptionSet {
+    schemas: Descriptions,
+    channels: Descriptions,
     names: NameBudget,
 }
 
-impl Described {
+impl DescriptionSet {
     /// Adds a description, if the record is a schema or a channel.
     pub(super) fn add(&mut self, code: u8, body: &[u8], trust: Trust) -> Result<(), FormatError> {
         let (id, statements) = match parse(code, body)? {
@@ -64,7 +64,7 @@ impl Described {
             Some(place) => place,
             None => {
                 self.names.add(body.len())?;
-                known.push(Statement { body: body.to_vec(), certain: 0, times: 0 });
+                known.push(Description { body: body.to_vec(), certain: 0, times: 0 });
                 known.len() - 1
             }
         };
@@ -104,8 +104,8 @@ impl Described {
 }
 
 /// Returns the description to be used; `None` if two are equally reliable.
-fn chosen(all: &[Statement]) -> Option<&[u8]> {
-    let weight = |it: &Statement| (it.certain, it.times);
+fn chosen(all: &[Description]) -> Option<&[u8]> {
+    let weight = |it: &Description| (it.certain, it.times);
     let best = all.iter().max_by_key(|it| weight(it))?;
     let equal = all.iter().filter(|it| weight(it) == weight(best)).count();
     (equal == 1).then_some(best.body.as_slice())

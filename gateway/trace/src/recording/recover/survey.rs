@@ -11,18 +11,18 @@ use std::io::{self, Read, Seek, SeekFrom};
 
 use mcap::records::op;
 
-use super::described::{Described, Trust};
-use super::{LONGEST_ATTACHMENT, RecoverError, RecoveryResult};
+use super::described::{DescriptionSet, Trust};
+use super::{MAX_ATTACHMENT_BYTES, RecoverError, RecoveryResult};
 use crate::container::{
     Chunk, FormatError, Framed, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER_BYTES, Record, RecordReader,
     first_record, is_record, parse,
 };
 
 /// The number of records before a wrong one that are examined again, because their lengths may have been wrong.
-const UNSURE: usize = 4;
+const MAX_UNSURE_RECORDS: usize = 4;
 
 /// The length of a footer record in bytes.
-const FOOTER: usize = 29;
+const FOOTER_BYTES: usize = 29;
 
 /// A part of the file that can be copied.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -38,12 +38,12 @@ pub(super) enum IntactRange {
 pub(super) struct FileSurvey {
     pub(super) profile: String,
     pub(super) pieces: Vec<IntactRange>,
-    pub(super) described: Described,
+    pub(super) described: DescriptionSet,
     pub(super) recovered: RecoveryResult,
 }
 
 /// The summary section of a file, which is found from the end of the file.
-struct Summary {
+struct SummarySection {
     /// The offset at which the data section ends.
     data_end: u64,
     /// The number of messages according to the statistics.
@@ -55,18 +55,18 @@ struct Summary {
 /// The result of examining a record.
 enum Examined {
     /// The record is intact.
-    Right,
+    Intact,
     /// The record is intact except for its operation code or one of its lengths. The fields are the correct operation
     /// code, the length of the contents, and the offset of the record's end.
-    As(u8, u64, u64),
+    WrongLength(u8, u64, u64),
     /// The data section or the file ends with this record.
     End,
     /// The record looks like the end of the data section, but other records follow it. The source is positioned at
     /// them.
-    NoEnd,
+    FalseEnd,
     /// The record is wrong. `end` is where it ends by its length field, if that may be correct. From `rows` on, several
     /// records in a row are accepted as intact; before it they may be inside of a damaged, uncompressed chunk.
-    Wrong { end: Option<u64>, rows: u64 },
+    Damaged { end: Option<u64>, rows: u64 },
 }
 
 /// The state of a survey while the file is read.
@@ -87,7 +87,7 @@ struct Surveyor<R> {
 impl FileSurvey {
     /// Surveys a file.
     pub(super) fn new(from: impl Read + Seek) -> Result<Self, RecoverError> {
-        let mut source = RecordReader::new(from, LONGEST_ATTACHMENT);
+        let mut source = RecordReader::new(from, MAX_ATTACHMENT_BYTES);
         let is_begun = source.magic().map_err(RecoverError::Read)?;
         let first = source.body().to_vec();
         let size = source.size().map_err(RecoverError::Read)?;
@@ -97,7 +97,7 @@ impl FileSurvey {
         let (chunk, survey) = (Chunk::default(), Self::default());
         let mut surveyor =
             Surveyor { source, size, limit: size, has_magic: false, chunk, survey, unsure: VecDeque::new() };
-        let done = surveyor.go(is_begun).map_err(RecoverError::Read)?;
+        let done = surveyor.run(is_begun).map_err(RecoverError::Read)?;
         match done {
             false => Err(RecoverError::NoMcap { got: first }),
             true if surveyor.survey.pieces.is_empty() => Err(RecoverError::Empty(size)),
@@ -108,7 +108,7 @@ impl FileSurvey {
 
 impl<R: Read + Seek> Surveyor<R> {
     /// Surveys the whole file. Returns true if the file is an MCAP recording.
-    fn go(&mut self, is_begun: bool) -> io::Result<bool> {
+    fn run(&mut self, is_begun: bool) -> io::Result<bool> {
         let summary = self.summary()?;
         let mut at = MAGIC.len() as u64;
         if !is_begun {
@@ -118,45 +118,45 @@ impl<R: Read + Seek> Surveyor<R> {
                 let Some(certain) = self.first(0, self.size, false)? else { return Ok(false) };
                 at = self.first(0, certain, true)?.unwrap_or(certain);
             }
-            self.lost(at);
+            self.count_lost(at);
         }
         if let Some(summary) = &summary {
             (self.limit, self.survey.recovered.stated) = (summary.data_end, summary.stated);
-            self.survey.recovered.checksum |= !summary.is_right;
+            self.survey.recovered.is_checksum_wrong |= !summary.is_right;
         }
-        self.source.move_to(at)?;
+        self.source.seek(at)?;
         let mut is_ended = false;
         while self.source.read() < self.limit {
             let began = self.source.read();
             match self.examine()? {
-                Examined::Right => self.right(began),
-                Examined::As(code, length, end) => {
+                Examined::Intact => self.add_intact(began),
+                Examined::WrongLength(code, length, end) => {
                     self.survey.pieces.push(IntactRange::Record { at: began, code, length });
-                    self.lost(0);
+                    self.count_lost(0);
                     self.unsure.clear();
-                    self.source.move_to(end)?;
+                    self.source.seek(end)?;
                 }
                 Examined::End => {
                     is_ended = true;
                     break;
                 }
-                Examined::NoEnd => {}
-                Examined::Wrong { end, rows } => {
+                Examined::FalseEnd => {}
+                Examined::Damaged { end, rows } => {
                     if !self.resume(began, end, rows)? {
                         break;
                     }
                 }
             }
         }
-        self.survey.recovered.whole |= summary.is_some();
+        self.survey.recovered.has_end |= summary.is_some();
         // The checksum of the data section is missing with the record that should end the section.
-        self.survey.recovered.checksum |= summary.is_some() && !is_ended;
+        self.survey.recovered.is_checksum_wrong |= summary.is_some() && !is_ended;
         Ok(true)
     }
 
     /// Returns true if a header record begins at `at`.
     fn is_header(&mut self, at: u64) -> io::Result<bool> {
-        self.source.move_to(at)?;
+        self.source.seek(at)?;
         let framed = self.source.next()?;
         let is_header = framed == Framed::Record(op::HEADER) && self.source.check(framed).is_ok();
         let end = self.source.read();
@@ -169,7 +169,7 @@ impl<R: Read + Seek> Surveyor<R> {
 
     /// Returns the offset of the first record: a chunk or attachment at or after `from`, or several records in a row at
     /// or after `rows`.
-    fn first_of_two(&mut self, from: u64, rows: u64, until: u64) -> io::Result<Option<u64>> {
+    fn first_record_or_row(&mut self, from: u64, rows: u64, until: u64) -> io::Result<Option<u64>> {
         match self.first(from, rows.min(until), false)? {
             None => self.first(rows, until, true),
             found => Ok(found),
@@ -177,13 +177,13 @@ impl<R: Read + Seek> Surveyor<R> {
     }
 
     /// Counts a damaged place at which `bytes` bytes were lost.
-    fn lost(&mut self, bytes: u64) {
+    fn count_lost(&mut self, bytes: u64) {
         self.survey.recovered.damaged.0 += 1;
         self.survey.recovered.damaged.1 += bytes;
     }
 
     /// Adds a record that begins at `began` and ends at the source's position to the intact parts.
-    fn right(&mut self, began: u64) {
+    fn add_intact(&mut self, began: u64) {
         let to = self.source.read();
         match self.survey.pieces.last_mut() {
             Some(IntactRange::Records { to: end, .. }) if *end == began => *end = to,
@@ -201,21 +201,21 @@ impl<R: Read + Seek> Surveyor<R> {
         // forward into the range that the chunk's length spans.
         let own = self.source.plain_chunk();
         let rows = own.map_or(0, |own| content.saturating_add(own));
-        let wrong = Examined::Wrong { end: Some(end), rows };
+        let wrong = Examined::Damaged { end: Some(end), rows };
         let code = match framed {
-            Framed::End(_) => return Ok(Examined::Wrong { end: None, rows: 0 }),
+            Framed::End(_) => return Ok(Examined::Damaged { end: None, rows: 0 }),
             Framed::Unknown(_, length) => {
                 let end = content.checked_add(length).filter(|by_length| *by_length == end);
-                return Ok(Examined::Wrong { end, rows: 0 });
+                return Ok(Examined::Damaged { end, rows: 0 });
             }
-            Framed::Cut(code, _) => {
+            Framed::Truncated(code, _) => {
                 let found = self.by_content(code, &checked)?;
-                return Ok(found.unwrap_or(Examined::Wrong { end: None, rows }));
+                return Ok(found.unwrap_or(Examined::Damaged { end: None, rows }));
             }
-            Framed::Record(code) | Framed::Passed(code, _) | Framed::Long(code, _) => code,
+            Framed::Record(code) | Framed::Skipped(code, _) | Framed::Oversized(code, _) => code,
         };
         if let Err(FormatError::Swallowed(_)) = checked {
-            return Ok(Examined::Wrong { end: None, rows: 0 });
+            return Ok(Examined::Damaged { end: None, rows: 0 });
         }
         if checked.is_err() {
             return Ok(self.by_content(code, &checked)?.unwrap_or(wrong));
@@ -224,11 +224,11 @@ impl<R: Read + Seek> Surveyor<R> {
             (Framed::Record(_), op::DATA_END) => return self.data_end(began),
             (Framed::Record(_), op::FOOTER) => {
                 let ends = end + MAGIC.len() as u64 == self.size && self.source.magic()?;
-                self.survey.recovered.whole |= ends;
+                self.survey.recovered.has_end |= ends;
                 return Ok(if ends { Examined::End } else { wrong });
             }
             (Framed::Record(_), _) if self.check_contents(code).is_err() => return Ok(wrong),
-            (Framed::Long(..), _) => return Ok(wrong),
+            (Framed::Oversized(..), _) => return Ok(wrong),
             _ => {}
         }
         match code {
@@ -237,12 +237,12 @@ impl<R: Read + Seek> Surveyor<R> {
             op::CHUNK | op::ATTACHMENT => self.doubt(began, end),
             _ => self.doubt(began, content),
         }
-        Ok(Examined::Right)
+        Ok(Examined::Intact)
     }
 
     /// Stores a record whose length is not confirmed by a checksum, to be examined again if the next record is wrong.
     fn doubt(&mut self, began: u64, rows: u64) {
-        if self.unsure.len() == UNSURE {
+        if self.unsure.len() == MAX_UNSURE_RECORDS {
             self.unsure.pop_front();
         }
         self.unsure.push_back((began, rows));
@@ -252,7 +252,7 @@ impl<R: Read + Seek> Surveyor<R> {
     fn by_content(&mut self, code: u8, checked: &Result<(), FormatError>) -> io::Result<Option<Examined>> {
         let &Err(FormatError::Length { own, bytes, .. }) = checked else { return Ok(None) };
         let content = self.source.began() + RECORD_HEADER_BYTES as u64;
-        let limit = if code == op::ATTACHMENT { LONGEST_ATTACHMENT } else { MAX_RECORD_BYTES };
+        let limit = if code == op::ATTACHMENT { MAX_ATTACHMENT_BYTES } else { MAX_RECORD_BYTES };
         let end = content + own.min(limit + 1);
         if own > limit || end > self.limit || matches!(code, op::DATA_END | op::FOOTER) {
             return Ok(None);
@@ -269,7 +269,7 @@ impl<R: Read + Seek> Surveyor<R> {
         let is_right = self.source.read_as(content - RECORD_HEADER_BYTES as u64, own)?
             && self.check_contents(code).is_ok();
         let end = if is_shorter { by_length } else { end };
-        Ok(is_right.then_some(Examined::As(code, own, end)))
+        Ok(is_right.then_some(Examined::WrongLength(code, own, end)))
     }
 
     /// Checks the record that was read last. Collects the schemas and channels in it.
@@ -281,14 +281,14 @@ impl<R: Read + Seek> Surveyor<R> {
             if let Record::Header { profile: of_file, .. } = parse(code, body)? {
                 of_file.clone_into(profile);
             }
-            return described.add(code, body, Trust::Plain);
+            return described.add(code, body, Trust::Unchecked);
         }
         chunk.unpack(body, source.read())?;
         while let Some((code, body)) = chunk.next() {
             parse(code, body)?;
         }
         chunk.rewind();
-        let trust = if chunk.is_checked() { Trust::Certain } else { Trust::Plain };
+        let trust = if chunk.is_checked() { Trust::Certain } else { Trust::Unchecked };
         while let Some((code, body)) = chunk.next() {
             if matches!(code, op::SCHEMA | op::CHANNEL) {
                 described.add(code, body, trust)?;
@@ -302,9 +302,9 @@ impl<R: Read + Seek> Surveyor<R> {
         let checked = self.source.check_section(op::DATA_END).is_ok();
         let end = self.source.read();
         if self.limit < self.size && end < self.limit {
-            return Ok(Examined::Wrong { end: Some(end), rows: 0 });
+            return Ok(Examined::Damaged { end: Some(end), rows: 0 });
         }
-        self.survey.recovered.checksum |= !checked;
+        self.survey.recovered.is_checksum_wrong |= !checked;
         if self.limit < self.size {
             return Ok(Examined::End);
         }
@@ -322,16 +322,16 @@ impl<R: Read + Seek> Surveyor<R> {
                 Framed::Record(op::FOOTER) => {
                     let has_none = self.source.body().ends_with(&[0; 4]);
                     let is_right = self.source.check_section(op::FOOTER).is_ok();
-                    self.survey.recovered.checksum |= !is_right;
+                    self.survey.recovered.is_checksum_wrong |= !is_right;
                     of_all = trust(is_right, has_none);
-                    self.survey.recovered.whole = self.source.magic()?;
+                    self.survey.recovered.has_end = self.source.magic()?;
                     break;
                 }
-                Framed::Passed(..) => {}
+                Framed::Skipped(..) => {}
                 Framed::Record(_)
-                | Framed::Long(..)
+                | Framed::Oversized(..)
                 | Framed::Unknown(..)
-                | Framed::Cut(..)
+                | Framed::Truncated(..)
                 | Framed::End(_) => break,
             }
         }
@@ -341,10 +341,10 @@ impl<R: Read + Seek> Surveyor<R> {
         }
         self.source.end_summary();
         let Some(more) = self.first(began + 1, self.size, false)? else { return Ok(Examined::End) };
-        self.lost(more - began);
-        self.source.move_to(more)?;
-        self.survey.recovered.whole = false;
-        Ok(Examined::NoEnd)
+        self.count_lost(more - began);
+        self.source.seek(more)?;
+        self.survey.recovered.has_end = false;
+        Ok(Examined::FalseEnd)
     }
 
     /// Continues at the next intact records after a wrong one. Returns false if there are no more.
@@ -357,11 +357,11 @@ impl<R: Read + Seek> Surveyor<R> {
         // record.
         let mut until = began;
         while let Some((at, within)) = self.unsure.pop_back() {
-            if let Some(found) = self.first_of_two(at + 1, within.max(at + 1), until)? {
+            if let Some(found) = self.first_record_or_row(at + 1, within.max(at + 1), until)? {
                 self.unsure.clear();
-                self.cut(at);
-                self.lost(found - at);
-                self.source.move_to(found)?;
+                self.truncate_intact(at);
+                self.count_lost(found - at);
+                self.source.seek(found)?;
                 return Ok(true);
             }
             until = at;
@@ -369,24 +369,24 @@ impl<R: Read + Seek> Surveyor<R> {
         let from = began + 1;
         let found = match end {
             Some(end) => self.first(from, end, false)?.or(Some(end)),
-            None => self.first_of_two(from, rows.max(from), self.limit)?,
+            None => self.first_record_or_row(from, rows.max(from), self.limit)?,
         };
         let Some(found) = found else {
             let rest = self.limit.saturating_sub(began);
             if self.has_magic {
-                self.lost(rest);
+                self.count_lost(rest);
             } else {
-                self.survey.recovered.unfinished = rest;
+                self.survey.recovered.unfinished_bytes = rest;
             }
             return Ok(false);
         };
-        self.lost(found.saturating_sub(began));
-        self.source.move_to(found)?;
+        self.count_lost(found.saturating_sub(began));
+        self.source.seek(found)?;
         Ok(true)
     }
 
     /// Removes the last record from the intact parts, because its length was wrong and spans other records.
-    fn cut(&mut self, at: u64) {
+    fn truncate_intact(&mut self, at: u64) {
         if let Some(IntactRange::Records { from, to }) = self.survey.pieces.last_mut() {
             *to = at;
             if from == to {
@@ -396,9 +396,11 @@ impl<R: Read + Seek> Surveyor<R> {
     }
 
     /// Reads the summary, if the file ends with one, and collects the schemas and channels in it.
-    fn summary(&mut self) -> io::Result<Option<Summary>> {
-        let Some(footer) = self.size.checked_sub((FOOTER + MAGIC.len()) as u64) else { return Ok(None) };
-        let mut at_end = [0; FOOTER + MAGIC.len()];
+    fn summary(&mut self) -> io::Result<Option<SummarySection>> {
+        let Some(footer) = self.size.checked_sub((FOOTER_BYTES + MAGIC.len()) as u64) else {
+            return Ok(None);
+        };
+        let mut at_end = [0; FOOTER_BYTES + MAGIC.len()];
         let input = self.source.input();
         input.seek(SeekFrom::Start(footer))?;
         input.read_exact(&mut at_end)?;
@@ -427,20 +429,20 @@ impl<R: Read + Seek> Surveyor<R> {
                 Framed::Record(code @ (op::SCHEMA | op::CHANNEL)) => {
                     all.push((code, of_summary.body().to_vec()))
                 }
-                Framed::Passed(op::STATISTICS, _) => {
+                Framed::Skipped(op::STATISTICS, _) => {
                     stated = of_summary.body().first_chunk().map(|count| u64::from_le_bytes(*count));
                 }
-                Framed::Passed(..) => {}
+                Framed::Skipped(..) => {}
                 Framed::Record(_)
-                | Framed::Long(..)
+                | Framed::Oversized(..)
                 | Framed::Unknown(..)
-                | Framed::Cut(..)
+                | Framed::Truncated(..)
                 | Framed::End(_) => {
                     return Ok(None);
                 }
             }
         };
-        if of_summary.read() != footer + FOOTER as u64 {
+        if of_summary.read() != footer + FOOTER_BYTES as u64 {
             return Ok(None);
         }
         let is_right = checksum.is_ok();
@@ -449,7 +451,7 @@ impl<R: Read + Seek> Surveyor<R> {
             // Descriptions that cannot be decoded are ignored.
             let _ = self.survey.described.add(code, &body, trust);
         }
-        Ok(Some(Summary { data_end: start, stated: stated.filter(|_| is_right), is_right }))
+        Ok(Some(SummarySection { data_end: start, stated: stated.filter(|_| is_right), is_right }))
     }
 }
 
@@ -457,7 +459,7 @@ impl<R: Read + Seek> Surveyor<R> {
 const fn trust(is_right: bool, has_none: bool) -> Trust {
     match (is_right, has_none) {
         (false, _) => Trust::Doubtful,
-        (true, true) => Trust::Plain,
+        (true, true) => Trust::Unchecked,
         (true, false) => Trust::Certain,
     }
 }

@@ -39,7 +39,7 @@ normal = [1.0, 0.0, 0.0]
 }
 
 fn arm(skin: &Skin) -> Result<RecordedRobot, RobotError> {
-    RecordedRobot::of_urdf(skin, Urdf::parse("arm.urdf", ARM).unwrap(), ARM.to_owned())
+    RecordedRobot::from_urdf(skin, Urdf::parse("arm.urdf", ARM).unwrap(), ARM.to_owned())
 }
 
 fn near(one: &[f64], other: &[f64]) -> bool {
@@ -50,13 +50,13 @@ fn near(one: &[f64], other: &[f64]) -> bool {
 fn a_robot_is_shown_by_the_urdf_that_its_skin_names() {
     let robot = arm(&skin(0.5)).unwrap();
     assert_eq!((robot.base(), robot.link((0, 1)), robot.link((0, 2))), ("world", Some("upper"), None));
-    let moving = robot.moving(&[0.3]);
+    let moving = robot.moving_transforms(&[0.3]);
     let names: Vec<_> = moving.iter().map(|it| (it.parent, it.child)).collect();
     assert_eq!(names, [("world", "upper"), ("upper", "other")]);
     assert!(near(&moving[0].translation, &[0.0, 0.0, 0.5]));
     assert!(near(&moving[0].rotation, &[0.0, 0.15_f64.sin(), 0.0, 0.15_f64.cos()]));
     assert!(near(&moving[1].translation, &[0.23, 0.0, 0.0]), "a tenth of the hinge's, and 0.2 m");
-    let still = robot.still();
+    let still = robot.fixed_transforms();
     let names: Vec<_> = still.iter().map(|it| (it.parent, it.child)).collect();
     assert_eq!(names, [("upper", "finger"), ("upper", "vcan0/7")]);
     assert!(near(&still[0].translation, &[0.03, 0.0, 0.0]), "in the middle of its limits");
@@ -75,15 +75,15 @@ fn a_urdf_of_another_robot_is_refused() {
     assert_eq!(error, "arm.urdf: no joint \"elbow\" moves; the nearest are \"grip\" or \"hinge\"");
     let error = arm(&skin(0.6)).unwrap_err().to_string();
     assert!(error.starts_with("arm.urdf: behind joint \"hinge\" it is not where chain \"upper\""), "{error}");
-    assert!(RecordedRobot::of_rows(&skin(0.6)).is_ok());
+    assert!(RecordedRobot::from_rows(&skin(0.6)).is_ok());
 }
 
 #[test]
 fn each_cell_of_a_skin_without_a_urdf_is_on_its_link() {
     let skin = testing::skin();
-    let robot = RecordedRobot::of_rows(&skin).unwrap();
-    let still = robot.still();
+    let robot = RecordedRobot::from_rows(&skin).unwrap();
+    let still = robot.fixed_transforms();
     let cells = still.iter().filter(|it| it.child.contains('/')).count();
     assert_eq!(cells, skin.cells.len());
-    assert_eq!(robot.moving(&[0.0; 6]).len(), skin.robot.joints.len());
+    assert_eq!(robot.moving_transforms(&[0.0; 6]).len(), skin.robot.joints.len());
 }

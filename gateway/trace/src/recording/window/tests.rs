@@ -9,7 +9,7 @@ const MS: u64 = 1_000_000;
 const START: u64 = 1_000_000_000 * MS;
 
 /// A message in the file: topic, log time, publish time, and sequence number within its topic.
-type Seen = (String, u64, u64, u32);
+type WrittenMessage = (String, u64, u64, u32);
 
 struct Bench {
     file: FileWriter<Vec<u8>>,
@@ -46,7 +46,7 @@ impl Bench {
     }
 
     /// Returns all messages of the file, and the number of those that arrived after later ones had been written.
-    fn end(mut self) -> (Vec<Seen>, u64) {
+    fn end(mut self) -> (Vec<WrittenMessage>, u64) {
         self.window.release_all(&mut self.file).unwrap();
         assert_eq!(self.window.count(), MessageCount::default());
         self.file.finish().unwrap();
@@ -127,14 +127,14 @@ fn a_time_in_the_future_is_waited_for_by_nobody() {
 #[test]
 fn no_more_waits_than_may() {
     let mut bench = Bench::new();
-    for at in 0..3 * MESSAGES as u64 {
+    for at in 0..3 * MAX_MESSAGES as u64 {
         bench.frame(START + at);
         if bench.window.is_full() {
             bench.window.release(&mut bench.file).unwrap();
         }
-        assert!(bench.window.waiting.len() < MESSAGES);
+        assert!(bench.window.waiting.len() < MAX_MESSAGES);
     }
-    assert_eq!(bench.end().0.len(), 3 * MESSAGES);
+    assert_eq!(bench.end().0.len(), 3 * MAX_MESSAGES);
 }
 
 #[test]
@@ -158,10 +158,10 @@ fn another_file_begins_with_the_same_buffers_and_an_order_of_its_own() {
 #[test]
 fn buffers_that_grew_while_a_file_stood_still_are_given_back() {
     let mut bench = Bench::new();
-    for at in 0..MESSAGES as u64 {
+    for at in 0..MAX_MESSAGES as u64 {
         bench.frame(START + at);
     }
-    assert!(bench.window.waiting.capacity() >= MESSAGES && bench.window.bytes.capacity() > INITIAL_BYTES);
+    assert!(bench.window.waiting.capacity() >= MAX_MESSAGES && bench.window.bytes.capacity() > INITIAL_BYTES);
     bench.at(START + 100 * MS);
     let ReorderWindow { waiting, bytes, buffers, .. } = &bench.window;
     let waiting = waiting.capacity() * size_of::<WaitingMessage>();

@@ -3,7 +3,7 @@
 use protocol::message::State;
 use protocol::parameters::Parameters;
 
-use super::Spoilt;
+use super::FaultCase;
 use crate::bench_conformance::wrong::{beat, force, retorqued, right_force, rounded, with, with_word};
 
 const UP: fn(i64) -> i64 = |f_z| (f_z + 128) >> 8;
@@ -11,7 +11,7 @@ const AT: fn(i64, i64) -> bool = |value, threshold| value >= threshold;
 const ALL: fn(i64) -> i64 = |sum| sum;
 
 /// Faults of the arithmetic.
-pub(crate) const ARITHMETIC: &[Spoilt] = &[
+pub(crate) const ARITHMETIC: &[FaultCase] = &[
     ("F_z is cut off, not rounded", "FORCE-1", |it| {
         it.say = |memory, message| {
             retorqued(memory, message, |memory, of| {

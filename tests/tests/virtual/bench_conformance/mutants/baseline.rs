@@ -4,11 +4,11 @@ use protocol::fixed::{Q, Q5_10};
 use protocol::message::{Answer, Message, Request, SensorPage, SkinSensors};
 use protocol::touch::contact_force;
 
-use super::Spoilt;
+use super::FaultCase;
 use crate::bench_conformance::wrong::Memory;
 
 /// Faults of the baseline.
-pub(crate) const BASELINE: &[Spoilt] = &[
+pub(crate) const BASELINE: &[FaultCase] = &[
     ("a threshold of 0 is accepted", "BASE-1", |it| {
         it.say = |memory, message| {
             let written = match memory.heard {

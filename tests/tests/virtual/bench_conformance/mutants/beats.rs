@@ -2,11 +2,11 @@
 
 use protocol::message::{Message, NetworkPage, State};
 
-use super::{NODE, Spoilt, is_claim};
+use super::{FaultCase, NODE, is_claim};
 use crate::bench_conformance::wrong::{Memory, beat, with};
 
 /// Faults of heartbeats.
-pub(crate) const BEATS: &[Spoilt] = &[
+pub(crate) const BEATS: &[FaultCase] = &[
     ("a heartbeat every 300 ms", "BEAT-1", |it| {
         it.say = |memory, mut message| {
             if beat(&mut message).is_none() || is_asked(memory) || !memory.settled {
@@ -110,7 +110,7 @@ fn is_asked(memory: &Memory) -> bool {
 }
 
 /// Faults of a settled cell that receives its own node id.
-pub(crate) const CLAIMS: &[Spoilt] = &[
+pub(crate) const CLAIMS: &[FaultCase] = &[
     ("claims are not answered", "CLAIM-6", |it| {
         it.say = |memory, mut message| {
             let is_answer = matches!(memory.heard, Some(Message::Network { .. }));

@@ -3,11 +3,11 @@
 use protocol::message::{Message, NetworkPage, SensorPage, State};
 use protocol::packet::Epoch;
 
-use super::{NODE, Spoilt};
+use super::{FaultCase, NODE};
 use crate::bench_conformance::wrong::with;
 
 /// Faults of halt, resume, sync and report.
-pub(crate) const COMMANDS: &[Spoilt] = &[
+pub(crate) const COMMANDS: &[FaultCase] = &[
     ("halt is ignored", "CMD-1", |it| {
         it.hear = |_, message, frame| if message == Some(&Message::Halt) { Vec::new() } else { vec![frame] };
     }),

@@ -4,11 +4,11 @@ use protocol::can::{EXTENDED, Format, Frame};
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::Packet;
 
-use super::{NODE, Spoilt};
+use super::{FaultCase, NODE};
 use crate::bench_conformance::wrong::{beat, fd, with};
 
 /// Faults with unusable frames.
-pub(crate) const COUNTERS: &[Spoilt] = &[
+pub(crate) const COUNTERS: &[FaultCase] = &[
     ("a wrong CRC is not counted", "COUNT-1", |it| {
         it.say = |memory, mut message| {
             let crc = match &mut message {
@@ -122,7 +122,7 @@ pub(crate) const COUNTERS: &[Spoilt] = &[
         it.put = |_, packet, format| {
             let mut packet = *packet;
             if packet.id.kind == protocol::id::Kind::Sensors && packet.count == 1 {
-                packet.words = packet.words.with(5, 7);
+                packet.words = packet.words.with_word(5, 7);
             }
             packet.frames(format).collect()
         };

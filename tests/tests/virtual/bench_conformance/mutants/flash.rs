@@ -5,7 +5,7 @@ use protocol::fixed::{Q, TorqueFormat};
 use protocol::message::{Answer, Message, Request, State};
 use protocol::parameters::{Parameters, Row, RowKind};
 
-use super::{NODE, Spoilt};
+use super::{FaultCase, NODE};
 use crate::bench_conformance::wrong::{Memory, beat, fd, with};
 
 /// Returns flash without some of the committed values.
@@ -20,7 +20,7 @@ fn loses(flash: FlashState, lose: fn(&mut Parameters)) -> FlashState {
 }
 
 /// Faults at a restart after a commit.
-pub(crate) const FLASH: &[Spoilt] = &[
+pub(crate) const FLASH: &[FaultCase] = &[
     ("flash takes ten commits and no more", "CONF-8", |it| {
         it.store = |memory, flash| memory.commits.get(9).copied().map_or(flash, FlashState::Valid);
     }),
@@ -98,7 +98,7 @@ fn hides(memory: &mut Memory, message: Message) -> Vec<(u64, Message)> {
 }
 
 /// Faults of a commit, a resume and a write of the mode that change other values.
-pub(crate) const LEAVES: &[Spoilt] = &[
+pub(crate) const LEAVES: &[FaultCase] = &[
     ("a commit clears ACTIVE", "STATE-1", |it| {
         it.say = |memory, message| {
             if matches!(

@@ -3,11 +3,11 @@
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::{Epoch, Words};
 
-use super::{NODE, Spoilt, decoded};
+use super::{FaultCase, NODE, decoded};
 use crate::bench_conformance::wrong::{fd, with};
 
 /// Faults with joints and contacts.
-pub(crate) const JOINTS: &[Spoilt] = &[
+pub(crate) const JOINTS: &[FaultCase] = &[
     ("a cell that measures answers everything with zeros", "JOINTS-6", |it| {
         it.add = |memory| match memory.heard {
             Some(Message::Joints { epoch, .. }) if !memory.test_mode && !memory.halted && memory.settled => {

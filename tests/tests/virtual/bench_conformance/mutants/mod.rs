@@ -16,16 +16,16 @@ pub(crate) mod stimuli;
 use protocol::can::{Format, Frame};
 use protocol::message::{Message, NetworkPage, SensorPage, State};
 
-use crate::bench_conformance::wrong::Wrong;
+use crate::bench_conformance::wrong::FaultyCell;
 
 /// Its name, the requirement, and the function that makes it from a correct cell.
-pub(crate) type Spoilt = (&'static str, &'static str, fn(&mut Wrong));
+pub(crate) type FaultCase = (&'static str, &'static str, fn(&mut FaultyCell));
 
 /// The node id of all of them.
 pub(crate) const NODE: u8 = 12;
 
 /// All of them, with the format of their bus.
-pub(crate) const ALL: &[(&[Spoilt], Format)] = &[
+pub(crate) const ALL: &[(&[FaultCase], Format)] = &[
     (arithmetic::ARITHMETIC, Format::Fd),
     (joints::JOINTS, Format::Fd),
     (commands::COMMANDS, Format::Fd),

@@ -3,11 +3,11 @@
 use protocol::message::{Answer, Message, NetworkPage, Request, State};
 use protocol::parameters::Parameter;
 
-use super::{NODE, Spoilt};
+use super::{FaultCase, NODE};
 use crate::bench_conformance::wrong::{Memory, beat, fd, with};
 
 /// Faults with parameters.
-pub(crate) const PARAMETERS: &[Spoilt] = &[
+pub(crate) const PARAMETERS: &[FaultCase] = &[
     ("the identity has the hash with the high byte first", "CONF-1", |it| {
         it.say = |_, mut message| {
             if let Message::Configured { answer: Answer::Value { number: 0, words, .. }, .. } = &mut message {

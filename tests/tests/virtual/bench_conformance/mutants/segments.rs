@@ -3,11 +3,11 @@
 use protocol::message::{Message, NetworkPage};
 use protocol::packet::Packet;
 
-use super::{NODE, Spoilt};
+use super::{FaultCase, NODE};
 use crate::bench_conformance::wrong::beat;
 
 /// Faults with segments, on a classic bus.
-pub(crate) const SEGMENTS: &[Spoilt] = &[
+pub(crate) const SEGMENTS: &[FaultCase] = &[
     ("segments are taken in either order", "COUNT-3", |it| {
         it.hear = |memory, _, frame| {
             if frame.id() >> 8 != 5 {

@@ -2,10 +2,10 @@
 
 use protocol::message::{Answer, Message, Request, SensorPage};
 
-use super::{Spoilt, page_0};
+use super::{FaultCase, page_0};
 
 /// Faults with sensor values without a request.
-pub(crate) const SENSING: &[Spoilt] = &[
+pub(crate) const SENSING: &[FaultCase] = &[
     ("a switch sends no pages", "SENSE-4", |it| {
         it.say = |memory, message| {
             let is_switch = matches!(memory.heard, Some(Message::Configure { .. }));

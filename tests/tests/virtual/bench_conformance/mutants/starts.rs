@@ -4,11 +4,11 @@ use cell_node::flash::FlashState;
 use protocol::message::{Answer, Message, NetworkPage, Request, State};
 use protocol::time::Micros;
 
-use super::{NODE, Spoilt, is_claim, page_0};
+use super::{FaultCase, NODE, is_claim, page_0};
 use crate::bench_conformance::wrong::{beat, fd, with};
 
 /// Faults that show at a start.
-pub(crate) const STARTS: &[Spoilt] = &[
+pub(crate) const STARTS: &[FaultCase] = &[
     ("the first heartbeat has no CLAIMING", "CLAIM-1", |it| {
         it.say = |memory, message| {
             let first = core::mem::replace(&mut memory.at, Micros(1)) == Micros(0);

@@ -3,11 +3,11 @@
 use protocol::message::{Message, NetworkPage, Request, SensorPage};
 use protocol::packet::Epoch;
 
-use super::{NODE, Spoilt};
+use super::{FaultCase, NODE};
 use crate::bench_conformance::wrong::fd;
 
 /// Faults with stimuli.
-pub(crate) const STIMULI: &[Spoilt] = &[
+pub(crate) const STIMULI: &[FaultCase] = &[
     ("stimuli of later epochs are latched at once", "STIM-3", |it| {
         it.hear = |_, message, frame| match message {
             Some(Message::Stimulus { to, page, .. }) => {

@@ -4,7 +4,7 @@ use hdrhistogram::Histogram;
 
 use super::super::bus_figures::BusFigures;
 use super::facts::micros;
-use super::{Draft, shown};
+use super::{PageDraft, without_empty_series};
 use crate::paper;
 use crate::report::figure::{Axis, Figure, LowerDiagram, Mark, Section, Shape, Table, quantity};
 use crate::report::thin::ThinnedLine;
@@ -21,7 +21,7 @@ fn without_rounding(error: f64) -> f64 {
     if error.abs() < ROUNDING_NM { 0.0 } else { error }
 }
 
-impl Draft<'_> {
+impl PageDraft<'_> {
     /// Creates the section on torques, which corresponds to the paper's Fig. 6.
     pub(super) fn torque(&self) -> Section {
         let joints = 0..self.run.skin.robot.joints.len();
@@ -34,7 +34,7 @@ impl Draft<'_> {
             let title = "Mean absolute error of an epoch that all cells answered in time";
             self.figure("torque-error", title, Axis::new("error", "Nm").log())
                 .series(errors.iter().map(|bus_figures| {
-                    let mut series = self.line(self.named(bus_figures), &bus_figures.lines.error);
+                    let mut series = self.line(self.bus_caption(bus_figures), &bus_figures.lines.error);
                     series.points.iter_mut().for_each(|(_, error)| *error = without_rounding(*error));
                     series
                 }))
@@ -53,7 +53,7 @@ impl Draft<'_> {
             section.text.extend(lacks.filter(|_| !is_compared));
         }
         if !free.is_empty() {
-            let names: Vec<_> = free.iter().map(|joint| self.joint(*joint)).collect();
+            let names: Vec<_> = free.iter().map(|joint| self.joint_name(*joint)).collect();
             section = section.text(format!(
                 "Torques below the resolution (half a step of the words), distributed and central: {}.",
                 names.join(", ")
@@ -62,8 +62,8 @@ impl Draft<'_> {
         if let Some(advice) = self.advice() {
             section = section.text(advice);
         }
-        let figures = loaded.into_iter().map(|joint| self.torque_of(joint));
-        section.figures(figures.chain(error)).tables(self.errors()).tables(self.formats())
+        let figures = loaded.into_iter().map(|joint| self.torque_figure(joint));
+        section.figures(figures.chain(error)).tables(self.error_table()).tables(self.formats())
     }
 
     /// Returns the buses with cells that may load a joint, each with the joint's index in its chain.
@@ -99,8 +99,8 @@ impl Draft<'_> {
     }
 
     /// Creates the figure of the torque on one joint, with the distributed minus the central torque below.
-    fn torque_of(&self, joint: usize) -> Figure {
-        let name = self.joint(joint);
+    fn torque_figure(&self, joint: usize) -> Figure {
+        let name = self.joint_name(joint);
         let name =
             name.strip_prefix("joint ").map_or_else(|| name.clone(), |number| format!("Joint {number}"));
         let title =
@@ -111,7 +111,7 @@ impl Draft<'_> {
         let distributed = self.run.motion.distributed.get(joint).map(|line| self.line("", line));
         let of_bus = |(_, place, bus_figures): (usize, usize, &BusFigures)| {
             let line = bus_figures.lines.difference.get(place)?;
-            (line.count() > 0).then(|| self.line(self.named(bus_figures), line))
+            (line.count() > 0).then(|| self.line(self.bus_caption(bus_figures), line))
         };
         let series: Vec<_> = self.buses_of(joint).filter_map(of_bus).collect();
         let figure = self
@@ -127,7 +127,7 @@ impl Draft<'_> {
     }
 
     /// Returns a joint's name in the skin's file, with its number unless the name contains it.
-    fn joint(&self, index: usize) -> String {
+    fn joint_name(&self, index: usize) -> String {
         let number = index + 1;
         match self.run.skin.robot.joints.get(index) {
             Some(joint) if joint.name != format!("joint{number}") => format!("{number} {}", joint.name),
@@ -142,7 +142,7 @@ impl Draft<'_> {
     }
 
     /// Creates the table of torque errors by joint.
-    fn errors(&self) -> Option<Table> {
+    fn error_table(&self) -> Option<Table> {
         let skin = &self.run.skin;
         let mut by_joint = vec![[Errors::default(); 2]; skin.robot.joints.len()];
         let mut accuracy = Accuracy::default();
@@ -151,7 +151,7 @@ impl Draft<'_> {
             let both = here.single_by_joint.iter().zip(&here.whole_by_joint);
             for ((joint, _), (single, whole)) in skin.joints_on_bus(bus).zip(both) {
                 if let Some([sum, of_whole]) = by_joint.get_mut(joint) {
-                    (*sum, *of_whole) = (sum.with(*single), of_whole.with(*whole));
+                    (*sum, *of_whole) = (sum.merged(*single), of_whole.merged(*whole));
                 }
             }
             accuracy = accuracy.with(here);
@@ -169,7 +169,7 @@ impl Draft<'_> {
         }
         let joints =
             single.zip(&skin.robot.joints).enumerate().map(|(joint, ((single, whole), described))| {
-                row(self.joint(joint), described.kind.torque_unit(), single, whole)
+                row(self.joint_name(joint), described.kind.torque_unit(), single, whole)
             });
         let all = row("all".to_owned(), self.torque_unit(), &accuracy.single, &accuracy.whole);
         let [single, whole] = [paper::SINGLE_NM, paper::SUMMED_NM].map(|mean| quantity(mean, "Nm"));
@@ -184,9 +184,9 @@ impl Draft<'_> {
     /// Creates the section on joint positions and torques over time, which corresponds to the paper's Fig. 7.
     pub(super) fn motion(&self) -> Section {
         let motion = &self.run.motion;
-        let figures = self.groups().into_iter().enumerate().flat_map(|(group, (kind, joints))| {
+        let figures = self.joint_groups().into_iter().enumerate().flat_map(|(group, (kind, joints))| {
             let figure = |name: &str, title: &str, y: Axis, all: &[ThinnedLine]| {
-                let of_joint = |&joint: &usize| Some(self.line(self.joint(joint), all.get(joint)?));
+                let of_joint = |&joint: &usize| Some(self.line(self.joint_name(joint), all.get(joint)?));
                 let name = if group == 0 { name.to_owned() } else { format!("{name}-{}", group + 1) };
                 self.figure(name, title, y).series(joints.iter().filter_map(of_joint)).marks(self.marks())
             };
@@ -200,7 +200,8 @@ impl Draft<'_> {
             self.missing_sentence("joint velocities, because joints frames contain only positions");
         let is_there = |figure: &Figure| no_velocity.is_none() || !figure.name.starts_with("velocities");
         let (still, figures): (Vec<_>, Vec<_>) = figures.filter(is_there).partition(is_zero);
-        let mut section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
+        let mut section =
+            Section::new("motion", "The arm").figures(figures.into_iter().filter_map(without_empty_series));
         section.text.extend(no_velocity);
         if still.is_empty() {
             section
@@ -211,7 +212,7 @@ impl Draft<'_> {
 
     /// Groups the joints that share a figure. A group has joints of one kind (revolute or prismatic) that a chain has
     /// and the chains before it do not, at most one for each colour.
-    fn groups(&self) -> Vec<(JointKind, Vec<usize>)> {
+    fn joint_groups(&self) -> Vec<(JointKind, Vec<usize>)> {
         let robot = &self.run.skin.robot;
         let mut rest: Vec<_> = (0..robot.joints.len()).collect();
         let mut groups = Vec::new();
@@ -247,7 +248,7 @@ impl Draft<'_> {
                 if is_known || self.run.frames_only.is_none() { "was in contact" } else { "sent a torque" };
             section.text(format!("No cell {none}."))
         } else {
-            section.figures(shown(figure))
+            section.figures(without_empty_series(figure))
         }
     }
 
@@ -292,7 +293,7 @@ impl Draft<'_> {
             .text(
                 "The distributed computation takes no time in a tick: the sum is updated as replies arrive.",
             )
-            .figures(figures.into_iter().filter_map(shown))
+            .figures(figures.into_iter().filter_map(without_empty_series))
             .tables([Table::new("The control loop", head, rows)])
     }
 }

@@ -1,9 +1,9 @@
 //! The sections on the buses: replies and packets of the cells, and the load of real buses.
 
 use super::super::bus_figures::{BusFigures, Latency};
-use super::{Draft, shown};
+use super::{PageDraft, without_empty_series};
 use crate::fit::limits::MAX_NODES;
-use crate::fit::verdict::{Answer, percent};
+use crate::fit::verdict::{FitSummary, percent};
 use crate::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table, number, quantity};
 use crate::report::svg::stairs;
 use crate::report::thin::{BinnedSums, ThinnedLine};
@@ -14,7 +14,7 @@ use model::table::{CellState, Event};
 /// Maximum number of cells in the table of the cells with most problems.
 const MAX_WORST_CELLS: usize = 12;
 
-impl Draft<'_> {
+impl PageDraft<'_> {
     pub(super) fn replies(&self) -> Section {
         let due = self.run.bus_figures.iter().filter(|bus_figures| bus_figures.account().due > 0);
         let mut section = Section::new("replies", "Replies")
@@ -22,9 +22,9 @@ impl Draft<'_> {
                 "A reply is due from every cell that is configured, awake and in contact; it is in time before the next \
                  joints, late within three more.",
             )
-            .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)).filter_map(shown))
-            .tables([self.accounts()])
-            .tables(self.worst());
+            .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)).filter_map(without_empty_series))
+            .tables([self.account_table()])
+            .tables(self.worst_cells_table());
         let none_due = |bus_figures: &&BusFigures| bus_figures.account().due == 0;
         let complete = |bus_figures: &&BusFigures| {
             let account = bus_figures.account();
@@ -65,11 +65,11 @@ impl Draft<'_> {
         figures
     }
 
-    fn accounts(&self) -> Table {
+    fn account_table(&self) -> Table {
         let row = |bus_figures: &BusFigures| {
             let account = bus_figures.account();
             let counters = bus_figures.table.counters();
-            let reply = Quantiles::from_histogram(bus_figures.table.delays().of_last_replies(), 1.0);
+            let reply = Quantiles::from_histogram(bus_figures.table.delays().last_replies(), 1.0);
             let numbers = [
                 account.due,
                 account.in_time,
@@ -100,7 +100,7 @@ impl Draft<'_> {
     }
 
     /// Creates the table of the cells with most problems; among cells with equally many, the slowest come first.
-    fn worst(&self) -> Option<Table> {
+    fn worst_cells_table(&self) -> Option<Table> {
         let cells = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
             let described = self.run.skin.cells_on_bus(bus);
             bus_figures.table.cells().iter().zip(described).zip(&bus_figures.latency).map(
@@ -162,7 +162,7 @@ impl Draft<'_> {
 
     /// Returns the load in % from the first tick or joints on. Before that the load is not typical, because all cells
     /// start at once.
-    pub(super) fn percent(&self, binned: &BinnedSums) -> Vec<(f64, f64)> {
+    pub(super) fn load_percent(&self, binned: &BinnedSums) -> Vec<(f64, f64)> {
         let rates = binned.rates().into_iter().map(|(x, part)| (x - self.zero, part * 100.0));
         rates.filter(|(x, _)| *x >= 0.0).collect()
     }
@@ -175,19 +175,21 @@ impl Draft<'_> {
 
     /// Creates the findings on whether real buses can carry the traffic, in this run and in the worst case. They are
     /// rated only if the bit rates were chosen, not for defaults.
-    pub(super) fn fits(&self) -> Vec<Finding> {
+    pub(super) fn fit_findings(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         let limits = format!("at most 100 %, replies before the next joints, {MAX_NODES} nodes");
         for bus in self.shadows() {
             let bus_figures = self.run.bus_figures.iter().find(|bus_figures| bus_figures.name == bus.bus);
             let origin = bus_figures.and_then(|bus_figures| bus_figures.rates_from);
             for answer in bus.this_run.iter().chain(&bus.worst_case) {
-                let Answer { load, rates, cells, verdict } = answer;
-                let what = format!("{} at {rates}, {}: {verdict} ({cells})", bus.bus, answer.case());
+                let FitSummary { load, rates, cells, verdict } = answer;
+                let what = format!("{} at {rates}, {}: {verdict} ({cells})", bus.bus, answer.case_name());
                 let finding = Finding::stated(what, (tenths(100.0 * load), "%"));
                 findings.push(match origin {
-                    Some(origin) => finding.must(limits.as_str(), verdict.fits()).from(origin),
-                    None => finding.against("not rated: these bit rates are defaults"),
+                    Some(origin) => {
+                        finding.with_requirement(limits.as_str(), verdict.fits()).with_origin(origin)
+                    }
+                    None => finding.with_reference("not rated: these bit rates are defaults"),
                 });
             }
         }
@@ -201,8 +203,8 @@ impl Draft<'_> {
             let (rates, width) = (rates.rates, quantity(load.width(), "s"));
             let title = format!("{name}: load of a real bus at {rates}, over {width} each");
             self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
-                .draw("load of a real bus", Shape::Steps, self.percent(load))
-                .draw("including bench-only frames", Shape::Dashed, stairs(&self.percent(load_of_all)))
+                .draw("load of a real bus", Shape::Steps, self.load_percent(load))
+                .draw("including bench-only frames", Shape::Dashed, stairs(&self.load_percent(load_of_all)))
                 .marks([Mark::y(100.0, "full load")])
         };
         let text = "On this bus a frame took no time. On a real bus it takes the time of its bits, including its stuff bits. \
@@ -217,8 +219,8 @@ impl Draft<'_> {
             );
         }
         section
-            .figures(self.run.bus_figures.iter().map(figure).filter_map(shown))
-            .tables(self.shadows().map(|bus| carried(&bus)))
+            .figures(self.run.bus_figures.iter().map(figure).filter_map(without_empty_series))
+            .tables(self.shadows().map(|bus| load_table(&bus)))
     }
 
     pub(super) fn losses(&self) -> Section {
@@ -256,25 +258,25 @@ impl Draft<'_> {
         let mut section = Section::new("losses", "Losses")
             .text("Rows of possible losses are always shown; other rows only when they are not 0.");
         section.text.extend(self.missing_sentence("skipped ticks and bad cycles"));
-        section.tables(self.lost()).tables([Table::new("All counts", ["what", "count"], rows)])
+        section.tables(self.loss_table()).tables([Table::new("All counts", ["what", "count"], rows)])
     }
 }
 
 /// Creates the table of a bus's load, with a column for operation and one for start-up.
-fn carried(bus: &BusShadow) -> Table {
+fn load_table(bus: &BusShadow) -> Table {
     let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
     let mut rows = Vec::new();
     let mut row = |cells: [&str; 6]| rows.push(cells.map(str::to_owned));
     if let Some(worst) = &bus.worst_case {
         let (verdict, load, cells) =
             (worst.verdict.to_string(), percent(worst.load), worst.cells.to_string());
-        row([worst.case(), &verdict, &load, "", "", &cells]);
+        row([worst.case_name(), &verdict, &load, "", "", &cells]);
     }
     if let Some(run) = &bus.this_run {
         let mean = bus.answering.and_then(|it| it.mean).unwrap_or(0.0);
         let cells = format!("{}, {} on average", run.cells, number(tenths(mean)));
         let [second, short] = [run.load, bus.load.worst_16_ms.value].map(percent);
-        row([run.case(), &run.verdict.to_string(), &share(bus.load.mean), &second, &short, &cells]);
+        row([run.case_name(), &run.verdict.to_string(), &share(bus.load.mean), &second, &short, &cells]);
     }
     if let Some(start) = &bus.start_up {
         let frames = format!("{} frames in {} without joints", start.frames, quantity(start.duration_s, "s"));

@@ -1,6 +1,6 @@
 //! The facts at the head of a report: the capture, its origin, and the machine.
 
-use super::super::Run;
+use super::super::RunData;
 use crate::report::figure::quantity;
 
 /// Formats a time in µs from the recording's metadata.
@@ -9,7 +9,7 @@ pub(super) fn micros(text: &str) -> String {
 }
 
 /// Returns the facts about the capture, each with its name.
-pub(super) fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
+pub(super) fn facts(run: &RunData, command: &str) -> Vec<(String, String)> {
     if let Some(frames_only) = &run.frames_only {
         let began = frames_only.began.map(utc).map(|began| ("first frame", began));
         let capture = ("capture", format!("{}, {}, {} bytes", run.name, frames_only.format, run.bytes));

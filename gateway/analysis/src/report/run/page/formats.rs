@@ -4,18 +4,18 @@ use model::table::RoundingErrors;
 use protocol::fixed::TorqueFormat;
 
 use super::super::bus_figures::BusFigures;
-use super::Draft;
+use super::PageDraft;
 use crate::report::figure::{Finding, Table, quantity};
 
 /// The rounding errors in each torque format, for the torques of one bus.
-struct Choice<'a> {
+struct FormatComparison<'a> {
     bus: &'a str,
     used: TorqueFormat,
     all: [(TorqueFormat, RoundingErrors); TorqueFormat::ALL.len()],
 }
 
-impl Choice<'_> {
-    fn of(&self, format: TorqueFormat) -> RoundingErrors {
+impl FormatComparison<'_> {
+    fn rounding(&self, format: TorqueFormat) -> RoundingErrors {
         self.all
             .iter()
             .find(|(it, _)| *it == format)
@@ -23,16 +23,17 @@ impl Choice<'_> {
     }
 
     /// Returns the finest format whose range contains every torque; the format with the widest range if there is none.
-    fn best(&self) -> TorqueFormat {
+    fn best_format(&self) -> TorqueFormat {
         let holds = |(_, rounded): &&(TorqueFormat, RoundingErrors)| rounded.beyond == 0;
         self.all.iter().find(holds).or_else(|| self.all.last()).map_or(self.used, |(format, _)| *format)
     }
 
     /// Returns a sentence on what a better format gains and costs; `None` if the format of the bus is the best.
     fn advice(&self) -> Option<String> {
-        let (used, best) = (self.used, self.best());
-        let beyond = self.of(used).beyond;
-        let cost = |format: TorqueFormat| quantity(self.of(format).errors.mean().unwrap_or(f64::NAN), "Nm");
+        let (used, best) = (self.used, self.best_format());
+        let beyond = self.rounding(used).beyond;
+        let cost =
+            |format: TorqueFormat| quantity(self.rounding(format).errors.mean().unwrap_or(f64::NAN), "Nm");
         let (costs, instead) = (cost(best), cost(used));
         let (name, bus) = (best.name(), self.bus);
         match (best == used, beyond) {
@@ -51,16 +52,16 @@ impl Choice<'_> {
     }
 }
 
-impl Draft<'_> {
+impl PageDraft<'_> {
     /// Returns the comparison of formats for each bus whose torques were compared.
-    fn choices(&self) -> impl Iterator<Item = Choice<'_>> {
+    fn choices(&self) -> impl Iterator<Item = FormatComparison<'_>> {
         let buses = self.run.bus_figures.iter().zip(&self.run.skin.buses);
         buses.filter_map(|(BusFigures { name, table, .. }, bus)| {
             let formats = table.accuracy().formats;
             let is_compared = formats.iter().any(|it| it.beyond + it.errors.count() > 0);
             let mut rounded = formats.into_iter();
             let all = TorqueFormat::ALL.map(|format| (format, rounded.next().unwrap_or_default()));
-            is_compared.then_some(Choice { bus: name, used: bus.torque_format, all })
+            is_compared.then_some(FormatComparison { bus: name, used: bus.torque_format, all })
         })
     }
 
@@ -70,7 +71,7 @@ impl Draft<'_> {
             let (bus, used) = (choice.bus, choice.used);
             let bound = quantity(used.bound(), "Nm");
             let what = format!("{bus}: torques beyond the range of {}, {bound}", used.name());
-            super::none(what, choice.of(used).beyond).from("skin: torque_format")
+            super::zero_required(what, choice.rounding(used).beyond).with_origin("skin: torque_format")
         })
     }
 

@@ -3,7 +3,7 @@
 use model::table::Notice;
 
 use super::super::moments::Loss;
-use super::Draft;
+use super::PageDraft;
 use crate::report::figure::{Table, quantity};
 
 /// Maximum number of rows of a table of moments.
@@ -13,13 +13,13 @@ const MAX_ROWS: usize = 25;
 const HEAD: [&str; 3] = ["at", "what", "command"];
 
 /// An event in the recording: its time, its weight by which it is selected, and its description.
-struct Moment {
+struct WeightedMoment {
     at: f64,
     weight: f64,
     what: String,
 }
 
-impl Draft<'_> {
+impl PageDraft<'_> {
     /// Returns the command that shows the recording around a time, given in s after its first message.
     pub(super) fn view_command(&self, at: f64) -> String {
         let seconds = (at - self.run.zero.unwrap_or(0.0)).max(0.0);
@@ -29,7 +29,7 @@ impl Draft<'_> {
     }
 
     /// Creates the table of touches, each on a link.
-    pub(super) fn touches(&self) -> Option<Table> {
+    pub(super) fn touch_table(&self) -> Option<Table> {
         let skin = &self.run.skin;
         let mut all = Vec::new();
         let mut further = 0;
@@ -39,7 +39,7 @@ impl Draft<'_> {
             further += bus_figures.touched.further;
             all.extend(bus_figures.touched.touches.iter().map(|touch| {
                 let ((from, to), (place, force)) = (touch.seconds, touch.strongest);
-                let link = self.link((chain, touch.row), Some(bus));
+                let link = self.link_name((chain, touch.row), Some(bus));
                 let (cells, node) = (touch.cells.len(), nodes.get(place));
                 let cell = node.map_or_else(String::new, |node| format!(" {node}"));
                 let long = quantity(to - from, "s");
@@ -49,14 +49,14 @@ impl Draft<'_> {
                 } else {
                     format!("{link}: {cells} cells, at most {force_n} on cell{cell}, {long}")
                 };
-                Moment { at: from, weight: force * cells as f64, what }
+                WeightedMoment { at: from, weight: force * cells as f64, what }
             }));
         }
         self.table("Touches, cells of a link together", all, further)
     }
 
     /// Creates the table of losses, and of cells that fell silent, came back or restarted.
-    pub(super) fn lost(&self) -> Option<Table> {
+    pub(super) fn loss_table(&self) -> Option<Table> {
         let mut all = Vec::new();
         let mut further = 0;
         for bus_figures in &self.run.bus_figures {
@@ -65,15 +65,15 @@ impl Draft<'_> {
             all.extend(moments.losses.iter().map(|loss| {
                 let what = format!(
                     "{name}: {} within {}",
-                    counts(loss),
+                    loss_text(loss),
                     quantity(loss.seconds.1 - loss.seconds.0, "s")
                 );
-                Moment { at: loss.seconds.0, weight: loss.total() as f64, what }
+                WeightedMoment { at: loss.seconds.0, weight: loss.total() as f64, what }
             }));
             all.extend(moments.notices.iter().filter_map(|(at, notice)| {
                 let what = match notice {
                     Notice::Dead(node) => format!("{name}: cell {node} is silent"),
-                    Notice::Back(node) => format!("{name}: cell {node} sends again"),
+                    Notice::Revived(node) => format!("{name}: cell {node} sends again"),
                     Notice::Restarted(node) => format!("{name}: cell {node} restarted"),
                     Notice::Duplicate(node) => {
                         format!("{name}: cell {node} received packets of another one with its node id")
@@ -81,7 +81,7 @@ impl Draft<'_> {
                     Notice::OtherGateway => format!("{name}: another gateway sends"),
                     Notice::Returned(_) => return None,
                 };
-                Some(Moment { at: *at, weight: f64::INFINITY, what })
+                Some(WeightedMoment { at: *at, weight: f64::INFINITY, what })
             }));
         }
         self.table("Moments of losses", all, further)
@@ -89,7 +89,7 @@ impl Draft<'_> {
 
     /// Creates a table of the events with the highest weights, in order of time. `further` is the number of events that
     /// were not kept.
-    fn table(&self, title: &str, mut all: Vec<Moment>, further: u64) -> Option<Table> {
+    fn table(&self, title: &str, mut all: Vec<WeightedMoment>, further: u64) -> Option<Table> {
         if all.is_empty() {
             return None;
         }
@@ -102,15 +102,15 @@ impl Draft<'_> {
         } else {
             title.to_owned()
         };
-        let rows = all.into_iter().map(|Moment { at, what, .. }| {
+        let rows = all.into_iter().map(|WeightedMoment { at, what, .. }| {
             vec![format!("{:.3}\u{a0}s", at - self.zero), what, self.view_command(at)]
         });
-        Some(Table::new(title, HEAD, rows).of_commands())
+        Some(Table::new(title, HEAD, rows).with_commands())
     }
 }
 
 /// Formats the counts of a loss.
-fn counts(loss: &Loss) -> String {
+fn loss_text(loss: &Loss) -> String {
     let all =
         [(loss.late, "replies late"), (loss.missing, "replies missing"), (loss.packets, "packets lost")];
     let all = all.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use model::surface::lay_flat;
 
 use super::super::bus_figures::BusFigures;
-use super::Draft;
+use super::PageDraft;
 use crate::report::figure::{
-    Drawing, Legend, Map, Panel, Section, Spot, Strip, StripGroup, StripRow, quantity,
+    Drawing, Legend, Map, MapCell, Panel, Section, Strip, StripGroup, StripRow, quantity,
 };
 
 /// Maximum number of rows of the strip of touched cells.
@@ -16,7 +16,7 @@ const MAX_STRIP_ROWS: usize = 40;
 /// A link of the robot: the index of a chain, and a row of it from 1.
 type ChainRow = (usize, u8);
 
-impl Draft<'_> {
+impl PageDraft<'_> {
     /// Creates the section on touches, with their times and forces.
     pub(super) fn skin(&self) -> Section {
         let section = Section::new("skin", "The skin");
@@ -36,7 +36,7 @@ impl Draft<'_> {
             (Some(strip), Some(force)) => section
                 .text("A force is that of Algorithm 1 on the cell's sensors, from the joints at which it was latched to the next.")
                 .drawings([Drawing::Strip(strip), Drawing::Map(force)])
-                .tables(self.touches()),
+                .tables(self.touch_table()),
             (..) if self.lacks_forces() => section.text(
                 self.missing_sentence("stimuli or sensors of the cells that sent torques, and so the forces on them").unwrap_or_default(),
             ),
@@ -100,7 +100,7 @@ impl Draft<'_> {
         for ((chain, row, bus, _), _, of_cell) in rows {
             let key = ((chain, row), bus);
             if groups.last().is_none_or(|(last, _)| *last != key) {
-                let title = self.link((chain, row), Some(bus));
+                let title = self.link_name((chain, row), Some(bus));
                 groups.push((key, StripGroup { title, rows: Vec::new() }));
             }
             if let Some((_, group)) = groups.last_mut() {
@@ -138,19 +138,19 @@ impl Draft<'_> {
         }
         let panels = links.into_iter().map(|(link, cells)| {
             let placed: Vec<_> = cells.iter().map(|(cell, _)| (cell.position, cell.normal)).collect();
-            let flat = lay_flat(&placed, self.to_tip(link));
+            let flat = lay_flat(&placed, self.tip_direction(link));
             let spots = cells.iter().zip(flat.places).map(|((cell, value), at)| {
                 let bus = skin.buses.get(cell.bus).map_or("", |bus| &bus.name);
-                Spot { at, value: *value, caption: format!("{bus} {}", cell.node) }
+                MapCell { at, value: *value, caption: format!("{bus} {}", cell.node) }
             });
-            Panel { title: self.link(link, None), radius: flat.radius, cells: spots.collect() }
+            Panel { title: self.link_name(link, None), radius: flat.radius, cells: spots.collect() }
         });
         let panels = panels.collect();
         Some(Map { name: name.to_owned(), title: title.to_owned(), legend, panels })
     }
 
     /// Returns the direction from the previous link to this one, in this link's frame.
-    fn to_tip(&self, (chain, row): ChainRow) -> [f64; 3] {
+    fn tip_direction(&self, (chain, row): ChainRow) -> [f64; 3] {
         let rows = self.run.skin.robot.chains.get(chain).map(|chain| &chain.rows);
         let row = rows.and_then(|rows| rows.get(usize::from(row).saturating_sub(1)));
         row.map_or([0.0, 0.0, 1.0], |row| {
@@ -160,7 +160,7 @@ impl Draft<'_> {
     }
 
     /// Returns the name of a link, with its bus if there are several.
-    pub(super) fn link(&self, (chain, row): ChainRow, bus: Option<usize>) -> String {
+    pub(super) fn link_name(&self, (chain, row): ChainRow, bus: Option<usize>) -> String {
         let skin = &self.run.skin;
         let chains = &skin.robot.chains;
         let of_chain = chains.get(chain).filter(|_| chains.len() > 1);

@@ -1,5 +1,5 @@
 use super::*;
-use crate::report::figure::{Spot, StripGroup, StripRow};
+use crate::report::figure::{MapCell, StripGroup, StripRow};
 use roxmltree::Document;
 
 const SVG: &str = "http://www.w3.org/2000/svg";
@@ -74,7 +74,7 @@ fn a_strip_has_each_value_at_its_time_in_its_row_and_colour() {
 
 #[test]
 fn a_map_has_each_cell_once_apart_and_inside() {
-    let spot = |at: [f64; 2], value: Option<f64>| Spot { at, value, caption: format!("vcan0 {at:?}") };
+    let spot = |at: [f64; 2], value: Option<f64>| MapCell { at, value, caption: format!("vcan0 {at:?}") };
     let cells = (0..30_u32).map(|at| {
         let angle = (f64::from(at % 10) - 4.5) / 10.0 * core::f64::consts::TAU;
         spot([0.05 * angle, f64::from(at / 10) * 0.03], if at == 4 { None } else { Some(f64::from(at)) })

@@ -22,7 +22,7 @@
 
 /// State of a cell's contact according to its last recorded torque.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(in super::super) enum Contact {
+pub(in super::super) enum RecordedContact {
     /// The cell has sent no torque in this pass.
     #[default]
     Unknown,
@@ -34,7 +34,7 @@ pub(in super::super) enum Contact {
 
 /// An input from the recording: a torque, or the start of a pass.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(in super::super) enum Recorded {
+pub(in super::super) enum RecordedTorque {
     Torque,
     /// A torque that ends a contact.
     End,
@@ -44,7 +44,7 @@ pub(in super::super) enum Recorded {
 
 /// End of a contact in this replay, compared with the recorded end.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(in super::super) enum End {
+pub(in super::super) enum EndNow {
     #[default]
     AsRecorded,
     /// The end came earlier than recorded, because the cell received joints that it had missed in the capture.
@@ -53,7 +53,7 @@ pub(in super::super) enum End {
 
 /// Torques of a cell in one round, in the recording and in this replay.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(in super::super) enum Round {
+pub(in super::super) enum RoundTorques {
     /// The cell sent a torque in the capture and in this replay.
     Both,
     /// The cell sent a torque only in this replay, and the recording explains why.
@@ -62,13 +62,13 @@ pub(in super::super) enum Round {
     LateEnd,
 }
 
-impl Contact {
+impl RecordedContact {
     /// Returns the state after an input.
-    pub(in super::super) const fn next(self, input: Recorded) -> Self {
+    pub(in super::super) const fn next(self, input: RecordedTorque) -> Self {
         match (self, input) {
-            (Self::Unknown | Self::Lasts | Self::Over, Recorded::Torque) => Self::Lasts,
-            (Self::Unknown | Self::Lasts | Self::Over, Recorded::End) => Self::Over,
-            (Self::Unknown | Self::Lasts | Self::Over, Recorded::PassBegins) => Self::Unknown,
+            (Self::Unknown | Self::Lasts | Self::Over, RecordedTorque::Torque) => Self::Lasts,
+            (Self::Unknown | Self::Lasts | Self::Over, RecordedTorque::End) => Self::Over,
+            (Self::Unknown | Self::Lasts | Self::Over, RecordedTorque::PassBegins) => Self::Unknown,
         }
     }
 
@@ -83,14 +83,14 @@ impl Contact {
     }
 }
 
-impl End {
+impl EndNow {
     /// Returns the state after an input.
-    pub(in super::super) const fn next(self, input: Round) -> Self {
+    pub(in super::super) const fn next(self, input: RoundTorques) -> Self {
         match (self, input) {
-            (Self::AsRecorded | Self::Earlier, Round::Extra { is_end: true }) => Self::Earlier,
+            (Self::AsRecorded | Self::Earlier, RoundTorques::Extra { is_end: true }) => Self::Earlier,
             (
                 Self::AsRecorded | Self::Earlier,
-                Round::Both | Round::Extra { is_end: false } | Round::LateEnd,
+                RoundTorques::Both | RoundTorques::Extra { is_end: false } | RoundTorques::LateEnd,
             ) => Self::AsRecorded,
         }
     }
@@ -100,20 +100,20 @@ impl End {
 mod tests {
     use super::*;
     use crate::replay::comparator::states::check_table;
-    use Contact::{Lasts, Over, Unknown};
-    use End::{AsRecorded, Earlier};
+    use EndNow::{AsRecorded, Earlier};
+    use RecordedContact::{Lasts, Over, Unknown};
 
     #[test]
     fn the_recorded_contact_follows_the_last_torque() {
         let all = [Unknown, Lasts, Over];
         check_table(
-            (&all, &[Recorded::Torque, Recorded::End, Recorded::PassBegins]),
+            (&all, &[RecordedTorque::Torque, RecordedTorque::End, RecordedTorque::PassBegins]),
             &[
-                ("lasts", &all, &[Recorded::Torque], |_| Lasts),
-                ("ends", &all, &[Recorded::End], |_| Over),
-                ("pass_begins", &all, &[Recorded::PassBegins], |_| Unknown),
+                ("lasts", &all, &[RecordedTorque::Torque], |_| Lasts),
+                ("ends", &all, &[RecordedTorque::End], |_| Over),
+                ("pass_begins", &all, &[RecordedTorque::PassBegins], |_| Unknown),
             ],
-            Contact::next,
+            RecordedContact::next,
         );
         let over = |later, may_answer| all.map(|it| it.was_over(later, may_answer));
         assert_eq!([over(false, false), over(false, true)], [[false, true, false], [false, false, false]]);
@@ -122,17 +122,20 @@ mod tests {
 
     #[test]
     fn an_end_that_only_came_now_is_earlier_until_the_next_reply() {
-        let (both, end, torque) =
-            ([AsRecorded, Earlier], Round::Extra { is_end: true }, Round::Extra { is_end: false });
+        let (both, end, torque) = (
+            [AsRecorded, Earlier],
+            RoundTorques::Extra { is_end: true },
+            RoundTorques::Extra { is_end: false },
+        );
         check_table(
-            (&both, &[Round::Both, end, torque, Round::LateEnd]),
+            (&both, &[RoundTorques::Both, end, torque, RoundTorques::LateEnd]),
             &[
-                ("both", &both, &[Round::Both], |_| AsRecorded),
+                ("both", &both, &[RoundTorques::Both], |_| AsRecorded),
                 ("extra_end", &both, &[end], |_| Earlier),
                 ("extra_torque", &both, &[torque], |_| AsRecorded),
-                ("late_end", &both, &[Round::LateEnd], |_| AsRecorded),
+                ("late_end", &both, &[RoundTorques::LateEnd], |_| AsRecorded),
             ],
-            End::next,
+            EndNow::next,
         );
     }
 }

@@ -63,7 +63,7 @@ impl Pass {
 
     /// Returns the epoch of the last joints before the resent ones, as long as replies to it can come. `last` is the
     /// epoch of the latest recorded joints.
-    pub(in super::super) const fn earlier(self, last: Option<Epoch>) -> Option<Epoch> {
+    pub(in super::super) const fn earlier_epoch(self, last: Option<Epoch>) -> Option<Epoch> {
         match self {
             Self::Fresh | Self::Whole => None,
             Self::Before => last,
@@ -101,7 +101,7 @@ mod tests {
     #[test]
     fn replies_to_earlier_joints_are_those_to_the_last_ones_before() {
         let (last, all) = (Some(Epoch(9)), [Fresh, Before, Whole, PART]);
-        assert_eq!(all.map(|pass| pass.earlier(last)), [None, last, None, Some(Epoch(7))]);
+        assert_eq!(all.map(|pass| pass.earlier_epoch(last)), [None, last, None, Some(Epoch(7))]);
         assert_eq!(all.map(Pass::begins_later), [false, true, false, true]);
     }
 }

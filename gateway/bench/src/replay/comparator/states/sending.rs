@@ -73,7 +73,7 @@ impl Sending {
     }
 
     /// Returns the epoch under which the joints were sent last.
-    pub(in super::super) const fn under(self) -> Option<Epoch> {
+    pub(in super::super) const fn sent_epoch(self) -> Option<Epoch> {
         match self {
             Self::Recorded => None,
             Self::Sent { under }
@@ -119,6 +119,6 @@ mod tests {
         assert_eq!(ALL.map(Sending::is_announced), [false, true, true, true, true]);
         assert_eq!(ALL.map(Sending::is_unsent), [false, false, false, true, true]);
         assert_eq!(ALL.map(Sending::is_repeated), [false, false, true, false, true]);
-        assert_eq!(ALL.map(Sending::under), [None, Some(OLD), Some(OLD), Some(OLD), Some(OLD)]);
+        assert_eq!(ALL.map(Sending::sent_epoch), [None, Some(OLD), Some(OLD), Some(OLD), Some(OLD)]);
     }
 }

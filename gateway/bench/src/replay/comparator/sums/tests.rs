@@ -87,7 +87,7 @@ fn a_forwarding_cell_must_not_add_anything() {
     let (then, other) = (sums(&contact, &[0, 1]), sums(&contact, &[0, 0]));
     let mut today = sums(&contact, &[0, 1]);
     let sum = today.0.0.get_mut(&cell(1)).unwrap();
-    let [a, b, _, d, e, f] = sum.torque.six();
+    let [a, b, _, d, e, f] = sum.torque.first_six();
     sum.torque = [a, b, 9, d, e, f].into();
     assert_eq!(outcomes(&then, &today, 2), [SumComparison::Different, SumComparison::Equal]);
     assert_eq!(outcomes(&other, &today, 2), [SumComparison::Different, SumComparison::Equal]);
@@ -189,7 +189,7 @@ fn saturated_words_are_compared_as_saturated() {
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
     let saturate = |mut side: (SumsByCell, Trees), node| {
         let sum = side.0.0.get_mut(&cell(node)).unwrap();
-        let [_, b, c, d, e, f] = sum.torque.six();
+        let [_, b, c, d, e, f] = sum.torque.first_six();
         sum.torque = [i16::MAX, b, c, d, e, f].into();
         side
     };

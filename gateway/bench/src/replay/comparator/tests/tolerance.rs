@@ -3,7 +3,7 @@
 use super::*;
 
 /// Number of torque words that differ by 0, 1, 2 and 3 steps, and the largest difference.
-fn steps(steps: &Steps) -> ([u64; 4], u32) {
+fn steps(steps: &StepHistogram) -> ([u64; 4], u32) {
     (*steps.by_steps.first_chunk().unwrap(), steps.max)
 }
 
