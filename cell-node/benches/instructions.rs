@@ -22,15 +22,15 @@ use protocol::parameters::MAX_JOINTS;
 mod counted;
 mod setting;
 
-use setting::Setting;
+use setting::BenchSetting;
 
 /// Creates the setting outside the counted part, and never drops it, so that neither is counted.
-fn cell() -> &'static Setting {
-    Box::leak(Box::new(Setting::new()))
+fn cell() -> &'static BenchSetting {
+    Box::leak(Box::new(BenchSetting::new()))
 }
 
 /// Calls a function for all angles of the circle and combines the results into one word.
-fn circle(function: impl Fn(Q1_14) -> Q1_14) -> i16 {
+fn fold_full_circle(function: impl Fn(Q1_14) -> Q1_14) -> i16 {
     let word = |angle| function(black_box(Q1_14::from_bits(angle))).to_bits();
     // The rotation keeps a sine and its negative from cancelling out.
     (i16::MIN..=i16::MAX).fold(0_i16, |sum, angle| sum.rotate_left(1) ^ word(angle))
@@ -38,36 +38,36 @@ fn circle(function: impl Fn(Q1_14) -> Q1_14) -> i16 {
 
 #[library_benchmark]
 #[bench::k6(cell())]
-fn wrench(cell: &Setting) -> [Q1_14; MAX_JOINTS] {
+fn wrench(cell: &BenchSetting) -> [Q1_14; MAX_JOINTS] {
     cell.wrench.jacobian(black_box(&cell.words))
 }
 
 #[library_benchmark]
 #[bench::k6(cell())]
-fn projection(cell: &Setting) -> [Q1_14; MAX_JOINTS] {
+fn projection(cell: &BenchSetting) -> [Q1_14; MAX_JOINTS] {
     cell.projection.jacobian(black_box(&cell.words))
 }
 
 #[library_benchmark]
 #[bench::k6(cell())]
-fn nalgebra_f64(cell: &Setting) -> [f64; MAX_JOINTS] {
+fn nalgebra_f64(cell: &BenchSetting) -> [f64; MAX_JOINTS] {
     cell.double.jacobian(black_box(&cell.radians))
 }
 
 #[library_benchmark]
 #[bench::k6(cell())]
-fn nalgebra_f32(cell: &Setting) -> [f32; MAX_JOINTS] {
+fn nalgebra_f32(cell: &BenchSetting) -> [f32; MAX_JOINTS] {
     cell.single.jacobian(black_box(&cell.radians_f32))
 }
 
 #[library_benchmark]
 fn seventh_order() -> i16 {
-    circle(sine::sine)
+    fold_full_circle(sine::sine)
 }
 
 #[library_benchmark]
 fn fifth_order() -> i16 {
-    circle(sine::paper_sine)
+    fold_full_circle(sine::paper_sine)
 }
 
 library_benchmark_group!(
@@ -78,9 +78,9 @@ library_benchmark_group!(
 library_benchmark_group!(name = sines; benchmarks = seventh_order, fifth_order);
 
 /// Runs each benchmark once and checks its result.
-fn once() {
+fn check_all_once() {
     cell().check();
-    assert_ne!(circle(sine::sine), circle(sine::paper_sine));
+    assert_ne!(fold_full_circle(sine::sine), fold_full_circle(sine::paper_sine));
 }
 
 mod all {
@@ -94,5 +94,5 @@ mod all {
 }
 
 fn main() {
-    counted::main(once, all::run);
+    counted::main(check_all_once, all::run);
 }

@@ -13,7 +13,7 @@ use protocol::fixed::Q1_14;
 
 mod setting;
 
-use setting::Setting;
+use setting::BenchSetting;
 
 fn main() {
     let mut criterion = Criterion::default()
@@ -22,7 +22,7 @@ fn main() {
         .measurement_time(Duration::from_secs(1))
         .configure_from_args();
 
-    let setting = Setting::new();
+    let setting = BenchSetting::new();
     setting.check();
     let mut group = criterion.benchmark_group("jacobian");
     group.bench_function("wrench", |bencher| {

@@ -6,7 +6,7 @@
 
 #![expect(clippy::print_stdout, clippy::unwrap_used, reason = "it prints, and stops where it cannot")]
 
-use cell_node::kernel::oracle::{Counted, PaperWord, Projection};
+use cell_node::kernel::oracle::{CountingWord, PaperWord, Projection};
 use cell_node::kernel::{Kernel, Operations, Scalar, Word, Wrench};
 use cell_node::sine::{cosine, paper_cosine, paper_sine, sine};
 use protocol::fixed::{Q1_14, Q3_12};
@@ -19,40 +19,40 @@ use oracle::{Case, Errors};
 fn main() {
     println!("Sine over all 65 536 angles (Q1.14; rounding alone: mean 1.52e-5)\n");
     println!("| function | mean error | max error |\n|---|---|---|");
-    angles("sine, seventh order", sine, f64::sin);
-    angles("cosine, seventh order", cosine, f64::cos);
-    angles("sine, fifth order (paper)", paper_sine, f64::sin);
-    angles("cosine, fifth order (paper)", paper_cosine, f64::cos);
+    print_sine_errors("sine, seventh order", sine, f64::sin);
+    print_sine_errors("cosine, seventh order", cosine, f64::cos);
+    print_sine_errors("sine, fifth order (paper)", paper_sine, f64::sin);
+    print_sine_errors("cosine, fifth order (paper)", paper_cosine, f64::cos);
 
     println!("\nOne Jacobian on a UR5\n");
     println!("| kernel | k | mul | add | sin | cos | negations | angle additions | roundings |");
     println!("|---|---|---|---|---|---|---|---|---|");
-    (1..=6).rev().for_each(|joint| operations::<Wrench<_>>("wrench", joint));
-    (1..=6).rev().for_each(|joint| operations::<Projection<_>>("projection", joint));
+    (1..=6).rev().for_each(|joint| print_operation_counts::<Wrench<_>>("wrench", joint));
+    (1..=6).rev().for_each(|joint| print_operation_counts::<Projection<_>>("projection", joint));
     println!("| paper, Eq. 27 | 6 | 103 | 57 | 6 | 6 | | | |");
 
     println!("\nTorques of loaded joints on a UR5, Nm\n");
     println!("| kernel and numbers | mean error | max error |\n|---|---|---|");
-    let wrench = of_kernel::<Q1_14, Wrench>();
-    torques("wrench, words", wrench);
-    torques("projection, words", of_kernel::<Q1_14, Projection>());
-    torques("wrench, words, paper's sine", of_kernel::<PaperWord, Wrench<_>>());
-    torques("projection, words, paper's sine", of_kernel::<PaperWord, Projection<_>>());
+    let wrench = kernel_errors::<Q1_14, Wrench>();
+    print_torque_errors("wrench, words", wrench);
+    print_torque_errors("projection, words", kernel_errors::<Q1_14, Projection>());
+    print_torque_errors("wrench, words, paper's sine", kernel_errors::<PaperWord, Wrench<_>>());
+    print_torque_errors("projection, words, paper's sine", kernel_errors::<PaperWord, Projection<_>>());
     let real = |case: &Case| {
         Wrench::<f64>::new(&case.parameters()).jacobian(&case.words()).map(|row| row * case.force)
     };
-    torques("either, real numbers, from the same words", Errors::of(real));
+    print_torque_errors("either, real numbers, from the same words", Errors::of(real));
     let rounded = Errors::of(|case| real(case).map(|torque| Q3_12::nearest(torque).to_f64()));
-    torques("the same, rounded to Q3.12", rounded);
+    print_torque_errors("the same, rounded to Q3.12", rounded);
     let (poses, Errors { torques, omitted, .. }) = (Case::all().len(), wrench);
     println!("\n{torques} torques in {poses} poses; {omitted} poses left out, beyond Q3.12");
 }
 
-fn of_kernel<W: Word + Scalar, K: Kernel<W>>() -> Errors {
+fn kernel_errors<W: Word + Scalar, K: Kernel<W>>() -> Errors {
     Errors::of_words(|parameters, joints| K::new(parameters).jacobian(joints).map(W::to_word))
 }
 
-fn angles(name: &str, function: impl Fn(Q1_14) -> Q1_14, oracle: impl Fn(f64) -> f64) {
+fn print_sine_errors(name: &str, function: impl Fn(Q1_14) -> Q1_14, oracle: impl Fn(f64) -> f64) {
     let errors = (i16::MIN..=i16::MAX).map(|bits| {
         let angle = Q1_14::from_bits(bits);
         (function(angle).to_f64() - oracle(angle.to_radians())).abs()
@@ -61,7 +61,7 @@ fn angles(name: &str, function: impl Fn(Q1_14) -> Q1_14, oracle: impl Fn(f64) ->
     println!("| {name} | {:.2e} | {max:.2e} |", sum / 65_536.0);
 }
 
-fn operations<K: Kernel<Counted>>(name: &str, joint: u8) {
+fn print_operation_counts<K: Kernel<CountingWord>>(name: &str, joint: u8) {
     let case = Case::all().into_iter().find(|case| case.joint == joint).unwrap();
     let kernel = K::new(&case.parameters());
     let (_, done) = Operations::count(|| kernel.jacobian(&case.words()));
@@ -73,6 +73,6 @@ fn operations<K: Kernel<Counted>>(name: &str, joint: u8) {
     );
 }
 
-fn torques(name: &str, Errors { mean, max, .. }: Errors) {
+fn print_torque_errors(name: &str, Errors { mean, max, .. }: Errors) {
     println!("| {name} | {mean:.2e} | {max:.2e} |");
 }

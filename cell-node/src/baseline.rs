@@ -13,8 +13,8 @@
 
 use protocol::fixed::{Q1_14, Q5_10, Q9_6};
 use protocol::message::{BaselinePage, SkinSensors};
-use protocol::parameters::{Baseline as Rule, BaselineSettings, Tare};
-use protocol::touch::{Touch, contact_force};
+use protocol::parameters::{Baseline as Rule, BaselineSettings, TareCommand};
+use protocol::touch::{TouchState, contact_force};
 
 /// Number of consecutive joints messages with a steady reading before the first tare.
 pub const STEADY_JOINTS: u8 = 32;
@@ -26,7 +26,7 @@ const MEAN_SHIFT: u32 = 3;
 /// difference, limited by the rate.
 const APPROACH_SHIFT: u32 = 4;
 /// Maximum temperature difference that is compensated: 64 °C, in steps of 2^-6 °C.
-const MAX_DEGREES: i32 = 64 << 6;
+const MAX_TEMPERATURE_CHANGE: i32 = 64 << 6;
 /// Temperature change after which the coefficient is corrected: 2 °C, in steps of 2^-6 °C.
 const LEARNING_SPAN: i32 = 2 << 6;
 /// Maximum temperature change for a correction of the coefficient. After a faster change, the zero has not followed the
@@ -67,7 +67,7 @@ pub struct Baseline {
     steady: u8,
     is_tared: bool,
     is_limited: bool,
-    touch: Touch,
+    touch: TouchState,
     refused: u16,
     /// Number of tares and changes of the settings, modulo 2^8. A change of this number is reported.
     changes: u8,
@@ -130,29 +130,29 @@ impl Baseline {
         let [temperature, _] = raw.temperature;
         let (sum, reading) = (contact_force(raw), contact_force(raw) << EXTRA_FRACTION_BITS);
         let mean = self.mean.unwrap_or(reading);
-        self.is_steady = (reading - mean).abs() < rule.threshold.finer() >> 2;
+        self.is_steady = (reading - mean).abs() < rule.threshold.to_zero_steps() >> 2;
         let mean = mean + ((reading - mean) >> MEAN_SHIFT);
         self.mean = Some(mean);
         if !self.is_tared {
-            let is_within = mean.abs() <= rule.limit.finer();
+            let is_within = mean.abs() <= rule.limit.to_zero_steps();
             self.steady = if self.is_steady && is_within { self.steady + 1 } else { 0 };
             if self.steady < STEADY_JOINTS {
                 let net = if is_within_limit(sum, &rule) { 0 } else { sum };
                 self.touch = self.touch.next(net, rule.threshold.to_bits(), rule.hysteresis);
                 return;
             }
-            self.zero_at(mean, temperature);
+            self.set_zero(mean, temperature);
         }
         let shift = self.shift(temperature);
-        let limit = rule.limit.finer();
+        let limit = rule.limit.to_zero_steps();
         self.zero = (self.base + shift).clamp(-limit, limit);
         let net = sum - self.coarse_zero();
         self.touch = self.touch.next(net, rule.threshold.to_bits(), rule.hysteresis);
-        if self.touch == Touch::Touched {
+        if self.touch == TouchState::Touched {
             self.anchor = None;
         } else if rule.rate_un_per_s > 0 {
-            self.follow(reading, shift, limit);
-            self.learn(temperature);
+            self.move_zero_towards(reading, shift, limit);
+            self.learn_coefficient(temperature);
         }
     }
 
@@ -176,7 +176,7 @@ impl Baseline {
     ///
     /// # Errors
     /// Returns the reason if the tare is refused. The zero does not change then; the refusal is counted.
-    pub fn tare(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), TareRefused> {
+    pub fn tare(&mut self, raw: &SkinSensors, how: TareCommand) -> Result<(), TareRefused> {
         let done = self.try_tare(raw, how);
         if done.is_err() {
             self.refused = self.refused.wrapping_add(1);
@@ -184,19 +184,19 @@ impl Baseline {
         done
     }
 
-    fn try_tare(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), TareRefused> {
-        if how == Tare::Forget {
+    fn try_tare(&mut self, raw: &SkinSensors, how: TareCommand) -> Result<(), TareRefused> {
+        if how == TareCommand::Forget {
             self.forget();
             return Ok(());
         }
         let Rule::On(rule) = self.rule else { return Err(TareRefused::Off) };
-        let is_free = how == Tare::Forced || self.is_steady && self.touch != Touch::Touched;
+        let is_free = how == TareCommand::Forced || self.is_steady && self.touch != TouchState::Touched;
         let mean = self.mean.filter(|_| is_free).ok_or(TareRefused::Touched)?;
-        if mean.abs() > rule.limit.finer() {
+        if mean.abs() > rule.limit.to_zero_steps() {
             return Err(TareRefused::Limit);
         }
         let [temperature, _] = raw.temperature;
-        self.zero_at(mean, temperature);
+        self.set_zero(mean, temperature);
         Ok(())
     }
 
@@ -208,7 +208,7 @@ impl Baseline {
             n_per_c: self.n_per_c,
             temperature: self.reference,
             tared: self.is_tared,
-            touched: self.touch == Touch::Touched,
+            touched: self.touch == TouchState::Touched,
             limited: self.is_limited,
             refused: self.refused,
         };
@@ -223,19 +223,19 @@ impl Baseline {
     /// Returns the part of the state whose changes are reported at once with page 3.
     #[must_use]
     pub fn status(&self) -> BaselineStatus {
-        (self.is_tared, self.touch == Touch::Touched, self.is_limited, self.refused, self.changes)
+        (self.is_tared, self.touch == TouchState::Touched, self.is_limited, self.refused, self.changes)
     }
 
-    fn zero_at(&mut self, reading: i32, temperature: Q9_6) {
+    fn set_zero(&mut self, reading: i32, temperature: Q9_6) {
         (self.base, self.zero, self.reference) = (reading, reading, temperature);
-        (self.is_tared, self.is_limited, self.touch, self.anchor) = (true, false, Touch::Free, None);
+        (self.is_tared, self.is_limited, self.touch, self.anchor) = (true, false, TouchState::Free, None);
         self.changes = self.changes.wrapping_add(1);
     }
 
     /// Returns the shift of the zero at a temperature, relative to the reference temperature.
     fn shift(&self, temperature: Q9_6) -> i32 {
         let degrees = i32::from(temperature.to_bits()) - i32::from(self.reference.to_bits());
-        let degrees = degrees.clamp(-MAX_DEGREES, MAX_DEGREES);
+        let degrees = degrees.clamp(-MAX_TEMPERATURE_CHANGE, MAX_TEMPERATURE_CHANGE);
         // 14 + 6 fraction bits.
         (i32::from(self.n_per_c.to_bits()) * degrees) << 2
     }
@@ -246,7 +246,7 @@ impl Baseline {
     }
 
     /// Moves the zero towards the reading of an untouched sensor, by at most the rate and within `limit`.
-    fn follow(&mut self, reading: i32, shift: i32, limit: i32) {
+    fn move_zero_towards(&mut self, reading: i32, shift: i32, limit: i32) {
         let step = self.pace.step;
         let target = self.zero + ((reading - self.zero) >> APPROACH_SHIFT).clamp(-step, step);
         self.zero = target.clamp(-limit, limit);
@@ -255,7 +255,7 @@ impl Baseline {
     }
 
     /// Corrects the coefficient (N/°C) by the drift of the zero since the start of a temperature change.
-    fn learn(&mut self, temperature: Q9_6) {
+    fn learn_coefficient(&mut self, temperature: Q9_6) {
         let fresh = Anchor { temperature, base: self.base, joints: 0 };
         let anchor = self.anchor.get_or_insert(fresh);
         anchor.joints = anchor.joints.saturating_add(1);
@@ -282,12 +282,12 @@ impl Baseline {
 pub type BaselineStatus = (bool, bool, bool, u16, u8);
 
 /// Conversion of a number to the fraction bits of the zero.
-trait Finer {
-    fn finer(self) -> i32;
+trait ToZeroSteps {
+    fn to_zero_steps(self) -> i32;
 }
 
-impl Finer for Q5_10 {
-    fn finer(self) -> i32 {
+impl ToZeroSteps for Q5_10 {
+    fn to_zero_steps(self) -> i32 {
         i32::from(self.to_bits()) << EXTRA_FRACTION_BITS
     }
 }

@@ -1,9 +1,9 @@
 //! The path from a cell's sensor words to joint torques: the paper's Algorithm 1 and `tau = J F_z`.
 //!
 //! The code uses integers only. It is exact except for three roundings: [`Force`] (16 fraction bits), [`Torque::words`]
-//! (the torque format), and the rounding of a sum of [`Torque::exact`]. It never panics, and its work is bounded.
+//! (the torque format), and the rounding of a sum of [`Torque::exact_torques`]. It never panics, and its work is bounded.
 
-use protocol::fixed::{Acc, Q1_14, Q5_10, TorqueFormat};
+use protocol::fixed::{Accumulator, Q1_14, Q5_10, TorqueFormat};
 use protocol::parameters::{Contact, MAX_JOINTS};
 
 /// A contact force along the cell's normal, in the range [0, 32 768) N in steps of 2^-16 N. A push on the cell is
@@ -24,12 +24,13 @@ impl Force {
     /// threshold.
     #[must_use]
     pub fn fuse(contact: [Q5_10; 3], proximity: Q1_14, rule: &Contact) -> Self {
-        let touch = contact.into_iter().fold(Acc::<10>::ZERO, |sum, word| sum.saturating_add(word.widen()));
-        let touch = if touch < rule.contact_threshold.widen() { Acc::ZERO } else { touch };
+        let touch =
+            contact.into_iter().fold(Accumulator::<10>::ZERO, |sum, word| sum.saturating_add(word.widen()));
+        let touch = if touch < rule.contact_threshold.widen() { Accumulator::ZERO } else { touch };
         let near = if proximity < rule.proximity_threshold { Q1_14::ZERO } else { proximity };
 
         // At most 2^18 * 2^15 * 2^2 + 2^30 steps.
-        let weighed = Acc::<22>::from_steps(touch.steps() * rule.alpha_c.widen().steps());
+        let weighed = Accumulator::<22>::from_steps(touch.steps() * rule.alpha_c.widen().steps());
         let fused = weighed.with_fraction_bits::<24>().saturating_add(rule.alpha_p.mul_wide::<14, 24>(near));
         if fused < rule.force_threshold.widen().with_fraction_bits() {
             return Self::ZERO;
@@ -73,11 +74,11 @@ impl<'a> Torque<'a> {
 
     /// Returns the exact torques in Nm, to be added to the sums of other cells.
     #[must_use]
-    pub fn exact(&self) -> [Acc<30>; MAX_JOINTS] {
-        let mut exact = [Acc::ZERO; MAX_JOINTS];
+    pub fn exact_torques(&self) -> [Accumulator<30>; MAX_JOINTS] {
+        let mut exact = [Accumulator::ZERO; MAX_JOINTS];
         for (exact, row) in exact.iter_mut().zip(self.jacobian) {
             // At most 2^15 * 2^31 steps.
-            *exact = Acc::from_steps(row.widen().steps() * i64::from(self.force.0));
+            *exact = Accumulator::from_steps(row.widen().steps() * i64::from(self.force.0));
         }
         exact
     }
@@ -86,20 +87,20 @@ impl<'a> Torque<'a> {
     /// smallest word, which mean *saturated*. The error of all others is at most half a step, for Q3.12 1.3e-4 Nm.
     #[must_use]
     pub fn words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
-        self.words_by(&TorqueRounding::new(format, MAX_J))
+        self.rounded_words(&TorqueRounding::new(format, MAX_JACOBIAN_STEPS))
     }
 
     /// Like [`Torque::words`], with a rounding computed once per configuration. J must not exceed the bound for which
     /// the rounding was created.
     #[must_use]
     #[inline]
-    pub fn words_by(&self, rounding: &TorqueRounding) -> [i16; MAX_JOINTS] {
+    pub fn rounded_words(&self, rounding: &TorqueRounding) -> [i16; MAX_JOINTS] {
         let mut words = [0; MAX_JOINTS];
         self.write_words(rounding, &mut words);
         words
     }
 
-    /// Like [`Torque::words_by`], but writes to an array. Words beyond the length of J do not change.
+    /// Like [`Torque::rounded_words`], but writes to an array. Words beyond the length of J do not change.
     #[inline]
     pub fn write_words(&self, rounding: &TorqueRounding, words: &mut [i16; MAX_JOINTS]) {
         if self.force.0 > rounding.max_unsaturated_force {
@@ -117,7 +118,7 @@ impl<'a> Torque<'a> {
     #[inline(never)]
     fn write_saturating_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
         self.write_each(words, |row| {
-            let steps = self.steps(row, format.fraction());
+            let steps = self.steps(row, format.fraction_bits());
             i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX })
         });
     }
@@ -148,7 +149,7 @@ impl<'a> Torque<'a> {
 }
 
 /// Largest possible |J| in steps of 2^-14.
-pub const MAX_J: u16 = 1 << 15;
+pub const MAX_JACOBIAN_STEPS: u16 = 1 << 15;
 
 /// The conversion of torques to words, computed once per configuration.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -159,12 +160,12 @@ pub struct TorqueRounding {
 }
 
 impl TorqueRounding {
-    /// Creates the conversion for |J| up to `bound`, in steps of 2^-14. `bound` is [`MAX_J`] if no lower bound is
+    /// Creates the conversion for |J| up to `bound`, in steps of 2^-14. `bound` is [`MAX_JACOBIAN_STEPS`] if no lower bound is
     /// known.
     #[must_use]
     pub fn new(format: TorqueFormat, bound: u16) -> Self {
         // J F is at most the largest word, so rounding cannot exceed it.
-        let largest = i64::from(i16::MAX) << (14 + 16 - format.fraction());
+        let largest = i64::from(i16::MAX) << (14 + 16 - format.fraction_bits());
         Self {
             format,
             max_unsaturated_force: i32::try_from(largest / i64::from(bound.max(1))).unwrap_or(i32::MAX),
@@ -253,7 +254,7 @@ mod tests {
         assert_eq!(torque.words(TorqueFormat::Q3_12)[..3], [i16::MAX, i16::MIN, 0]);
         let wider = torque.words(TorqueFormat::Q5_10);
         assert_eq!(wider[..3], [Q5_10::nearest(10.0 * arm.to_f64()).to_bits(), -wider[0], 0]);
-        assert_eq!(torque.exact()[1].to_f64(), -10.0 * arm.to_f64());
+        assert_eq!(torque.exact_torques()[1].to_f64(), -10.0 * arm.to_f64());
 
         let less = Torque::new(&jacobian, Force::from_steps(9 << 16));
         assert_eq!(less.words(TorqueFormat::Q3_12)[0], Q3_12::nearest(9.0 * arm.to_f64()).to_bits());
@@ -261,17 +262,16 @@ mod tests {
 
     #[test]
     fn the_largest_force_that_surely_fits_is_not_held_and_fits() {
-        for (format, bound) in TorqueFormat::ALL
-            .into_iter()
-            .flat_map(|format| [0, 1, 3, 777, MAX_J - 1, MAX_J].map(|it| (format, it)))
-        {
+        for (format, bound) in TorqueFormat::ALL.into_iter().flat_map(|format| {
+            [0, 1, 3, 777, MAX_JACOBIAN_STEPS - 1, MAX_JACOBIAN_STEPS].map(|it| (format, it))
+        }) {
             let rounding = TorqueRounding::new(format, bound);
             let most = Q1_14::from_bits(bound.wrapping_neg().cast_signed()); // -2 m is the longest
             for steps in [rounding.max_unsaturated_force, rounding.max_unsaturated_force.saturating_add(1)] {
                 let torque = Torque { jacobian: &[most], force: Force(steps) };
                 let mut words = [0; MAX_JOINTS];
                 torque.write_words(&rounding, &mut words);
-                assert_eq!(words[0], format.round(torque.exact()[0]), "{format:?}, {bound}, {steps}");
+                assert_eq!(words[0], format.round(torque.exact_torques()[0]), "{format:?}, {bound}, {steps}");
             }
         }
     }
@@ -320,14 +320,14 @@ mod tests {
             for force in [sensed, Force::from_steps(steps)] {
                 prop_assert!(force.steps() >= 0);
                 let torque = Torque::new(&jacobian, force);
-                for ((row, exact), word) in jacobian.iter().zip(torque.exact()).zip(torque.words(TorqueFormat::Q3_12)) {
+                for ((row, exact), word) in jacobian.iter().zip(torque.exact_torques()).zip(torque.words(TorqueFormat::Q3_12)) {
                     let real = row.to_f64() * force.to_f64();
                     prop_assert_eq!(exact.to_f64(), real);
                     let held = real.clamp(Q3_12::MIN.to_f64(), Q3_12::MAX.to_f64());
                     prop_assert!((Q3_12::from_bits(word).to_f64() - held).abs() <= 0.5 / 4_096.0);
                 }
                 for format in TorqueFormat::ALL {
-                    let rounded = torque.exact().map(|exact| format.round(exact));
+                    let rounded = torque.exact_torques().map(|exact| format.round(exact));
                     prop_assert_eq!(torque.words(format), rounded);
                     let bound = jacobian.iter().map(|row| row.to_bits().unsigned_abs()).max().unwrap_or(0);
                     let mut words = [0; MAX_JOINTS];

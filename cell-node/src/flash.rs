@@ -24,7 +24,7 @@ pub const BYTES: usize = HEAD_BYTES + IMAGE_BYTES + 2;
 pub const MAX_BYTES: usize = HEAD_BYTES + MAX_IMAGE_BYTES + 2;
 
 /// A flash image.
-pub type Bytes = heapless::Vec<u8, MAX_BYTES>;
+pub type FlashImage = heapless::Vec<u8, MAX_BYTES>;
 
 /// The node id and parameters kept in flash.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -81,14 +81,14 @@ pub enum FlashError {
 
 /// Encodes a flash image.
 #[must_use]
-pub fn encode(serial: u32, kept: &FlashContent) -> Bytes {
-    let mut bytes = Bytes::new();
+pub fn encode(serial: u32, kept: &FlashContent) -> FlashImage {
+    let mut bytes = FlashImage::new();
     encode_into(&mut bytes, serial, kept);
     bytes
 }
 
 /// Encodes a flash image into an empty buffer. The image is not copied, which saves stack.
-pub fn encode_into(bytes: &mut Bytes, serial: u32, kept: &FlashContent) {
+pub fn encode_into(bytes: &mut FlashImage, serial: u32, kept: &FlashContent) {
     let number = kept.number.map_or(0, CellId::get);
     let serial = serial.to_le_bytes();
     let head: [&[u8]; 4] = [MAGIC, &[VERSION, number], &serial, &[kept.parameters.is_some().into()]];

@@ -10,7 +10,7 @@ mod subscriptions;
 
 use std::time::{Duration, Instant};
 
-use protocol::bus::{BusError, BusOptions, Received};
+use protocol::bus::{BusError, BusOptions, ReceivedFrame};
 use protocol::can::Format;
 use protocol::id::{CellId, Kind};
 use protocol::packet;
@@ -22,7 +22,7 @@ use crate::identity::Identity;
 use crate::node::Node;
 use clock::Clock;
 use outbox::Outbox;
-use sockets::{ReceiveFilters, ReceivedFrame};
+use sockets::{MergedFrame, ReceiveFilters};
 use subscriptions::Subscriptions;
 
 pub use flash_file::FlashFile;
@@ -126,7 +126,7 @@ impl HostedCells {
             link_ids.iter().enumerate().filter_map(|(port, link_id)| Some((port, (*link_id)?)))
         {
             wired |= 1 << port;
-            self.subscriptions.wire(link_id.reversed(), self.cells.len(), port);
+            self.subscriptions.subscribe_port(link_id.reversed(), self.cells.len(), port);
         }
         let node = Node::new(identity, self.format, flash, true, self.clock.now()).with_ports(wired);
         self.cells.push(HostedCell { node, file, link_ids });
@@ -202,7 +202,7 @@ impl HostedCells {
                 Err(error) => return Err(error),
             }
             now = self.clock.now();
-            for &ReceivedFrame { ref received, waited } in sockets.frames() {
+            for &MergedFrame { ref received, waited } in sockets.frames() {
                 let age = self.clock.age(now, received.at_nanos);
                 // A frame that a resting cell only counts is processed as if it had woken the process. With
                 // sums, its epoch is as old as its joints.
@@ -278,7 +278,13 @@ impl HostedCells {
     }
 
     /// Passes a frame to the cells that receive it, and collects the packets that they answer with.
-    fn deliver(&mut self, received: &Received, age: Span, bus: &str, now: Micros) -> Result<(), StopReason> {
+    fn deliver(
+        &mut self,
+        received: &ReceivedFrame,
+        age: Span,
+        bus: &str,
+        now: Micros,
+    ) -> Result<(), StopReason> {
         let frame = &received.frame;
         if let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) {
             if let Some((place, port)) = self.subscriptions.port_for_link(link_id)

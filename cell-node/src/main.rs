@@ -129,7 +129,7 @@ fn prepare(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
     if let Some(flash) = arguments.flash.as_deref().filter(|flash| !flash.is_dir()) {
         bail!("--flash {}: there is no such directory; make it first", flash.display());
     }
-    let skin = Skin::read_on(&arguments.skin, &arguments.bus)?;
+    let skin = Skin::read_for_bus(&arguments.skin, &arguments.bus)?;
     let bus_index = skin.bus_named(&arguments.bus).with_context(|| {
         let names = skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
         format!("bus {} is not in {}, which has {names}", arguments.bus, arguments.skin.display())
@@ -142,7 +142,7 @@ fn prepare(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
     let (first, last) = arguments.nodes().context("--node or --nodes is needed")?;
     let mut cells = HostedCells::new(bus.format);
     for number in first..=last {
-        start(&mut cells, arguments, &skin, bus_index, wires.as_ref(), CellId::new(number.into())?)?;
+        start_cell(&mut cells, arguments, &skin, bus_index, wires.as_ref(), CellId::new(number.into())?)?;
     }
     let line = BusPort {
         name: arguments.bus.clone(),
@@ -164,7 +164,7 @@ fn prepare(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
 }
 
 /// Starts a cell with the contents of its flash, which is first initialised from the skin.
-fn start(
+fn start_cell(
     cells: &mut HostedCells,
     arguments: &Arguments,
     skin: &Skin,

@@ -26,7 +26,7 @@ pub(crate) mod paper;
 pub use paper::{paper_cosine, paper_sine};
 
 /// The number one, with the 16 fraction bits of the polynomials.
-const ONE: i32 = 1 << 16;
+const ONE_Q16: i32 = 1 << 16;
 /// A quarter turn as a word.
 pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
 
@@ -34,7 +34,7 @@ pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
 ///
 /// The coefficients were found by search. Among all integers whose sum is one (so that the sine of a quarter turn is
 /// one), they have the smallest mean error when every intermediate result is truncated.
-const SEVENTH_ORDER: [i32; 4] = [ONE + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
+const SEVENTH_ORDER: [i32; 4] = [ONE_Q16 + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
 
 /// Returns the sine of an angle in quarter turns, in [-1, 1].
 ///
@@ -81,7 +81,7 @@ fn evaluate<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i3
 }
 
 /// Folds an angle to a word within [-1, 1] quarter turns with the same sine.
-fn fold(angle: Q1_14) -> i32 {
+fn fold_angle(angle: Q1_14) -> i32 {
     let z = angle.to_bits();
     let folded = if z.unsigned_abs() <= 1 << 14 { z } else { i16::MIN.wrapping_sub(z) };
     i32::from(folded)
@@ -89,7 +89,7 @@ fn fold(angle: Q1_14) -> i32 {
 
 /// Evaluates an odd polynomial at the folded angle. Its coefficients must add up to one.
 fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> Q1_14 {
-    let z = fold(angle);
+    let z = fold_angle(angle);
     let square = product(z, z) >> 13; // 15 fraction bits, at most 2^15
     let horner = |sum: i32, coefficient: i32| coefficient + (product(square, sum) >> 15);
     let factor = coefficients.into_iter().rev().reduce(horner).unwrap_or(0);
@@ -113,7 +113,7 @@ pub(crate) const FINE_FRACTION_BITS: u32 = 28;
 /// turns; elsewhere the error is at most 1e-8.
 pub(crate) fn fine_sine_cosine(angle: Q1_14) -> [i64; 2] {
     [angle, angle.wrapping_add(QUARTER)].map(|angle| {
-        let z = i64::from(fold(angle));
+        let z = i64::from(fold_angle(angle));
         let factor = TAYLOR.into_iter().rev().reduce(|sum, c| c + ((z * z * sum) >> 28)).unwrap_or(0);
         let product = z * factor; // 14 + 32 fraction bits
         (product + (1 << 17)) >> 18
@@ -140,7 +140,7 @@ const TAYLOR: [i64; 8] = {
 mod tests {
     use super::paper::paper_sine_cosine;
     use super::*;
-    use protocol::fixed::Acc;
+    use protocol::fixed::Accumulator;
 
     /// Returns the mean and maximum error over all angles.
     fn errors(function: impl Fn(Q1_14) -> f64, oracle: impl Fn(f64) -> f64) -> (f64, f64) {
@@ -224,7 +224,7 @@ mod tests {
         {
             assert_eq!(fine_sine_cosine(Q1_14::from_bits(angle)), target, "at {angle}");
         }
-        let real = |fine: i64| Acc::<FINE_FRACTION_BITS>::from_steps(fine).to_f64();
+        let real = |fine: i64| Accumulator::<FINE_FRACTION_BITS>::from_steps(fine).to_f64();
         for (index, oracle) in [f64::sin, f64::cos].into_iter().enumerate() {
             let (_, max) = errors(|z| real(fine_sine_cosine(z)[index]), oracle);
             assert!(max <= 1e-8, "{max:e}");

@@ -10,10 +10,10 @@
 //! an epoch without a sum. A child that has sent no sum for one epoch may therefore send to another parent, and a child
 //! that is late loses only that epoch. A sum with a count of 0 ends the lease.
 
-use protocol::fixed::{Acc, Q7_8};
+use protocol::fixed::{Accumulator, Q7_8};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
-use protocol::parameters::Slots;
+use protocol::parameters::SumSchedule;
 use protocol::port::PORTS;
 use protocol::time::{Micros, Span};
 
@@ -60,7 +60,7 @@ struct Child {
 /// The sum of a cell's own torque and the sums of its children, and the times to send it.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Sum {
-    slots: Option<Slots>,
+    slots: Option<SumSchedule>,
     /// The present epoch.
     pub(crate) epoch: Option<Epoch>,
     /// The values at the start of the present or last epoch.
@@ -111,7 +111,7 @@ pub struct EpochStart {
 
 impl Sum {
     /// Sets the schedule of sums, which applies from the next joints on. With `None` the cell sends no sums.
-    pub fn set_slots(&mut self, slots: Option<Slots>) {
+    pub fn set_slots(&mut self, slots: Option<SumSchedule>) {
         if slots.is_none() {
             *self = Self { sent: self.sent, taken: self.taken, dropped: self.dropped, ..Self::default() };
         }
@@ -124,7 +124,7 @@ impl Sum {
     }
 
     /// Starts an epoch. `own` is the exact torque of this cell; `None` if it is not in contact.
-    pub fn begin(&mut self, begin: &EpochStart, own: Option<&[Acc<30>; MAX_JOINTS]>) {
+    pub fn begin(&mut self, begin: &EpochStart, own: Option<&[Accumulator<30>; MAX_JOINTS]>) {
         let Some(slots) = self.slots else { return };
         let before = self.epoch.replace(begin.epoch);
         let follows = before.is_some_and(|before| before.next() == begin.epoch);
@@ -164,7 +164,7 @@ impl Sum {
     }
 
     /// Rounds exact torques to Q7.8. If `carries` is true, the rounding errors are added to the next torques.
-    fn round(&mut self, exact: &[Acc<30>; MAX_JOINTS], carries: bool) -> [i32; MAX_JOINTS] {
+    fn round(&mut self, exact: &[Accumulator<30>; MAX_JOINTS], carries: bool) -> [i32; MAX_JOINTS] {
         let mut words = [0; MAX_JOINTS];
         for ((word, carry), exact) in words.iter_mut().zip(&mut self.carry).zip(exact) {
             let target = exact.steps() + if carries { *carry } else { 0 };
@@ -253,7 +253,7 @@ impl Sum {
     }
 
     /// Returns the time at which the sum of the next epoch is sent even if a child is late.
-    pub(crate) fn late_at_next(&self) -> Micros {
+    pub(crate) fn next_late_send_time(&self) -> Micros {
         self.begin.at + self.begin.period + self.late_send_time()
     }
 

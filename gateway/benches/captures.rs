@@ -9,12 +9,12 @@ use std::time::Duration;
 
 use criterion::{Criterion, Throughput};
 use protocol::candump::write_record;
-use trace::capture::{Entry, Reader};
+use trace::capture::{CaptureEntry, Reader};
 
 const LINES: u64 = 20_000;
 
 /// A log as `candump -L` writes it.
-fn log() -> &'static [u8] {
+fn candump_log() -> &'static [u8] {
     let mut log = String::new();
     for line in 0..LINES {
         let micros = 1_700_000_000_000_000 + line * 63;
@@ -30,7 +30,7 @@ fn log() -> &'static [u8] {
     log.leak().as_bytes()
 }
 
-fn with_socketcan(log: &'static [u8]) -> u64 {
+fn read_with_socketcan(log: &'static [u8]) -> u64 {
     let mut reader = socketcan::dump::Reader::from_reader(log);
     let mut frames = 0;
     while let Some(record) = reader.next_record().expect("a sound log") {
@@ -40,20 +40,20 @@ fn with_socketcan(log: &'static [u8]) -> u64 {
     frames
 }
 
-fn with_ours(log: &'static [u8]) -> u64 {
+fn read_with_skinbus(log: &'static [u8]) -> u64 {
     let mut reader = Reader::from_read("memory", log).expect("a sound log");
     let mut frames = 0;
     while let Some(entry) = reader.next().expect("a sound log") {
-        frames += u64::from(matches!(black_box(&entry), Entry::Frame(_)));
+        frames += u64::from(matches!(black_box(&entry), CaptureEntry::Frame(_)));
     }
     frames
 }
 
-fn and_written(log: &'static [u8]) -> usize {
+fn read_and_write(log: &'static [u8]) -> usize {
     let mut reader = Reader::from_read("memory", log).expect("a sound log");
     let (mut line, mut bytes) = (String::new(), 0);
     while let Some(entry) = reader.next().expect("a sound log") {
-        if let Entry::Frame(record) = entry {
+        if let CaptureEntry::Frame(record) = entry {
             line.clear();
             write_record(&mut line, &record).expect("a String takes everything");
             bytes += black_box(&line).len();
@@ -68,18 +68,18 @@ fn main() {
         .warm_up_time(Duration::from_millis(300))
         .measurement_time(Duration::from_millis(1_500))
         .configure_from_args();
-    let log = log();
-    assert_eq!([with_ours(log), with_socketcan(log)], [LINES; 2]);
+    let log = candump_log();
+    assert_eq!([read_with_skinbus(log), read_with_socketcan(log)], [LINES; 2]);
     assert_eq!(
-        and_written(log),
+        read_and_write(log),
         log.iter().filter(|&&byte| byte != b'\n').count(),
         "what is written is what was read"
     );
     let mut group = criterion.benchmark_group("candump");
     group.throughput(Throughput::Elements(LINES));
-    group.bench_function("this reader", |bencher| bencher.iter(|| with_ours(black_box(log))));
-    group.bench_function("socketcan", |bencher| bencher.iter(|| with_socketcan(black_box(log))));
-    group.bench_function("read and written", |bencher| bencher.iter(|| and_written(black_box(log))));
+    group.bench_function("this reader", |bencher| bencher.iter(|| read_with_skinbus(black_box(log))));
+    group.bench_function("socketcan", |bencher| bencher.iter(|| read_with_socketcan(black_box(log))));
+    group.bench_function("read and written", |bencher| bencher.iter(|| read_and_write(black_box(log))));
     group.finish();
     criterion.final_summary();
 }

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use criterion::{Criterion, Throughput};
 use model::generate::{SkinRequest, generate};
-use model::table::Table;
+use model::table::BusTable;
 use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q3_12;
@@ -27,7 +27,7 @@ const CELLS: usize = 253;
 const END_MARKER_ID: u32 = 0x7FF;
 
 /// An embedded bus with replies, their sender, and their receiver.
-struct Wire {
+struct ReplyBus {
     _served: ServerThread,
     cells: Bus,
     gateway: Bus,
@@ -35,7 +35,7 @@ struct Wire {
     inbox: Inbox,
 }
 
-impl Wire {
+impl ReplyBus {
     fn new(directory: PathBuf) -> Self {
         let served = ServerThread::start_in(&directory, "vcan0").expect("a new directory");
         let open = |filters| {
@@ -49,7 +49,7 @@ impl Wire {
     }
 
     /// Queues all these frames in the gateway's socket.
-    fn put(&mut self, replies: &[Frame]) {
+    fn send_replies(&mut self, replies: &[Frame]) {
         self.cells.send(replies).expect("there is room");
         self.cells
             .send(&[Frame::classic(END_MARKER_ID, &[]).expect("an empty frame")])
@@ -83,7 +83,7 @@ fn replies(epoch: Epoch) -> Vec<Frame> {
 
 /// A table that follows epochs.
 struct Listener {
-    table: Table,
+    table: BusTable,
     number: u64,
 }
 
@@ -91,13 +91,13 @@ impl Listener {
     fn new() -> Self {
         let text = generate(&SkinRequest { cells: CELLS, ..SkinRequest::default() }).expect("a UR5 has room");
         let skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
-        let mut table = Table::new(&skin, 0);
+        let mut table = BusTable::new(&skin, 0);
         table.set_comparing(false);
         Self { table, number: 0 }
     }
 
     /// Opens the next epoch, like the gateway's own joints when they are read back.
-    fn open(&mut self) -> Epoch {
+    fn open_epoch(&mut self) -> Epoch {
         let epoch = Epoch(self.number.to_le_bytes()[0]);
         let joints = Joints { in_use: 6, ..Joints::default() };
         for frame in (Message::Joints { epoch, joints }).encode().frames(Format::Fd) {
@@ -131,7 +131,7 @@ fn compile() -> PathBuf {
 }
 
 /// Lets the C program receive `epochs` epochs. Returns the time that it prints.
-fn in_c(program: &Path, epochs: u64) -> Duration {
+fn time_c_program(program: &Path, epochs: u64) -> Duration {
     let output = Command::new(program).args([epochs.to_string(), CELLS.to_string()]).output();
     let output = output.expect("it was compiled");
     let text = String::from_utf8_lossy(&output.stdout);
@@ -144,7 +144,7 @@ fn in_c(program: &Path, epochs: u64) -> Duration {
 fn main() {
     let program = compile();
     let place = tempfile::tempdir().expect("a temporary directory");
-    let mut wire = Wire::new(place.path().join("skinbus"));
+    let mut wire = ReplyBus::new(place.path().join("skinbus"));
     let mut listener = Listener::new();
     let mut criterion = Criterion::default()
         .sample_size(20)
@@ -159,7 +159,7 @@ fn main() {
         bencher.iter_custom(|epochs| {
             let mut sum = 0;
             let took = (0..epochs).map(|_| {
-                wire.put(&frames);
+                wire.send_replies(&frames);
                 wire.receive_epoch(|at_nanos, frame| sum += u64::from(frame.len()) + (at_nanos & 1))
             });
             let took = took.sum();
@@ -171,15 +171,17 @@ fn main() {
         bencher.iter_custom(|epochs| {
             let mut took = Duration::ZERO;
             for _ in 0..epochs {
-                let epoch = listener.open();
-                wire.put(&replies(epoch));
+                let epoch = listener.open_epoch();
+                wire.send_replies(&replies(epoch));
                 took += wire.receive_epoch(|_, frame| listener.receive(frame));
                 assert_eq!(listener.table.snapshot().sums.contributing, 253, "every reply counts");
             }
             took
         });
     });
-    group.bench_function("recv in C", |bencher| bencher.iter_custom(|epochs| in_c(&program, epochs)));
+    group.bench_function("recv in C", |bencher| {
+        bencher.iter_custom(|epochs| time_c_program(&program, epochs))
+    });
     group.finish();
     criterion.final_summary();
 }

@@ -9,8 +9,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bench::bus::realtime;
-use control::controller::Kinesthetic;
-use control::cycle::turn::{BusPort, Shared, TickDriver, TimedRecord};
+use control::controller::KinestheticController;
+use control::cycle::turn::{BusPort, SharedRunState, TickDriver, TimedRecord};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use criterion::{BenchmarkId, Criterion};
@@ -32,13 +32,13 @@ const TICKS_PER_EPOCH: u64 = 8;
 
 /// Work of the loop, and the contact states.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Case {
+enum BenchCase {
     Distributed,
     CentralNoneActive,
     CentralAllActive,
 }
 
-impl Case {
+impl BenchCase {
     const ALL: [Self; 3] = [Self::Distributed, Self::CentralNoneActive, Self::CentralAllActive];
 
     const fn name(self) -> &'static str {
@@ -95,7 +95,7 @@ struct Bench {
 }
 
 impl Bench {
-    fn new(skin: &Skin, case: Case) -> Self {
+    fn new(skin: &Skin, case: BenchCase) -> Self {
         let (mut lines, mut buses) = (Vec::new(), Vec::new());
         for (index, bus) in skin.buses.iter().enumerate() {
             let sensors = skin.cells_on_bus(index).map(|_| case.sensors()).collect::<Vec<_>>();
@@ -105,18 +105,20 @@ impl Bench {
             lines.push(BusPort { format: bus.format, snapshot, positions: producer, state: Arc::default() });
             buses.push(Receiver { snapshots, positions });
         }
-        let mode = if case == Case::Distributed { TorqueSource::Distributed } else { TorqueSource::Compare };
+        let mode =
+            if case == BenchCase::Distributed { TorqueSource::Distributed } else { TorqueSource::Compare };
         let modes = vec![ModeChange { at: Micros(0), mode }];
         let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
-        let controller = Box::new(Kinesthetic::new(skin).expect("a generated skin has one"));
+        let controller = Box::new(KinestheticController::new(skin).expect("a generated skin has one"));
         let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, padded(&[0.1; WORDS]))));
         let (producer, records) = rtrb::RingBuffer::new(64);
-        let turn = TickDriver::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), producer);
+        let turn =
+            TickDriver::new(cycle, lines, Arc::new(scenario), Arc::new(SharedRunState::default()), producer);
         Self { turn, buses, records, tick: 0 }
     }
 
     /// Runs eight ticks, of which the first sends joints. Returns their duration and the number of active cells.
-    fn epoch(&mut self) -> (Duration, u32) {
+    fn run_epoch(&mut self) -> (Duration, u32) {
         let last = (self.tick / TICKS_PER_EPOCH).checked_sub(1).map(|epoch| Epoch(epoch.to_le_bytes()[0]));
         for Receiver { snapshots, .. } in &mut self.buses {
             let next = snapshots.input_buffer_mut();
@@ -156,14 +158,14 @@ fn main() {
     for cells in [1, 253, 1_000, 2_160, 10_000_u32] {
         let skin = skin(usize::try_from(cells).expect("a few"));
         let mut group = criterion.benchmark_group("tick");
-        for case in Case::ALL {
+        for case in BenchCase::ALL {
             group.bench_function(BenchmarkId::new(case.name(), cells), |bencher| {
                 let mut bench = Bench::new(&skin, case);
-                let (_, active) = bench.epoch();
-                assert_eq!(active, if case == Case::CentralAllActive { cells } else { 0 });
+                let (_, active) = bench.run_epoch();
+                assert_eq!(active, if case == BenchCase::CentralAllActive { cells } else { 0 });
                 bencher.iter_custom(|ticks| {
                     let epochs = ticks.div_ceil(TICKS_PER_EPOCH);
-                    let took: Duration = (0..epochs).map(|_| bench.epoch().0).sum();
+                    let took: Duration = (0..epochs).map(|_| bench.run_epoch().0).sum();
                     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
                     took.mul_f64(ticks as f64 / (epochs * TICKS_PER_EPOCH) as f64)
                 });

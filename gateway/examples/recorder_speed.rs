@@ -17,10 +17,10 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use bench::record::feed::{self, Feed};
+use bench::record::feed::{self, RecorderFeed};
 use bench::record::{Mcap, Outputs, RecordOptions};
-use model::central::Central;
-use model::latched::ReceivedFrame;
+use model::central::CentralComputation;
+use model::latched::LatchedFrame;
 use protocol::can::Format;
 use protocol::candump::{self, CandumpLine, Direction, Record, Timestamp};
 use protocol::fixed::{Q1_14, Q3_12};
@@ -43,27 +43,27 @@ fn main() -> Result<(), Box<dyn Error>> {
     let folder = words.next().map_or_else(|| PathBuf::from("."), PathBuf::from);
     let skin = Skin::parse("ur5-253.toml", SKIN)?;
     let frames = match words.next() {
-        Some(log) => of_log(&std::fs::read_to_string(log)?)?,
-        None => of_run(&skin, 60),
+        Some(log) => log_frames(&std::fs::read_to_string(log)?)?,
+        None => run_frames(&skin, 60),
     };
     println!("{} frames, {:.1} s of a bus", frames.len(), seconds(&frames));
-    speed(&skin, &folder, &frames)?;
-    size(&frames)
+    measure_speed(&skin, &folder, &frames)?;
+    measure_size(&frames)
 }
 
 #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
-fn seconds(frames: &[ReceivedFrame]) -> f64 {
+fn seconds(frames: &[LatchedFrame]) -> f64 {
     let ends = frames.first().zip(frames.last());
     ends.map_or(0.0, |(first, last)| last.at_nanos.saturating_sub(first.at_nanos) as f64 * 1e-9)
 }
 
 /// Frames of 253 cells that are pressed by 1.5 N each, while each joint swings to and fro.
-fn of_run(skin: &Skin, seconds: u32) -> Vec<ReceivedFrame> {
-    let central = Central::new(skin);
+fn run_frames(skin: &Skin, seconds: u32) -> Vec<LatchedFrame> {
+    let central = CentralComputation::new(skin);
     let (hz, began) = (skin.timing.broadcast_hz(), 1_700_000_000_000_000_000_u64);
     let mut frames = Vec::new();
     let mut add_message = |at_nanos, own, message: &Message| {
-        frames.extend(message.encode().frames(Format::Fd).map(|frame| ReceivedFrame {
+        frames.extend(message.encode().frames(Format::Fd).map(|frame| LatchedFrame {
             at_nanos,
             from_gateway: own,
             frame,
@@ -99,11 +99,11 @@ fn of_run(skin: &Skin, seconds: u32) -> Vec<ReceivedFrame> {
     }
 }
 
-fn of_log(text: &str) -> Result<Vec<ReceivedFrame>, Box<dyn Error>> {
+fn log_frames(text: &str) -> Result<Vec<LatchedFrame>, Box<dyn Error>> {
     let mut frames = Vec::new();
     for line in text.lines() {
         if let CandumpLine::Frame(Record { time, frame, direction, .. }) = candump::parse(line)? {
-            frames.push(ReceivedFrame {
+            frames.push(LatchedFrame {
                 at_nanos: time.nanos,
                 from_gateway: direction == Some(Direction::Sent),
                 frame,
@@ -115,15 +115,19 @@ fn of_log(text: &str) -> Result<Vec<ReceivedFrame>, Box<dyn Error>> {
 
 /// Pushes frames into the recorder as fast as it accepts them.
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn speed(skin: &Skin, folder: &std::path::Path, frames: &[ReceivedFrame]) -> Result<(), Box<dyn Error>> {
+fn measure_speed(
+    skin: &Skin,
+    folder: &std::path::Path,
+    frames: &[LatchedFrame],
+) -> Result<(), Box<dyn Error>> {
     let path = folder.join("recorder_speed.mcap");
     let split = SplitLimits { bytes: u64::MAX / 2, age: Duration::MAX };
     let mcap =
         Mcap { path: path.clone(), split, attachments: Vec::new(), robot: None, command_line: Vec::new() };
     let options = RecordOptions { mcap: Some(mcap), force: true, ..RecordOptions::default() };
-    let outputs = Outputs::claim(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
+    let outputs = Outputs::open_outputs(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
     let (mut outlet, bus_feed) = feed::bus_feed(1, true, Arc::default(), Arc::default());
-    let feed = Feed { bus_feeds: vec![bus_feed], ticks: None };
+    let feed = RecorderFeed { bus_feeds: vec![bus_feed], ticks: None };
     let recorder = outputs.start(feed, Layout::new(skin), FileHead::default())?;
     let began = Instant::now();
     let mut count = 0_u64;
@@ -133,10 +137,10 @@ fn speed(skin: &Skin, folder: &std::path::Path, frames: &[ReceivedFrame]) -> Res
                 break 'pushed;
             }
             // A bus never waits; this loop does, so that it measures the sustainable rate.
-            while outlet.free() < chunk.len() {
+            while outlet.free_slots() < chunk.len() {
                 std::thread::sleep(Duration::from_micros(200));
             }
-            chunk.iter().for_each(|&seen| outlet.frame(seen));
+            chunk.iter().for_each(|&seen| outlet.push_frame(seen));
             count += chunk.len() as u64;
         }
     }
@@ -173,19 +177,19 @@ impl Write for Counter {
 
 /// Writes only frames, flushed as in a run.
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn size(frames: &[ReceivedFrame]) -> Result<(), Box<dyn Error>> {
+fn measure_size(frames: &[LatchedFrame]) -> Result<(), Box<dyn Error>> {
     let mut writer = FileWriter::new(Counter::default())?;
     let mut channel = writer.channel::<Record<'_>>("/can/vcan0", &[("time_digits", "9")])?;
     let (mut flushes, mut next) = (0_u64, 0);
     let began = Instant::now();
-    for &ReceivedFrame { at_nanos, from_gateway: own, frame } in frames {
+    for &LatchedFrame { at_nanos, from_gateway: own, frame } in frames {
         if at_nanos >= next {
             writer.flush()?;
             next = at_nanos + FLUSH_NANOS;
             flushes += 1;
         }
         let direction = Some(if own { Direction::Sent } else { Direction::Received });
-        let time = Timestamp::nine_digits(at_nanos);
+        let time = Timestamp::with_nine_digits(at_nanos);
         let message = Record { time, interface: "vcan0", frame, direction };
         writer.write(&mut channel, at_nanos, &message)?;
     }

@@ -7,7 +7,7 @@
 use std::fmt::Write as _;
 use std::time::Duration;
 
-use bench::replay::player::Pace;
+use bench::replay::player::ReplaySpeed;
 use bench::replay::replay_plan::SenderFilter;
 use bench::replay::survey::TimeRange;
 use bench::replay::{ReplayOptions, replay};
@@ -48,7 +48,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             map: Vec::new(),
             part: TimeRange::default(),
             passes: Some(1),
-            pace: Pace::Timed(1.0),
+            pace: ReplaySpeed::Timed(1.0),
             spin: Duration::from_micros(spin),
             lockstep: false,
             expect: None,

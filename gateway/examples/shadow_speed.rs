@@ -24,7 +24,7 @@ use protocol::packet::{Epoch, Packet, WORDS};
 mod watched;
 
 /// Time between joints in µs.
-const PERIOD: u64 = 16_000;
+const JOINTS_INTERVAL_US: u64 = 16_000;
 /// Number of cells.
 const CELLS: i64 = 253;
 
@@ -37,8 +37,8 @@ fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) ->
         let count = u8::from(id.kind != id::Kind::Network);
         let packet = Packet { id, words: [word; WORDS].into(), epoch, count };
         for frame in packet.frames(Format::Fd) {
-            let nanos = (1_700_000_000_000_000 + number * PERIOD + micros) * 1_000;
-            let time = Timestamp::six_digits(nanos);
+            let nanos = (1_700_000_000_000_000 + number * JOINTS_INTERVAL_US + micros) * 1_000;
+            let time = Timestamp::with_six_digits(nanos);
             line.clear();
             write_record(line, &Record { time, interface: "vcan0", frame, direction: None }).unwrap();
             line.push('\n');
@@ -74,11 +74,11 @@ fn main() {
     let log = place.path().join("run.log");
     let mut out = BufWriter::with_capacity(1 << 20, File::create(&log).unwrap());
     let mut line = String::new();
-    let epochs = minutes * 60_000_000 / PERIOD;
+    let epochs = minutes * 60_000_000 / JOINTS_INTERVAL_US;
     let frames: u64 = (0..epochs).map(|number| write_epoch(&mut out, &mut line, number)).sum();
     out.flush().unwrap();
     drop(out);
-    let lasts = (epochs * PERIOD) as f64 / 1e6;
+    let lasts = (epochs * JOINTS_INTERVAL_US) as f64 / 1e6;
     println!(
         "capture                  {frames} frames in {lasts:.0} s, {:.0} a second",
         frames as f64 / lasts

@@ -107,7 +107,7 @@ pub(crate) fn cells_per_process() -> Result<usize, Failure> {
 
 /// The option for the number of cells per process.
 #[derive(Args, Clone, Copy, Debug)]
-pub(crate) struct Processes {
+pub(crate) struct ProcessOptions {
     /// Put up to N cells into one process
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254))]
     pub(crate) cells_per_process: u8,

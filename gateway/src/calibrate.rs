@@ -20,7 +20,7 @@ use model::accelerometer::kinematics::UPRIGHT_GRAVITY;
 use model::accelerometer::sensor::{DataSheet, DataSheetInput};
 use model::decode::{Decoded, Decoder};
 use model::scenario::Scenario;
-use protocol::bus::GATEWAY_RECEIVE_BUFFER;
+use protocol::bus::GATEWAY_RECEIVE_BUFFER_BYTES;
 use protocol::document::{self, KeyPath};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use protocol::id::CellId;
@@ -28,13 +28,13 @@ use protocol::parameters::{Events, Sensing};
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::{Micros, Span};
 use protocol::usage::{Failure, print_text};
-use trace::capture::{Entry, Reader};
+use trace::capture::{CaptureEntry, Reader};
 use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{BusKinds, bus_names, parse_duration};
 use super::input::no_frame;
-use super::output::{Overwrite, check_distinct, note, print_beside};
-use super::print::{count, json};
+use super::output::{OverwriteOption, check_distinct, print_beside, print_note};
+use super::print::{count_with_noun, json};
 use super::robot_file::{SkinRobot, urdf_path};
 
 /// Find the poses of cells from their accelerometers
@@ -49,7 +49,7 @@ use super::robot_file::{SkinRobot, urdf_path};
   skinbus calibrate skin.toml -o found.toml && skinbus commission found.toml
   skinbus calibrate skin.toml --recording run.mcap --page found.html
   skinbus calibrate skin.toml --dry-run > motion.json")]
-pub(crate) struct Calibrate {
+pub(crate) struct CalibrateCommand {
     /// The skin: robot, buses and cells; the poses of its cells may be wrong
     skin: PathBuf,
     /// Write a copy of the skin with the poses found
@@ -99,10 +99,10 @@ pub(crate) struct Calibrate {
     #[arg(long, short)]
     json: bool,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Calibrate {
+impl CalibrateCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let text = document::read_text(&self.skin).map_err(Failure::usage)?;
         let skin = Skin::parse(&self.skin.display().to_string(), &text).map_err(Failure::usage)?;
@@ -145,7 +145,7 @@ impl Calibrate {
                 "{}: {} of {} cannot be trusted: see the lines above",
                 skin.name,
                 troubled,
-                count(skin.cells.len(), "cell")
+                count_with_noun(skin.cells.len(), "cell")
             ))),
         }
     }
@@ -211,10 +211,10 @@ impl Calibrate {
             let last = complaints.pop().unwrap_or_else(|| "the run did not come to its end".to_owned());
             return Err(Failure::run(last));
         }
-        complaints.iter().for_each(|line| note(format_args!("skinbus: {line}")));
+        complaints.iter().for_each(|line| print_note(format_args!("skinbus: {line}")));
         if summary.control.ticks_skipped > 0 {
             let (ticks, broadcasts) = (summary.control.ticks_skipped, summary.control.broadcasts_skipped);
-            note(format_args!("the loop skipped {ticks} ticks, and {broadcasts} broadcasts with them"));
+            print_note(format_args!("the loop skipped {ticks} ticks, and {broadcasts} broadcasts with them"));
         }
         calibrate_capture(&[path], skin, settings)
     }
@@ -266,7 +266,7 @@ impl Calibrate {
             // One process per bus: cells that share a machine do not affect the result.
             cells_per_process: usize::from(CellId::MAX.get()),
             flash: None,
-            receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
+            receive_buffer: GATEWAY_RECEIVE_BUFFER_BYTES as usize,
             record: record::RecordOptions {
                 candump: None,
                 mcap: Some(mcap),
@@ -290,7 +290,7 @@ fn calibrate_capture(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Res
     let mut decoder = Decoder::new(None);
     let mut has_frames = false;
     while let Some(entry) = reader.next().map_err(Failure::run)? {
-        let Entry::Frame(record) = entry else { continue };
+        let CaptureEntry::Frame(record) = entry else { continue };
         has_frames = true;
         let at = Micros(record.time.nanos / 1_000);
         if let (Decoded::Message(message), Some(bus)) =
@@ -317,7 +317,7 @@ fn report_text(skin: &Skin, calibration: &Calibration) -> String {
     let mut lines = vec![format!(
         "{}: {}, {} found, {} not to be trusted",
         skin.name,
-        count(summary.cells, "cell"),
+        count_with_noun(summary.cells, "cell"),
         summary.determined,
         summary.troubled
     )];
@@ -329,7 +329,8 @@ fn report_text(skin: &Skin, calibration: &Calibration) -> String {
         ));
     }
     lines.push(summary.joints.to_string());
-    let changes = calibration.cells.iter().filter(|cell| cell.is_written()).filter_map(|cell| cell.found);
+    let changes =
+        calibration.cells.iter().filter(|cell| cell.is_pose_written()).filter_map(|cell| cell.found);
     let mut moved: Vec<_> = changes.filter_map(|found| Some((found.moved_mm?, found.turned_deg?))).collect();
     moved.sort_by(|one, other| one.0.total_cmp(&other.0));
     if let (Some(middle), Some(most)) = (moved.get(moved.len() / 2), moved.last()) {
@@ -337,7 +338,7 @@ fn report_text(skin: &Skin, calibration: &Calibration) -> String {
         lines.push(format!("from where the skin has them: median {middle:.2} mm, at most {most:.2} mm"));
     }
     if summary.wires > 0 {
-        lines.push(format!("{} made positions better", count(summary.wires, "wire")));
+        lines.push(format!("{} made positions better", count_with_noun(summary.wires, "wire")));
     }
     lines.extend(calibration.zero_offsets.iter().flatten().map(ToString::to_string));
     for cell in &calibration.cells {

@@ -33,7 +33,7 @@ const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
   skinbus cells vcan0
   skinbus cells can0 --skin skin.toml --watch
   skinbus cells vcan0 --json | jq '.cells[] | select(.configured | not) | .node'")]
-pub(crate) struct Cells {
+pub(crate) struct CellsCommand {
     /// The bus
     bus: String,
     /// Compare with this skin: show which cells have its configuration, and which are missing
@@ -52,7 +52,7 @@ pub(crate) struct Cells {
     kinds: BusKinds,
 }
 
-impl Cells {
+impl CellsCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let known = self.described_bus()?;
         let kind = self.kinds.kinds_of([self.bus.as_str()])?.kind_of(&self.bus);
@@ -67,7 +67,7 @@ impl Cells {
         let mut watch = CellWatch::open(&self.bus, kind, format).map_err(Failure::usage)?;
         let seconds = self.duration.or_else(|| (!self.watch).then_some(DEFAULT_LISTEN_S));
         let show = |watch: &CellWatch| {
-            let shown = CellList::of(watch, known.as_ref());
+            let shown = CellList::from_watch(watch, known.as_ref());
             match (self.json, self.watch) {
                 (false, _) => Ok(shown.table()),
                 (true, false) => json(&shown),
@@ -79,7 +79,7 @@ impl Cells {
         while seconds.is_none_or(|seconds| watch.elapsed().as_secs_f64() < seconds)
             && !stopped.load(Ordering::Relaxed)
         {
-            watch.request(self.watch).and_then(|()| watch.receive(&stopped)).map_err(Failure::run)?;
+            watch.query_cells(self.watch).and_then(|()| watch.receive(&stopped)).map_err(Failure::run)?;
             if self.watch && drawn.elapsed() >= UPDATE_INTERVAL {
                 drawn = Instant::now();
                 let text = show(&watch)?;

@@ -10,7 +10,7 @@ use protocol::document;
 use protocol::skin::{CellName, Skin};
 use protocol::usage::{Failure, print_text};
 
-use self::skin::Listed;
+use self::skin::ListedCells;
 
 /// Check skins and scenarios, and summarise them
 ///
@@ -22,7 +22,7 @@ use self::skin::Listed;
   skinbus check gateway/examples/ur5-253.toml gateway/examples/demo.toml
   skinbus check scenario.toml --skin skin.toml --json | jq '.events[] | select(.what == \"touch\")'
   skinbus check skin.toml --cell vcan0:12")]
-pub(crate) struct Check {
+pub(crate) struct CheckCommand {
     /// Skins and scenarios; - for standard input
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
@@ -42,39 +42,39 @@ pub(crate) struct Check {
 }
 
 /// Content of a checked file: a skin, or the text of a scenario.
-enum Described {
+enum CheckedContent {
     Skin(Box<Skin>),
     /// Text of the file, kept until its skin is known.
     Scenario(String),
 }
 
-impl Check {
+impl CheckCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let has_skin = self.skin.is_some() || self.files.len() > 1;
         let described = self.files.iter().map(|file| Ok((file, read_description(file, has_skin)?)));
         let described = described.collect::<Result<Vec<_>, Failure>>()?;
         let named = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         let mut skins = described.iter().filter_map(|(_, described)| match described {
-            Described::Skin(skin) => Some(&**skin),
-            Described::Scenario(_) => None,
+            CheckedContent::Skin(skin) => Some(&**skin),
+            CheckedContent::Scenario(_) => None,
         });
         let beside = (skins.next(), skins.next());
         let listed = match &self.cell {
-            Some(cell) => Listed::Only(cell),
-            None if self.list => Listed::All,
-            None => Listed::None,
+            Some(cell) => ListedCells::Only(cell),
+            None if self.list => ListedCells::All,
+            None => ListedCells::None,
         };
         let (mut text, mut refused) = (String::new(), None);
         for (file, described) in &described {
             text += &match described {
-                Described::Skin(skin) => skin::summary(file, skin, listed, self.json)?,
-                Described::Scenario(text) => {
+                CheckedContent::Skin(skin) => skin::summary(file, skin, listed, self.json)?,
+                CheckedContent::Scenario(text) => {
                     let skin = match (&named, beside) {
                         (Some(skin), _) | (None, (Some(skin), None)) => skin,
                         (None, (None, _)) => return Err(ambiguous_skin(file, "no skin is")),
                         (None, (Some(_), Some(_))) => return Err(ambiguous_skin(file, "several skins are")),
                     };
-                    let (text, refusal) = scenario::plan(file, text, skin, self.json)?;
+                    let (text, refusal) = scenario::describe_scenario(file, text, skin, self.json)?;
                     refused = refused.or(refusal);
                     text
                 }
@@ -94,10 +94,10 @@ fn ambiguous_skin(file: &Path, found: &str) -> Failure {
 
 /// Reads a skin, or recognises a scenario by its tables, which differ from those of a skin. A file without any of these
 /// tables counts as a scenario if `has_skin`, else as a skin.
-fn read_description(file: &Path, has_skin: bool) -> Result<Described, Failure> {
-    const OF_SKINS: [&str; 8] =
+fn read_description(file: &Path, has_skin: bool) -> Result<CheckedContent, Failure> {
+    const SKIN_TABLES: [&str; 8] =
         ["robot", "chain", "bus", "cell", "timing", "controller", "contact", "safety"];
-    const OF_SCENARIOS: [&str; 5] = ["motion", "mode", "touch", "fault", "sensors"];
+    const SCENARIO_TABLES: [&str; 5] = ["motion", "mode", "touch", "fault", "sensors"];
     let text = document::read_text(file).map_err(Failure::usage)?;
     let has = |names: &[&str]| {
         let tables = text.lines().filter_map(|line| line.trim_start().strip_prefix('['));
@@ -106,9 +106,9 @@ fn read_description(file: &Path, has_skin: bool) -> Result<Described, Failure> {
         };
         tables.map(name).any(|name| names.contains(&name.as_str()))
     };
-    if !has(&OF_SKINS) && (has(&OF_SCENARIOS) || has_skin) {
-        return Ok(Described::Scenario(text));
+    if !has(&SKIN_TABLES) && (has(&SCENARIO_TABLES) || has_skin) {
+        return Ok(CheckedContent::Scenario(text));
     }
     let skin = Skin::parse(&file.display().to_string(), &text).map_err(Failure::usage)?;
-    Ok(Described::Skin(Box::new(skin)))
+    Ok(CheckedContent::Skin(Box::new(skin)))
 }

@@ -3,7 +3,7 @@
 use csv::{StringRecord, StringRecordsIntoIter, Trim};
 use protocol::usage::Failure;
 
-use super::print::{comma_separated, count};
+use super::print::{comma_separated, count_with_noun};
 
 /// Maximum number of characters of a first line that an error quotes.
 const MAX_REPEATED_CHARS: usize = 60;
@@ -25,7 +25,7 @@ impl Columns {
 }
 
 /// A CSV file that is read row by row. Empty lines and lines that begin with `#` are skipped.
-pub(crate) struct Table<'a> {
+pub(crate) struct CsvTable<'a> {
     file: String,
     names: StringRecord,
     rows: StringRecordsIntoIter<&'a [u8]>,
@@ -33,7 +33,7 @@ pub(crate) struct Table<'a> {
 }
 
 /// A row of a file.
-pub(crate) struct Row<'a> {
+pub(crate) struct CsvRow<'a> {
     file: &'a str,
     names: &'a StringRecord,
     values: StringRecord,
@@ -41,7 +41,7 @@ pub(crate) struct Row<'a> {
     pub(crate) line: usize,
 }
 
-impl<'a> Table<'a> {
+impl<'a> CsvTable<'a> {
     /// Reads the header.
     pub(crate) fn new(file: &str, text: &'a str, columns: Columns) -> Result<Self, Failure> {
         let mut reader = csv::ReaderBuilder::new()
@@ -71,23 +71,23 @@ impl<'a> Table<'a> {
     }
 
     /// Returns the next row.
-    pub(crate) fn next_row(&mut self) -> Result<Option<Row<'_>>, Failure> {
+    pub(crate) fn next_row(&mut self) -> Result<Option<CsvRow<'_>>, Failure> {
         let Some(values) = self.rows.next() else { return Ok(None) };
         let file = self.file.as_str();
         let values = values.map_err(|error| Failure::usage(format!("{file}: {error}")))?;
         let byte = values.position().map_or(0, csv::Position::byte);
         let line = self.lines.line_at(usize::try_from(byte).unwrap_or_default());
         if values.len() != self.names.len() {
-            let (got, names) = (count(values.len(), "value"), comma_separated(&self.names));
+            let (got, names) = (count_with_noun(values.len(), "value"), comma_separated(&self.names));
             return Err(Failure::usage(format!(
                 "{file}: line {line} has {got}: one is needed for each of the columns {names}"
             )));
         }
-        Ok(Some(Row { file, names: &self.names, values, line }))
+        Ok(Some(CsvRow { file, names: &self.names, values, line }))
     }
 }
 
-impl Row<'_> {
+impl CsvRow<'_> {
     /// Returns the text in a column, or an empty text if the file does not have the column.
     pub(crate) fn text(&self, column: &str) -> &str {
         let place = self.names.iter().position(|name| name == column);
@@ -128,19 +128,19 @@ impl LineCounter<'_> {
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "a test may stop")]
 mod tests {
-    use super::{Columns, Table};
+    use super::{Columns, CsvTable};
 
     const COLUMNS: Columns = Columns { needed: &["a", "b"], optional: &["c"] };
 
     fn refused(text: &str) -> String {
-        Table::new("t.csv", text, COLUMNS).err().unwrap().to_string()
+        CsvTable::new("t.csv", text, COLUMNS).err().unwrap().to_string()
     }
 
     #[test]
     fn rows_know_their_line() {
         for end in ["\n", "\r\n"] {
             let text = "# first\n\nb,a\n1,2\n\n# two\n# three\n\"4\", 3\n5,6".replace('\n', end);
-            let mut table = Table::new("t.csv", &text, COLUMNS).unwrap();
+            let mut table = CsvTable::new("t.csv", &text, COLUMNS).unwrap();
             for (line, a, b) in [(4, "2", 1.0), (8, "3", 4.0), (9, "6", 5.0)] {
                 let row = table.next_row().unwrap().unwrap();
                 assert_eq!((row.line, row.text("a"), row.text("c")), (line, a, ""));
@@ -161,12 +161,12 @@ mod tests {
         }
         assert!(refused("# x\n\n1,2").starts_with("t.csv: line 3: "));
         assert!(refused(&"x".repeat(99)).contains(&format!("\"{}\"", "x".repeat(60))));
-        assert!(Table::new("t.csv", "\u{feff}c,b,a", COLUMNS).is_ok());
+        assert!(CsvTable::new("t.csv", "\u{feff}c,b,a", COLUMNS).is_ok());
     }
 
     #[test]
     fn values_are_named_with_their_line() {
-        let mut table = Table::new("t.csv", "a,b\n1\n# x\n2,inf\n", COLUMNS).unwrap();
+        let mut table = CsvTable::new("t.csv", "a,b\n1\n# x\n2,inf\n", COLUMNS).unwrap();
         let short = table.next_row().err().unwrap().to_string();
         assert_eq!(short, "t.csv: line 2 has 1 value: one is needed for each of the columns a, b");
         let row = table.next_row().unwrap().unwrap();

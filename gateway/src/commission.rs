@@ -9,14 +9,14 @@ use std::time::Instant;
 use bench::commission::{CommissionedBus, commission, open};
 use bench::progress::Progress as Line;
 use clap::Args;
-use model::commission::node_ids::{NodeIds, renumbered};
+use model::commission::node_ids::{NodeIds, renumber_nodes};
 use model::commission::{CommissionOptions, Outcome, Progress};
 use protocol::document;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 
 use super::arguments::{BusKinds, bus_names, find_bus};
-use super::output::{Overwrite, check_distinct, print_beside};
+use super::output::{OverwriteOption, check_distinct, print_beside};
 use super::print::{abbreviated, comma_separated};
 use super::{input, output};
 
@@ -33,7 +33,7 @@ use super::{input, output};
   skinbus commission skin.toml --dry-run
   skinbus commission skin.toml --verify --json | jq '.buses[0].failed'
   skinbus commission skin.toml --node-ids as-wired.toml && skinbus run as-wired.toml --no-spawn")]
-pub(crate) struct Commission {
+pub(crate) struct CommissionCommand {
     /// The skin
     skin: PathBuf,
     /// Commission only this bus of the skin
@@ -51,7 +51,7 @@ pub(crate) struct Commission {
     #[arg(long, value_name = "FILE")]
     node_ids: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
@@ -60,7 +60,7 @@ pub(crate) struct Commission {
     json: bool,
 }
 
-impl Commission {
+impl CommissionCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let text = document::read_text(&self.skin).map_err(Failure::usage)?;
         let file = self.skin.display().to_string();
@@ -91,20 +91,20 @@ impl Commission {
             seconds: began.elapsed().as_secs_f64(),
             dry_run: self.dry_run,
             interrupted,
-            buses: done.iter().map(show::BusShown::of).collect(),
+            buses: done.iter().map(show::DisplayedBus::from_bus).collect(),
         };
         if !self.quiet && !self.json {
-            whole.notes(self.node_ids.is_some()).iter().for_each(output::note);
+            whole.notes(self.node_ids.is_some()).iter().for_each(output::print_note);
         }
         let shown = if self.json { super::print::json(&whole)? } else { whole.table() };
         print_beside([self.node_ids.as_deref()], &shown)?;
         if let Some((file, out)) = begun {
             let node_ids: NodeIds =
                 done.iter().flat_map(|done| &done.report.cells).map(|it| (it.serial, it.number)).collect();
-            let copy = renumbered(&skin, &text, &node_ids);
+            let copy = renumber_nodes(&skin, &text, &node_ids);
             let copy =
                 copy.map_err(|error| Failure::run(format!("--node-ids {}: {error}", file.path().display())))?;
-            output::finish("--node-ids", file, out, &copy)?;
+            output::write_and_finish("--node-ids", file, out, &copy)?;
         }
         whole.outcome()
     }

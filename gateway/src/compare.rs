@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use analysis::compare::{Both, CaptureSide, CompareOptions, CompareReport, Comparison};
+use analysis::compare::{CaptureSide, CompareOptions, CompareReport, Comparison, PerCapture};
 use analysis::explain::NotFound;
 use clap::Args;
 use model::decode::Decoder;
@@ -17,13 +17,13 @@ use protocol::stop;
 use protocol::time::Micros;
 use protocol::usage::Failure;
 use serde::Serialize;
-use trace::capture::{CaptureFormat, Entry, NoteKind, Reader};
+use trace::capture::{CaptureEntry, CaptureFormat, NoteKind, Reader};
 
 use self::files::{first_numbers, recording_parts};
 use super::input;
-use super::input::{captures, difference, format, location, needs_frames, no_frame, skin_of};
-use super::output::{self, Overwrite, check_distinct, print_beside};
-use super::print::{count, json};
+use super::input::{difference, format_name, location, no_frame, open_capture, require_frames, skin_of};
+use super::output::{self, OverwriteOption, check_distinct, print_beside};
+use super::print::{count_with_noun, json};
 
 /// Compare two recordings or logs of one skin, epoch by epoch
 ///
@@ -51,7 +51,7 @@ Keys of --json:
   cells, extra_cells cells with differences or losses; cells in only one run
   first              the first difference: what, how, bus, cell, joint, epoch, number, time_s,
                      words, values, unit, steps, inputs, unknown_inputs, occurrence")]
-pub(crate) struct Compare {
+pub(crate) struct CompareCommand {
     /// An MCAP recording or a candump log; - for standard input. For a split recording name the first part; the other
     /// parts beside it are read too
     #[arg(value_name = "A")]
@@ -78,7 +78,7 @@ pub(crate) struct Compare {
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
 /// Result of the comparison with its inputs, as JSON.
@@ -95,7 +95,7 @@ struct CompareOutput<'a> {
 }
 
 /// A capture that is being read.
-struct Input {
+struct CaptureInput {
     files: Vec<PathBuf>,
     name: String,
     reader: Reader,
@@ -106,9 +106,9 @@ struct Input {
     damage: Option<Failure>,
 }
 
-impl Input {
+impl CaptureInput {
     fn open(files: Vec<PathBuf>) -> Result<Self, Failure> {
-        let reader = captures(&files, |file| Box::new(file))?;
+        let reader = open_capture(&files, |file| Box::new(file))?;
         let (name, missing) = (reader.name().to_owned(), input::LossCounts::default());
         let decoder = Decoder::new(None);
         Ok(Self { files, name, reader, decoder, missing, has_frames: false, damage: None })
@@ -127,25 +127,25 @@ impl Input {
     /// Passes the next entry to the comparison.
     fn read_entry(&mut self, which: CaptureSide, comparison: &mut Comparison<'_>) {
         match self.reader.next() {
-            Ok(Some(Entry::Frame(record))) => {
+            Ok(Some(CaptureEntry::Frame(record))) => {
                 self.has_frames = true;
                 let nanos = record.time.nanos;
                 let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
                 comparison.receive(which, nanos, record.interface, decoded.message());
             }
-            Ok(Some(Entry::Note(note))) => {
+            Ok(Some(CaptureEntry::Note(note))) => {
                 self.missing.count(&note);
                 match note.kind {
                     NoteKind::Dropped(frames) => comparison.record_dropped(which, frames),
                     NoteKind::Unreadable(why) if self.missing.unreadable() == 1 => {
-                        output::note(format_args!("{}: {why}", location(&self.name, note.line)));
+                        output::print_note(format_args!("{}: {why}", location(&self.name, note.line)));
                     }
                     NoteKind::Text | NoteKind::CanXl | NoteKind::Unreadable(_) => {}
                 }
             }
             Ok(None) => {
                 if !self.reader.has_times() {
-                    comparison.without_times(which);
+                    comparison.mark_untimed(which);
                 }
                 comparison.end(which, self.reader.extras().unfinished.is_some());
             }
@@ -157,7 +157,7 @@ impl Input {
     }
 }
 
-impl Compare {
+impl CompareCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let began = Instant::now();
         let read = [&self.a, &self.b].into_iter().chain(&self.skin).map(PathBuf::as_path);
@@ -167,12 +167,12 @@ impl Compare {
                 "- and -: standard input is read once: name a file for one of the two",
             ));
         }
-        let files = Both { a: recording_parts(&self.a)?, b: recording_parts(&self.b)? };
+        let files = PerCapture { a: recording_parts(&self.a)?, b: recording_parts(&self.b)? };
         let skin = self.skin(&files)?;
         let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;
         let mut comparison = Comparison::new(&skin, self.options(), first_numbers(&files, &skin)?);
-        let Both { a, b } = files;
-        let mut inputs = Both { a: Input::open(a)?, b: Input::open(b)? };
+        let PerCapture { a, b } = files;
+        let mut inputs = PerCapture { a: CaptureInput::open(a)?, b: CaptureInput::open(b)? };
         for which in [CaptureSide::A, CaptureSide::B] {
             inputs.get_mut(which).pass_latched(which, &mut comparison);
         }
@@ -183,7 +183,7 @@ impl Compare {
             return Err(Failure::run("stopped before all was compared"));
         }
         for which in [CaptureSide::A, CaptureSide::B] {
-            self.check(inputs.get_mut(which), which, &mut comparison, &skin)?;
+            self.check_capture(inputs.get_mut(which), which, &mut comparison, &skin)?;
         }
         let report = comparison.report();
         for which in [CaptureSide::A, CaptureSide::B] {
@@ -191,7 +191,7 @@ impl Compare {
             input.missing.report(&input.reader, "left out");
         }
         let shown = show::ComparisonText {
-            inputs: Both { a: about(&inputs.a), b: about(&inputs.b) },
+            inputs: PerCapture { a: capture_names(&inputs.a), b: capture_names(&inputs.b) },
             skin: self.skin.as_deref(),
             report: &report,
         };
@@ -207,7 +207,7 @@ impl Compare {
         let text = if self.json { json(&whole)? } else { shown.text() };
         let printed = print_beside([self.junit.as_deref()], &text);
         let reported = junit.map_or(Ok(()), |(file, out)| {
-            output::finish("--junit", file, out, &shown.junit(began.elapsed()).text())
+            output::write_and_finish("--junit", file, out, &shown.junit(began.elapsed()).to_xml())
         });
         printed.and(reported)?;
         match inputs.a.damage.or(inputs.b.damage) {
@@ -227,7 +227,7 @@ impl Compare {
 
     /// Returns the skin of both captures: from the option, or else from a recording. Refuses a recording of another
     /// skin.
-    fn skin(&self, files: &Both<Vec<PathBuf>>) -> Result<Skin, Failure> {
+    fn skin(&self, files: &PerCapture<Vec<PathBuf>>) -> Result<Skin, Failure> {
         let named = self.skin.as_deref().map(input::read_skin).transpose()?;
         let (mut skin, mut name) = (named, self.skin.clone());
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
@@ -242,7 +242,7 @@ impl Compare {
                 own => own?,
             };
             match (&skin, &name) {
-                (Some(skin), Some(name)) => same_skin((name, skin), (path, &own))?,
+                (Some(skin), Some(name)) => check_same_skin((name, skin), (path, &own))?,
                 _ => (skin, name) = (Some(own), Some(path.clone())),
             }
         }
@@ -252,7 +252,7 @@ impl Compare {
         // Report a capture without frames first, because naming a skin would not help.
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
             if can_be_read_again(path) {
-                needs_frames(files)?;
+                require_frames(files)?;
             }
         }
         let (a, b) = (self.a.display(), self.b.display());
@@ -260,9 +260,9 @@ impl Compare {
     }
 
     /// Refuses a capture without frames or joints, or of another skin.
-    fn check(
+    fn check_capture(
         &self,
-        input: &mut Input,
+        input: &mut CaptureInput,
         which: CaptureSide,
         comparison: &mut Comparison<'_>,
         skin: &Skin,
@@ -276,7 +276,7 @@ impl Compare {
         let name = &input.name;
         if let Some(Ok(own)) = input.reader.extras().skin() {
             let of = self.skin.as_ref().unwrap_or(&self.a);
-            same_skin((of, skin), (Path::new(name), &own))?;
+            check_same_skin((of, skin), (Path::new(name), &own))?;
         }
         if let Some(error) = comparison.not_found(which) {
             let text = format!("{name}: {error}");
@@ -287,14 +287,14 @@ impl Compare {
             Err(Failure::usage(format!(
                 "{name} belongs to another skin than {}: of {}, {same} have its parameters; name the right one with --skin",
                 skin.name,
-                count(all, "cell")
+                count_with_noun(all, "cell")
             )))
         })
     }
 }
 
 /// Returns an error if the two captures are of different skins.
-fn same_skin(
+fn check_same_skin(
     (one, skin): (impl AsRef<Path>, &Skin),
     (other, own): (impl AsRef<Path>, &Skin),
 ) -> Result<(), Failure> {
@@ -305,6 +305,6 @@ fn same_skin(
     )))
 }
 
-fn about(input: &Input) -> show::CaptureNames<'_> {
-    show::CaptureNames { name: &input.name, format: format(&input.reader), files: &input.files }
+fn capture_names(input: &CaptureInput) -> show::CaptureNames<'_> {
+    show::CaptureNames { name: &input.name, format: format_name(&input.reader), files: &input.files }
 }

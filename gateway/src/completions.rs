@@ -7,7 +7,7 @@ use clap::{Args, Command};
 use clap_complete::Shell;
 use protocol::usage::{Failure, ignore_broken_pipe, print_raw};
 
-use super::output::{Overwrite, is_standard_output, note};
+use super::output::{OverwriteOption, is_standard_output, print_note};
 
 /// Print completions for a shell
 #[derive(Args, Debug)]
@@ -15,12 +15,12 @@ use super::output::{Overwrite, is_standard_output, note};
   skinbus completions bash > ~/.local/share/bash-completion/completions/skinbus
   skinbus completions zsh > ~/.zfunc/_skinbus
   skinbus completions fish > ~/.config/fish/completions/skinbus.fish")]
-pub(crate) struct Completions {
+pub(crate) struct CompletionsCommand {
     /// The shell
     shell: Shell,
 }
 
-impl Completions {
+impl CompletionsCommand {
     pub(crate) fn run(self, mut program: Command) -> Result<(), Failure> {
         let mut script = Vec::new();
         clap_complete::generate(self.shell, &mut program, "skinbus", &mut script);
@@ -33,15 +33,15 @@ impl Completions {
 #[command(after_help = "Examples:
   skinbus man ~/.local/share/man/man1
   skinbus man - | man -l -")]
-pub(crate) struct Man {
+pub(crate) struct ManCommand {
     /// An existing directory; - for skinbus.1 on standard output
     #[arg(value_name = "DIR")]
     folder: PathBuf,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Man {
+impl ManCommand {
     pub(crate) fn run(self, mut program: Command) -> Result<(), Failure> {
         if is_standard_output(&self.folder) {
             return ignore_broken_pipe(clap_mangen::Man::new(program).render(&mut io::stdout()));
@@ -59,7 +59,7 @@ impl Man {
         for (name, text) in &pages {
             self.overwrite.write("", &self.folder.join(name), text)?;
         }
-        note(format_args!("{} man pages in {}", pages.len(), self.folder.display()));
+        print_note(format_args!("{} man pages in {}", pages.len(), self.folder.display()));
         Ok(())
     }
 }

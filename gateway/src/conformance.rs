@@ -19,7 +19,7 @@ use protocol::usage::Failure;
 
 use self::show::ConformanceResult;
 use super::arguments::{BusKinds, FORMATS, one_of_values};
-use super::output::{Overwrite, print_beside};
+use super::output::{OverwriteOption, print_beside};
 use super::{input, output};
 
 /// Maximum duration of a test, without the time to listen at the start and to restore the cell at the end.
@@ -37,7 +37,7 @@ const MAX_TEST_DURATION: Span = Span::from_millis(80_000);
   skinbus conformance --bus can0 --cell 12 --restart './relay off; sleep 0.2; ./relay on' --junit cell.xml
   skinbus conformance --bus can0 --cell 12 --requirement CONF,COUNT-1
   skinbus conformance --bus can0 --cell 12 --restore conformance-can0-12.json")]
-pub(crate) struct Conformance {
+pub(crate) struct ConformanceCommand {
     /// The bus, if --cell does not name it
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
@@ -71,10 +71,10 @@ pub(crate) struct Conformance {
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Conformance {
+impl ConformanceCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let only = RequirementFilter::new(&self.requirement).map_err(|word| {
             Failure::usage(format!(
@@ -115,7 +115,7 @@ impl Conformance {
         let began = Instant::now();
         let saved = session.save().map_err(Failure::run)?;
         let saved = saved.map_err(|why| Failure::run(format!("cell {} on {name}: {why}", node)))?;
-        Overwrite { overwrite: false }.write("--save", &path, &super::print::json(&saved)?)?;
+        OverwriteOption { overwrite: false }.write("--save", &path, &super::print::json(&saved)?)?;
         let stopped = conformance::run(&mut session, &only).err();
         let back = restore_cell(&mut session, &saved, &path);
         let whole = ConformanceResult::new(
@@ -130,8 +130,8 @@ impl Conformance {
             let shown = if self.json { json } else { whole.text() };
             print_beside([self.junit.as_deref()], &shown)
         });
-        let reported =
-            junit.map_or(Ok(()), |(file, out)| output::finish("--junit", file, out, &whole.junit()));
+        let reported = junit
+            .map_or(Ok(()), |(file, out)| output::write_and_finish("--junit", file, out, &whole.junit()));
         back.and(shown).and(reported)?;
         match stopped {
             Some(StopReason::Interrupted) => Err(Failure::run("interrupted; the cell has been restored")),
@@ -162,6 +162,6 @@ fn restore_cell(session: &mut Session<'_>, saved: &SavedCell, path: &PathBuf) ->
     if saved.hash != 0 && !left.is_empty() {
         return Err(keep(&left.join(", ")));
     }
-    left.iter().for_each(output::note);
+    left.iter().for_each(output::print_note);
     fs::remove_file(path).map_err(|error| Failure::run(format!("{}: {error}", path.display())))
 }

@@ -17,16 +17,16 @@ use protocol::input::can_be_read_again;
 use protocol::stop::{self, InterruptibleWriter};
 use protocol::usage::Failure;
 use trace::capture::convert::{
-    CaptureWriter, ConversionCounts, ConvertError, EntrySink, LossCounts, Origin, convert,
+    CaptureWriter, ConversionCounts, ConvertError, EntrySink, LossCounts, RecordingOrigin, convert,
 };
-use trace::capture::log::{Digits, Style, WriteOutcome};
-use trace::capture::{CaptureFormat, Entry, NoteKind, Reader};
-use trace::files::WholeFile;
+use trace::capture::log::{LogStyle, TimeDigits, WriteOutcome};
+use trace::capture::{CaptureEntry, CaptureFormat, NoteKind, Reader};
+use trace::files::AtomicFile;
 
 use self::live::GrowingCapture;
 use super::arguments::{OptionValue, one_of_values};
-use super::input::{captures, location, no_frame, other_contents, skin_for};
-use super::output::{Overwrite, check_distinct, is_standard_output, note, write_refused};
+use super::input::{location, no_frame, open_capture, other_contents, skin_for};
+use super::output::{OverwriteOption, check_distinct, is_standard_output, print_note, write_refused};
 
 /// Maximum number of unreadable lines that are reported one by one.
 const MAX_NAMED_LINES: u64 = 100;
@@ -49,7 +49,7 @@ const WRITE_BYTES: usize = 1 << 18;
   skinbus convert run.mcap torques.csv
   skinbus convert run.log torques.csv --skin skin.toml
   candump -L can0 | skinbus convert - can0.mcap")]
-pub(crate) struct Convert {
+pub(crate) struct ConvertCommand {
     /// A candump log or an MCAP recording; - for standard input. Several are read as one: the parts of a split
     /// recording in any order, other captures in the order of their first frames
     #[arg(value_name = "IN", required = true)]
@@ -58,13 +58,13 @@ pub(crate) struct Convert {
     #[arg(value_name = "OUT")]
     to: PathBuf,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
     /// Fail at the first malformed frame line, or if IN is truncated; then write nothing
     #[arg(long)]
     strict: bool,
     /// Digits of a second in a log [default: as many as IN has]
     #[arg(long, value_parser = one_of_values(DIGITS), value_name = "N")]
-    digits: Option<Digits>,
+    digits: Option<TimeDigits>,
     /// Write the direction, T or R, behind each frame of a log, which Wireshark cannot read. Without this option, only
     /// a log that has directions keeps them
     #[arg(long, conflicts_with = "plain")]
@@ -78,14 +78,14 @@ pub(crate) struct Convert {
 }
 
 /// Hint in the error for a capture that is truncated and was refused because of `--strict`.
-const WITHOUT_STRICT: &str = "without --strict the intact part would be written";
+const WITHOUT_STRICT_HINT: &str = "without --strict the intact part would be written";
 
-const DIGITS: &[OptionValue<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
+const DIGITS: &[OptionValue<TimeDigits>] = &[("6", "", TimeDigits::Six), ("9", "", TimeDigits::Nine)];
 
-impl Convert {
+impl ConvertCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         if torques::is_csv(&self.to) {
-            return self.torques();
+            return self.write_torques();
         }
         if let Some(skin) = &self.skin {
             return Err(Failure::usage(format!(
@@ -120,10 +120,10 @@ impl Convert {
         if !text && !of_log && !reader.has_foreign_frames() {
             return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
         }
-        let digits = self.digits.unwrap_or(if self.plain { Digits::Six } else { Digits::Own });
+        let digits = self.digits.unwrap_or(if self.plain { TimeDigits::Six } else { TimeDigits::Own });
         let directions = !self.plain && (self.direction || reader.is_from_log());
-        let style = Style { digits, plain: self.plain, directions };
-        let mut sink = if live && self.is_new() {
+        let style = LogStyle { digits, plain: self.plain, directions };
+        let mut sink = if live && self.is_regular_output() {
             let refused = |error: io::Error| write_refused("", &self.to, &error);
             Sink::Live(
                 GrowingCapture::create(&self.to, self.overwrite.overwrite, (format, style, of_log), stopped)
@@ -133,7 +133,7 @@ impl Convert {
             let (whole, out) = self.create(stopped)?;
             let output = match format {
                 CaptureFormat::Candump => CaptureWriter::new(out, format, style),
-                CaptureFormat::Mcap => CaptureWriter::new_mcap(out, Origin { of_log, file: None }),
+                CaptureFormat::Mcap => CaptureWriter::new_mcap(out, RecordingOrigin { of_log, file: None }),
             };
             Sink::Whole(whole, output.map_err(|error| Failure::run(format!("{to}: {error}")))?)
         };
@@ -145,10 +145,10 @@ impl Convert {
                 return Err(format!("{place}: {why}; without --strict it would be kept as it is"));
             }
             if named <= MAX_NAMED_LINES {
-                bar.suspend(|| note(format_args!("{place}: {why}")));
+                bar.suspend(|| print_note(format_args!("{place}: {why}")));
             }
             if named == MAX_NAMED_LINES {
-                bar.suspend(|| note(format_args!("{name}: further lines of that kind are counted")));
+                bar.suspend(|| print_note(format_args!("{name}: further lines of that kind are counted")));
             }
             Ok(())
         });
@@ -169,15 +169,15 @@ impl Convert {
         if let Some(why) = &reader.extras().unfinished {
             let said = format!("{name}: {why}");
             if self.strict {
-                return Err(sink.discard(Failure::run(format!("{said}; {WITHOUT_STRICT}"))));
+                return Err(sink.discard(Failure::run(format!("{said}; {WITHOUT_STRICT_HINT}"))));
             }
-            note(said);
+            print_note(said);
         }
         sink.finish().or_else(|(left, error)| write_error(&self.to, &left, error))?;
         for line in remarks(&reader, &done, &style, text) {
-            note(format_args!("{name}: {line}"));
+            print_note(format_args!("{name}: {line}"));
         }
-        note(format_args!("{name} -> {to}: {} frames, {} notes", done.frames, done.notes));
+        print_note(format_args!("{name} -> {to}: {} frames, {} notes", done.frames, done.notes));
         Ok(())
     }
 
@@ -186,12 +186,12 @@ impl Convert {
         if !self.from.iter().all(|file| can_be_read_again(file)) {
             return Ok(());
         }
-        let mut reader = captures(&self.from, |file| Box::new(file))?;
+        let mut reader = open_capture(&self.from, |file| Box::new(file))?;
         let name = reader.name().to_owned();
         let mut unreadable = Vec::new();
         loop {
             match reader.next() {
-                Ok(Some(Entry::Note(line))) => {
+                Ok(Some(CaptureEntry::Note(line))) => {
                     if let NoteKind::Unreadable(why) = &line.kind
                         && (unreadable.len() as u64) < MAX_NAMED_LINES
                     {
@@ -202,7 +202,7 @@ impl Convert {
                     if !stop::stop_flag().load(Ordering::Relaxed)
                         && (!self.strict || unreadable.is_empty()) =>
                 {
-                    unreadable.iter().for_each(note);
+                    unreadable.iter().for_each(print_note);
                     return Err(no_frame(&reader));
                 }
                 // The error is reported when the file is read again.
@@ -212,7 +212,7 @@ impl Convert {
     }
 
     /// Returns true if OUT is new or a regular file, false if it is a FIFO or a device, which is written to directly.
-    fn is_new(&self) -> bool {
+    fn is_regular_output(&self) -> bool {
         !is_standard_output(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
     }
 
@@ -222,7 +222,7 @@ impl Convert {
     }
 
     /// Writes the torque of every epoch to a CSV file.
-    fn torques(&self) -> Result<(), Failure> {
+    fn write_torques(&self) -> Result<(), Failure> {
         let to = self.to.display();
         let options =
             [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
@@ -246,16 +246,18 @@ impl Convert {
             return Err(Failure::run(format!("interrupted after {epochs} epochs: {to} is not written")));
         }
         if let Some(why) = reader.extras().unfinished.as_ref().filter(|_| self.strict) {
-            return Err(Failure::run(format!("{name}: {why}; {WITHOUT_STRICT}")));
+            return Err(Failure::run(format!("{name}: {why}; {WITHOUT_STRICT_HINT}")));
         }
         if let Some(whole) = whole {
             whole.finish().map_err(|error| Failure::run(format!("{to}: {error}")))?;
         }
         missing.report(&reader, "left out");
         if let Some(buses) = torques::summed_buses(&skin) {
-            note(format_args!("{name}: {buses} answers with sums: distributed torques and errors are empty"));
+            print_note(format_args!(
+                "{name}: {buses} answers with sums: distributed torques and errors are empty"
+            ));
         }
-        note(format_args!("{name} -> {to}: {epochs} epochs"));
+        print_note(format_args!("{name} -> {to}: {epochs} epochs"));
         Ok(())
     }
 
@@ -264,7 +266,7 @@ impl Convert {
         let size = input_bytes(&self.from);
         let bar = progress_bar(size);
         let progress = bar.clone();
-        let reader = captures(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
+        let reader = open_capture(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
         Ok((reader, bar, size.is_none()))
     }
 
@@ -272,11 +274,11 @@ impl Convert {
     fn create(
         &self,
         stopped: &AtomicBool,
-    ) -> Result<(Option<WholeFile>, BufWriter<InterruptibleWriter<File>>), Failure> {
+    ) -> Result<(Option<AtomicFile>, BufWriter<InterruptibleWriter<File>>), Failure> {
         let begun = if is_standard_output(&self.to) {
             io::stdout().as_fd().try_clone_to_owned().map(|file| (None, file.into()))
         } else {
-            WholeFile::create_unless(&self.to, self.overwrite.overwrite, stopped)
+            AtomicFile::create_unless(&self.to, self.overwrite.overwrite, stopped)
                 .map(|(whole, file)| (Some(whole), file))
         };
         let (whole, file) = begun.map_err(|error| write_refused("", &self.to, &error))?;
@@ -322,7 +324,7 @@ fn write_error(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
 
 /// Destination of the converted entries: a file that appears when it is complete, or one that grows.
 enum Sink {
-    Whole(Option<WholeFile>, CaptureWriter<BufWriter<InterruptibleWriter<File>>>),
+    Whole(Option<AtomicFile>, CaptureWriter<BufWriter<InterruptibleWriter<File>>>),
     Live(GrowingCapture),
 }
 
@@ -360,7 +362,7 @@ impl Sink {
         let left = self.remaining_file();
         let finished = match self {
             Self::Whole(whole, mut output) => {
-                output.finish().and_then(|()| whole.map_or(Ok(()), WholeFile::finish))
+                output.finish().and_then(|()| whole.map_or(Ok(()), AtomicFile::finish))
             }
             Self::Live(live) => live.finish(),
         };
@@ -369,7 +371,7 @@ impl Sink {
 }
 
 impl EntrySink for Sink {
-    fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
+    fn write(&mut self, entry: &CaptureEntry<'_>) -> io::Result<WriteOutcome> {
         match self {
             Self::Whole(_, output) => output.write(entry),
             Self::Live(live) => live.write(entry),
@@ -393,7 +395,7 @@ fn progress_bar(size: Option<u64>) -> ProgressBar {
 }
 
 /// Returns the notes on a conversion, one per line.
-fn remarks(reader: &Reader, done: &ConversionCounts, style: &Style, text: bool) -> Vec<String> {
+fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: bool) -> Vec<String> {
     let mut lines = reader.remarks();
     let how = if style.plain { "" } else { ", which not every tool reads; --direction writes it" };
     let LossCounts { digits, direction, raw_dlc, name } = done.shortened;

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use analysis::stats::StatsReport;
 use bench::bus::listen::now;
 use clap::Args;
-use model::decode::pick::{FrameFilter, IdMask, Party, Selector};
+use model::decode::pick::{FrameFilter, IdMask, NodeSelector, Selector};
 use protocol::bus::BusOptions;
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
@@ -19,13 +19,13 @@ use protocol::skin::Skin;
 use protocol::stop::{self, InterruptibleWriter};
 use protocol::usage::{Failure, ignore_broken_pipe, print_text};
 use serde::Serialize;
-use trace::capture::{Entry, NoteKind, Reader, RecordingExtras, Topic};
+use trace::capture::{CaptureEntry, NoteKind, Reader, RecordingExtras, Topic};
 
 use self::show::{FrameOutput, OutputStyle};
 use super::arguments::{BusKinds, OptionValue, one_of_values, parse_time_ns};
 use super::input::{
-    self, LossCounts, POLL_TIMEOUT, ReceiveEnd, captures, is_file, is_path, location, no_frame,
-    note_other_skin, skin_so_far, stop_flag,
+    self, BusReceiver, LossCounts, POLL_TIMEOUT, is_file, is_path, location, no_frame, note_other_skin,
+    open_capture, skin_so_far, stop_flag,
 };
 use super::output;
 use super::print::{comma_separated, json};
@@ -48,7 +48,7 @@ use super::print::{comma_separated, json};
   skinbus dump run.mcap run-*.mcap --stats
   skinbus dump can0 --stats --to 10
   candump -L can0 | skinbus dump - -n 100")]
-pub(crate) struct Dump {
+pub(crate) struct DumpCommand {
     /// Buses; or a candump log or MCAP recording if a file has this name, - for standard input. The parts of a split
     /// recording count as one, in any order
     #[arg(required = true, value_name = "BUS|FILE")]
@@ -59,7 +59,7 @@ pub(crate) struct Dump {
     kind: Vec<Selector>,
     /// Only packets from or to these cells; also gateway and everyone
     #[arg(long, value_name = "[BUS:]NODE", value_delimiter = ',')]
-    cell: Vec<Party>,
+    cell: Vec<NodeSelector>,
     /// Only frames of these buses
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
@@ -117,7 +117,7 @@ const ANY_FORMAT: &[OptionValue<PacketFormat>] = &[
     ("classic", "Two to four classic frames", Some(Format::Classic)),
 ];
 
-impl Dump {
+impl DumpCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let is_capture = self.is_capture()?;
         let mut title = comma_separated(self.sources.iter().map(|source| source.display()));
@@ -160,7 +160,7 @@ impl Dump {
             show.set_units(&skin);
         }
         let (what, extras, done) = if is_capture {
-            let mut reader = captures(&self.sources, |file| Box::new(file))?;
+            let mut reader = open_capture(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
             if self.skin.is_none() && !self.stats {
                 let instead = "torques are read as Q3.12 and joints as revolute: name the skin with --skin";
@@ -168,19 +168,19 @@ impl Dump {
                     show.set_units(&skin);
                 }
             }
-            reader.extras().run_began().into_iter().for_each(|zero| show.count_from(zero));
+            reader.extras().run_began().into_iter().for_each(|zero| show.set_zero_time(zero));
             let done = show_capture(&mut reader, &mut show);
             if let (Ok(()), Some(absent)) = (&done, show.absent_buses()) {
-                output::note(format_args!("{title}: no frame comes from {absent}"));
+                output::print_note(format_args!("{title}: no frame comes from {absent}"));
             }
-            (input::format(&reader), Some(reader.extras().clone()), done)
+            (input::format_name(&reader), Some(reader.extras().clone()), done)
         } else {
             // Signals must be caught before the dump reports that it listens.
             let stopped = stop_flag()?;
             let kinds = self.kinds.any_kinds()?;
             let until = self.wait.then_some(&*stopped);
             let mut receive_ends =
-                input::receive_ends(&self.sources, &kinds, self.format, &BusOptions::default(), until)?;
+                input::open_bus_receivers(&self.sources, &kinds, self.format, &BusOptions::default(), until)?;
             ("live", None, show_live(&mut receive_ends, &mut show, self.to, &stopped))
         };
         ignore_broken_pipe(show.finish().and_then(|()| show.flush()))?;
@@ -222,7 +222,7 @@ fn as_json(
     extras: Option<&RecordingExtras>,
 ) -> Result<String, Failure> {
     #[derive(Serialize)]
-    struct Whole<'a> {
+    struct DumpStatistics<'a> {
         source: &'a str,
         format: &'a str,
         #[serde(flatten)]
@@ -232,7 +232,7 @@ fn as_json(
     }
     let other_topics = extras.map_or(&[][..], |extras| &extras.topics);
     let attachments = extras.iter().flat_map(|extras| &extras.attachments).map(|(name, _)| name.as_str());
-    let whole = Whole { source, format, report, other_topics, attachments: attachments.collect() };
+    let whole = DumpStatistics { source, format, report, other_topics, attachments: attachments.collect() };
     json(&whole)
 }
 
@@ -248,34 +248,34 @@ fn show_capture(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Resu
         }
         match reader.next().map_err(Failure::run)? {
             None => break Ok(()),
-            Some(Entry::Frame(record)) => {
+            Some(CaptureEntry::Frame(record)) => {
                 frames += 1;
-                if let Err(error) = show.frame(&record) {
+                if let Err(error) = show.add_frame(&record) {
                     break Err(error);
                 }
-                if show.has_enough() {
+                if show.is_limit_reached() {
                     break Ok(());
                 }
             }
-            Some(Entry::Note(note)) => {
+            Some(CaptureEntry::Note(note)) => {
                 missing.count(&note);
                 let place = location(&name, note.line);
                 match note.kind {
                     NoteKind::Text | NoteKind::CanXl => {}
                     NoteKind::Dropped(lost) => {
-                        show.dropped(note.interface, lost);
-                        output::note(format_args!(
+                        show.count_dropped(note.interface, lost);
+                        output::print_note(format_args!(
                             "{place}: {lost} frames are missing here: the recorder lost them"
                         ));
                     }
-                    NoteKind::Unreadable(why) => output::note(format_args!("{place}: {why}")),
+                    NoteKind::Unreadable(why) => output::print_note(format_args!("{place}: {why}")),
                 }
             }
         }
     };
     ignore_broken_pipe(done)?;
     if !reader.has_times() {
-        show.without_times();
+        show.disable_rates();
     }
     // Missing frames have been reported at their places, so they are not reported again at the end.
     missing.frames = 0;
@@ -291,7 +291,7 @@ const SETTLE_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Shows buses until a signal, or until one is closed.
 fn show_live(
-    receive_ends: &mut [ReceiveEnd],
+    receive_ends: &mut [BusReceiver],
     show: &mut FrameOutput<impl Write>,
     to: Option<u64>,
     stopped: &AtomicBool,
@@ -312,14 +312,14 @@ fn show_live(
             }
             Ok(Ok(false)) => {}
         }
-        if show.has_enough() {
+        if show.is_limit_reached() {
             break Ok(());
         }
     };
     for receive_end in receive_ends {
-        match receive_end.missing("shown") {
+        match receive_end.report_missing_frames("shown") {
             0 => {}
-            missing => show.dropped(receive_end.bus().name(), missing),
+            missing => show.count_dropped(receive_end.bus().name(), missing),
         }
     }
     done
@@ -327,7 +327,7 @@ fn show_live(
 
 /// Waits for frames and shows them. Returns true if any arrived, or the error of the output.
 fn show_received(
-    receive_ends: &mut [ReceiveEnd],
+    receive_ends: &mut [BusReceiver],
     show: &mut FrameOutput<impl Write>,
 ) -> Result<io::Result<bool>, Failure> {
     let wait = if show.is_waiting() { SETTLE_INTERVAL } else { POLL_TIMEOUT };
@@ -343,12 +343,12 @@ fn show_received(
         }
         any = true;
         let shown = receive_end.frames().try_for_each(|received| {
-            if show.has_enough() {
+            if show.is_limit_reached() {
                 return Ok(());
             }
-            let time = Timestamp::six_digits(received.at_nanos);
+            let time = Timestamp::with_six_digits(received.at_nanos);
             let interface = receive_end.bus().name();
-            show.frame(&Record { time, interface, frame: received.frame, direction: None })
+            show.add_frame(&Record { time, interface, frame: received.frame, direction: None })
         });
         if let Err(error) = shown {
             return Ok(Err(error));

@@ -18,16 +18,16 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use model::quantiles::Quantiles;
 use paper::arm::Reply;
-use paper::moving::Run;
+use paper::moving::BenchRun;
 use paper::scale::ScaleBench;
 use paper::{Effort, Experiment as Named, Lab, Session, files};
 use protocol::usage::{Failure, print_text, shell_quoted_os};
 use serde_json::Value;
 
 use super::input::stop_flag;
-use super::output::{Overwrite, note};
+use super::output::{OverwriteOption, print_note};
 use super::print::{KeyValueTable, json};
-use benches::Benches;
+use benches::BenchRunner;
 use folder::ResultFolder;
 
 /// Repeat the paper's experiments, and draw and rate the results
@@ -44,7 +44,7 @@ use folder::ResultFolder;
   skinbus experiment list
   skinbus experiment fig9 fig10 -o laws
   skinbus experiment all -o experiments")]
-pub(crate) struct Experiment {
+pub(crate) struct ExperimentCommand {
     /// Experiments, or all, or list
     #[arg(value_name = "NAME", required = true)]
     names: Vec<ExperimentArgument>,
@@ -52,7 +52,7 @@ pub(crate) struct Experiment {
     #[arg(long, short, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
     /// Measure little: a few cells for a few seconds, to see that everything works
     #[arg(long)]
     quick: bool,
@@ -81,10 +81,10 @@ impl FromStr for ExperimentArgument {
     }
 }
 
-impl Experiment {
+impl ExperimentCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         if self.names.contains(&ExperimentArgument::List) {
-            return list();
+            return list_experiments();
         }
         let Some(output) = &self.output else {
             return Err(Failure::usage("-o DIR is missing: name the folder for report.html and the figures"));
@@ -101,7 +101,7 @@ impl Experiment {
         let page = self.perform(&named, &folder, stop)?;
         write_results(&page, &folder)?;
         // Keep the measured data even if it cannot be drawn.
-        draw(&page, folder).map_err(|failure| {
+        write_report(&page, folder).map_err(|failure| {
             failure.append(format_args!(
                 "{} has the results, the data of the figures and the recordings",
                 output.display()
@@ -118,14 +118,14 @@ impl Experiment {
     ) -> Result<Page, Failure> {
         let effort = if self.quick { Effort::Quick } else { Effort::Full };
         let progress = Progress::new(named.iter().map(|named| named.seconds(effort)).sum(), self.quiet);
-        let benches = Benches { folder: folder.staging_directory(), stop: Arc::clone(&stop) };
+        let benches = BenchRunner { folder: folder.staging_directory(), stop: Arc::clone(&stop) };
         let mut lab = LocalLab { benches, stop, idle: None };
         let mut session = Session::new(effort);
         let mut sections = Vec::with_capacity(named.len());
         for named in named {
-            progress.begin(*named);
+            progress.begin_experiment(*named);
             sections.push(session.perform(*named, &mut lab)?);
-            progress.end(named.seconds(effort));
+            progress.add_finished_seconds(named.seconds(effort));
         }
         lab.check_stopped()?;
         progress.clear();
@@ -139,7 +139,7 @@ impl Experiment {
             shell_quoted_os(name.unwrap_or(&word))
         });
         let command = words.collect::<Vec<_>>().join(" ");
-        let about = facts::program(std::slice::from_ref(&command), 0);
+        let about = facts::program_metadata(std::slice::from_ref(&command), 0);
         let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
         let quick = "quick: few cells, few measurements; no figures of these are results";
         let facts = [
@@ -163,7 +163,7 @@ impl Experiment {
 
 /// Runs the measurements of experiments on this machine.
 struct LocalLab {
-    benches: Benches,
+    benches: BenchRunner,
     stop: Arc<AtomicBool>,
     /// Wake-up lateness of the idle machine before a bench, as text.
     idle: Option<String>,
@@ -176,20 +176,20 @@ impl Lab for LocalLab {
         realtime::now()
     }
 
-    fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
+    fn run_bench(&mut self, reply: Reply, effort: Effort) -> Result<BenchRun, Failure> {
         let run = self.benches.run(reply, effort);
         // If a signal has ended the bench, return that it was interrupted, not that it failed.
         self.check_stopped()?;
         let run = run?;
-        let late = |key: &str| run.figure(&["loop", "idle_late_us", key]);
+        let late = |key: &str| run.summary_number(&["loop", "idle_late_us", key]);
         self.idle.get_or_insert_with(|| {
             format!("median {:.0}, 99 % {:.0}, max {:.0} µs", late("p50"), late("p99"), late("max"))
         });
         Ok(run)
     }
 
-    fn scaled(&mut self, bench: &ScaleBench) -> Result<Value, Failure> {
-        let summary = self.benches.scaled(bench);
+    fn run_scaled_bench(&mut self, bench: &ScaleBench) -> Result<Value, Failure> {
+        let summary = self.benches.run_scaled(bench);
         self.check_stopped()?;
         summary
     }
@@ -204,7 +204,7 @@ impl Lab for LocalLab {
 
 /// Returns the names of the processor and the kernel in one line.
 fn machine() -> String {
-    let about = facts::machine(&Quantiles::default());
+    let about = facts::machine_metadata(&Quantiles::default());
     let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
@@ -218,7 +218,7 @@ fn machine() -> String {
     )
 }
 
-fn list() -> Result<(), Failure> {
+fn list_experiments() -> Result<(), Failure> {
     let line = |named: Named| format!("{:12} {}\n", named.name(), named.description());
     print_text(&Named::ALL.into_iter().map(line).collect::<String>())
 }
@@ -229,11 +229,11 @@ fn write_results(page: &Page, folder: &ResultFolder) -> Result<(), Failure> {
     for figure in page.sections.iter().flat_map(|section| &section.figures) {
         folder.write(&format!("{}.csv", figure.name), &files::csv(figure))?;
     }
-    folder.publish()
+    folder.publish_files()
 }
 
 /// Writes the HTML page and the figures.
-fn draw(page: &Page, folder: ResultFolder) -> Result<(), Failure> {
+fn write_report(page: &Page, folder: ResultFolder) -> Result<(), Failure> {
     folder.write("report.html", &page::html(page))?;
     for figure in page.sections.iter().flat_map(|section| &section.figures) {
         folder.write(&format!("{}.svg", figure.name), &svg::draw(figure))?;
@@ -245,7 +245,7 @@ fn draw(page: &Page, folder: ResultFolder) -> Result<(), Failure> {
 fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
     let mut rows = KeyValueTable::new("", "here", "paper, bar");
     for section in &page.sections {
-        rows.section(&section.title, "", "");
+        rows.add_section(&section.title, "", "");
         for Finding { what, paper, ours, bar, verdict, .. } in &section.findings {
             let beside = [paper.as_ref().map(|paper| format!("paper {paper}")), bar.clone()];
             let beside = beside.into_iter().flatten().collect::<Vec<_>>().join("; ");
@@ -255,7 +255,7 @@ fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
                     format!("  {verdict}")
                 }
             };
-            rows.row(what, ours, format!("{beside}{verdict}"));
+            rows.add_row(what, ours, format!("{beside}{verdict}"));
         }
     }
     let worse = page.sections.iter().flat_map(|section| &section.findings);
@@ -265,7 +265,7 @@ fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
     } else {
         format!("worse than the paper's or than required: {worse}\n")
     };
-    print_text(&format!("{}{worse}{}\n", rows.text(), report.display()))
+    print_text(&format!("{}{worse}{}\n", rows.to_text(), report.display()))
 }
 
 /// A progress bar on a terminal; elsewhere one line per experiment.
@@ -287,14 +287,14 @@ impl Progress {
         Self { bar, lines }
     }
 
-    fn begin(&self, named: Named) {
+    fn begin_experiment(&self, named: Named) {
         self.bar.set_message(named.name());
         if self.lines {
-            note(format_args!("{named}: {}", named.description()));
+            print_note(format_args!("{named}: {}", named.description()));
         }
     }
 
-    fn end(&self, seconds: u64) {
+    fn add_finished_seconds(&self, seconds: u64) {
         self.bar.inc(seconds);
     }
 

@@ -41,7 +41,7 @@ Examples:
   skinbus explain run.mcap --epoch 77 --at 20 --joint 2 --json
   skinbus explain skin.toml --cell 12 --force 2.5 --joints \"0 -1.2 1.0 -1.4 -1.57 0\"
   skinbus explain skin.toml --batch rows.csv --json > torques.jsonl")]
-pub(crate) struct Explain {
+pub(crate) struct ExplainCommand {
     /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input. With --force
     /// or --batch: a skin or a recording
     #[arg(required = true, value_name = "FILE")]
@@ -62,7 +62,7 @@ pub(crate) struct Explain {
     #[arg(long, value_name = "J", conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u8).range(1..=32))]
     joint: Option<u8>,
     #[command(flatten)]
-    given: torque::Given,
+    given: torque::TorqueOptions,
     /// The skin [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
@@ -80,10 +80,10 @@ struct ExplainOutput<'a> {
     explanation: &'a Explanation,
 }
 
-impl Explain {
+impl ExplainCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let Some(epoch) = self.epoch else {
-            return self.given.compute(&self.files, self.cell.as_ref(), self.json);
+            return self.given.print_torques(&self.files, self.cell.as_ref(), self.json);
         };
         if let Some(bus) = self.files.iter().find(|file| !is_file(file) && !is_path(file)) {
             let bus = bus.display();
@@ -106,11 +106,11 @@ impl Explain {
             (found.unreadable, "lines before this point could not be read"),
         ] {
             if count > 0 {
-                output::note(format_args!("{name}: {count} {what}"));
+                output::print_note(format_args!("{name}: {count} {what}"));
             }
         }
         if let Some(why) = &reader.extras().unfinished {
-            output::note(format_args!("{name}: {why}"));
+            output::print_note(format_args!("{name}: {why}"));
         }
         if found.is_empty {
             return Err(no_frame(&reader));
@@ -142,7 +142,13 @@ impl Explain {
             (false, Some(_)) => show::ExplainDetail::Joint,
             (false, None) => show::ExplainDetail::All,
         };
-        print_text(&show::text(&name, epoch, (found.zero_ns, found.counts_from_run), &explanation, what))
+        print_text(&show::format_explanation(
+            &name,
+            epoch,
+            (found.zero_ns, found.counts_from_run),
+            &explanation,
+            what,
+        ))
     }
 
     /// Checks that the skin has the cell and the joint.

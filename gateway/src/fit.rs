@@ -36,7 +36,7 @@ use super::print::comma_separated;
   skinbus fit run.mcap --rates vcan0=1M/8M --rates vcan1=500k
   skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   skinbus fit vcan0 vcan1 --duration 10")]
-pub(crate) struct Fit {
+pub(crate) struct FitCommand {
     /// A skin; a candump log or MCAP recording, all parts of a split recording in any order; or buses. - for standard
     /// input, which is traffic unless an option is for a skin
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
@@ -54,7 +54,7 @@ pub(crate) struct Fit {
     #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
     /// For a skin: longest time of a cell from joints to its answer, in µs [the paper's cell: 68.5]
-    #[arg(long, value_name = "US", value_parser = computation)]
+    #[arg(long, value_name = "US", value_parser = parse_computation_ns)]
     computation: Option<u64>,
     /// For traffic: bit rates of one bus; repeat the option for further buses: can0=500k/2M, can1=1M
     #[arg(long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
@@ -86,9 +86,9 @@ pub(crate) struct Fit {
     kinds: BusKinds,
 }
 
-impl Fit {
+impl FitCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let Some(skin) = self.skin_file()? else { return self.of_traffic() };
+        let Some(skin) = self.skin_file()? else { return self.print_traffic_fit() };
         let of_traffic = [
             ("--rates", !self.rates.is_empty()),
             ("--skin", self.skin.is_some()),
@@ -106,7 +106,7 @@ impl Fit {
             return Err(Failure::usage("--data of a skin needs --nominal beside it"));
         }
         let skin = read_skin(skin)?;
-        self.of_skin(&skin)
+        self.print_skin_fit(&skin)
     }
 
     /// Returns the path of the skin's file, if the sources name one.
@@ -152,7 +152,7 @@ fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
 }
 
 /// Parses a time in µs with up to three decimals, and returns it in ns.
-fn computation(text: &str) -> Result<u64, String> {
+fn parse_computation_ns(text: &str) -> Result<u64, String> {
     let allowed = "0 to 65000 µs";
     let us: f64 = text.parse().map_err(|_| format!("not a number; allowed is {allowed}"))?;
     if !(0.0..=65_000.0).contains(&us) {

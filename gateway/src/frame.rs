@@ -14,7 +14,7 @@ use bench::bus::listen::{self, Listener};
 use bench::sensing as switching;
 use clap::Args;
 use model::decode::Decoded;
-use model::decode::pick::Party;
+use model::decode::pick::NodeSelector;
 use protocol::bus::{Bus, BusError, BusOptions, KindChoice, KindChoices};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
 use protocol::id::CellId;
@@ -43,7 +43,7 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(1);
   skinbus frame stimulus --cell 12 --force 3.0 --bus vcan0
   skinbus frame resume --skin skin.toml
   skinbus frame sensing continuous 62.5 --bus vcan0")]
-pub(crate) struct Frame {
+pub(crate) struct FrameCommand {
     #[command(subcommand)]
     what: PacketCommand,
     /// Frame format of the packet [default: with --skin the format of each bus, else fd]
@@ -59,7 +59,7 @@ pub(crate) struct Frame {
     kinds: BusKinds,
 }
 
-impl Frame {
+impl FrameCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let message = self.what.message().map_err(Failure::usage)?;
         let (targets, kinds) = self.targets()?;
@@ -109,7 +109,7 @@ impl Frame {
         };
         let names = comma_separated(targets.iter().map(|(name, _)| name));
         let kinds = self.kinds.kinds_of(targets.iter().map(|(name, _)| name.as_str()))?;
-        if let Some(Party { bus: Some(bus), node }) = to {
+        if let Some(NodeSelector { bus: Some(bus), node }) = to {
             targets.retain(|(name, _)| name == bus);
             if targets.is_empty() {
                 return Err(Failure::usage(format!(
@@ -139,7 +139,7 @@ impl Frame {
             return switch.send(bus, format);
         }
         listen::send(&bus, message, format).map_err(Failure::run)?;
-        output::note(format_args!("sent on {name} ({})", bus.kind()));
+        output::print_note(format_args!("sent on {name} ({})", bus.kind()));
         let tag = if let Message::Configure { tag, .. } = message {
             Some(*tag)
         } else if let Message::Stimulus { .. } = message {
@@ -190,7 +190,7 @@ fn verdict(
     }
     print_text(&lines)?;
     let who = only.map_or_else(|| "cell".to_owned(), |cell| format!("cell {cell}"));
-    let (waited, other) = (ANSWER_TIMEOUT.as_secs_f64(), format.other().name());
+    let (waited, other) = (ANSWER_TIMEOUT.as_secs_f64(), format.other_format().name());
     if !refused.is_empty() {
         return Err(Failure::run(comma_separated(&refused)));
     }

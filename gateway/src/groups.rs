@@ -25,15 +25,15 @@ Examples:
   skinbus run skin.toml --scenario scenario.toml --record run.mcap";
 
 /// Replaces the list of commands in the help by groups.
-pub(crate) fn grouped(program: Command) -> Command {
+pub(crate) fn group_commands(program: Command) -> Command {
     let help = format!(
         "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n{}\nOptions:\n{{options}}\n\n{HELP_END}\n",
-        list(&program)
+        format_command_list(&program)
     );
     program.help_template(help)
 }
 
-fn list(program: &Command) -> String {
+fn format_command_list(program: &Command) -> String {
     let mut text = String::new();
     for (group, names) in GROUPS {
         let _ = write!(text, "\n{group}:\n");
@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     fn program() -> Command {
-        let mut program = grouped(crate::Arguments::command());
+        let mut program = group_commands(crate::Arguments::command());
         program.build();
         program
     }

@@ -11,7 +11,7 @@ use std::time::Duration;
 use bench::bus::follow::{FollowStep, Follower, OpenedOnce};
 use bench::bus::listen;
 use bench::signals::catch_signals;
-use protocol::bus::{Bus, BusError, BusOptions, KindChoice, KindChoices, Received};
+use protocol::bus::{Bus, BusError, BusOptions, KindChoice, KindChoices, ReceivedFrame};
 use protocol::can::{self, EXTENDED_MASK};
 use protocol::input::{can_be_read_again, is_standard_input};
 use protocol::skin::{Cell, Skin};
@@ -20,11 +20,11 @@ use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use trace::capture::{
-    CaptureError, CaptureFormat, Note, NoteKind, ORIGIN_METADATA, Reader, SKIN_OR_SCENARIO,
+    CaptureError, CaptureFormat, CaptureNote, NoteKind, ORIGIN_METADATA, Reader, SKIN_OR_SCENARIO,
 };
 
 use super::output;
-use super::print::{abbreviated, count};
+use super::print::{abbreviated, count_with_noun};
 
 /// Interval between attempts to open an awaited bus.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
@@ -82,7 +82,7 @@ pub(crate) fn note_other_skin(files: &[PathBuf], path: &Path, skin: &Skin) {
     let Some(Ok(own)) = reader.extras().skin() else { return };
     if let Some((what, is, was)) = difference(skin, &own) {
         let (path, name) = (path.display(), reader.name());
-        output::note(format_args!(
+        output::print_note(format_args!(
             "--skin {path} is not the skin that {name} was recorded with: {what} {is}, recorded {was}"
         ));
     }
@@ -122,7 +122,7 @@ pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
     if !is_recording {
         return read_skin(file);
     }
-    attached(&[file.to_owned()], "name the skin's own file", || Ok(()))
+    attached_skin(&[file.to_owned()], "name the skin's own file", || Ok(()))
 }
 
 /// Reads a skin file. If the file is a capture, the error says so, as far as that can be recognised.
@@ -144,7 +144,7 @@ fn capture_error(file: &Path) -> Option<Failure> {
     Some(match reader.has_frame().ok()? {
         true => Failure::usage(format!(
             "{name} is a capture ({}), and a skin is needed: name the skin's own file",
-            format(&reader)
+            format_name(&reader)
         )),
         false if reader.text_kind().is_some_and(|(kind, _)| kind == SKIN_OR_SCENARIO) => return None,
         false => no_frame(&reader),
@@ -164,12 +164,16 @@ pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
             pipe.display()
         )));
     }
-    attached(files, "name one with --skin", || needs_frames(files))
+    attached_skin(files, "name one with --skin", || require_frames(files))
 }
 
 /// Returns the skin attached to a recording. For a recording without one, `check` runs first and may return another
 /// error; `hint` is part of the error.
-fn attached(files: &[PathBuf], hint: &str, check: impl Fn() -> Result<(), Failure>) -> Result<Skin, Failure> {
+fn attached_skin(
+    files: &[PathBuf],
+    hint: &str,
+    check: impl Fn() -> Result<(), Failure>,
+) -> Result<Skin, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     // The attached skin may come after the frames, so read until it is found.
     while reader.format() == CaptureFormat::Mcap
@@ -190,7 +194,7 @@ fn attached(files: &[PathBuf], hint: &str, check: impl Fn() -> Result<(), Failur
 }
 
 /// Returns an error for a capture without frames, because naming a skin would not help.
-pub(crate) fn needs_frames(files: &[PathBuf]) -> Result<(), Failure> {
+pub(crate) fn require_frames(files: &[PathBuf]) -> Result<(), Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     if reader.has_frame().map_err(Failure::run)? { Ok(()) } else { Err(no_frame(&reader)) }
 }
@@ -200,11 +204,11 @@ pub(crate) fn needs_frames(files: &[PathBuf]) -> Result<(), Failure> {
 pub(crate) fn skin_so_far(reader: &Reader, instead: &str) -> Option<Skin> {
     let name = reader.name();
     let skin = reader.extras().skin()?;
-    skin.inspect_err(|error| output::note(format_args!("{name}, {error}; {instead}"))).ok()
+    skin.inspect_err(|error| output::print_note(format_args!("{name}, {error}; {instead}"))).ok()
 }
 
 /// Returns the name of a capture's format.
-pub(crate) fn format(reader: &Reader) -> &'static str {
+pub(crate) fn format_name(reader: &Reader) -> &'static str {
     match reader.format() {
         CaptureFormat::Candump => "candump log",
         CaptureFormat::Mcap => "MCAP",
@@ -227,7 +231,7 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
         (CaptureFormat::Candump, lines) => format!(
             "there is no frame in {}; the output of candump is expected: lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
-            count(lines, "line")
+            count_with_noun(lines, "line")
         ),
         (CaptureFormat::Mcap, _) => match other_contents(reader) {
             others if others.is_empty() => "there is no frame in it".to_owned(),
@@ -263,7 +267,7 @@ pub(crate) struct LossCounts {
 
 impl LossCounts {
     /// Counts an entry that is not a frame.
-    pub(crate) fn count(&mut self, note: &Note<'_>) {
+    pub(crate) fn count(&mut self, note: &CaptureNote<'_>) {
         match note.kind {
             NoteKind::Text => {}
             NoteKind::CanXl => self.can_xl += 1,
@@ -283,46 +287,46 @@ impl LossCounts {
         let name = reader.name();
         // In a recording, candump lines are notes.
         let unread = match reader.line_count() {
-            0 => format!("{} of a log could not be read", count(self.lines, "line")),
+            0 => format!("{} of a log could not be read", count_with_noun(self.lines, "line")),
             lines => format!("{} of {lines} lines could not be read", self.lines),
         };
         let said = [
             (self.lines, unread),
-            (self.messages, format!("{} could not be read", count(self.messages, "message"))),
+            (self.messages, format!("{} could not be read", count_with_noun(self.messages, "message"))),
             (self.frames, format!("{} frames are missing: the recorder lost them", self.frames)),
             (self.can_xl, format!("CAN XL frames are {can_xl}: {}", self.can_xl)),
         ];
         let said = said.iter().filter(|(count, _)| *count > 0).map(|(_, said)| said);
         for line in said.chain(&reader.extras().unfinished) {
-            output::note(format_args!("{name}: {line}"));
+            output::print_note(format_args!("{name}: {line}"));
         }
         for remark in reader.remarks() {
-            output::note(format_args!("{name}: {remark}"));
+            output::print_note(format_args!("{name}: {remark}"));
         }
     }
 }
 
 /// A live bus from which a command receives. A loss of the bus is reported once, until the bus works again.
 #[derive(Debug)]
-pub(crate) struct ReceiveEnd {
+pub(crate) struct BusReceiver {
     bus: Bus,
     follower: Follower,
 }
 
 /// Opens buses as [`ReceiveEnd::open`] does. If `until` is given, waits for buses that do not exist, until that flag is
 /// set.
-pub(crate) fn receive_ends(
+pub(crate) fn open_bus_receivers(
     sources: &[PathBuf],
     kinds: &KindChoices,
     format: Option<can::Format>,
     options: &BusOptions,
     until: Option<&AtomicBool>,
-) -> Result<Vec<ReceiveEnd>, Failure> {
+) -> Result<Vec<BusReceiver>, Failure> {
     let mut opened = Vec::new();
     for source in sources {
         let name = source.display().to_string();
         loop {
-            match (ReceiveEnd::open(&name, kinds.kind_of(&name), format, options.clone()), until) {
+            match (BusReceiver::open(&name, kinds.kind_of(&name), format, options.clone()), until) {
                 (Ok(receive_end), _) => break opened.push(receive_end),
                 (Err(_), Some(stopped)) if stopped.load(Ordering::Relaxed) => return Ok(opened),
                 (Err(error), Some(_)) if error.may_open_later() => thread::sleep(RETRY_INTERVAL),
@@ -333,7 +337,7 @@ pub(crate) fn receive_ends(
     Ok(opened)
 }
 
-impl ReceiveEnd {
+impl BusReceiver {
     /// Opens a bus to receive all its frames, and prints the kind of the bus. Without a format, also opens a classic
     /// interface.
     fn open(
@@ -343,7 +347,7 @@ impl ReceiveEnd {
         options: BusOptions,
     ) -> Result<Self, BusError> {
         let bus = listen::open(name, kind, format, BusOptions { error_mask: EXTENDED_MASK, ..options })?;
-        output::note(format_args!("{} is {}", bus.name(), bus.kind()));
+        output::print_note(format_args!("{} is {}", bus.name(), bus.kind()));
         Ok(Self { bus, follower: Follower::default() })
     }
 
@@ -356,7 +360,7 @@ impl ReceiveEnd {
             FollowStep::Frames(_) | FollowStep::Leftover(_) => Ok(true),
             FollowStep::Nothing | FollowStep::Drained | FollowStep::Refused(_) => Ok(false),
             FollowStep::Down(error) => {
-                output::note(format_args!("skinbus: {error}; waiting"));
+                output::print_note(format_args!("skinbus: {error}; waiting"));
                 Ok(false)
             }
             FollowStep::Gone(error) => Err(error),
@@ -364,7 +368,7 @@ impl ReceiveEnd {
     }
 
     /// The frames received last.
-    pub(crate) fn frames(&self) -> impl Iterator<Item = Received> + '_ {
+    pub(crate) fn frames(&self) -> impl Iterator<Item = ReceivedFrame> + '_ {
         self.follower.frames()
     }
 
@@ -374,10 +378,10 @@ impl ReceiveEnd {
 
     /// Prints and returns the number of frames lost because they arrived faster than they were processed. `done` says
     /// in the note how they would have been processed.
-    pub(crate) fn missing(&self, done: &str) -> u64 {
+    pub(crate) fn report_missing_frames(&self, done: &str) -> u64 {
         let (name, missing) = (self.bus().name(), self.follower.dropped());
         if missing > 0 {
-            output::note(format_args!(
+            output::print_note(format_args!(
                 "{name}: {missing} frames are missing: they came faster than they were {done}"
             ));
         }
@@ -386,7 +390,7 @@ impl ReceiveEnd {
 }
 
 /// Waits until a frame arrives on one of these buses, at most for `timeout`.
-pub(crate) fn wait(receive_ends: &[ReceiveEnd], timeout: Duration) -> Result<(), Failure> {
+pub(crate) fn wait(receive_ends: &[BusReceiver], timeout: Duration) -> Result<(), Failure> {
     let mut fds: Vec<_> =
         receive_ends.iter().map(|receive_end| PollFd::new(receive_end.bus(), PollFlags::IN)).collect();
     match poll(&mut fds, Timespec::try_from(timeout).ok().as_ref()) {
@@ -397,26 +401,26 @@ pub(crate) fn wait(receive_ends: &[ReceiveEnd], timeout: Duration) -> Result<(),
 
 /// Opens a capture, standard input or the parts of a recording, so that a signal can stop its reader. Signals are
 /// caught only once a file is open: a program that waits for the other end of a pipe has nothing to clean up.
-pub(crate) fn captures(
+pub(crate) fn open_capture(
     sources: &[PathBuf],
-    through: impl Fn(Interruptible) -> Box<dyn Read + Send> + Send + 'static,
+    through: impl Fn(InterruptibleFile) -> Box<dyn Read + Send> + Send + 'static,
 ) -> Result<Reader, Failure> {
     let flag = OnceLock::new();
     let interruptible = move |file| {
         // All parts share one flag. If signals cannot be caught, they end the program at once.
         let caught = || stop_flag().unwrap_or_else(|_| Arc::clone(stop::stop_flag()));
-        through(Interruptible { file, stopped: Arc::clone(flag.get_or_init(caught)) })
+        through(InterruptibleFile { file, stopped: Arc::clone(flag.get_or_init(caught)) })
     };
     Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)
 }
 
 /// A file whose reading can be stopped: it then reports the end of the file.
-pub(crate) struct Interruptible {
+pub(crate) struct InterruptibleFile {
     pub(crate) file: File,
     pub(crate) stopped: Arc<AtomicBool>,
 }
 
-impl Read for Interruptible {
+impl Read for InterruptibleFile {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let timeout = Timespec::try_from(POLL_TIMEOUT).ok();
         while !self.stopped.load(Ordering::Relaxed) {

@@ -6,16 +6,16 @@ use protocol::xml::escaped;
 
 /// A report with its test cases in order.
 #[derive(Debug)]
-pub(crate) struct Suite {
+pub(crate) struct TestSuite {
     pub(crate) name: String,
     /// Duration in s.
     pub(crate) seconds: f64,
-    pub(crate) cases: Vec<Case>,
+    pub(crate) cases: Vec<TestCase>,
 }
 
 /// A test case of a JUnit report.
 #[derive(Debug)]
-pub(crate) struct Case {
+pub(crate) struct TestCase {
     pub(crate) class: String,
     pub(crate) name: String,
     pub(crate) outcome: Outcome,
@@ -29,9 +29,9 @@ pub(crate) enum Outcome {
     Skipped { why: Option<String> },
 }
 
-impl Suite {
+impl TestSuite {
     /// Formats the report as XML.
-    pub(crate) fn text(&self) -> String {
+    pub(crate) fn to_xml(&self) -> String {
         let count = |is: fn(&Outcome) -> bool| self.cases.iter().filter(|case| is(&case.outcome)).count();
         let mut text = format!(
             "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuite name=\"{}\" tests=\"{}\" failures=\"{}\" \
@@ -42,7 +42,7 @@ impl Suite {
             count(|it| matches!(it, Outcome::Skipped { .. })),
             self.seconds,
         );
-        for Case { class, name, outcome } in &self.cases {
+        for TestCase { class, name, outcome } in &self.cases {
             let (class, name) = (escaped(class), escaped(name));
             let _ = write!(text, "  <testcase classname=\"{class}\" name=\"{name}\"");
             let _ = match outcome {

@@ -55,27 +55,27 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    Demo(run::Demo),
-    Run(run::Run),
-    View(view::View),
-    Dump(dump::Dump),
-    Explain(explain::Explain),
-    Report(report::Report),
-    Cells(cells::Cells),
-    Compare(compare::Compare),
-    Convert(convert::Convert),
-    Replay(replay::Replay),
-    Recover(recover::Recover),
-    Fit(fit::Fit),
-    Commission(commission::Commission),
-    Calibrate(calibrate::Calibrate),
-    Conformance(conformance::Conformance),
-    Frame(frame::Frame),
-    Skin(skin::Skin),
-    Check(check::Check),
-    Experiment(experiment::Experiment),
-    Completions(completions::Completions),
-    Man(completions::Man),
+    Demo(run::DemoCommand),
+    Run(run::RunCommand),
+    View(view::ViewCommand),
+    Dump(dump::DumpCommand),
+    Explain(explain::ExplainCommand),
+    Report(report::ReportCommand),
+    Cells(cells::CellsCommand),
+    Compare(compare::CompareCommand),
+    Convert(convert::ConvertCommand),
+    Replay(replay::ReplayCommand),
+    Recover(recover::RecoverCommand),
+    Fit(fit::FitCommand),
+    Commission(commission::CommissionCommand),
+    Calibrate(calibrate::CalibrateCommand),
+    Conformance(conformance::ConformanceCommand),
+    Frame(frame::FrameCommand),
+    Skin(skin::SkinCommand),
+    Check(check::CheckCommand),
+    Experiment(experiment::ExperimentCommand),
+    Completions(completions::CompletionsCommand),
+    Man(completions::ManCommand),
 }
 
 impl Command {
@@ -108,7 +108,7 @@ impl Command {
 
 /// The command line with its commands in groups.
 fn program() -> clap::Command {
-    groups::grouped(Arguments::command())
+    groups::group_commands(Arguments::command())
 }
 
 fn main() -> ExitCode {

@@ -7,20 +7,20 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use protocol::usage::{Failure, eprint_line, eprint_lines, ignore_broken_pipe, print_raw, print_text};
-use trace::files::{STANDARD_OUTPUT, WholeFile, check, parent_folder, with_hint};
+use trace::files::{AtomicFile, STANDARD_OUTPUT, check, parent_folder, with_hint};
 
 /// The option that allows existing files to be overwritten.
 #[derive(Args, Clone, Copy, Debug)]
-pub(crate) struct Overwrite {
+pub(crate) struct OverwriteOption {
     /// Overwrite existing files
     #[arg(long)]
     pub(crate) overwrite: bool,
 }
 
-impl Overwrite {
+impl OverwriteOption {
     /// Creates the file that an option names, so that errors show up before there is anything to write.
-    pub(crate) fn create(self, option: &str, path: &Path) -> Result<(WholeFile, File), Failure> {
-        WholeFile::create(path, self.overwrite).map_err(|error| write_refused(option, path, &error))
+    pub(crate) fn create(self, option: &str, path: &Path) -> Result<(AtomicFile, File), Failure> {
+        AtomicFile::create(path, self.overwrite).map_err(|error| write_refused(option, path, &error))
     }
 
     /// Checks that the file which an option names can be written, before its content is computed.
@@ -31,7 +31,7 @@ impl Overwrite {
     /// Writes the file that an option names. On an error, a former file stays unchanged.
     pub(crate) fn write(self, option: &str, path: &Path, text: &str) -> Result<(), Failure> {
         let (whole, file) = self.create(option, path)?;
-        finish(option, whole, file, text)
+        write_and_finish(option, whole, file, text)
     }
 }
 
@@ -70,7 +70,12 @@ pub(crate) fn print_table<'a>(
 }
 
 /// Writes the whole content of a created file.
-pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str) -> Result<(), Failure> {
+pub(crate) fn write_and_finish(
+    option: &str,
+    whole: AtomicFile,
+    mut file: File,
+    text: &str,
+) -> Result<(), Failure> {
     if is_standard_output(whole.path()) {
         return ignore_broken_pipe(file.write_all(text.as_bytes()));
     }
@@ -127,6 +132,6 @@ pub(crate) fn is_coloured(out: &impl IsTerminal) -> bool {
 }
 
 /// Prints a line on standard error, or drops it if that is closed.
-pub(crate) fn note(text: impl Display) {
+pub(crate) fn print_note(text: impl Display) {
     eprint_line(&text.to_string());
 }

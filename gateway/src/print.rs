@@ -70,7 +70,7 @@ pub(crate) fn abbreviated(names: &[String]) -> String {
 }
 
 /// Formats a count with its noun.
-pub(crate) fn count(count: impl TryInto<u64>, one: &str) -> String {
+pub(crate) fn count_with_noun(count: impl TryInto<u64>, one: &str) -> String {
     let count = count.try_into().unwrap_or(u64::MAX);
     match one {
         _ if count == 1 => format!("1 {one}"),
@@ -116,7 +116,7 @@ pub(crate) fn table<H: Into<String>>(
 }
 
 /// Limits a table to the width of the terminal, and to a readable width.
-pub(crate) fn readable(mut table: Table) -> Table {
+pub(crate) fn limit_width(mut table: Table) -> Table {
     let width = table.width().map_or(MAX_TABLE_WIDTH, |width| width.min(MAX_TABLE_WIDTH));
     table.set_width(width);
     table
@@ -152,21 +152,21 @@ pub(crate) struct KeyValueTable {
 impl KeyValueTable {
     /// Creates a [`readable`] table with this header and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
-        Self::in_columns(None, name, value, beside)
+        Self::with_terminal_width(None, name, value, beside)
     }
 
     /// Creates the table for a terminal of this width; `None` detects the width.
-    pub(crate) fn in_columns(
+    pub(crate) fn with_terminal_width(
         columns: Option<u16>,
         name: impl Display,
         value: impl Display,
         beside: impl Display,
     ) -> Self {
-        let mut table = table(line(name, value, beside), [], |_| false);
+        let mut table = table(printable_row(name, value, beside), [], |_| false);
         if let Some(columns) = columns {
             table.set_width(columns);
         }
-        let mut table = readable(table);
+        let mut table = limit_width(table);
         let width = (table.width().unwrap_or(MAX_TABLE_WIDTH) * 2 / 5).min(MAX_NAME_WIDTH);
         if let Some(names) = table.column_mut(0) {
             names.set_constraint(ColumnConstraint::ContentWidth);
@@ -198,41 +198,41 @@ impl KeyValueTable {
     }
 
     /// Breaks names into lines of this width.
-    pub(crate) const fn names_in(mut self, letters: usize) -> Self {
+    pub(crate) const fn with_name_width(mut self, letters: usize) -> Self {
         self.name_width = Some(letters);
         self
     }
 
     /// Formats the table.
-    pub(crate) fn text(&self) -> String {
+    pub(crate) fn to_text(&self) -> String {
         format!("{}\n", self.table).replace(INDENT, " ")
     }
 
-    pub(crate) fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
-        let [name, value, beside] = line(name, value, beside);
+    pub(crate) fn add_section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
+        let [name, value, beside] = printable_row(name, value, beside);
         self.table.add_row([fold_name(&name, self.name_width), value, beside]);
     }
 
-    pub(crate) fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
-        self.section(format!("  {name}"), value, beside);
+    pub(crate) fn add_row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
+        self.add_section(format!("  {name}"), value, beside);
     }
 
     /// Adds a row whose last text is coloured if colours are enabled ([`Rows::coloured`]).
-    pub(crate) fn row_in_colour(
+    pub(crate) fn add_coloured_row(
         &mut self,
         name: impl Display,
         value: impl Display,
         beside: impl Display,
         colour: Color,
     ) {
-        let [name, value, beside] = line(format!("  {name}"), value, beside);
+        let [name, value, beside] = printable_row(format!("  {name}"), value, beside);
         let name = Cell::new(fold_name(&name, self.name_width));
         self.table.add_row([name, Cell::new(value), Cell::new(beside).fg(colour)]);
     }
 
     /// Adds a row whose last text is kept in one line.
-    pub(crate) fn row_in_one_line(&mut self, name: impl Display, value: impl Display, beside: &str) {
-        self.row(name, value, beside);
+    pub(crate) fn add_row_in_one_line(&mut self, name: impl Display, value: impl Display, beside: &str) {
+        self.add_row(name, value, beside);
         let width = u16::try_from(beside.chars().count() + 2).unwrap_or(MAX_TABLE_WIDTH);
         if let Some(texts) = self.table.column_mut(2) {
             texts.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(width)));
@@ -247,13 +247,13 @@ impl KeyValueTable {
         beside: impl Display,
     ) {
         if let Some(count) = count.try_into().ok().filter(|&count| count > 0) {
-            self.row(name, count, beside);
+            self.add_row(name, count, beside);
         }
     }
 }
 
 /// Returns the texts of a row, made safe for terminals by [`shown`].
-fn line(name: impl Display, value: impl Display, beside: impl Display) -> [String; 3] {
+fn printable_row(name: impl Display, value: impl Display, beside: impl Display) -> [String; 3] {
     [name.to_string(), value.to_string(), beside.to_string()].map(|text| printable(&text).into_owned())
 }
 

@@ -9,7 +9,7 @@ use trace::files::with_hint;
 use trace::recording::recover::RecoverError;
 use trace::recording::{names, repair};
 
-use super::output::{Overwrite, check_distinct, print_beside};
+use super::output::{OverwriteOption, check_distinct, print_beside};
 
 /// Repair a recording that was cut off
 ///
@@ -19,17 +19,17 @@ use super::output::{Overwrite, check_distinct, print_beside};
 /// 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus recover run.mcap.part -o run.mcap")]
-pub(crate) struct Recover {
+pub(crate) struct RecoverCommand {
     /// The recording: an MCAP file of any program
     file: PathBuf,
     /// The new file [default: FILE-recovered.mcap]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Recover {
+impl RecoverCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = self.file.display();
         let file = input::open(&self.file).map_err(|error| Failure::usage(format!("{name}: {error}")))?;

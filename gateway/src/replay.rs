@@ -4,9 +4,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use bench::replay::comparator::StepHistogram;
-use bench::replay::player::Pace;
+use bench::replay::player::ReplaySpeed;
 use bench::replay::replay_plan::SenderFilter;
-use bench::replay::report::{Expect, Summary};
+use bench::replay::report::{ReplyComparison, Summary};
 use bench::replay::survey::TimeRange;
 use bench::replay::{ReplayError, ReplayOptions, SpawnOptions, replay};
 use clap::Args;
@@ -15,17 +15,17 @@ use protocol::usage::{Failure, printable, printable_lines};
 use super::arguments::{
     BusKinds, OptionValue, cells_per_process, environment_number, one_of_values, parse_time_ns,
 };
-use super::output::{self, Overwrite, check_distinct, print_table};
+use super::output::{self, OverwriteOption, check_distinct, print_table};
 use super::print::{
-    GREEN, KeyValueTable, PLAIN, YELLOW, comma_separated, count, hanging_indent, json, or_else_text,
-    quantiles,
+    GREEN, KeyValueTable, PLAIN, YELLOW, comma_separated, count_with_noun, hanging_indent, json,
+    or_else_text, quantiles,
 };
 
 /// Receive buffer in bytes: all cells may answer a report at once.
-const RECEIVE_BUFFER: u32 = 8 << 20;
+const RECEIVE_BUFFER_BYTES: u32 = 8 << 20;
 
 /// Time before a frame is due during which the sender spins instead of sleeping.
-const SPIN: Duration = Duration::from_micros(100);
+const SPIN_TIME: Duration = Duration::from_micros(100);
 
 /// Time in ms to wait for room on a full bus before a frame is refused.
 const SEND_TIMEOUT_MS: u32 = 100;
@@ -46,7 +46,7 @@ const SEND_TIMEOUT_MS: u32 = 100;
   skinbus replay run.mcap --expect --spawn --lockstep
   skinbus replay run.mcap run-*.mcap --expect --spawn --lockstep
   skinbus replay foreign.log --map can0=vcan0 --speed max --loop 10")]
-pub(crate) struct Replay {
+pub(crate) struct ReplayCommand {
     /// A candump log or an MCAP recording; the parts of a split recording count as one, in any order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
@@ -59,7 +59,7 @@ pub(crate) struct Replay {
     passes: u32,
     /// Speed factor, 0.1 to 100; or max for as fast as the bus accepts frames, whatever their times
     #[arg(long, value_name = "X", default_value = "1", value_parser = speed, allow_negative_numbers = true)]
-    speed: Pace,
+    speed: ReplaySpeed,
     /// Send joints only after every cell has answered the last ones: gives the same result on any machine, however slow
     #[arg(long)]
     lockstep: bool,
@@ -82,7 +82,7 @@ pub(crate) struct Replay {
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
     #[command(flatten)]
     shown: OutputOptions,
 }
@@ -99,14 +99,14 @@ struct OutputOptions {
 #[derive(Args, Debug)]
 struct FrameOptions {
     /// Send the frames of one of the capture's buses on another bus
-    #[arg(long, value_name = "FROM=TO", value_parser = route)]
+    #[arg(long, value_name = "FROM=TO", value_parser = parse_route)]
     map: Vec<(String, String)>,
     /// Send only the frames of these buses of the capture
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
     /// Send only these frames: inputs are commands, configuration and stimuli. Default: inputs with --expect,
     /// --lockstep or --spawn, else all
-    #[arg(long, value_parser = one_of_values(ONLY))]
+    #[arg(long, value_parser = one_of_values(SENDER_FILTERS))]
     only: Option<SenderFilter>,
     /// Begin at this second of the run, counted from the first frame if there is no run; with inputs only, in the state
     /// that was latched there
@@ -117,28 +117,28 @@ struct FrameOptions {
     to: Option<u64>,
 }
 
-const ONLY: &[OptionValue<SenderFilter>] = &[
+const SENDER_FILTERS: &[OptionValue<SenderFilter>] = &[
     ("inputs", "Commands, configuration, stimuli", SenderFilter::Inputs),
     ("replies", "Frames from cells", SenderFilter::Replies),
     ("all", "Everything", SenderFilter::All),
 ];
 
-fn route(text: &str) -> Result<(String, String), String> {
+fn parse_route(text: &str) -> Result<(String, String), String> {
     match text.split_once('=') {
         Some((from, to)) if !from.is_empty() && !to.is_empty() => Ok((from.to_owned(), to.to_owned())),
         _ => Err("a bus of the capture and the bus it goes to, such as vcan0=vcan1".to_owned()),
     }
 }
 
-fn speed(text: &str) -> Result<Pace, String> {
+fn speed(text: &str) -> Result<ReplaySpeed, String> {
     match text.parse::<f64>() {
-        _ if text == "max" => Ok(Pace::Max),
-        Ok(speed) if (0.1..=100.0).contains(&speed) => Ok(Pace::Timed(speed)),
+        _ if text == "max" => Ok(ReplaySpeed::Max),
+        Ok(speed) if (0.1..=100.0).contains(&speed) => Ok(ReplaySpeed::Timed(speed)),
         _ => Err("a number from 0.1 to 100, or max".to_owned()),
     }
 }
 
-impl Replay {
+impl ReplayCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let options = self.options()?;
         let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
@@ -148,7 +148,7 @@ impl Replay {
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
         let json = json(&summary)?;
-        let write = |(whole, file)| output::finish("--summary", whole, file, &json);
+        let write = |(whole, file)| output::write_and_finish("--summary", whole, file, &json);
         let written = file.map_or(Ok(()), write);
         let files = [self.summary.as_deref()];
         print_table(files, |is_coloured| table(&summary, is_coloured)).and(written)?;
@@ -184,15 +184,15 @@ impl Replay {
             part: TimeRange { from: self.frames.from, to: self.frames.to },
             passes: (self.passes > 0).then_some(self.passes),
             pace: self.speed,
-            spin: SPIN,
-            lockstep: self.lockstep || (self.expect && matches!(self.speed, Pace::Max)),
+            spin: SPIN_TIME,
+            lockstep: self.lockstep || (self.expect && matches!(self.speed, ReplaySpeed::Max)),
             expect: self.expect.then_some(self.tolerance),
             spawn: self
                 .spawn
                 .then_some(SpawnOptions { skin: self.skin.clone(), cells_per_process: cells_per_process()? }),
             test_mode: self.test_mode,
             timeout: Duration::from_millis(timeout_ms.unwrap_or(SEND_TIMEOUT_MS).into()),
-            receive_buffer: RECEIVE_BUFFER as usize,
+            receive_buffer: RECEIVE_BUFFER_BYTES as usize,
             quiet: self.shown.quiet,
         })
     }
@@ -213,55 +213,59 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         true => format!("{YELLOW}{first_line}{PLAIN}\n"),
         false => format!("{first_line}\n"),
     };
-    rows.section("frames", "", "");
-    rows.row("sent", summary.sent, "");
+    rows.add_section("frames", "", "");
+    rows.add_row("sent", summary.sent, "");
     rows.row_unless_zero("refused", summary.refused, "a bus stayed full");
     rows.row_unless_zero("lost", summary.lost, "a bus was down");
     for (reason, count) in &summary.skipped {
-        rows.row("not sent", count, reason);
+        rows.add_row("not sent", count, reason);
     }
     rows.row_unless_zero("sent at once", summary.sent_at_once, "older than frames sent before");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
-        rows.section("lateness", "50 % / 90 % / 99 % / max, µs", "");
-        rows.row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));
+        rows.add_section("lateness", "50 % / 90 % / 99 % / max, µs", "");
+        rows.add_row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));
     }
     if summary.buses.len() > 1 || summary.buses.iter().any(|bus| bus.capture != bus.name) {
         for bus in &summary.buses {
             let from = if bus.capture == bus.name { String::new() } else { format!("from {}", bus.capture) };
-            rows.section(format!("{} ({})", bus.name, bus.kind), format!("{} sent", bus.frames.sent), from);
+            rows.add_section(
+                format!("{} ({})", bus.name, bus.kind),
+                format!("{} sent", bus.frames.sent),
+                from,
+            );
         }
     }
     if let Some(lockstep) = &summary.lockstep {
         let silent = comma_separated(&lockstep.silent_cells);
         let silent = if silent.is_empty() { "all answered".to_owned() } else { format!("silent: {silent}") };
-        rows.section("lockstep", silent, format!("{} joints retried", lockstep.retried));
+        rows.add_section("lockstep", silent, format!("{} joints retried", lockstep.retried));
     }
     if let Some(expect) = &summary.expect {
         comparison_rows(&mut rows, expect);
     }
     let first = summary.expect.as_ref().and_then(|expect| expect.first.as_ref());
     first_line
-        + &rows.text()
+        + &rows.to_text()
         + &or_else_text(first.map(|first| format!("{}\n", printable_lines(&first.text))), "")
 }
 
-fn comparison_rows(rows: &mut KeyValueTable, expect: &Expect) {
+fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {
     let tally = &expect.tally;
-    rows.section("replies", "against the recording", "");
+    rows.add_section("replies", "against the recording", "");
     let within = format!("{} of them within the tolerance of {} steps", tally.tolerated, expect.tolerance);
-    rows.row("equal", tally.equal, if tally.tolerated > 0 { &within } else { "bit for bit" });
-    rows.row("different", tally.different, "");
+    rows.add_row("equal", tally.equal, if tally.tolerated > 0 { &within } else { "bit for bit" });
+    rows.add_row("different", tally.different, "");
     difference_rows(rows, "torque", &tally.torque_words, 0);
     difference_rows(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
-        skipped => format!("cells received joints too late {}", count(skipped, "time")),
+        skipped => format!("cells received joints too late {}", count_with_noun(skipped, "time")),
     };
-    rows.row("missing", tally.missing, late);
-    rows.row("extra", tally.extra, "");
+    rows.add_row("missing", tally.missing, late);
+    rows.add_row("extra", tally.extra, "");
     rows.row_unless_zero("not requested", tally.not_requested, "a bus refused the joints");
     for (reason, count) in tally.lacking.reasons() {
-        rows.row("not in the recording", count, reason);
+        rows.add_row("not in the recording", count, reason);
     }
     rows.row_unless_zero(
         "lost by the recorder",
@@ -285,6 +289,6 @@ fn difference_rows(rows: &mut KeyValueTable, what: &str, steps: &StepHistogram, 
     let of = format!("of {}, at most {} steps off", steps.by_steps.iter().sum::<u64>(), steps.max);
     for (by, count) in &found {
         let more = if *by == last { " or more" } else { "" };
-        rows.row(format!("{what} words {by}{more} off"), count, if by == worst { &of } else { "" });
+        rows.add_row(format!("{what} words {by}{more} off"), count, if by == worst { &of } else { "" });
     }
 }

@@ -12,7 +12,7 @@ use protocol::usage::{Failure, command_line, ignore_broken_pipe, print_text, pri
 use protocol::wire_time::parse_bit_rate;
 
 use super::input::{difference, read_skin};
-use super::output::{Overwrite, check_distinct, is_standard_output, note};
+use super::output::{OverwriteOption, check_distinct, is_standard_output, print_note};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
@@ -26,7 +26,7 @@ use super::output::{Overwrite, check_distinct, is_standard_output, note};
   skinbus report run.mcap --svg figures --overwrite
   skinbus report run.mcap run-*.mcap -o all.html
   skinbus report run.log --skin skin.toml -o - > log.html")]
-pub(crate) struct Report {
+pub(crate) struct ReportCommand {
     /// The recording of a run, as written by `skinbus run SKIN --record FILE`; all parts of a split one in any order.
     /// Or frames only: a candump log, or another program's MCAP file
     #[arg(required = true, value_name = "FILE")]
@@ -47,10 +47,10 @@ pub(crate) struct Report {
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Report {
+impl ReportCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let first = self.files.iter().min_by_key(|file| (file.as_os_str().len(), file.as_os_str()));
         let page = match first {
@@ -93,10 +93,10 @@ impl Report {
             return Err(failure);
         }
         if let Some(missing) = report.missing.as_ref().filter(|_| !report.is_damaged) {
-            note(format_args!("skinbus: {}: {missing}", report.name));
+            print_note(format_args!("skinbus: {}: {missing}", report.name));
         }
         for remark in &report.remarks {
-            note(format_args!("skinbus: {}: {remark}", report.name));
+            print_note(format_args!("skinbus: {}: {remark}", report.name));
         }
         let figures = drawings(&report.page).count();
         let beside =
@@ -154,7 +154,7 @@ fn create_folder(folder: &Path) -> Result<bool, Failure> {
 }
 
 /// Writes all files, or none: each gets its name after all are complete. Each path comes with its option.
-fn write(files: &[(&str, PathBuf, String)], overwrite: Overwrite) -> Result<(), Failure> {
+fn write(files: &[(&str, PathBuf, String)], overwrite: OverwriteOption) -> Result<(), Failure> {
     let failed = |option: &str, path: &Path, error: io::Error| {
         Failure::run(format!("{option} {}: {error}", path.display()))
     };

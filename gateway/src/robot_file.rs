@@ -11,7 +11,7 @@ use robots::Urdf;
 use trace::files::parent_folder;
 use trace::recording::robot::RecordedRobot;
 
-use super::output::note;
+use super::output::print_note;
 
 /// Robot of a skin: its geometry for recordings, and the text of the URDF that the skin names.
 #[derive(Default)]
@@ -29,7 +29,7 @@ impl SkinRobot {
     pub(crate) fn read(skin: &Skin, file: Option<&Path>) -> Result<Self, Failure> {
         let of_rows = || {
             RecordedRobot::from_rows(skin)
-                .map_err(|error| note(format_args!("the robot is not shown: {error}")))
+                .map_err(|error| print_note(format_args!("the robot is not shown: {error}")))
                 .ok()
         };
         let Some(path) = file else { return Ok(Self { robot: of_rows(), urdf: None }) };
@@ -38,7 +38,7 @@ impl SkinRobot {
         let (urdf, text) = read_urdf(path).map_err(|error| wrong(&error))?;
         let robot = RecordedRobot::from_urdf(skin, urdf, text.clone());
         let robot = robot.or_else(|error| {
-            note(format_args!("robot.urdf: {error}; the robot is shown by the skin's rows"));
+            print_note(format_args!("robot.urdf: {error}; the robot is shown by the skin's rows"));
             of_rows().ok_or(())
         });
         Ok(Self { robot: robot.ok(), urdf: Some(text) })

@@ -7,7 +7,7 @@ use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use bench::emulate::Emulated;
+use bench::emulate::EmulatedCells;
 use bench::processes::memory_file;
 use bench::record::{self, Candump};
 use bench::remote::JsonPipe;
@@ -15,7 +15,7 @@ use bench::run::{self, RunOptions};
 use bench::summary::Summary;
 use clap::Args;
 use model::scenario::{DEFAULT_DURATION, Scenario};
-use protocol::bus::{BusKind, GATEWAY_RECEIVE_BUFFER, KindChoice, KindChoices};
+use protocol::bus::{BusKind, GATEWAY_RECEIVE_BUFFER_BYTES, KindChoice, KindChoices};
 use protocol::document;
 use protocol::input::can_be_read_again;
 use protocol::skin::{CellName, Skin};
@@ -24,14 +24,14 @@ use protocol::usage::{Failure, command_line, shell_quoted_os};
 use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{
-    BusKinds, Processes, bus_names, cells_per_process, environment_number, find_cell, parse_duration,
+    BusKinds, ProcessOptions, bus_names, cells_per_process, environment_number, find_cell, parse_duration,
     parse_time,
 };
 use super::buses;
-use super::output::{self, Overwrite, check_distinct, note, print_table};
+use super::output::{self, OverwriteOption, check_distinct, print_note, print_table};
 use super::print::json;
 use super::robot_file::{SkinRobot, urdf_path};
-use super::view::{Page, PageOptions};
+use super::view::{PageOptions, PageProcess};
 use show::TableStyle;
 
 /// Skin and scenario of the demonstration.
@@ -46,7 +46,7 @@ const DEMO_LOG: &str = "skinbus-demo.log";
 
 /// Options that `skinbus run` and `skinbus demo` share.
 #[derive(Args, Debug)]
-struct Common {
+struct CommonOptions {
     /// End after this time: 10, 10s or 2min [default: the scenario's duration, or 10s]
     #[arg(long, value_name = "TIME", value_parser = parse_duration, allow_negative_numbers = true)]
     duration: Option<f64>,
@@ -67,7 +67,7 @@ struct Common {
     #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
     listen: Option<SocketAddr>,
     #[command(flatten)]
-    recording: Recording,
+    recording: RecordingArguments,
 }
 
 /// Texts of the skin and the scenario as they were read, and the robot of the skin.
@@ -79,13 +79,13 @@ struct RunTexts {
 
 /// Options for a recording, besides candump text.
 #[derive(Args, Debug)]
-struct Recording {
+struct RecordingArguments {
     /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/reference/recording.md lists the
     /// topics
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
 /// Limit of size or age at which a new file of a recording is started.
@@ -110,7 +110,7 @@ fn limit(text: &str) -> Result<SplitLimit, String> {
     age.map(SplitLimit::Age).ok_or_else(|| allowed.to_owned())
 }
 
-impl Recording {
+impl RecordingArguments {
     /// Returns the outputs of the recording, with the files attached.
     fn options(
         &self,
@@ -141,7 +141,7 @@ impl Recording {
     }
 }
 
-fn demo_kinds() -> String {
+fn demo_bus_kinds_help() -> String {
     let names = BusKind::names();
     format!("{names}; auto is SocketCAN if an interface vcan0 exists [default: embedded]")
 }
@@ -154,11 +154,11 @@ fn demo_kinds() -> String {
 #[derive(Args, Debug)]
 #[command(
     after_help = "Example:\n  skinbus demo --duration 5",
-    mut_arg("bus_kind", |arg| arg.help(demo_kinds()))
+    mut_arg("bus_kind", |arg| arg.help(demo_bus_kinds_help()))
 )]
-pub(crate) struct Demo {
+pub(crate) struct DemoCommand {
     #[command(flatten)]
-    common: Common,
+    common: CommonOptions,
     /// Write the frames to this file [default: skinbus-demo.log, or skinbus-demo-1.log, ... if that exists]
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
@@ -178,20 +178,20 @@ pub(crate) struct Demo {
 #[command(after_help = "Examples:
   skinbus run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
   skinbus run skin.toml --duration 60 --no-spawn --candump run.log --summary run.json")]
-pub(crate) struct Run {
+pub(crate) struct RunCommand {
     /// The skin
     skin: PathBuf,
     /// The scenario: touches, motion, faults [default: nothing touches the skin]
     #[arg(long, value_name = "FILE")]
     scenario: Option<PathBuf>,
     #[command(flatten)]
-    common: Common,
+    common: CommonOptions,
     /// Start a new file of the recording (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given
     /// twice
     #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
     record_split: Vec<SplitLimit>,
     #[command(flatten)]
-    processes: Processes,
+    processes: ProcessOptions,
     #[command(flatten)]
     page: PageOptions,
     /// Write all frames as candump text: a log that can be followed while it grows
@@ -220,7 +220,7 @@ pub(crate) struct Run {
     emulate: Vec<CellName>,
 }
 
-impl Demo {
+impl DemoCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let (_file, skin_file) = memory_file(SKIN.as_bytes()).map_err(Failure::run)?;
         let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
@@ -242,7 +242,7 @@ impl Demo {
         let place = place.map(|path| format!("SKINBUS_DIR={} ", shell_quoted_os(path.as_os_str())));
         let place = place.filter(|_| !kind.is_interface()).unwrap_or_default();
         options.announced.push(format!("its frames in words: {place}skinbus dump vcan0 --bus-kind {kind}"));
-        let Common { recording, summary, verbose, view, listen, .. } = self.common;
+        let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
@@ -252,12 +252,12 @@ impl Demo {
         };
         let files = RunTexts { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
         options.record = recording.options(candump, files, &[]);
-        let page = view.then(|| Page::of(&options, listen, &PageOptions::default())).transpose()?;
+        let page = view.then(|| PageProcess::start(&options, listen, &PageOptions::default())).transpose()?;
         run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], page)
     }
 }
 
-impl Run {
+impl RunCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = |path: &Path| path.display().to_string();
         let skin_text = document::read_text(&self.skin).map_err(Failure::usage)?;
@@ -284,10 +284,10 @@ impl Run {
             (Some(file), path)
         };
         for remark in scenario.warnings(&skin) {
-            note(format_args!("remark: {remark}"));
+            print_note(format_args!("remark: {remark}"));
         }
         let mut options = self.common.options(skin_file, skin, scenario);
-        let Common { recording, summary, verbose, view, listen, .. } = self.common;
+        let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
         options.kinds = self.kinds.kinds_of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
         let files = RunTexts { skin: skin_text, scenario: scenario_text, robot };
@@ -297,15 +297,19 @@ impl Run {
         options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
         // The kernel grants twice the size, or less without the privilege.
         let bytes = environment_number("SKINBUS_RECEIVE_BUFFER", 0..=1 << 30)?;
-        options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER) as usize;
+        options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER_BYTES) as usize;
         options.cells_per_process = self.processes.cells_per_process.into();
-        let page = view.then(|| Page::of(&options, listen, &self.page)).transpose()?;
+        let page = view.then(|| PageProcess::start(&options, listen, &self.page)).transpose()?;
         run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, page)
     }
 }
 
 /// Returns the cells to emulate and their firmware, if any.
-fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Result<Option<Emulated>, Failure> {
+fn emulated(
+    firmware: Option<PathBuf>,
+    named: &[CellName],
+    skin: &Skin,
+) -> Result<Option<EmulatedCells>, Failure> {
     let Some(firmware) = firmware else { return Ok(None) };
     let mut cells = Vec::new();
     for named in named {
@@ -315,10 +319,10 @@ fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Resul
         }
         cells.push(cell);
     }
-    Ok(Some(Emulated { firmware, cells }))
+    Ok(Some(EmulatedCells { firmware, cells }))
 }
 
-impl Common {
+impl CommonOptions {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
     fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> RunOptions {
         let until_stopped = self.view.then_some(MAX_VIEW_DURATION_S);
@@ -335,7 +339,7 @@ impl Common {
             emulated: None,
             cells_per_process: 1,
             flash: None,
-            receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
+            receive_buffer: GATEWAY_RECEIVE_BUFFER_BYTES as usize,
             record: record::RecordOptions::default(),
             quiet: self.quiet,
             planned: None,
@@ -346,10 +350,10 @@ impl Common {
 
 fn run_bench(
     options: &RunOptions,
-    (summary_file, overwrite): (Option<&Path>, Overwrite),
+    (summary_file, overwrite): (Option<&Path>, OverwriteOption),
     is_verbose: bool,
     read: &[PathBuf],
-    page: Option<(Page, JsonPipe)>,
+    page: Option<(PageProcess, JsonPipe)>,
 ) -> Result<(), Failure> {
     let written = [
         ("--candump", options.record.candump.as_ref().map(|candump| candump.path.as_path())),
@@ -365,16 +369,19 @@ fn run_bench(
     drop(page);
     let (ended, panicked) = match ended {
         Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),
-        Err(panic) => (Summary::of_no_run(&options.skin, "the gateway panicked".to_owned()), Some(panic)),
+        Err(panic) => {
+            (Summary::for_failed_start(&options.skin, "the gateway panicked".to_owned()), Some(panic))
+        }
     };
     let unwritten = summary.and_then(|(whole, file)| {
-        json(&ended).and_then(|text| output::finish("--summary", whole, file, &text)).err()
+        json(&ended).and_then(|text| output::write_and_finish("--summary", whole, file, &text)).err()
     });
     if let Some(panic) = panicked {
         panic::resume_unwind(panic);
     }
     let files = written.map(|(_, path)| path);
-    let table = |is_coloured| show::text(&ended, TableStyle { is_verbose, is_coloured, columns: None });
+    let table =
+        |is_coloured| show::format_summary(&ended, TableStyle { is_verbose, is_coloured, columns: None });
     let printed = if ended.control.ticks > 0 { print_table(files, table) } else { Ok(()) };
     // The failure prints the last line itself; each other message is one line.
     let mut lines = ended.end_messages(options.quiet);
@@ -383,7 +390,7 @@ fn run_bench(
     lines.extend(lost.iter().map(ToString::to_string));
     let Some(last) = lines.pop() else { return Ok(()) };
     for line in lines {
-        note(format_args!("skinbus: {line}"));
+        print_note(format_args!("skinbus: {line}"));
     }
     Err(Failure::with_code(code, last))
 }

@@ -14,7 +14,7 @@ use protocol::can::Format;
 use protocol::usage::{Failure, print_text};
 
 use super::arguments::{FORMATS, OptionValue, one_of_values};
-use super::output::Overwrite;
+use super::output::OverwriteOption;
 pub(crate) use show::still_view;
 
 const REPLIES: &[OptionValue<Answers>] =
@@ -22,18 +22,18 @@ const REPLIES: &[OptionValue<Answers>] =
 
 /// Create and draw skins, and convert them to URDF and DBC
 #[derive(Args, Debug)]
-pub(crate) struct Skin {
+pub(crate) struct SkinCommand {
     #[command(subcommand)]
-    command: Command,
+    command: SkinSubcommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum Command {
-    Generate(Generate),
-    Import(import::Import),
-    Dbc(dbc::Dbc),
-    Show(show::Show),
-    Urdf(urdf::Urdf),
+enum SkinSubcommand {
+    Generate(GenerateCommand),
+    Import(import::ImportCommand),
+    Dbc(dbc::DbcCommand),
+    Show(show::ShowCommand),
+    Urdf(urdf::UrdfCommand),
 }
 
 /// Describe a skin of hexagonal cells on the arm of a UR5
@@ -43,7 +43,7 @@ enum Command {
 #[command(after_help = "Examples:
   skinbus skin generate -o skin.toml
   skinbus skin generate --cells 508 --buses 2 --format classic > skin.toml")]
-struct Generate {
+struct GenerateCommand {
     /// Number of cells, 1 to 254 per bus
     #[arg(long, default_value_t = 253)]
     cells: usize,
@@ -63,22 +63,22 @@ struct Generate {
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Skin {
+impl SkinCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         match self.command {
-            Command::Generate(command) => command.run(),
-            Command::Import(command) => command.run(),
-            Command::Dbc(command) => command.run(),
-            Command::Show(command) => command.run(),
-            Command::Urdf(command) => command.run(),
+            SkinSubcommand::Generate(command) => command.run(),
+            SkinSubcommand::Import(command) => command.run(),
+            SkinSubcommand::Dbc(command) => command.run(),
+            SkinSubcommand::Show(command) => command.run(),
+            SkinSubcommand::Urdf(command) => command.run(),
         }
     }
 }
 
-impl Generate {
+impl GenerateCommand {
     fn run(self) -> Result<(), Failure> {
         let Self { cells, buses, broadcast_hz, reply, format, output, overwrite } = self;
         let target = SkinRequest { cells, buses, broadcast_hz, reply, format, ..SkinRequest::default() };

@@ -9,10 +9,10 @@ use protocol::skin::{Chain, ChainRow, Skin};
 use robots::{DhRow, Isometry3, LinkFrame, Urdf};
 use view::RowMesh;
 
-use super::output::note;
-use super::print::count;
+use super::output::print_note;
+use super::print::count_with_noun;
 use super::robot_file::{read_urdf, urdf_path};
-use super::visuals::{Packages, Visuals};
+use super::visuals::{PackageOptions, Visuals};
 
 /// A part of a link's shape, placed on a row of a chain.
 struct PlacedPart {
@@ -26,11 +26,12 @@ struct PlacedPart {
 
 /// Returns the drawing of the robot that a skin's file describes: triangles for each row, simplified to at most `most`
 /// in all. The list is empty if the skin names no URDF. Prints a note on parts that cannot be drawn.
-pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize) -> Vec<RowMesh> {
+pub(crate) fn shells(file: &Path, skin: &Skin, packages: &PackageOptions, most: usize) -> Vec<RowMesh> {
     let Some(path) = skin.robot.urdf.as_deref().map(|urdf| urdf_path(file, urdf)) else { return Vec::new() };
     let parts = read_urdf(&path).and_then(|(urdf, _)| parts(&urdf, &path, skin, packages));
-    let parts =
-        parts.map_err(|error| note(format_args!("the robot is not drawn: {error}"))).unwrap_or_default();
+    let parts = parts
+        .map_err(|error| print_note(format_args!("the robot is not drawn: {error}")))
+        .unwrap_or_default();
     let mut rows = BTreeMap::<_, Vec<_>>::new();
     for PlacedPart { chain, row, part } in parts {
         rows.entry((chain, row)).or_default().extend(part.triangles(&Isometry3::identity()));
@@ -43,7 +44,12 @@ pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize)
     shells.map(|((chain, row), all)| RowMesh { chain, row, triangles: points(all) }).collect()
 }
 
-fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<Vec<PlacedPart>, String> {
+fn parts(
+    urdf: &Urdf,
+    file: &Path,
+    skin: &Skin,
+    packages: &PackageOptions,
+) -> Result<Vec<PlacedPart>, String> {
     let found = skin.robot.chains.iter().map(|chain| {
         chain_of(urdf, chain).ok_or_else(|| {
             format!(
@@ -66,7 +72,7 @@ fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<V
         }
     }
     if let Some(first) = missing.first() {
-        note(format_args!("{} not drawn: {first}", count(missing.len(), "link")));
+        print_note(format_args!("{} not drawn: {first}", count_with_noun(missing.len(), "link")));
     }
     Ok(parts)
 }
@@ -98,7 +104,7 @@ fn attachment(
     chains: &[robots::UrdfChain],
     link: &str,
 ) -> Option<(usize, usize, Isometry3<f64>)> {
-    let pose = |link: &str| urdf.pose(link, &|joint| urdf.rest(joint)).ok();
+    let pose = |link: &str| urdf.pose(link, &|joint| urdf.rest_position(joint)).ok();
     let at = pose(link)?;
     let mut above = Some(link);
     while let Some(carrier) = above {

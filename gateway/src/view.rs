@@ -21,14 +21,14 @@ use trace::capture::{CaptureError, CaptureFormat, Reader};
 use view::RowMesh;
 use view::play::{self, play};
 use view::player::PlayError;
-use view::serve::{Options, ServeError, serve};
-use view::server::{Access, url};
+use view::serve::{ServeError, ServeOptions, serve};
+use view::server::{PageAccess, url};
 
 use super::arguments::{BusKinds, bus_names, find_bus, parse_time_ns};
 use super::input::{no_frame, note_other_skin, read_skin, skin_of, stop_flag};
-use super::output::note;
+use super::output::print_note;
 use super::surface::shells;
-use super::visuals::Packages;
+use super::visuals::PackageOptions;
 use address::AddressFile;
 
 /// Maximum number of triangles of a robot that a page draws; larger meshes are simplified.
@@ -54,7 +54,7 @@ const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHO
   skinbus view run.mcap run-*.mcap --at 12.5
   skinbus view run.log --skin skin.toml
   skinbus view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
-pub(crate) struct View {
+pub(crate) struct ViewCommand {
     /// A skin, for its buses; or some of its buses, with --skin; or a candump log or MCAP recording, or all parts of a
     /// split one in any order
     #[arg(required = true, value_name = "SKIN|BUS|FILE")]
@@ -86,7 +86,7 @@ pub(crate) struct View {
     #[arg(long, hide = true)]
     of_run: bool,
     #[command(flatten)]
-    packages: Packages,
+    packages: PackageOptions,
     #[command(flatten)]
     kinds: BusKinds,
 }
@@ -106,17 +106,17 @@ pub(crate) struct PageOptions {
 /// The page to be served, and how.
 struct PageServer {
     listener: TcpListener,
-    access: Access,
+    access: PageAccess,
     /// Address of the page, if this program prints it; `None` if the run prints it.
     url: Option<String>,
 }
 
-impl View {
+impl ViewCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let is_recording = self.is_recording()?;
         let may_act = !self.read_only && !is_recording;
         let (listener, token) = if self.of_run {
-            (listener_of_run().map_err(|error| failed(&error))?, token::chosen_token(None)?)
+            (inherited_listener().map_err(|error| failed(&error))?, token::chosen_token(None)?)
         } else {
             let listen = self.listen;
             let token = token::chosen_token(self.token_file.as_deref())?;
@@ -128,14 +128,15 @@ impl View {
         let url = (!self.of_run).then(|| url(address, token.as_ref()));
         let of_file = self.address_file.as_deref().zip(url.as_deref());
         let _file = of_file.map(|(path, url)| AddressFile::write(path, url)).transpose()?;
-        let served = PageServer { listener, access: Access { may_act, may_play: is_recording, token }, url };
-        if is_recording { self.recorded(served) } else { self.live(served) }
+        let served =
+            PageServer { listener, access: PageAccess { may_act, may_play: is_recording, token }, url };
+        if is_recording { self.serve_recording(served) } else { self.serve_live(served) }
     }
 
     /// Serves the page of live buses.
-    fn live(self, served: PageServer) -> Result<(), Failure> {
+    fn serve_live(self, served: PageServer) -> Result<(), Failure> {
         let (skin, surface) = match self.sources.as_slice() {
-            [one, ..] if !one.exists() => self.on_buses()?,
+            [one, ..] if !one.exists() => self.skin_on_named_buses()?,
             [one] if self.skin.is_none() && self.at.is_none() => self.read(one)?,
             [one] => {
                 let why = "is for a recording, and this is a skin";
@@ -150,7 +151,7 @@ impl View {
         let stop = stop_flag()?;
         let bench = self.of_run.then(connect_to_run).transpose().map_err(|error| failed(&error))?;
         let PageServer { listener, access, url } = served;
-        let options = Options {
+        let options = ServeOptions {
             skin,
             surface,
             kinds,
@@ -165,7 +166,7 @@ impl View {
     }
 
     /// Returns the part of a skin that is on the named buses, with the meshes of its robot.
-    fn on_buses(&self) -> Result<(Skin, Vec<RowMesh>), Failure> {
+    fn skin_on_named_buses(&self) -> Result<(Skin, Vec<RowMesh>), Failure> {
         let Some(file) = &self.skin else {
             let name = self.sources.first().map(|it| it.display().to_string()).unwrap_or_default();
             return Err(Failure::usage(format!(
@@ -184,14 +185,14 @@ impl View {
     }
 
     /// Serves the page of a recording.
-    fn recorded(self, served: PageServer) -> Result<(), Failure> {
+    fn serve_recording(self, served: PageServer) -> Result<(), Failure> {
         let (skin, surface) = self.recorded_skin()?;
         #[expect(clippy::cast_precision_loss, reason = "to the µs")]
         let at_s = self.at.map(|nanos| nanos as f64 / 1e9);
         let stop = stop_flag()?;
-        let warns = |what: &str| note(format_args!("{what}"));
+        let warns = |what: &str| print_note(format_args!("{what}"));
         let PageServer { listener, access, url } = served;
-        let options = play::Options { paths: self.sources, skin, surface, listener, access, at_s };
+        let options = play::PlayOptions { paths: self.sources, skin, surface, listener, access, at_s };
         play(options, &stop, || print_address(url), warns).map_err(|error| match error {
             ServeError::Play(PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. })) => {
                 Failure::run(error)
@@ -221,7 +222,7 @@ impl View {
             None => {
                 let skin = skin_of(&self.sources)?;
                 if skin.robot.urdf.is_some() {
-                    note(
+                    print_note(
                         "the recording does not have the robot's meshes: with the --skin beside its URDF they are shown",
                     );
                 }
@@ -269,7 +270,7 @@ fn bind_error(listen: SocketAddr, error: &io::Error) -> Failure {
 
 /// Prints the address of the page.
 fn print_address(url: Option<String>) {
-    url.iter().for_each(|url| note(format_args!("view: {url}")));
+    url.iter().for_each(|url| print_note(format_args!("view: {url}")));
 }
 
 /// Returns the connection to the run that has started this program: a socket that is this program's standard output.
@@ -279,7 +280,7 @@ fn connect_to_run() -> io::Result<JsonPipe> {
 }
 
 /// Returns the listener that is this program's standard input.
-fn listener_of_run() -> io::Result<TcpListener> {
+fn inherited_listener() -> io::Result<TcpListener> {
     Ok(io::stdin().as_fd().try_clone_to_owned()?.into())
 }
 
@@ -289,15 +290,15 @@ fn failed(error: &io::Error) -> Failure {
 
 /// The page of a run in a process of its own; dropping it ends the process.
 #[derive(Debug)]
-pub(crate) struct Page {
+pub(crate) struct PageProcess {
     process: Child,
     _address_file: Option<AddressFile>,
 }
 
-impl Page {
+impl PageProcess {
     /// Starts a process that serves the page of a run, whose buses open later. Returns it with the connection for its
     /// commands.
-    pub(crate) fn of(
+    pub(crate) fn start(
         run: &run::RunOptions,
         listen: Option<SocketAddr>,
         options: &PageOptions,
@@ -317,8 +318,8 @@ impl Page {
         let token = token::required_token(token::chosen_token(options.token_file.as_deref())?, true, listen)?;
         // Only this user can read the environment of a process, but everyone can read its command line.
         match &token {
-            Some(token) => command.env(token::VARIABLE, token.as_str()),
-            None => command.env_remove(token::VARIABLE),
+            Some(token) => command.env(token::TOKEN_VARIABLE, token.as_str()),
+            None => command.env_remove(token::TOKEN_VARIABLE),
         };
         let listener = TcpListener::bind(listen).map_err(|error| bind_error(listen, &error))?;
         let address = listener.local_addr().map_err(|error| failed(&error))?;
@@ -336,7 +337,7 @@ impl Page {
     }
 }
 
-impl Drop for Page {
+impl Drop for PageProcess {
     fn drop(&mut self) {
         let _ = self.process.kill();
         let _ = self.process.wait();

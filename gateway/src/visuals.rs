@@ -10,7 +10,7 @@ use trace::files::parent_folder;
 
 /// Directories of the packages that a URDF refers to.
 #[derive(Args, Clone, Debug, Default)]
-pub(crate) struct Packages {
+pub(crate) struct PackageOptions {
     /// Directory of the files that the URDF names as package://NAME/...; repeat the option for further packages.
     /// Default: search the directory of the URDF and those above it
     #[arg(long, value_name = "NAME=DIR", value_parser = package)]
@@ -20,7 +20,7 @@ pub(crate) struct Packages {
     only_beside: bool,
 }
 
-impl Packages {
+impl PackageOptions {
     /// Creates a search in the directory of the URDF and those above it, for commands without the option.
     pub(crate) fn beside_urdf() -> Self {
         Self { package: Vec::new(), only_beside: true }
@@ -41,12 +41,12 @@ pub(crate) struct Visuals<'a> {
     urdf: &'a Urdf,
     /// Directory of the URDF.
     folder: PathBuf,
-    packages: &'a Packages,
+    packages: &'a PackageOptions,
 }
 
 impl<'a> Visuals<'a> {
     /// Creates the shapes of the URDF in this file.
-    pub(crate) fn new(urdf: &'a Urdf, file: &Path, packages: &'a Packages) -> Self {
+    pub(crate) fn new(urdf: &'a Urdf, file: &Path, packages: &'a PackageOptions) -> Self {
         let folder = parent_folder(file);
         // Resolve the path, because `.` has no parent directories.
         let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
@@ -144,11 +144,11 @@ fn path_of_uri(uri: &str) -> &str {
 
 /// Returns a path as written and, for a URI, also with its escapes such as `%20` decoded.
 fn spellings(path: &str, is_uri: bool) -> impl Iterator<Item = String> {
-    let decoded = is_uri.then(|| decoded(path)).flatten().filter(|decoded| decoded != path);
+    let decoded = is_uri.then(|| percent_decode(path)).flatten().filter(|decoded| decoded != path);
     core::iter::once(path.to_owned()).chain(decoded)
 }
 
-fn decoded(path: &str) -> Option<String> {
+fn percent_decode(path: &str) -> Option<String> {
     let mut parts = path.split('%');
     let mut bytes = parts.next().unwrap_or_default().as_bytes().to_vec();
     for part in parts {
@@ -165,13 +165,13 @@ mod tests {
     #[test]
     fn a_command_without_the_option_does_not_name_it() {
         let urdf = Urdf::parse("r.urdf", "<robot><link name=\"a\"/></robot>").unwrap();
-        let hint = |packages: &Packages| {
+        let hint = |packages: &PackageOptions| {
             Visuals::new(&urdf, Path::new("none/r.urdf"), packages)
                 .find_file("package://p/a.stl")
                 .unwrap_err()
         };
-        assert!(hint(&Packages::default()).ends_with("name its directory with --package p=DIR"));
-        let beside = hint(&Packages::beside_urdf());
+        assert!(hint(&PackageOptions::default()).ends_with("name its directory with --package p=DIR"));
+        let beside = hint(&PackageOptions::beside_urdf());
         assert!(beside.ends_with("put the folder of package p beside the URDF, or above it"), "{beside}");
     }
 

@@ -7,7 +7,7 @@ use criterion::{Criterion, Throughput};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet::{Epoch, Packet};
-use protocol::wire_time::Bits;
+use protocol::wire_time::FrameBits;
 
 /// Returns the replies of cells 1 to 253 in one epoch.
 fn replies(format: Format) -> Vec<Frame> {
@@ -24,7 +24,7 @@ fn replies(format: Format) -> Vec<Frame> {
     packets.flat_map(|packet| packet.frames(format)).collect()
 }
 
-fn long() -> Vec<Frame> {
+fn long_frames() -> Vec<Frame> {
     let bytes: [u8; 64] = std::array::from_fn(|at| u8::try_from(at * 37 % 256).unwrap_or(0));
     (0..253).map(|id| Frame::fd(0x200 + id, BIT_RATE_SWITCH, &bytes).expect("64 bytes fit")).collect()
 }
@@ -38,17 +38,17 @@ fn main() {
     let mut group = criterion.benchmark_group("frame time");
     for (name, frames) in [
         ("FD, 16 bytes", replies(Format::Fd)),
-        ("FD, 64 bytes", long()),
+        ("FD, 64 bytes", long_frames()),
         ("classic, 8 bytes", replies(Format::Classic)),
     ] {
         assert!(
-            frames.iter().all(|frame| Bits::from_frame(frame).is_some_and(|bits| bits.total() > 100)),
+            frames.iter().all(|frame| FrameBits::from_frame(frame).is_some_and(|bits| bits.total() > 100)),
             "{name}"
         );
         group.throughput(Throughput::Elements(frames.len() as u64));
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
-                black_box(&frames).iter().filter_map(Bits::from_frame).map(Bits::total).sum::<u32>()
+                black_box(&frames).iter().filter_map(FrameBits::from_frame).map(FrameBits::total).sum::<u32>()
             });
         });
     }

@@ -17,7 +17,7 @@ use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembler, Reassembly};
 use protocol::time::Micros;
-use protocol::wire_time::Bits;
+use protocol::wire_time::FrameBits;
 
 mod counted;
 
@@ -48,7 +48,7 @@ fn decode(frame: Frame) -> Packet {
 
 const SIX: Lengths = Lengths::only(Length::Six);
 
-fn pair(id: Id, frames: [Frame; 2]) -> Packet {
+fn reassemble(id: Id, frames: [Frame; 2]) -> Packet {
     let mut segment = Reassembler::NONE;
     let [first, second] = black_box(&frames);
     let waiting = segment.push(Micros(0), id, SIX, first.data());
@@ -74,27 +74,27 @@ fn decoded(frame: Frame) -> Packet {
 #[library_benchmark]
 #[bench::classic(packet().id, classic_frames())]
 fn paired(id: Id, frames: [Frame; 2]) -> Packet {
-    pair(id, frames)
+    reassemble(id, frames)
 }
 
 #[library_benchmark]
 #[bench::fd_16_bytes(fd_frame())]
 #[bench::classic_8_bytes(classic_frames()[0])]
-fn bits(frame: Frame) -> Option<Bits> {
-    Bits::from_frame(black_box(&frame))
+fn bits(frame: Frame) -> Option<FrameBits> {
+    FrameBits::from_frame(black_box(&frame))
 }
 
 library_benchmark_group!(name = packets; benchmarks = encoded, decoded, paired);
 library_benchmark_group!(name = frame_time; benchmarks = bits);
 
 /// Runs each benchmark once and checks its result.
-fn once() {
+fn check_benchmarks() {
     let packet = packet();
     assert_eq!(encode(packet, Format::Fd), [Some(fd_frame()), None]);
     assert_eq!(decode(fd_frame()), packet);
     assert_eq!(encode(packet, Format::Classic), classic_frames().map(Some));
-    assert_eq!(pair(packet.id, classic_frames()), packet);
-    assert_ne!(Bits::from_frame(&fd_frame()), Bits::from_frame(&classic_frames()[0]));
+    assert_eq!(reassemble(packet.id, classic_frames()), packet);
+    assert_ne!(FrameBits::from_frame(&fd_frame()), FrameBits::from_frame(&classic_frames()[0]));
 }
 
 mod all {
@@ -108,5 +108,5 @@ mod all {
 }
 
 fn main() {
-    counted::main(once, all::run);
+    counted::main(check_benchmarks, all::run);
 }

@@ -17,17 +17,17 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 /// Time between two frames, in µs.
-const BETWEEN_US: u64 = 1_000;
+const FRAME_INTERVAL_US: u64 = 1_000;
 
 /// Prints the result for `frames` frames of `min` to 8 random bytes.
-fn row(name: &str, lengths: Lengths, min: usize, frames: u64) {
+fn print_row(name: &str, lengths: Lengths, min: usize, frames: u64) {
     let mut dice = Pcg64Mcg::seed_from_u64(1);
     let id = Id { kind: Kind::Torque, node: 12 };
     let (mut segment, mut packets, mut ambiguous) = (Reassembler::NONE, 0_u64, 0_u64);
     for frame in 0..frames {
         let (bytes, len): ([u8; 8], usize) = (dice.random(), dice.random_range(min..=8));
         let data = bytes.get(..len).unwrap_or(&bytes);
-        match segment.push(Micros(frame * BETWEEN_US), id, lengths, data) {
+        match segment.push(Micros(frame * FRAME_INTERVAL_US), id, lengths, data) {
             Ok(Reassembly::Complete(_)) => packets += 1,
             Ok(Reassembly::Ambiguous) => ambiguous += 1,
             Ok(Reassembly::Waiting | Reassembly::Incomplete) | Err(_) => {}
@@ -53,8 +53,8 @@ fn main() {
     ];
     for min in [8, 0] {
         for (name, length) in known {
-            row(name, Lengths::only(length), min, frames);
+            print_row(name, Lengths::only(length), min, frames);
         }
-        row("each is tried", Lengths::ALL, min, frames);
+        print_row("each is tried", Lengths::ALL, min, frames);
     }
 }

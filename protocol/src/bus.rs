@@ -33,8 +33,8 @@ use rustix::net::sockopt::{self, Timeout};
 use socketcan::CanFdSocket;
 
 use crate::can::{Format, Frame};
-use batch::{BATCH, Batch, SMALL_BATCH};
-use carrier::Carrier;
+use batch::{MAX_BATCH_DATAGRAMS, ReceiveBatch, SMALL_BATCH_SIZE};
+use carrier::BusBackend;
 
 pub mod batch;
 #[expect(unsafe_code, reason = "recvmmsg and sendmmsg have no safe wrapper")]
@@ -52,14 +52,14 @@ mod slot;
 
 pub use error::{BusError, SendError};
 pub use filter::Filter;
-pub use inbox::{Inbox, Received};
-pub use kernel::{GATEWAY_RECEIVE_BUFFER, has_socketcan, set_receive_buffer};
+pub use inbox::{Inbox, ReceivedFrame};
+pub use kernel::{GATEWAY_RECEIVE_BUFFER_BYTES, has_socketcan, set_receive_buffer};
 pub use kinds::{BusKind, KindChoice, KindChoices, KindOption, KindsError, UnknownKind};
 
 /// Options for opening a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct BusOptions {
-    /// Filters for received frames, at most [`Filter::MAX`]. Without filters the socket receives nothing, which suits a
+    /// Filters for received frames, at most [`Filter::MAX_COUNT`]. Without filters the socket receives nothing, which suits a
     /// program that only sends.
     pub filters: Vec<Filter>,
     /// True to receive the frames that this socket sends, marked as own.
@@ -98,7 +98,7 @@ impl Default for BusOptions {
 /// The processes of a bench wake each other hundreds of times a second: the cells, and the server of their bus. Without
 /// this policy, every cell that receives a frame preempts the server, at the cost of a context switch per frame.
 pub fn set_batch_scheduling() -> bool {
-    calls::set_batch()
+    calls::set_sched_batch()
 }
 
 /// An open bus.
@@ -136,7 +136,7 @@ impl Bus {
         check_name(name)?;
         check_filter_count(name, &options.filters)?;
         let kind = choice.resolve(name);
-        let (socket, receive_buffer) = match (kind.carrier().open(name, options), choice) {
+        let (socket, receive_buffer) = match (kind.backend().open(name, options), choice) {
             (Err(BusError::NotServed { name, directory }), KindChoice::Auto) => {
                 return Err(BusError::Absent { name, directory });
             }
@@ -181,11 +181,11 @@ impl Bus {
     /// # Errors
     /// Returns an error if the kernel does not report the type of the interface.
     pub fn is_virtual(&self) -> Result<bool, BusError> {
-        self.carrier().is_virtual(&self.name).map_err(|error| self.io_error("look at", error))
+        self.backend().is_virtual(&self.name).map_err(|error| self.io_error("look at", error))
     }
 
-    const fn carrier(&self) -> &'static dyn Carrier {
-        self.kind.carrier()
+    const fn backend(&self) -> &'static dyn BusBackend {
+        self.kind.backend()
     }
 
     /// Returns the size of the receive buffer in bytes, as granted and counted by the kernel: twice the
@@ -266,7 +266,7 @@ impl Bus {
     fn receive_with(
         &self,
         inbox: &mut Inbox,
-        receive: impl Fn(&mut Batch, &CanFdSocket) -> io::Result<usize>,
+        receive: impl Fn(&mut ReceiveBatch, &CanFdSocket) -> io::Result<usize>,
     ) -> Result<usize, BusError> {
         inbox.clear();
         if self.down.swap(false, Ordering::Relaxed) {
@@ -285,7 +285,7 @@ impl Bus {
                 }
                 Err(error)
                     if batch::is_memory_shortage(&error)
-                        && is_before_deadline(&mut give_up, MAX_SHORTAGE) =>
+                        && is_before_deadline(&mut give_up, OUT_OF_MEMORY_TIMEOUT) =>
                 {
                     std::thread::sleep(RETRY_INTERVAL);
                 }
@@ -294,7 +294,7 @@ impl Bus {
         }
         inbox.failure = inbox.batch.take_failure();
         self.failed.store(inbox.failure.is_some(), Ordering::Relaxed);
-        let over = inbox.decode(self.carrier());
+        let over = inbox.decode(self.backend());
         match inbox.frames().len() {
             0 if over => Err(self.closed_error()),
             count => Ok(count),
@@ -375,14 +375,14 @@ impl Bus {
         sent.is_ok_and(|sent| sent == frames.len())
     }
 
-    /// Replaces the receive filters, at most [`Filter::MAX`]. Frames that already wait in the receive buffer stay
+    /// Replaces the receive filters, at most [`Filter::MAX_COUNT`]. Frames that already wait in the receive buffer stay
     /// there. Only one thread may call this at a time.
     ///
     /// # Errors
     /// Returns an error if there are too many filters, or the bus does not accept them.
     pub fn set_filters(&self, filters: &[Filter]) -> Result<(), BusError> {
         check_filter_count(&self.name, filters)?;
-        self.carrier().set_filters(self, filters)
+        self.backend().set_filters(self, filters)
     }
 
     fn send_batch(&self, frames: &[Frame]) -> io::Result<usize> {
@@ -391,8 +391,8 @@ impl Bus {
                 let (bytes, len) = (frame.to_bytes(), frame.byte_len());
                 batch::send_one(&self.socket, bytes.get(..len).unwrap_or(&bytes))
             }
-            few if few.len() <= SMALL_BATCH => self.send_up_to::<SMALL_BATCH>(few),
-            many => self.send_up_to::<BATCH>(many),
+            few if few.len() <= SMALL_BATCH_SIZE => self.send_up_to::<SMALL_BATCH_SIZE>(few),
+            many => self.send_up_to::<MAX_BATCH_DATAGRAMS>(many),
         }
     }
 
@@ -423,7 +423,7 @@ impl Bus {
 
     fn io_error(&self, doing: &'static str, source: io::Error) -> BusError {
         let name = self.name.clone();
-        let cause = Errno::from_io_error(&source).and_then(|errno| self.carrier().bus_error(errno));
+        let cause = Errno::from_io_error(&source).and_then(|errno| self.backend().bus_error(errno));
         let Some(cause) = cause else { return BusError::Io { name, doing, source } };
         let error = cause(name);
         if matches!(error, BusError::Closed(_)) { self.closed_error() } else { error }
@@ -439,7 +439,7 @@ impl AsFd for Bus {
 /// Retry interval while a transmit queue is full: the duration of a few frames at 1 Mbit/s.
 const RETRY_INTERVAL: Duration = Duration::from_micros(500);
 /// Maximum time for which a call is retried when the system lacks memory.
-const MAX_SHORTAGE: Duration = Duration::from_millis(100);
+const OUT_OF_MEMORY_TIMEOUT: Duration = Duration::from_millis(100);
 
 fn poll_descriptors(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, Errno> {
     let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
@@ -466,7 +466,7 @@ fn is_errno(error: &io::Error, errno: Errno) -> bool {
 
 fn check_filter_count(name: &str, filters: &[Filter]) -> Result<(), BusError> {
     let got = filters.len();
-    if got <= Filter::MAX { Ok(()) } else { Err(BusError::Filters { name: name.to_owned(), got }) }
+    if got <= Filter::MAX_COUNT { Ok(()) } else { Err(BusError::Filters { name: name.to_owned(), got }) }
 }
 
 /// Checks that a name is valid for a bus. The rule is that of network interfaces, so that the same bench runs on either

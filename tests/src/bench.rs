@@ -22,7 +22,7 @@ use cell_node::identity::Identity;
 use model::scenario::{Scenario, contact_words};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q5_10;
-use protocol::message::{AppliesFrom, Message, SkinSensors};
+use protocol::message::{Message, SkinSensors, StimulusStart};
 use protocol::packet::{Packet, WORDS};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -209,14 +209,14 @@ impl Bench {
     /// # Panics
     /// Panics if the skin does not have the cell.
     pub fn press(&mut self, place: usize, newtons: f64) {
-        self.press_from(place, newtons, AppliesFrom::Next);
+        self.press_from(place, newtons, StimulusStart::Next);
     }
 
     /// Makes the gateway press a cell from the joints `from` on.
     ///
     /// # Panics
     /// Panics if the skin does not have the cell.
-    pub fn press_from(&mut self, place: usize, newtons: f64, from: AppliesFrom) {
+    pub fn press_from(&mut self, place: usize, newtons: f64, from: StimulusStart) {
         let message = self.gateway.stimulus(place, from, touch(newtons)).expect("a cell of the skin");
         self.act(Act::SendFromGateway(message));
     }

@@ -8,10 +8,10 @@ use control::cycle::{Cycle, Tick, TickRecord};
 use control::motion::controller_of;
 use control::robot::SimulatedArm;
 use model::scenario::{Scenario, Touches};
-use model::table::{Notice, Snapshot, Table};
+use model::table::{BusTable, Notice, Snapshot};
 use protocol::can::Frame;
 use protocol::id::{CellId, Command, Node};
-use protocol::message::{AppliesFrom, Message, SensorPage, SkinSensors};
+use protocol::message::{Message, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
@@ -24,7 +24,7 @@ const STIMULUS_LEAD_EPOCHS: u64 = 5;
 #[derive(Debug)]
 pub struct Gateway {
     /// The gateway's table of the cells on its bus.
-    pub table: Table,
+    pub table: BusTable,
     /// The records of all ticks.
     pub records: Vec<TickRecord>,
     /// The notices of the table, with their times.
@@ -56,7 +56,7 @@ impl Gateway {
     /// Panics if the skin's controller is another program.
     #[must_use]
     pub fn new(skin: &Skin, scenario: &Scenario) -> Self {
-        let table = Table::new(skin, 0);
+        let table = BusTable::new(skin, 0);
         let controller = controller_of(skin, &scenario.motion).expect("a controller of our own");
         let robot = SimulatedArm::new(skin, scenario.motion.start);
         Self {
@@ -105,7 +105,7 @@ impl Gateway {
 
     /// Returns the stimulus with these sensor values for a cell, given by its index in the skin.
     #[must_use]
-    pub fn stimulus(&mut self, place: usize, from: AppliesFrom, sensors: SkinSensors) -> Option<Message> {
+    pub fn stimulus(&mut self, place: usize, from: StimulusStart, sensors: SkinSensors) -> Option<Message> {
         *self.pressed.get_mut(place)? = sensors;
         let to = Node::Cell(*self.nodes.get(place)?);
         Some(Message::Stimulus { to, from, page: SensorPage::Skin(sensors) })
@@ -162,7 +162,7 @@ impl Gateway {
         let mut messages = Vec::new();
         let until = self.cycle.broadcasts() + STIMULUS_LEAD_EPOCHS;
         while self.script_epoch < until {
-            let from = AppliesFrom::Epoch(epoch_of(self.script_epoch));
+            let from = StimulusStart::Epoch(epoch_of(self.script_epoch));
             for stimulus in self.touches.stimuli_for(self.script_epoch) {
                 let to = Node::Cell(stimulus.node);
                 messages.extend(stimulus.pages().map(|page| Message::Stimulus { to, from, page }));
@@ -179,7 +179,7 @@ impl Gateway {
             let place = self.nodes.iter().position(|&it| it == node).filter(|_| self.reminds);
             let sensors = place.and_then(|place| self.pressed.get(place).copied());
             if let (Some(place), Some(sensors)) = (place, sensors) {
-                messages.extend(self.stimulus(place, AppliesFrom::Next, sensors));
+                messages.extend(self.stimulus(place, StimulusStart::Next, sensors));
             }
         }
         messages

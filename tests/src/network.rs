@@ -25,9 +25,9 @@ use cell_node::sum::SumWords;
 use model::network::Uplinks;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10, Q7_8};
-use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
+use protocol::message::{Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::{self, Epoch, WORDS};
-use protocol::parameters::{LinksDown, Parameter, Reply, Slots};
+use protocol::parameters::{LinksDown, Parameter, Reply, SumSchedule};
 use protocol::port::{PORTS, PortMessage, UPLINK};
 use protocol::time::{Micros, Span};
 use rand::seq::{IndexedRandom, SliceRandom};
@@ -439,7 +439,7 @@ impl Wiring {
     pub fn switch(&mut self, deepest: u8, carry: bool) {
         self.deepest = deepest;
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).expect("a slot");
-        let reply = Reply::Sum(Slots { slot_us, deepest, carry });
+        let reply = Reply::Sum(SumSchedule { slot_us, deepest, carry });
         let request = Request::Write { number: Parameter::Reply.number(), words: reply.words() };
         self.send(&Message::Configure { to: protocol::id::Node::Everyone, tag: 0, request });
     }
@@ -452,7 +452,7 @@ impl Wiring {
         let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
         self.send(&Message::Stimulus {
             to: protocol::id::Node::Cell(node_id),
-            from: AppliesFrom::Next,
+            from: StimulusStart::Next,
             page,
         });
     }

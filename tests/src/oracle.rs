@@ -7,7 +7,7 @@ use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::{Epoch, Packet, Reassembler, WORDS};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{Safety, Skin};
+use protocol::skin::{SafetyLimits, Skin};
 use protocol::time::Micros;
 
 use crate::fault::{Harm, Party};
@@ -93,7 +93,7 @@ pub struct Oracle {
     /// True if the sum of torques is compared, which is not possible while several cells have one node id.
     pub compares: bool,
     format: Format,
-    safety: Safety,
+    safety: SafetyLimits,
     mirrors: Vec<OracleCell>,
     /// The index of the cell with each node id.
     places: [Option<usize>; 256],
@@ -305,7 +305,7 @@ impl OracleCell {
 
     /// Updates the cell's torque in the sum: it is held for some epochs without an answer, then decays to zero in equal
     /// steps.
-    fn decay(&mut self, newest: usize, safety: &Safety) {
+    fn decay(&mut self, newest: usize, safety: &SafetyLimits) {
         let (Some(held), Some(answered)) = (self.held, self.answered) else { return };
         let (hold, decay) = (safety.hold_epochs as usize, safety.decay_epochs as usize);
         // There was no time to answer the newest broadcast.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use bus_model::{Attempt, BusModel, Priority, Request};
 use protocol::can::Frame;
 use protocol::time::Micros;
-use protocol::wire_time::{BitRates, Bits};
+use protocol::wire_time::{BitRates, FrameBits};
 
 /// A requested frame, with the time of the request.
 pub type Requested = (Micros, Frame);
@@ -34,7 +34,7 @@ impl<T> RealBus<T> {
 
     /// Requests the transmission of a frame.
     pub(crate) fn request(&mut self, now: Micros, frame: &Frame, item: T) {
-        let Some(bits) = Bits::from_frame(frame) else { return };
+        let Some(bits) = FrameBits::from_frame(frame) else { return };
         let tag = u64::try_from(self.requested.len()).unwrap_or(u64::MAX);
         let request =
             Request { at: now.0 * 1_000, priority: Priority::from_frame(frame), bits, queue: None, tag };

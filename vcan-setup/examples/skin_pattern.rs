@@ -41,7 +41,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     for ids in ids.chunks(share.max(1)) {
         let (bus, ids) = (open(exact(0x001))?, ids.to_vec());
         // The threads are not joined; they end with the process.
-        Builder::new().stack_size(128 << 10).spawn(move || answer(&bus, &ids))?;
+        Builder::new().stack_size(128 << 10).spawn(move || answer_broadcasts(&bus, &ids))?;
     }
     let gateway = open(vec![Filter { id: 0x200, mask: 0x700 }])?;
 
@@ -96,7 +96,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 /// Answers every broadcast once for each of some cells, with the first bytes of the broadcast, until the bus is closed.
-fn answer(bus: &Bus, ids: &[u32]) {
+fn answer_broadcasts(bus: &Bus, ids: &[u32]) {
     let mut inbox = Inbox::new();
     let mut replies = Vec::new();
     while bus.wait(None).is_ok() && bus.receive(&mut inbox).is_ok() {

@@ -19,13 +19,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = protocol::usage::command_line().into_iter().skip(1);
     let first = arguments.next();
     if first.as_deref() == Some("echo") {
-        return Ok(echo()?);
+        return Ok(echo_datagrams()?);
     }
     let processes: usize = first.map_or(Ok(253), |word| word.parse())?;
     let seconds: u32 = arguments.next().map_or(Ok(5), |word| word.parse())?;
     let mut echoes = Vec::new();
     for _ in 0..processes {
-        echoes.push(start()?);
+        echoes.push(start_echo_process()?);
     }
     let cpu = || echoes.iter().map(|(child, _)| processor_seconds(child.id())).sum::<f64>();
     let cycles = seconds.saturating_mul(125).div_ceil(2);
@@ -53,13 +53,13 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 /// Starts a process whose standard input is one end of a socket pair. Returns the process and the other end.
-fn start() -> Result<(Child, OwnedFd), Box<dyn Error>> {
+fn start_echo_process() -> Result<(Child, OwnedFd), Box<dyn Error>> {
     let (near, far) = socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)?;
     let child = Command::new(std::env::current_exe()?).arg("echo").stdin(Stdio::from(far)).spawn()?;
     Ok((child, near))
 }
 
-fn echo() -> rustix::io::Result<()> {
+fn echo_datagrams() -> rustix::io::Result<()> {
     let mut bytes = FRAME;
     let socket = std::io::stdin();
     while recv(&socket, &mut bytes, RecvFlags::empty())?.0 > 0 {

@@ -19,7 +19,7 @@ use crate::plan::InterfaceTarget;
 mod facts;
 mod interface;
 
-pub use facts::{BusFacts, Facts, ObservedTraffic, Program, User};
+pub use facts::{BusFacts, MachineFacts, ObservedTraffic, Program, User};
 
 /// The size that the kernel counts for one frame in a receive buffer, in bytes.
 const FRAME_BYTES: usize = 1_024;
@@ -29,7 +29,7 @@ const BUFFERED_ANSWERS: usize = 4;
 /// The severity of a finding.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Level {
+pub enum FindingLevel {
     /// Everything is in order.
     Ok,
     /// A bench runs, but the user should know this.
@@ -38,7 +38,7 @@ pub enum Level {
     Fault,
 }
 
-impl Level {
+impl FindingLevel {
     /// Returns the printed name of the level.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -54,7 +54,7 @@ impl Level {
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Finding {
     /// The severity.
-    pub level: Level,
+    pub level: FindingLevel,
     /// The text that describes the finding.
     pub text: String,
     /// Shell commands, each of which fixes the fault.
@@ -63,15 +63,15 @@ pub struct Finding {
 
 impl Finding {
     fn ok(text: impl Into<String>) -> Self {
-        Self { level: Level::Ok, text: text.into(), hints: Vec::new() }
+        Self { level: FindingLevel::Ok, text: text.into(), hints: Vec::new() }
     }
 
     fn note(text: impl Into<String>) -> Self {
-        Self { level: Level::Note, text: text.into(), hints: Vec::new() }
+        Self { level: FindingLevel::Note, text: text.into(), hints: Vec::new() }
     }
 
     fn fault(text: impl Into<String>) -> Self {
-        Self { level: Level::Fault, text: text.into(), hints: Vec::new() }
+        Self { level: FindingLevel::Fault, text: text.into(), hints: Vec::new() }
     }
 
     /// Adds a hint.
@@ -89,31 +89,31 @@ impl Finding {
 /// Returns true if none of the findings is a fault, so that a bench would run.
 #[must_use]
 pub fn would_run(findings: &[Finding]) -> bool {
-    findings.iter().all(|finding| finding.level != Level::Fault)
+    findings.iter().all(|finding| finding.level != FindingLevel::Fault)
 }
 
 /// Assesses the facts about a machine. The findings are sorted: causes come before their consequences.
 #[must_use]
-pub fn assess(facts: &Facts) -> Vec<Finding> {
-    let mut findings = vec![facts.kind()];
+pub fn assess(facts: &MachineFacts) -> Vec<Finding> {
+    let mut findings = vec![facts.check_bus_kind()];
     let kind = facts.bus_kind();
     if !kind.is_interface() {
-        findings.push(facts.embedded());
-        findings.extend(facts.buses.iter().filter_map(|bus| facts.absent(bus)));
-        findings.extend(facts.buses.iter().flat_map(|bus| facts.traffic(bus, kind.display_name())));
+        findings.push(facts.check_embedded());
+        findings.extend(facts.buses.iter().filter_map(|bus| facts.check_absent_interface(bus)));
+        findings.extend(facts.buses.iter().flat_map(|bus| facts.check_traffic(bus, kind.display_name())));
     } else if facts.kernel.has_can {
-        findings.extend(facts.making());
-        findings.extend(facts.buses.iter().flat_map(|bus| facts.interface(bus)));
-        findings.extend(facts.any_interface());
-        findings.extend(facts.receive_buffer());
-        findings.extend(facts.backlog());
+        findings.extend(facts.check_creation());
+        findings.extend(facts.buses.iter().flat_map(|bus| facts.check_interface(bus)));
+        findings.extend(facts.check_any_interface());
+        findings.extend(facts.check_receive_buffer());
+        findings.extend(facts.check_backlog());
     }
     // Without CAN in the kernel there are no interfaces to check.
-    findings.extend(facts.cell_node());
+    findings.extend(facts.check_cell_node());
     findings
 }
 
-impl Facts {
+impl MachineFacts {
     /// Returns the kind of bus (SocketCAN or embedded) that a bench would use on this machine.
     #[must_use]
     pub fn bus_kind(&self) -> BusKind {
@@ -131,10 +131,10 @@ impl Facts {
 
     /// Returns the text of a `vcan-setup` command that root has to run.
     fn own_command(&self, command: &str) -> String {
-        self.sudo(&format!("{} {command}", self.program))
+        self.with_sudo(&format!("{} {command}", self.program))
     }
 
-    fn sudo(&self, command: &str) -> String {
+    fn with_sudo(&self, command: &str) -> String {
         if self.user.admin || self.user.root { command.to_owned() } else { format!("sudo {command}") }
     }
 
@@ -144,7 +144,7 @@ impl Facts {
         self.own_command(&format!("up {what}"))
     }
 
-    fn kind(&self) -> Finding {
+    fn check_bus_kind(&self) -> Finding {
         let Kernel { release, has_can, can_raw, .. } = &self.kernel;
         let hints = || self.kernel.hints(*can_raw);
         match (self.choice, has_can) {
@@ -168,7 +168,7 @@ impl Facts {
     }
 
     /// Reports the gateway and the cells that already send on a bus.
-    fn traffic(&self, bus: &BusFacts, on: &str) -> Vec<Finding> {
+    fn check_traffic(&self, bus: &BusFacts, on: &str) -> Vec<Finding> {
         let name = &bus.target.name;
         let heard = match &bus.traffic {
             Ok(Some(heard)) => heard,
@@ -176,7 +176,7 @@ impl Facts {
             Err(why) => return vec![Finding::fault(why)],
         };
         let on = if on == name { name.clone() } else { format!("{on} {name}") };
-        let (all, count) = (nodes(&heard.cells), heard.cells.len());
+        let (all, count) = (format_node_ids(&heard.cells), heard.cells.len());
         let gateway = heard.gateway.then(|| {
             Finding::fault(format!("another gateway sends joints on {on}"))
                 .hint("pgrep -a skinbus  # and stop it, or take another bus")
@@ -200,7 +200,7 @@ impl Facts {
             ),
             (true, 1..) if absent().is_empty() => Some(Finding::ok(format!("{count} cells are on {on}"))),
             (true, 1..) => {
-                let absent = nodes(&absent());
+                let absent = format_node_ids(&absent());
                 let text =
                     format!("{count} cells are on {on}; these cells of the skin sent nothing: {absent}");
                 Some(Finding::note(text))
@@ -210,14 +210,15 @@ impl Facts {
     }
 
     /// Checks that the receive buffer of a socket can hold a burst of replies.
-    fn receive_buffer(&self) -> Option<Finding> {
+    fn check_receive_buffer(&self) -> Option<Finding> {
         let granted = self.receive_buffer?;
         let all = usize::from(CellId::MAX.get());
-        let frames = |bus: &BusFacts| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_of(&bus.target);
+        let frames =
+            |bus: &BusFacts| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_per_packet(&bus.target);
         let frames = self.buses.iter().map(frames).max().unwrap_or(all);
         let needed = BUFFERED_ANSWERS * frames * FRAME_BYTES;
         let (has, wants) = (granted >> 10, needed >> 10);
-        let hint = self.sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
+        let hint = self.with_sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
         Some(if granted >= needed {
             Finding::ok(format!(
                 "receive buffers of {has} KiB hold all answers, {frames} frames, {BUFFERED_ANSWERS} times over"
@@ -238,8 +239,9 @@ impl Facts {
     }
 
     /// Checks that the kernel's queue between sender and receiver can hold one reply of every cell.
-    fn backlog(&self) -> Option<Finding> {
-        let frames = |bus: &BusFacts| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.target);
+    fn check_backlog(&self) -> Option<Finding> {
+        let frames =
+            |bus: &BusFacts| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_per_packet(&bus.target);
         let frames: usize = self.buses.iter().map(frames).sum();
         if frames == 0 {
             return None;
@@ -254,18 +256,18 @@ impl Facts {
                 "the kernel's backlog of {backlog} does not hold an answer of all cells, {frames} frames: some would \
                  be lost silently"
             ))
-            .hint(self.sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
+            .hint(self.with_sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
         })
     }
 
-    fn embedded(&self) -> Finding {
+    fn check_embedded(&self) -> Finding {
         match &self.embedded {
             Ok(directory) => Finding::ok(format!("embedded buses can be served in {}", directory.display())),
             Err(why) => Finding::fault(why),
         }
     }
 
-    fn cell_node(&self) -> Option<Finding> {
+    fn check_cell_node(&self) -> Option<Finding> {
         let Program { path, there } = &self.cell_node;
         let absent =
             format!("cell-node is not at {}: the gateway starts it from beside itself", path.display());
@@ -282,7 +284,7 @@ impl Facts {
 }
 
 /// Returns the number of CAN frames that a packet takes on this bus.
-const fn frames_of(target: &InterfaceTarget) -> usize {
+const fn frames_per_packet(target: &InterfaceTarget) -> usize {
     match target.format {
         Format::Fd => 1,
         Format::Classic => 2,
@@ -290,7 +292,7 @@ const fn frames_of(target: &InterfaceTarget) -> usize {
 }
 
 /// Formats node ids as a list: `1, 2, 5`.
-fn nodes(cells: &BTreeSet<CellId>) -> String {
+fn format_node_ids(cells: &BTreeSet<CellId>) -> String {
     let first: Vec<_> = cells.iter().take(12).map(ToString::to_string).collect();
     let more = if cells.len() > first.len() {
         format!(" and {} more", cells.len() - first.len())

@@ -43,7 +43,7 @@ impl Kernel {
     pub fn detect() -> Self {
         let uname = rustix::system::uname();
         let release = uname.release().to_string_lossy().into_owned();
-        let lists = Lists::read(&release);
+        let lists = ModuleLists::read(&release);
         // Opening such a socket makes the kernel load the module, if it has one.
         let has_can = has_socketcan();
         let loaded = |name: &str| Path::new("/sys/module").join(name).exists();
@@ -73,7 +73,7 @@ impl Kernel {
         let here = match module {
             ModuleState::Available => None,
             ModuleState::Loadable => Some(modprobe.to_owned()),
-            ModuleState::Missing => Some(self.other_kernel(modprobe)),
+            ModuleState::Missing => Some(self.other_kernel_hint(modprobe)),
             ModuleState::Unknown => {
                 Some(format!("{modprobe}  # on the host, if this is a container: its modules are not here"))
             }
@@ -82,7 +82,7 @@ impl Kernel {
         here.into_iter().chain([lab.to_owned()]).collect()
     }
 
-    fn other_kernel(&self, modprobe: &str) -> String {
+    fn other_kernel_hint(&self, modprobe: &str) -> String {
         let is = |name: &str| self.distribution.split_whitespace().any(|word| word == name);
         let architecture = match self.machine.as_str() {
             "x86_64" => "amd64",
@@ -110,14 +110,14 @@ impl Kernel {
 }
 
 /// The lists in which the kernel names its modules.
-struct Lists {
+struct ModuleLists {
     built_in: Option<String>,
     on_disk: Option<String>,
     /// True if the kernel can load modules.
     takes_modules: bool,
 }
 
-impl Lists {
+impl ModuleLists {
     fn read(release: &str) -> Self {
         let directory = Path::new("/lib/modules").join(release);
         let read = |name| fs::read_to_string(directory.join(name)).ok();
@@ -173,7 +173,7 @@ mod tests {
 
     #[test]
     fn where_a_module_is() {
-        let lists = Lists {
+        let lists = ModuleLists {
             built_in: Some("kernel/net/can/can.ko\n".into()),
             on_disk: Some(DEP.into()),
             takes_modules: true,
@@ -182,7 +182,7 @@ mod tests {
         assert_eq!(lists.module("vcan", false), ModuleState::Loadable);
         assert_eq!(lists.module("vcan", true), ModuleState::Available);
         assert_eq!(lists.module("vxcan", false), ModuleState::Missing);
-        let none = |takes_modules| Lists { built_in: None, on_disk: None, takes_modules };
+        let none = |takes_modules| ModuleLists { built_in: None, on_disk: None, takes_modules };
         assert_eq!(none(true).module("vcan", false), ModuleState::Unknown);
         assert_eq!(none(false).module("vcan", false), ModuleState::Missing);
     }

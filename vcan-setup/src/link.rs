@@ -27,7 +27,7 @@ pub struct Interface {
     /// The MTU in bytes: 16 for classic CAN, 72 for CAN FD, more for CAN XL.
     pub mtu: u32,
     /// The traffic counters.
-    pub counters: Counters,
+    pub counters: InterfaceCounters,
 }
 
 /// The kind of an interface.
@@ -38,7 +38,7 @@ pub enum InterfaceKind {
     /// One end of a pair of virtual interfaces. The other end may be in another network namespace.
     Vxcan(Option<Peer>),
     /// A CAN controller, or an adapter with a CAN driver.
-    Hardware(Hardware),
+    Hardware(CanHardware),
     /// An interface that does not carry CAN; the text describes it.
     Other(String),
 }
@@ -72,7 +72,7 @@ pub struct Peer {
 
 /// The properties of a CAN controller.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Hardware {
+pub struct CanHardware {
     /// The name of the driver.
     pub driver: Option<String>,
     /// The error state of the controller, by its error counters.
@@ -96,7 +96,7 @@ pub struct HardwareRates {
     pub data_bitrate: Option<u32>,
 }
 
-impl Hardware {
+impl CanHardware {
     /// Returns the bit rates in use; a controller in classic mode has no data bit rate.
     #[must_use]
     pub fn rates(&self) -> HardwareRates {
@@ -186,7 +186,7 @@ impl ControllerState {
 
 /// Counts of the frames of an interface since it was made.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Counters {
+pub struct InterfaceCounters {
     /// Frames received by the interface.
     pub received: u64,
     /// Frames sent by the interface.
@@ -212,7 +212,7 @@ impl Interface {
 
     /// Returns the properties of the controller if the interface is hardware.
     #[must_use]
-    pub const fn hardware(&self) -> Option<&Hardware> {
+    pub const fn hardware(&self) -> Option<&CanHardware> {
         if let InterfaceKind::Hardware(hardware) = &self.kind { Some(hardware) } else { None }
     }
 
@@ -228,7 +228,7 @@ impl Interface {
         match &self.kind {
             InterfaceKind::Vcan => "a vcan".to_owned(),
             InterfaceKind::Vxcan(_) => "a vxcan".to_owned(),
-            InterfaceKind::Hardware(Hardware { driver: Some(driver), .. }) => {
+            InterfaceKind::Hardware(CanHardware { driver: Some(driver), .. }) => {
                 format!("CAN hardware ({driver})")
             }
             InterfaceKind::Hardware(_) => "CAN hardware".to_owned(),

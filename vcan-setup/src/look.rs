@@ -7,7 +7,7 @@ use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
 use protocol::bus::embedded::{address, default_directory, open_directory, seqpacket, socket_name};
-use protocol::bus::{self, BusError, BusKind, BusOptions, GATEWAY_RECEIVE_BUFFER, Inbox, KindChoice};
+use protocol::bus::{self, BusError, BusKind, BusOptions, GATEWAY_RECEIVE_BUFFER_BYTES, Inbox, KindChoice};
 use protocol::can::Format;
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::usage::shell_quoted_os;
@@ -16,7 +16,7 @@ use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use rustix::thread::{CapabilitySet, capabilities};
 use serde::Serialize;
 
-use crate::doctor::{BusFacts, Facts, ObservedTraffic, Program, User};
+use crate::doctor::{BusFacts, MachineFacts, ObservedTraffic, Program, User};
 use crate::kernel::Kernel;
 use crate::link::Interface;
 use crate::plan::InterfaceTarget;
@@ -28,7 +28,12 @@ const OBSERVATION_TIME: Duration = Duration::from_millis(600);
 /// Collects all facts that determine whether a bench would run on these buses. `present` are the interfaces of the
 /// machine.
 #[must_use]
-pub fn facts(mut buses: Vec<BusFacts>, choice: KindChoice, no_spawn: bool, present: &[Interface]) -> Facts {
+pub fn collect_facts(
+    mut buses: Vec<BusFacts>,
+    choice: KindChoice,
+    no_spawn: bool,
+    present: &[Interface],
+) -> MachineFacts {
     for bus in &mut buses {
         bus.interface = present.iter().find(|interface| interface.name == bus.target.name).cloned();
     }
@@ -38,24 +43,24 @@ pub fn facts(mut buses: Vec<BusFacts>, choice: KindChoice, no_spawn: bool, prese
             bus.traffic = heard;
         }
     }
-    Facts {
+    MachineFacts {
         choice,
         no_spawn,
-        program: program(),
+        program: own_program_command(),
         kernel: Kernel::detect(),
         user: User { root: rustix::process::geteuid().is_root(), admin: is_admin() },
-        receive_buffer: receive_buffer().ok(),
+        receive_buffer: granted_receive_buffer().ok(),
         backlog: fs::read_to_string("/proc/sys/net/core/netdev_max_backlog")
             .ok()
             .and_then(|text| text.trim().parse().ok()),
-        cell_node: cell_node(),
-        embedded: embedded(),
+        cell_node: find_cell_node(),
+        embedded: embedded_directory(),
         buses,
         present: present.iter().filter(|interface| interface.is_can()).cloned().collect(),
     }
 }
 
-fn usable(target: &InterfaceTarget, interface: &Interface) -> bool {
+fn is_usable(target: &InterfaceTarget, interface: &Interface) -> bool {
     interface.is_can() && interface.up && target.carried_by(interface.mtu)
 }
 
@@ -70,7 +75,7 @@ fn observe_all(
         (KindChoice::Auto, None) => BusKind::Embedded,
     };
     let is_open = |bus: &&BusFacts| {
-        !kind_of(bus).is_interface() || bus.interface.as_ref().is_some_and(|it| usable(&bus.target, it))
+        !kind_of(bus).is_interface() || bus.interface.as_ref().is_some_and(|it| is_usable(&bus.target, it))
     };
     thread::scope(|scope| {
         let begin = |bus: &'_ BusFacts| {
@@ -131,16 +136,16 @@ impl ObservedTraffic {
 
 /// Returns the size of the receive buffer that the kernel grants if a gateway requests its usual size, in bytes. The
 /// kernel grants the same to all kinds of sockets.
-fn receive_buffer() -> io::Result<usize> {
+fn granted_receive_buffer() -> io::Result<usize> {
     let socket =
         rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
-    bus::set_receive_buffer(&socket, GATEWAY_RECEIVE_BUFFER as usize)
+    bus::set_receive_buffer(&socket, GATEWAY_RECEIVE_BUFFER_BYTES as usize)
 }
 
 /// Returns a command by which `sudo` finds this program: its name, or its path if it is not in a folder of the system,
 /// because `sudo` searches only these.
 #[must_use]
-pub fn program() -> String {
+pub fn own_program_command() -> String {
     let own = std::env::current_exe().unwrap_or_default();
     let system = ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin"];
     if own.as_os_str().is_empty() || system.iter().any(|directory| own.parent() == Some(Path::new(directory)))
@@ -158,7 +163,7 @@ pub fn is_admin() -> bool {
 }
 
 /// Returns the cell program: `SKINBUS_CELL_NODE`, or the file `cell-node` beside this program.
-fn cell_node() -> Program {
+fn find_cell_node() -> Program {
     if let Some(path) = std::env::var_os("SKINBUS_CELL_NODE").filter(|path| !path.is_empty()) {
         let path = PathBuf::from(path);
         return Program { there: path.is_file(), path };
@@ -169,7 +174,7 @@ fn cell_node() -> Program {
 }
 
 /// Returns the directory for embedded buses, or an error text if no bus can be served in it.
-fn embedded() -> Result<PathBuf, String> {
+fn embedded_directory() -> Result<PathBuf, String> {
     let directory = default_directory();
     address(&directory, "a23456789012345").map_err(|error| error.to_string())?;
     match open_directory(&directory) {

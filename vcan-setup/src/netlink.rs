@@ -20,16 +20,16 @@ use protocol::bus::netlink::RtnetlinkSocket;
 use rustix::io::Errno;
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-use crate::link::{ALIAS_MARK, FD_MTU, Hardware, HardwareRates, Interface, InterfaceKind, Peer};
+use crate::link::{ALIAS_MARK, CanHardware, FD_MTU, HardwareRates, Interface, InterfaceKind, Peer};
 use crate::namespace::NAMESPACE_DIRECTORY;
 use crate::plan::{Step, StepAction};
 
 mod reading;
 
-use reading::{driver, interface};
+use reading::{decode_interface, driver};
 
 /// The length in bytes of the header before the attributes of a namespace message.
-const NSID_HEADER: usize = 4;
+const NSID_HEADER_BYTES: usize = 4;
 /// The maximum number of indices to try for a new interface if other programs take them at the same time. A pair takes
 /// two.
 const MAX_INDEX_ATTEMPTS: u32 = 64;
@@ -68,7 +68,8 @@ impl Netlink {
     /// # Errors
     /// Returns an error if the kernel does not answer.
     pub fn interfaces(&mut self) -> io::Result<Vec<Interface>> {
-        let mut interfaces: Vec<_> = self.all()?.iter().filter_map(|link| interface(link)).collect();
+        let mut interfaces: Vec<_> =
+            self.query_all()?.iter().filter_map(|link| decode_interface(link)).collect();
         interfaces.sort_by_key(|interface| interface.index);
         let names: HashMap<_, _> =
             interfaces.iter().map(|interface| (interface.index, interface.name.clone())).collect();
@@ -92,7 +93,7 @@ impl Netlink {
     }
 
     /// Returns the kernel's message about each interface.
-    fn all(&mut self) -> io::Result<Vec<Vec<u8>>> {
+    fn query_all(&mut self) -> io::Result<Vec<Vec<u8>>> {
         self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)
     }
 
@@ -105,7 +106,7 @@ impl Netlink {
         let mut message = NsidMessage::default();
         message.attributes.push(NsidAttribute::Fd(fd));
         let answers = self.exchange.request(RouteNetlinkMessage::GetNsId(message), 0)?;
-        let attributes = answers.iter().filter_map(|answer| answer.get(NSID_HEADER..));
+        let attributes = answers.iter().filter_map(|answer| answer.get(NSID_HEADER_BYTES..));
         let mut ids =
             attributes.flat_map(NlasIterator::new).flatten().filter_map(|it| NsidAttribute::parse(&it).ok());
         Ok(ids
@@ -126,14 +127,14 @@ impl Netlink {
     }
 
     fn name_in(&mut self, namespace: i32, index: u32) -> io::Result<Option<String>> {
-        let queried = link(index, [LinkAttribute::IfNetnsId(namespace)]);
+        let queried = link_message(index, [LinkAttribute::IfNetnsId(namespace)]);
         Ok(self.query(queried)?.map(|interface| interface.name))
     }
 
     /// Queries the interface that a message identifies. Returns `None` if it does not exist.
     fn query(&mut self, about: LinkMessage) -> io::Result<Option<Interface>> {
         let answers = self.exchange.request(RouteNetlinkMessage::GetLink(about), 0)?;
-        Ok(answers.iter().find_map(|answer| interface(answer)))
+        Ok(answers.iter().find_map(|answer| decode_interface(answer)))
     }
 
     /// Makes a vcan interface, marks it and brings it up. Returns its index.
@@ -141,9 +142,9 @@ impl Netlink {
     /// # Errors
     /// Returns the kernel's error. The interface was then not made, or was removed again.
     pub fn make_vcan(&mut self, name: &str) -> io::Result<u32> {
-        let index = self.add(name, |_| Ok(vec![LinkInfo::Kind(InfoKind::Vcan)]))?;
-        let marked = self.mark(index);
-        self.or_undo(marked, Undo::Remove { index }).map(|_| index)
+        let index = self.add_interface(name, |_| Ok(vec![LinkInfo::Kind(InfoKind::Vcan)]))?;
+        let marked = self.mark_and_set_up(index);
+        self.undo_on_error(marked, Undo::Remove { index }).map(|_| index)
     }
 
     /// Makes a pair of virtual interfaces, marks both ends and brings them up. Returns the index of the end in this
@@ -158,8 +159,9 @@ impl Netlink {
         mut there: Option<(&File, &mut Self)>,
     ) -> io::Result<u32> {
         let mut peer_index = 0;
-        let index = self.add(name, |attempt| {
-            let mut end = link(0, [LinkAttribute::IfName(peer.to_owned()), LinkAttribute::Mtu(FD_MTU)]);
+        let index = self.add_interface(name, |attempt| {
+            let mut end =
+                link_message(0, [LinkAttribute::IfName(peer.to_owned()), LinkAttribute::Mtu(FD_MTU)]);
             if let Some((namespace, there)) = &mut there {
                 end.attributes.push(LinkAttribute::NetNsFd(namespace.as_raw_fd()));
                 peer_index = there.free_index()? + attempt.number;
@@ -170,16 +172,16 @@ impl Netlink {
             let data = InfoData::Vxcan(InfoVxcan::Peer(end));
             Ok(vec![LinkInfo::Kind(InfoKind::Vxcan), LinkInfo::Data(data)])
         })?;
-        let marked = self.mark(index).and_then(|()| match there {
-            Some((_, there)) => there.mark(peer_index),
-            None => self.mark(peer_index),
+        let marked = self.mark_and_set_up(index).and_then(|()| match there {
+            Some((_, there)) => there.mark_and_set_up(peer_index),
+            None => self.mark_and_set_up(peer_index),
         });
-        self.or_undo(marked, Undo::Remove { index }).map(|_| index)
+        self.undo_on_error(marked, Undo::Remove { index }).map(|_| index)
     }
 
     /// Returns an index that is higher than those of all interfaces.
     fn free_index(&mut self) -> io::Result<u32> {
-        let links = self.all()?;
+        let links = self.query_all()?;
         let indices = links.iter().filter_map(|link| LinkHeader::parse(link).ok()).map(|header| header.index);
         Ok(indices.max().unwrap_or(0) + 1)
     }
@@ -187,27 +189,29 @@ impl Netlink {
     /// Makes an interface with MTU 72, which is down. Returns its index. The index is chosen here, because the kernel
     /// does not report the one that it would choose, and the name might belong to another interface before it can be
     /// looked up.
-    fn add(
+    fn add_interface(
         &mut self,
         name: &str,
-        mut info: impl FnMut(Attempt) -> io::Result<Vec<LinkInfo>>,
+        mut info: impl FnMut(CreationAttempt) -> io::Result<Vec<LinkInfo>>,
     ) -> io::Result<u32> {
         let first = self.free_index()?;
         let mut number = 0;
         loop {
             let index = first + number;
-            let info = LinkAttribute::LinkInfo(info(Attempt { index, number })?);
-            let message =
-                link(index, [LinkAttribute::IfName(name.to_owned()), LinkAttribute::Mtu(FD_MTU), info]);
+            let info = LinkAttribute::LinkInfo(info(CreationAttempt { index, number })?);
+            let message = link_message(
+                index,
+                [LinkAttribute::IfName(name.to_owned()), LinkAttribute::Mtu(FD_MTU), info],
+            );
             let flags = NLM_F_CREATE | NLM_F_EXCL;
             match self.exchange.request(RouteNetlinkMessage::NewLink(message), flags) {
                 Ok(_) => return Ok(index),
                 // Another program has taken the index of the other end in the meantime.
-                Err(error) if is(&error, Errno::BUSY) && number < MAX_INDEX_ATTEMPTS => number += 2,
+                Err(error) if is_errno(&error, Errno::BUSY) && number < MAX_INDEX_ATTEMPTS => number += 2,
                 // Another program has taken the index of this end. The kernel returns the same error if the name is
                 // taken.
                 Err(error)
-                    if is(&error, Errno::EXIST)
+                    if is_errno(&error, Errno::EXIST)
                         && number < MAX_INDEX_ATTEMPTS
                         && self.free_index()? > index =>
                 {
@@ -218,10 +222,10 @@ impl Netlink {
         }
     }
 
-    fn mark(&mut self, index: u32) -> io::Result<()> {
+    fn mark_and_set_up(&mut self, index: u32) -> io::Result<()> {
         // The alias is set first. If a later step fails, the next command then recognises the interface and can remove
         // it.
-        self.change(link(index, [LinkAttribute::IfAlias(ALIAS_MARK.to_owned())]))?;
+        self.change(link_message(index, [LinkAttribute::IfAlias(ALIAS_MARK.to_owned())]))?;
         self.set_up(index, true)
     }
 
@@ -234,7 +238,7 @@ impl Netlink {
     /// # Errors
     /// Returns the kernel's error.
     pub fn set_up(&mut self, index: u32, up: bool) -> io::Result<()> {
-        let mut message = link(index, []);
+        let mut message = link_message(index, []);
         message.header.change_mask = LinkFlags::Up;
         message.header.flags = if up { LinkFlags::Up } else { LinkFlags::empty() };
         self.change(message)
@@ -245,7 +249,7 @@ impl Netlink {
     /// # Errors
     /// Returns the kernel's error.
     pub fn set_mtu(&mut self, index: u32, mtu: u32) -> io::Result<()> {
-        self.change(link(index, [LinkAttribute::Mtu(mtu)]))
+        self.change(link_message(index, [LinkAttribute::Mtu(mtu)]))
     }
 
     /// Sets the bit rates of CAN hardware, which must be down. Without a data rate it is switched to classic CAN.
@@ -258,13 +262,14 @@ impl Netlink {
         data.extend(rates.bitrate.map(|rate| InfoCan::BitTiming(CanBitTiming::new(rate))));
         data.extend(rates.data_bitrate.map(|rate| InfoCan::DataBitTiming(CanBitTiming::new(rate))));
         let info = vec![LinkInfo::Kind(InfoKind::Can), LinkInfo::Data(InfoData::Can(data))];
-        self.change(link(index, [LinkAttribute::LinkInfo(info)]))
+        self.change(link_message(index, [LinkAttribute::LinkInfo(info)]))
     }
 
     /// Checks that the actual bit rates are close enough to the requested ones, because drivers accept deviations of up
     /// to 5 %.
     fn check_rates(&mut self, index: u32, target: HardwareRates) -> io::Result<()> {
-        let nearest = self.query(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
+        let nearest =
+            self.query(link_message(index, []))?.and_then(|it| it.hardware().map(CanHardware::rates));
         match nearest.filter(|nearest| !nearest.matches(target)) {
             Some(nearest) => Err(io::Error::other(format!("the nearest that its clock gives is {nearest}"))),
             None => Ok(()),
@@ -276,7 +281,7 @@ impl Netlink {
     /// # Errors
     /// Returns the kernel's error.
     pub fn remove(&mut self, index: u32) -> io::Result<()> {
-        self.exchange.request(RouteNetlinkMessage::DelLink(link(index, [])), 0).map(|_| ())
+        self.exchange.request(RouteNetlinkMessage::DelLink(link_message(index, [])), 0).map(|_| ())
     }
 
     /// Executes a step of a plan. Returns the action that undoes the step, if there is one.
@@ -297,7 +302,7 @@ impl Netlink {
             StepAction::Widen { index, from, was_up } => {
                 let done = self.set_up(index, false).and_then(|()| self.set_mtu(index, FD_MTU));
                 let done = done.and_then(|()| self.set_up(index, true));
-                self.or_undo(done, restore(index, Some(from), was_up)).map(Some)
+                self.undo_on_error(done, restore(index, Some(from), was_up)).map(Some)
             }
             StepAction::SetRates { index, rates, before, was_up } => {
                 let undo = Undo::Restore { index, mtu: None, rates: Some(before), up: was_up };
@@ -306,13 +311,13 @@ impl Netlink {
                     .and_then(|()| self.set_rates(index, rates))
                     .and_then(|()| self.check_rates(index, rates))
                     .and_then(|()| self.set_up(index, true));
-                self.or_undo(done, undo).map(Some)
+                self.undo_on_error(done, undo).map(Some)
             }
             StepAction::Remove { index } => self.remove(index).map(|()| None),
         }
     }
 
-    fn or_undo(&mut self, done: io::Result<()>, undo: Undo) -> io::Result<Undo> {
+    fn undo_on_error(&mut self, done: io::Result<()>, undo: Undo) -> io::Result<Undo> {
         if done.is_err() {
             // The error of the step is reported, not one of undoing it.
             let _ = self.undo(&undo);
@@ -365,17 +370,17 @@ pub enum Undo {
 
 /// The arguments of one attempt to make an interface.
 #[derive(Clone, Copy)]
-struct Attempt {
+struct CreationAttempt {
     index: u32,
     number: u32,
 }
 
-fn is(error: &io::Error, errno: Errno) -> bool {
+fn is_errno(error: &io::Error, errno: Errno) -> bool {
     error.raw_os_error() == Some(errno.raw_os_error())
 }
 
 /// Returns a netlink message about the interface with this index.
-fn link(index: u32, attributes: impl IntoIterator<Item = LinkAttribute>) -> LinkMessage {
+fn link_message(index: u32, attributes: impl IntoIterator<Item = LinkAttribute>) -> LinkMessage {
     let mut message = LinkMessage::default();
     message.header.index = index;
     message.attributes.extend(attributes);

@@ -16,13 +16,13 @@ use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::usage::shell_quoted_os;
 
-use crate::link::{FD_MTU, Hardware, HardwareRates, Interface, InterfaceKind};
+use crate::link::{CanHardware, FD_MTU, HardwareRates, Interface, InterfaceKind};
 use crate::namespace::Namespace;
 
 mod refusal;
 mod step;
 
-pub use refusal::Refusal;
+pub use refusal::PlanRefusal;
 pub(crate) use step::set_fd_mtu_command;
 pub use step::{Step, StepAction};
 
@@ -68,7 +68,7 @@ impl InterfaceTarget {
     }
 
     /// Restricts a target without a skin to the frame format that the hardware of this name is set to.
-    pub fn take_format_of_hardware(&mut self, present: &[Interface]) {
+    pub fn adopt_hardware_format(&mut self, present: &[Interface]) {
         let there = find(present, &self.name).filter(|it| it.hardware().is_some());
         if self.skin.is_none() && there.is_some_and(|it| it.mtu < FD_MTU) {
             self.format = Format::Classic;
@@ -82,12 +82,12 @@ impl InterfaceTarget {
     }
 
     /// Returns a refusal if another skin states different bit rates for the same bus.
-    fn conflict(&self, others: &[Self]) -> Option<Refusal> {
+    fn conflict(&self, others: &[Self]) -> Option<PlanRefusal> {
         let own = self.hardware()?;
         let mut skins = others.iter().filter(|other| other.name == self.name).filter_map(Self::hardware);
         let other = skins.find(|skin| skin.rates != own.rates)?;
         let says = |skin: &SkinBus| format!("{} says {}", skin.file, skin.rates);
-        Some(Refusal::AtOdds { name: self.name.clone(), one: says(other), other: says(own) })
+        Some(PlanRefusal::AtOdds { name: self.name.clone(), one: says(other), other: says(own) })
     }
 
     /// Returns true if an interface with this MTU (in bytes) can carry the frames of the target.
@@ -134,30 +134,34 @@ fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
 /// Plans the steps after which every target interface exists, is up and carries the required frames.
 ///
 /// # Errors
-/// Returns [`Refusal`] if an interface would have to be changed that this program has not made.
-pub fn up(target: &[InterfaceTarget], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
+/// Returns [`PlanRefusal`] if an interface would have to be changed that this program has not made.
+pub fn plan_up(
+    target: &[InterfaceTarget],
+    present: &[Interface],
+    set_bit_rates: bool,
+) -> Result<Plan, PlanRefusal> {
     let mut plan = Plan::default();
     if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.conflict(target.get(..at)?)) {
         return Err(refusal);
     }
     for target in target {
-        if plan.changes(&target.name) {
+        if plan.has_step_for(&target.name) {
             continue;
         }
         let Some(interface) = find(present, &target.name) else {
             if let Some(SkinBus { file, .. }) = target.hardware() {
-                return Err(Refusal::Absent { name: target.name.clone(), file: file.clone() });
+                return Err(PlanRefusal::Absent { name: target.name.clone(), file: file.clone() });
             }
             plan.steps.push(Step { name: target.name.clone(), action: StepAction::MakeVcan });
             continue;
         };
         match (&interface.kind, &target.skin) {
-            (InterfaceKind::Vcan | InterfaceKind::Vxcan(_), _) => plan.fit(target, interface)?,
+            (InterfaceKind::Vcan | InterfaceKind::Vxcan(_), _) => plan.plan_virtual(target, interface)?,
             (InterfaceKind::Hardware(hardware), Some(skin)) => {
-                plan.hardware(target, skin, interface, hardware, set_bit_rates)?;
+                plan.plan_hardware(target, skin, interface, hardware, set_bit_rates)?;
             }
             (InterfaceKind::Hardware(_), None) | (InterfaceKind::Other(_), _) => {
-                return Err(Refusal::not_virtual(interface));
+                return Err(PlanRefusal::not_virtual(interface));
             }
         }
     }
@@ -167,11 +171,11 @@ pub fn up(target: &[InterfaceTarget], present: &[Interface], set_bit_rates: bool
 /// Plans the steps after which both ends of a pair exist and are up.
 ///
 /// # Errors
-/// Returns [`Refusal`] if an interface would have to be changed that this program has not made.
-pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, Refusal> {
+/// Returns [`PlanRefusal`] if an interface would have to be changed that this program has not made.
+pub fn plan_pair_up(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, PlanRefusal> {
     let TargetPair { name, peer, there } = *target;
     if there.is_none() && name == peer {
-        return Err(Refusal::OneName(name.to_owned()));
+        return Err(PlanRefusal::OneName(name.to_owned()));
     }
     let present_there = there.map_or(present, |there| &there.present);
     let ends = (find(present, name), find(present_there, peer));
@@ -184,12 +188,12 @@ pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, R
             return Ok(plan);
         }
         (Some(here), Some(other)) if are_a_pair(here, other, there) => (here, other),
-        (Some(in_the_way), _) => return Err(not_a_pair(in_the_way, peer, None)),
-        (None, Some(in_the_way)) => return Err(not_a_pair(in_the_way, name, there)),
+        (Some(in_the_way), _) => return Err(not_a_pair_refusal(in_the_way, peer, None)),
+        (None, Some(in_the_way)) => return Err(not_a_pair_refusal(in_the_way, name, there)),
     };
-    plan.fit(&InterfaceTarget::named(name), here)?;
+    plan.plan_virtual(&InterfaceTarget::named(name), here)?;
     let Some(there) = there else {
-        plan.fit(&InterfaceTarget::named(peer), other)?;
+        plan.plan_virtual(&InterfaceTarget::named(peer), other)?;
         return Ok(plan);
     };
     // In the other namespace, nothing is changed except that a missing pair is made.
@@ -200,7 +204,7 @@ pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, R
         (_, false) => (format!("of MTU {}", other.mtu), format!("sh -c '{}'", set_fd_mtu_command(&ip, peer))),
     };
     let end = format!("{peer} in {}, is {what}", there.name);
-    Err(Refusal::OtherEnd { name: name.to_owned(), end, command })
+    Err(PlanRefusal::OtherEnd { name: name.to_owned(), end, command })
 }
 
 fn are_a_pair(here: &Interface, other: &Interface, there: Option<&OtherNamespace>) -> bool {
@@ -212,10 +216,10 @@ fn are_a_pair(here: &Interface, other: &Interface, there: Option<&OtherNamespace
     same_place && peer.index == other.index && matches!(other.kind, InterfaceKind::Vxcan(_))
 }
 
-fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&OtherNamespace>) -> Refusal {
+fn not_a_pair_refusal(in_the_way: &Interface, peer: &str, there: Option<&OtherNamespace>) -> PlanRefusal {
     let Interface { name, .. } = in_the_way;
     if !in_the_way.is_virtual() {
-        return Refusal::not_virtual(in_the_way);
+        return PlanRefusal::not_virtual(in_the_way);
     }
     let hint = match (in_the_way.ours, there) {
         (true, None) => format!("`sudo vcan-setup down {name}` removes it, or choose another name"),
@@ -226,12 +230,12 @@ fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&OtherNamespace>
     };
     let at = there.map(|there| format!(" in {}", there.name)).unwrap_or_default();
     let what = format!("{}{at}", in_the_way.description());
-    Refusal::OtherPair { name: name.clone(), what, peer: peer.to_owned(), hint }
+    PlanRefusal::OtherPair { name: name.clone(), what, peer: peer.to_owned(), hint }
 }
 
 impl Plan {
     /// Returns true if the plan already has a step for the interface of this name.
-    fn changes(&self, name: &str) -> bool {
+    fn has_step_for(&self, name: &str) -> bool {
         self.steps.iter().any(|step| step.name == name)
     }
 
@@ -243,7 +247,7 @@ impl Plan {
     }
 
     /// Plans the steps by which an existing virtual interface fulfils its target, if this program has made it.
-    fn fit(&mut self, target: &InterfaceTarget, interface: &Interface) -> Result<(), Refusal> {
+    fn plan_virtual(&mut self, target: &InterfaceTarget, interface: &Interface) -> Result<(), PlanRefusal> {
         let Interface { index, mtu, .. } = *interface;
         let name = interface.name.clone();
         let wide = target.carried_by(mtu);
@@ -256,8 +260,8 @@ impl Plan {
                 ));
                 return Ok(());
             }
-            (false, _, false) => return Err(Refusal::Narrow { name, mtu }),
-            (true, false, false) => return Err(Refusal::Down(name)),
+            (false, _, false) => return Err(PlanRefusal::Narrow { name, mtu }),
+            (true, false, false) => return Err(PlanRefusal::Down(name)),
             (false, was_up, true) => StepAction::Widen { index, from: mtu, was_up },
             (true, false, true) => StepAction::BringUp { index },
         };
@@ -266,14 +270,14 @@ impl Plan {
     }
 
     /// Compares the bit rates of hardware with those of the skin. Plans to set them if the user requests it.
-    fn hardware(
+    fn plan_hardware(
         &mut self,
         target: &InterfaceTarget,
         skin: &SkinBus,
         interface: &Interface,
-        hardware: &Hardware,
+        hardware: &CanHardware,
         set: bool,
-    ) -> Result<(), Refusal> {
+    ) -> Result<(), PlanRefusal> {
         let (name, file, what) = (interface.name.clone(), skin.file.clone(), interface.description());
         let (before, rates) = (hardware.rates(), skin.rates);
         let agrees = before.matches(rates);
@@ -291,23 +295,23 @@ impl Plan {
         };
         if set {
             if let Some((key, example)) = missing {
-                return Err(Refusal::NoRate { name, key, example, file });
+                return Err(PlanRefusal::NoRate { name, key, example, file });
             }
             let (index, was_up) = (interface.index, interface.up);
             self.steps.push(Step { name, action: StepAction::SetRates { index, rates, before, was_up } });
             return Ok(());
         }
         if !agrees {
-            return Err(Refusal::Rates { name, has: before, wants: rates, file });
+            return Err(PlanRefusal::Rates { name, has: before, wants: rates, file });
         }
         if !wide {
-            return Err(Refusal::HardwareNarrow { name, what, mtu: interface.mtu, file });
+            return Err(PlanRefusal::HardwareNarrow { name, what, mtu: interface.mtu, file });
         }
         match missing {
             // The hardware is down and has bit rates, but the skin states none, so this program does not set it up.
-            Some(_) if before.bitrate.is_some() => Err(Refusal::Down(name)),
-            Some((key, example)) => Err(Refusal::NoRate { name, key, example, file }),
-            None => Err(Refusal::HardwareDown { name, what, file }),
+            Some(_) if before.bitrate.is_some() => Err(PlanRefusal::Down(name)),
+            Some((key, example)) => Err(PlanRefusal::NoRate { name, key, example, file }),
+            None => Err(PlanRefusal::HardwareDown { name, what, file }),
         }
     }
 }
@@ -315,19 +319,19 @@ impl Plan {
 /// Plans the steps that remove the target interfaces, as far as this program has made them.
 ///
 /// # Errors
-/// Returns [`Refusal`] if an interface that this program has not made was named on the command line. If it was named by
+/// Returns [`PlanRefusal`] if an interface that this program has not made was named on the command line. If it was named by
 /// a skin, it is left as it is.
-pub fn down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, Refusal> {
+pub fn plan_down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, PlanRefusal> {
     let mut plan = Plan::default();
     for target in target {
         let name = target.name.clone();
-        if plan.changes(&name) {
+        if plan.has_step_for(&name) {
             continue;
         }
         match (find(present, &name), &target.skin) {
             (None, _) => plan.add_unchanged(format!("{name} is not there")),
             (Some(interface), _) if interface.ours && interface.is_virtual() => {
-                if !removed_with(&plan, interface, present) {
+                if !is_removed_with_peer(&plan, interface, present) {
                     plan.steps.push(Step { name, action: StepAction::Remove { index: interface.index } });
                 }
             }
@@ -343,7 +347,7 @@ pub fn down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, R
                 } else {
                     String::new()
                 };
-                return Err(Refusal::NotOurs { name, what: interface.description(), hint });
+                return Err(PlanRefusal::NotOurs { name, what: interface.description(), hint });
             }
         }
     }
@@ -352,10 +356,10 @@ pub fn down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, R
 
 /// Returns true if the plan already removes the other end of the interface's pair: the kernel then removes this end
 /// too.
-fn removed_with(plan: &Plan, interface: &Interface, present: &[Interface]) -> bool {
+fn is_removed_with_peer(plan: &Plan, interface: &Interface, present: &[Interface]) -> bool {
     let peer = interface.peer().filter(|peer| peer.namespace_id.is_none());
     let peer = peer.and_then(|peer| present.iter().find(|other| other.index == peer.index));
-    peer.is_some_and(|peer| plan.changes(&peer.name))
+    peer.is_some_and(|peer| plan.has_step_for(&peer.name))
 }
 
 #[cfg(test)]

@@ -2,11 +2,11 @@
 //!
 //! ```text
 //!              one client for each line, with its filters
-//!   bus  ────> [Outgoing: queue, pacing] ────> line      t1232AABB CR
-//!        <──── [Incoming: decoder, queue] <────
+//!   bus  ────> [BusToLineQueue: pacing] ──> line      t1232AABB CR
+//!        <──── [LineToBusQueue: decoder] <──
 //! ```
 //!
-//! [`Outgoing`](outgoing::Outgoing), [`Incoming`](incoming::Incoming) and the account process bytes, frames and times
+//! [`BusToLineQueue`](outgoing::BusToLineQueue), [`LineToBusQueue`](incoming::LineToBusQueue) and the account process bytes, frames and times
 //! without input or output. A [`Bridge`] is one thread that serves all lines of a bus. It never waits for a line or for
 //! the bus: frames that do not fit into a queue are dropped, and counted by reason.
 
@@ -24,5 +24,5 @@ mod settings;
 pub use account::LineAccount;
 pub use bridge::{Bridge, BridgeError};
 pub use event::LineEvent;
-pub use options::{Address, LineError, LineOptions};
+pub use options::{LineAddress, LineError, LineOptions};
 pub use settings::BridgeSettings;

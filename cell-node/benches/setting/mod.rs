@@ -10,14 +10,14 @@ use protocol::fixed::Q1_14;
 use protocol::parameters::MAX_JOINTS;
 
 use oracle::Case;
-use peer::Peer;
+use peer::NalgebraKernel;
 
 /// The kernels of a cell moved by joint 6, and the joint positions as input.
-pub(crate) struct Setting {
+pub(crate) struct BenchSetting {
     pub(crate) wrench: Wrench,
     pub(crate) projection: Projection,
-    pub(crate) double: Peer<f64>,
-    pub(crate) single: Peer<f32>,
+    pub(crate) double: NalgebraKernel<f64>,
+    pub(crate) single: NalgebraKernel<f32>,
     /// Joint positions in quarter turns.
     pub(crate) words: [Q1_14; MAX_JOINTS],
     /// Joint positions in rad.
@@ -26,7 +26,7 @@ pub(crate) struct Setting {
     pub(crate) radians_f32: [f32; MAX_JOINTS],
 }
 
-impl Setting {
+impl BenchSetting {
     /// Creates the setting from the first test vector whose cell is on joint 6.
     pub(crate) fn new() -> Self {
         let case = Case::all().into_iter().find(|case| case.joint == 6).expect("there are some");
@@ -38,8 +38,8 @@ impl Setting {
         Self {
             wrench: Wrench::new(&parameters),
             projection: Projection::new(&parameters),
-            double: Peer::new(&parameters),
-            single: Peer::new(&parameters),
+            double: NalgebraKernel::new(&parameters),
+            single: NalgebraKernel::new(&parameters),
             words,
             radians,
             radians_f32,

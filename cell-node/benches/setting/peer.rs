@@ -6,14 +6,14 @@ use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
 /// The Jacobian of one cell by Eq. 8. The frames are multiplied from the base to the cell, without optimisations.
 #[derive(Debug)]
-pub(crate) struct Peer<T: RealField> {
+pub(crate) struct NalgebraKernel<T: RealField> {
     /// The constant part of each link's transform.
     fixed: Vec<IsometryMatrix3<T>>,
     position: Point3<T>,
     force: Vector3<T>,
 }
 
-impl<T: RealField + Copy> Peer<T> {
+impl<T: RealField + Copy> NalgebraKernel<T> {
     /// Creates the computation for a force of one newton against the normal of the cell.
     pub(crate) fn new(parameters: &Parameters) -> Self {
         let number = |word: Q1_14| convert::<f64, T>(word.to_f64());

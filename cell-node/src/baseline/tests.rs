@@ -55,7 +55,7 @@ fn without_a_baseline_nothing_is_subtracted_and_nothing_told() {
     let raw = reads(0.3, 25.0);
     baseline.run(100, &raw);
     assert_eq!((baseline.subtract_zero(&raw), baseline.page()), (raw, None));
-    assert_eq!(baseline.tare(&raw, Tare::Untouched), Err(TareRefused::Off));
+    assert_eq!(baseline.tare(&raw, TareCommand::Untouched), Err(TareRefused::Off));
 }
 
 #[test]
@@ -152,17 +152,21 @@ fn a_tare_needs_that_nothing_touches_it_unless_it_is_forced() {
     let mut baseline = tared(rule());
     let touched = reads(0.45, 25.0);
     baseline.run(50, &touched);
-    assert_eq!(baseline.tare(&touched, Tare::Untouched), Err(TareRefused::Touched));
+    assert_eq!(baseline.tare(&touched, TareCommand::Untouched), Err(TareRefused::Touched));
     let page = baseline.page().unwrap();
     assert_eq!((page.refused, page.zero, page.touched), (1, Q5_10::nearest(0.3), true));
-    assert_eq!(baseline.tare(&touched, Tare::Forced), Ok(()));
+    assert_eq!(baseline.tare(&touched, TareCommand::Forced), Ok(()));
     assert_eq!(baseline.run(1, &touched), 0.0);
     let more = reads(0.95, 25.0);
     baseline.run(50, &more);
-    assert_eq!(baseline.tare(&more, Tare::Forced), Err(TareRefused::Limit), "0.95 N");
-    baseline.tare(&more, Tare::Forget).unwrap();
+    assert_eq!(baseline.tare(&more, TareCommand::Forced), Err(TareRefused::Limit), "0.95 N");
+    baseline.tare(&more, TareCommand::Forget).unwrap();
     assert!(!baseline.is_tared());
-    assert_eq!(with(rule()).tare(&more, Tare::Untouched), Err(TareRefused::Touched), "it has read nothing");
+    assert_eq!(
+        with(rule()).tare(&more, TareCommand::Untouched),
+        Err(TareRefused::Touched),
+        "it has read nothing"
+    );
 }
 
 #[test]
@@ -206,7 +210,7 @@ proptest! {
                 baseline.process_joints(&raw, PERIOD);
                 if before.is_tared {
                     prop_assert!(before.zero.abs_diff(baseline.zero) <= most.unsigned_abs());
-                    if baseline.touch == Touch::Touched {
+                    if baseline.touch == TouchState::Touched {
                         prop_assert_eq!(before.zero, baseline.zero);
                     }
                 }
@@ -232,7 +236,7 @@ proptest! {
             for _ in 0..tare {
                 baseline.process_joints(&raw, period);
             }
-            let how = [Tare::Forget, Tare::Untouched, Tare::Forced];
+            let how = [TareCommand::Forget, TareCommand::Untouched, TareCommand::Forced];
             let _ = how.get(usize::from(tare)).map(|how| baseline.tare(&raw, *how));
             let _ = (baseline.subtract_zero(&raw), baseline.page());
         }

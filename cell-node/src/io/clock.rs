@@ -21,7 +21,7 @@ pub(super) struct Clock {
 impl Clock {
     pub(super) fn new() -> Self {
         let mut clock = Self { start: Instant::now(), wall: 0, measured: Micros(0) };
-        clock.set(Micros(0));
+        clock.measure_offset(Micros(0));
         clock
     }
 
@@ -32,11 +32,11 @@ impl Clock {
     /// Measures the offset to the wall clock again if the interval between measurements has passed.
     pub(super) fn remeasure(&mut self, now: Micros) {
         if now.elapsed_since(self.measured) >= MEASURE_INTERVAL {
-            self.set(now);
+            self.measure_offset(now);
         }
     }
 
-    fn set(&mut self, now: Micros) {
+    fn measure_offset(&mut self, now: Micros) {
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_micros();
         self.wall = u64::try_from(wall).unwrap_or(0).saturating_sub(self.now().0);
         self.measured = now;

@@ -4,8 +4,8 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use protocol::bus::batch::BATCH;
-use protocol::bus::{Bus, BusError, BusOptions, Filter, Inbox, Received, SendError};
+use protocol::bus::batch::MAX_BATCH_DATAGRAMS;
+use protocol::bus::{Bus, BusError, BusOptions, Filter, Inbox, ReceivedFrame, SendError};
 use protocol::can::Frame;
 
 use super::BusPort;
@@ -42,18 +42,18 @@ pub struct Sockets {
     /// was moved.
     settled: Option<Instant>,
     /// Frames from the deferred socket that have not been handled yet.
-    deferred_frames: VecDeque<Received>,
+    deferred_frames: VecDeque<ReceivedFrame>,
     inbox: Inbox,
     /// Frames from the socket that wakes the process.
     woke: Inbox,
     /// Frames from both sockets, in the order of the kernel's time stamps.
-    arrived: Vec<ReceivedFrame>,
+    arrived: Vec<MergedFrame>,
 }
 
 /// A received frame.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct ReceivedFrame {
-    pub(super) received: Received,
+pub(super) struct MergedFrame {
+    pub(super) received: ReceivedFrame,
     /// True if the frame was deferred and is older than all frames that woke the process.
     pub(super) waited: bool,
 }
@@ -122,7 +122,7 @@ impl Sockets {
         self.bus.receive(&mut self.woke)?;
         // Includes frames that a slow server delivered after the settling time.
         self.receive_deferred()?;
-        self.order(due_nanos);
+        self.merge_by_time(due_nanos);
         Ok(!self.arrived.is_empty())
     }
 
@@ -134,7 +134,7 @@ impl Sockets {
             if self.bus.wait_with(&self.deferred, wait.min(left))? {
                 self.bus.receive(&mut self.woke)?;
                 self.receive_deferred()?;
-                self.order(0);
+                self.merge_by_time(0);
             }
             if left.is_zero() {
                 self.settled = None;
@@ -150,7 +150,7 @@ impl Sockets {
             if self.has_deferred_filters {
                 self.receive_deferred()?;
             }
-            self.order(u64::MAX);
+            self.merge_by_time(u64::MAX);
         }
         Ok(())
     }
@@ -164,7 +164,7 @@ impl Sockets {
         for _ in 0..MAX_DEFERRED_BATCHES {
             let count = self.deferred.receive(&mut self.inbox)?;
             self.deferred_frames.extend(self.inbox.frames());
-            if count < BATCH {
+            if count < MAX_BATCH_DATAGRAMS {
                 break;
             }
         }
@@ -173,26 +173,26 @@ impl Sockets {
 
     /// Merges the frames of both sockets in the order of their time stamps. Deferred frames that are older than the
     /// first waking frame and than `until` are marked as having waited.
-    fn order(&mut self, until: u64) {
+    fn merge_by_time(&mut self, until: u64) {
         let until = self.woke.frames().next().map_or(until, |first| first.at_nanos.min(until));
-        let mut earlier = |than: u64, came: &mut Vec<ReceivedFrame>| {
+        let mut earlier = |than: u64, came: &mut Vec<MergedFrame>| {
             while let Some(&received) = self.deferred_frames.front().filter(|first| first.at_nanos < than) {
                 self.deferred_frames.pop_front();
-                came.push(ReceivedFrame { received, waited: received.at_nanos < until });
+                came.push(MergedFrame { received, waited: received.at_nanos < until });
             }
         };
         for received in self.woke.frames() {
             earlier(received.at_nanos, &mut self.arrived);
-            self.arrived.push(ReceivedFrame { received, waited: false });
+            self.arrived.push(MergedFrame { received, waited: false });
         }
         // If the waking socket has more pending frames, those come first.
-        if self.woke.frames().len() < BATCH {
+        if self.woke.frames().len() < MAX_BATCH_DATAGRAMS {
             earlier(u64::MAX, &mut self.arrived);
         }
     }
 
     /// Returns the frames of the last receive.
-    pub(super) fn frames(&self) -> &[ReceivedFrame] {
+    pub(super) fn frames(&self) -> &[MergedFrame] {
         &self.arrived
     }
 }

@@ -29,7 +29,7 @@ struct Subscribers {
 
 impl Subscriptions {
     /// Subscribes the port of a cell to a link id. The subscription is permanent.
-    pub(super) fn wire(&mut self, link_id: LinkId, cell: usize, port: usize) {
+    pub(super) fn subscribe_port(&mut self, link_id: LinkId, cell: usize, port: usize) {
         self.by_link_id.insert(link_id, (cell, port));
     }
 
@@ -59,7 +59,7 @@ impl Subscriptions {
     pub(super) fn filters(&self) -> ReceiveFilters {
         let ids = |wakes| self.by_id.iter().filter(move |(_, heard)| heard.wakes == wakes).map(|(id, _)| *id);
         let link_ids = self.by_link_id.keys().copied();
-        if self.by_id.len() + link_ids.len() <= Filter::MAX {
+        if self.by_id.len() + link_ids.len() <= Filter::MAX_COUNT {
             return ReceiveFilters {
                 at_once: ids(true).map(Filter::exact).chain(link_ids.map(Filter::for_link)).collect(),
                 deferred: ids(false).map(Filter::exact).collect(),
@@ -90,7 +90,7 @@ mod tests {
         let hears = |(at, cell)| [Kind::Network, Kind::Sum].map(|kind| (at, id(kind, cell), false));
         subscriptions.replace(cells().flat_map(hears));
         for (at, cell) in cells() {
-            subscriptions.wire(LinkId { wire: cell.get().into(), back: true }, at, 2);
+            subscriptions.subscribe_port(LinkId { wire: cell.get().into(), back: true }, at, 2);
         }
         subscriptions
     }

@@ -72,7 +72,7 @@ fn chain(parameters: &Parameters) -> &[Row] {
 
 /// Returns a length of the robot's table; `None` for zero, for which the multiplications are omitted.
 fn length<N: Number>(word: Q1_14) -> Option<N> {
-    (word != Q1_14::ZERO).then(|| N::word(word))
+    (word != Q1_14::ZERO).then(|| N::from_word(word))
 }
 
 /// Marks a branch as unlikely, so that the compiler keeps it out of the main path.
@@ -81,8 +81,8 @@ fn length<N: Number>(word: Q1_14) -> Option<N> {
 const fn cold_path() {}
 
 /// Returns sine and cosine of a constant angle.
-fn settled_turn<N: Number>(angle: Q1_14) -> [N; 2] {
-    let [sine, cosine, _] = N::fine_turn(angle);
+fn constant_sine_cosine<N: Number>(angle: Q1_14) -> [N; 2] {
+    let [sine, cosine, _] = N::fine_sine_cosine_one(angle);
     [N::round_constant::<FINE_FRACTION_BITS>(sine), N::round_constant::<FINE_FRACTION_BITS>(cosine)]
 }
 
@@ -109,7 +109,7 @@ impl<N: Number> Twist<N> {
             i16::MIN => Self::Half,
             -0x4000 => Self::Back,
             _ => {
-                let [sine, cosine] = settled_turn(alpha);
+                let [sine, cosine] = constant_sine_cosine(alpha);
                 Self::Other { sine, cosine }
             }
         }

@@ -21,7 +21,7 @@ mod numbers;
 mod projection;
 
 #[cfg(feature = "std")]
-pub use numbers::Counted;
+pub use numbers::CountingWord;
 pub use projection::Projection;
 
 use protocol::fixed::Q1_14;

@@ -5,15 +5,15 @@ use super::Number;
 /// A way to round sums to words, with saturation or without it.
 pub(super) trait Rounding {
     /// Rounds the sum of two products. In each product one factor must be within [-1, 1].
-    fn sum<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N;
+    fn sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N;
     /// Rounds the difference of two products. In each product one factor must be within [-1, 1].
-    fn difference<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N;
+    fn difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N;
     /// Rounds the sum of a number and a product.
-    fn more<N: Number>(number: N, product: N::Wide) -> N;
+    fn add_product<N: Number>(number: N, product: N::WideSum) -> N;
     /// Rounds the difference of a number and a product.
-    fn less<N: Number>(number: N, product: N::Wide) -> N;
+    fn subtract_product<N: Number>(number: N, product: N::WideSum) -> N;
     /// Rounds a number plus the product `more` minus the product `less`.
-    fn more_and_less<N: Number>(number: N, more: N::Wide, less: N::Wide) -> N;
+    fn add_and_subtract<N: Number>(number: N, more: N::WideSum, less: N::WideSum) -> N;
     /// Negates a number.
     fn negative<N: Number>(number: N) -> N;
 }
@@ -23,27 +23,27 @@ pub(super) enum Saturating {}
 
 impl Rounding for Saturating {
     #[inline(always)]
-    fn sum<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N {
+    fn sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
         N::rounded_sum(lhs, rhs)
     }
 
     #[inline(always)]
-    fn difference<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N {
+    fn difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
         N::rounded_difference(lhs, rhs)
     }
 
     #[inline(always)]
-    fn more<N: Number>(number: N, product: N::Wide) -> N {
+    fn add_product<N: Number>(number: N, product: N::WideSum) -> N {
         N::rounded_sum(number.widen(), product)
     }
 
     #[inline(always)]
-    fn less<N: Number>(number: N, product: N::Wide) -> N {
+    fn subtract_product<N: Number>(number: N, product: N::WideSum) -> N {
         N::rounded_difference(number.widen(), product)
     }
 
     #[inline(always)]
-    fn more_and_less<N: Number>(number: N, more: N::Wide, less: N::Wide) -> N {
+    fn add_and_subtract<N: Number>(number: N, more: N::WideSum, less: N::WideSum) -> N {
         N::round(N::minus(N::plus(number.widen(), more), less))
     }
 
@@ -58,28 +58,28 @@ pub(super) enum Bounded {}
 
 impl Rounding for Bounded {
     #[inline(always)]
-    fn sum<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N {
-        N::bounded(N::bounded_plus(lhs, rhs))
+    fn sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
+        N::round_bounded(N::bounded_plus(lhs, rhs))
     }
 
     #[inline(always)]
-    fn difference<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N {
-        N::bounded(N::bounded_minus(lhs, rhs))
+    fn difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
+        N::round_bounded(N::bounded_minus(lhs, rhs))
     }
 
     #[inline(always)]
-    fn more<N: Number>(number: N, product: N::Wide) -> N {
-        number.bounded_more(product)
+    fn add_product<N: Number>(number: N, product: N::WideSum) -> N {
+        number.bounded_add_product(product)
     }
 
     #[inline(always)]
-    fn less<N: Number>(number: N, product: N::Wide) -> N {
-        number.bounded_less(product)
+    fn subtract_product<N: Number>(number: N, product: N::WideSum) -> N {
+        number.bounded_subtract_product(product)
     }
 
     #[inline(always)]
-    fn more_and_less<N: Number>(number: N, more: N::Wide, less: N::Wide) -> N {
-        number.bounded_more(N::bounded_minus(more, less))
+    fn add_and_subtract<N: Number>(number: N, more: N::WideSum, less: N::WideSum) -> N {
+        number.bounded_add_product(N::bounded_minus(more, less))
     }
 
     #[inline(always)]

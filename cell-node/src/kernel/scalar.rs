@@ -4,7 +4,7 @@ use core::fmt::Debug;
 use core::marker::PhantomData;
 use core::ops::{Add, Mul, Neg, Sub};
 
-use protocol::fixed::{Acc, Q1_14};
+use protocol::fixed::{Accumulator, Q1_14};
 
 use crate::sine::{FINE_FRACTION_BITS, fine_sine_cosine, sine_cosine};
 
@@ -22,67 +22,67 @@ pub trait Scalar: Copy {
 /// For words, each sum of products is rounded once; no other operation loses bits.
 pub trait Number: Copy + Debug + PartialEq {
     /// A sum of products before rounding.
-    type Wide: Copy;
+    type WideSum: Copy;
     /// The type for constants, which are computed once when a kernel is created. For integers a constant is a number of
     /// steps; the size of a step is passed to [`Number::round_constant`].
-    type Fine: Copy
-        + Add<Output = Self::Fine>
-        + Sub<Output = Self::Fine>
-        + Mul<Output = Self::Fine>
-        + Neg<Output = Self::Fine>;
+    type FineNumber: Copy
+        + Add<Output = Self::FineNumber>
+        + Sub<Output = Self::FineNumber>
+        + Mul<Output = Self::FineNumber>
+        + Neg<Output = Self::FineNumber>;
 
     /// Converts a word of the parameters to a number.
-    fn word(word: Q1_14) -> Self;
+    fn from_word(word: Q1_14) -> Self;
     /// Returns zero.
     #[must_use]
     fn zero() -> Self {
-        Self::word(Q1_14::ZERO)
+        Self::from_word(Q1_14::ZERO)
     }
     /// Multiplies two numbers.
-    fn times(self, rhs: Self) -> Self::Wide;
+    fn times(self, rhs: Self) -> Self::WideSum;
     /// Converts a number to a sum.
-    fn widen(self) -> Self::Wide;
+    fn widen(self) -> Self::WideSum;
     /// Adds two sums.
-    fn plus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
+    fn plus(lhs: Self::WideSum, rhs: Self::WideSum) -> Self::WideSum;
     /// Subtracts two sums.
-    fn minus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
+    fn minus(lhs: Self::WideSum, rhs: Self::WideSum) -> Self::WideSum;
     /// Rounds a sum to the nearest number, ties up, with saturation.
-    fn round(sum: Self::Wide) -> Self;
+    fn round(sum: Self::WideSum) -> Self;
     /// Adds two products, or a number and a product, and rounds the sum. This is faster than [`Number::plus`] and
     /// [`Number::round`]. If both terms are products, one factor of each must be within [-1, 1], as sines are.
     #[must_use]
-    fn rounded_sum(lhs: Self::Wide, rhs: Self::Wide) -> Self {
+    fn rounded_sum(lhs: Self::WideSum, rhs: Self::WideSum) -> Self {
         Self::round(Self::plus(lhs, rhs))
     }
     /// Subtracts two products, or a product from a number, and rounds. The rule of [`Number::rounded_sum`] applies.
     #[must_use]
-    fn rounded_difference(lhs: Self::Wide, rhs: Self::Wide) -> Self {
+    fn rounded_difference(lhs: Self::WideSum, rhs: Self::WideSum) -> Self {
         Self::round(Self::minus(lhs, rhs))
     }
     /// Negates a number.
     #[must_use]
     fn negative(self) -> Self;
     /// Adds two sums whose result is known to fit a word.
-    fn bounded_plus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide {
+    fn bounded_plus(lhs: Self::WideSum, rhs: Self::WideSum) -> Self::WideSum {
         Self::plus(lhs, rhs)
     }
     /// Subtracts two sums whose result is known to fit a word.
-    fn bounded_minus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide {
+    fn bounded_minus(lhs: Self::WideSum, rhs: Self::WideSum) -> Self::WideSum {
         Self::minus(lhs, rhs)
     }
     /// Rounds a sum that is known to fit a word.
     #[must_use]
-    fn bounded(sum: Self::Wide) -> Self {
+    fn round_bounded(sum: Self::WideSum) -> Self {
         Self::round(sum)
     }
     /// Adds a product to the number and rounds, if the result is known to fit a word.
     #[must_use]
-    fn bounded_more(self, product: Self::Wide) -> Self {
+    fn bounded_add_product(self, product: Self::WideSum) -> Self {
         Self::round(Self::plus(self.widen(), product))
     }
     /// Subtracts a product from the number and rounds, if the result is known to fit a word.
     #[must_use]
-    fn bounded_less(self, product: Self::Wide) -> Self {
+    fn bounded_subtract_product(self, product: Self::WideSum) -> Self {
         Self::round(Self::minus(self.widen(), product))
     }
     /// Negates a number that is known not to be the smallest word.
@@ -101,11 +101,11 @@ pub trait Number: Copy + Debug + PartialEq {
     }
 
     /// Converts a word of the parameters for the computation of a constant.
-    fn fine(word: Q1_14) -> Self::Fine;
+    fn fine_from_word(word: Q1_14) -> Self::FineNumber;
     /// Returns the sine and cosine of an angle in quarter turns, and one, all in the same steps: 2^-28 for integers.
-    fn fine_turn(angle: Q1_14) -> [Self::Fine; 3];
+    fn fine_sine_cosine_one(angle: Q1_14) -> [Self::FineNumber; 3];
     /// Rounds a computed constant to a number. For integers, the constant is in steps of 2^-F.
-    fn round_constant<const F: u32>(constant: Self::Fine) -> Self;
+    fn round_constant<const F: u32>(constant: Self::FineNumber) -> Self;
 }
 
 /// A 16-bit number in the format Q1.14, for computations with [`Steps`].
@@ -121,7 +121,7 @@ pub trait Word: Copy + Debug + PartialEq {
         sine_cosine(angle)
     }
     /// Records an operation, if this type counts operations; else does nothing.
-    fn note(_operation: impl FnOnce(&mut Operations)) {}
+    fn record_operation(_operation: impl FnOnce(&mut Operations)) {}
 }
 
 /// Numbers of operations in a computation.
@@ -181,7 +181,7 @@ impl<W> Steps<W> {
     /// Converts a sum in steps of 2^-28 to steps of 2^-14, with saturation. The caller has added half a step of 2^-14
     /// for rounding.
     #[inline]
-    fn held(sum: i32) -> Self {
+    fn saturate_sum(sum: i32) -> Self {
         let steps = sum >> 14;
         let [low, high, ..] = steps.to_le_bytes();
         let fits = i32::from(i16::from_le_bytes([low, high])) == steps;
@@ -198,7 +198,7 @@ const fn to_steps(sum: i32) -> i32 {
 
 /// Checks in debug builds that steps fit a word.
 #[inline]
-fn within_word(steps: i32) -> i32 {
+fn debug_assert_fits_word(steps: i32) -> i32 {
     debug_assert!(i16::try_from(steps).is_ok(), "{steps} is no word");
     steps
 }
@@ -207,17 +207,17 @@ fn within_word(steps: i32) -> i32 {
 const HALF: i32 = 1 << 13;
 
 impl<W: Word> Number for Steps<W> {
-    type Wide = i32;
-    type Fine = i64;
+    type WideSum = i32;
+    type FineNumber = i64;
 
     #[inline]
-    fn word(word: Q1_14) -> Self {
+    fn from_word(word: Q1_14) -> Self {
         Self::new(word.to_bits().into())
     }
 
     #[inline]
     fn times(self, rhs: Self) -> i32 {
-        W::note(|done| done.multiplications += 1);
+        W::record_operation(|done| done.multiplications += 1);
         self.steps.wrapping_mul(rhs.steps) // at most 2^30
     }
 
@@ -228,70 +228,78 @@ impl<W: Word> Number for Steps<W> {
 
     #[inline]
     fn plus(lhs: i32, rhs: i32) -> i32 {
-        W::note(|done| done.additions += 1);
+        W::record_operation(|done| done.additions += 1);
         lhs.saturating_add(rhs)
     }
 
     #[inline]
     fn minus(lhs: i32, rhs: i32) -> i32 {
-        W::note(|done| done.additions += 1);
+        W::record_operation(|done| done.additions += 1);
         lhs.saturating_sub(rhs)
     }
 
     #[inline]
     fn round(sum: i32) -> Self {
-        W::note(|done| done.roundings += 1);
-        Self::held(sum.saturating_add(HALF))
+        W::record_operation(|done| done.roundings += 1);
+        Self::saturate_sum(sum.saturating_add(HALF))
     }
 
     /// The sum of a number and a product is at most 2^29 + 2^30 steps of 2^-28, so 32 bits suffice.
     #[inline]
     fn rounded_sum(lhs: i32, rhs: i32) -> Self {
-        W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
+        W::record_operation(|done| {
+            (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1)
+        });
         debug_assert!(lhs.checked_add(rhs).and_then(|sum| sum.checked_add(HALF)).is_some(), "{lhs} + {rhs}");
-        Self::held(lhs.wrapping_add(rhs).wrapping_add(HALF))
+        Self::saturate_sum(lhs.wrapping_add(rhs).wrapping_add(HALF))
     }
 
     #[inline]
     fn rounded_difference(lhs: i32, rhs: i32) -> Self {
-        W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
+        W::record_operation(|done| {
+            (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1)
+        });
         debug_assert!(lhs.checked_sub(rhs).and_then(|sum| sum.checked_add(HALF)).is_some(), "{lhs} - {rhs}");
-        Self::held(lhs.wrapping_sub(rhs).wrapping_add(HALF))
+        Self::saturate_sum(lhs.wrapping_sub(rhs).wrapping_add(HALF))
     }
 
     #[inline]
     fn bounded_plus(lhs: i32, rhs: i32) -> i32 {
-        W::note(|done| done.additions += 1);
+        W::record_operation(|done| done.additions += 1);
         lhs.wrapping_add(rhs)
     }
 
     #[inline]
     fn bounded_minus(lhs: i32, rhs: i32) -> i32 {
-        W::note(|done| done.additions += 1);
+        W::record_operation(|done| done.additions += 1);
         lhs.wrapping_sub(rhs)
     }
 
     #[inline]
-    fn bounded(sum: i32) -> Self {
-        W::note(|done| done.roundings += 1);
-        Self::new(within_word(to_steps(sum)))
+    fn round_bounded(sum: i32) -> Self {
+        W::record_operation(|done| done.roundings += 1);
+        Self::new(debug_assert_fits_word(to_steps(sum)))
     }
 
     #[inline]
-    fn bounded_more(self, product: i32) -> Self {
-        W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
-        Self::new(within_word(self.steps + to_steps(product)))
+    fn bounded_add_product(self, product: i32) -> Self {
+        W::record_operation(|done| {
+            (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1)
+        });
+        Self::new(debug_assert_fits_word(self.steps + to_steps(product)))
     }
 
     #[inline]
-    fn bounded_less(self, product: i32) -> Self {
-        W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
-        Self::new(within_word(self.steps + to_steps(product.wrapping_neg())))
+    fn bounded_subtract_product(self, product: i32) -> Self {
+        W::record_operation(|done| {
+            (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1)
+        });
+        Self::new(debug_assert_fits_word(self.steps + to_steps(product.wrapping_neg())))
     }
 
     #[inline]
     fn bounded_negative(self) -> Self {
-        W::note(|done| done.negations += 1);
+        W::record_operation(|done| done.negations += 1);
         debug_assert!(self.steps > -0x8000);
         Self::new(-self.steps)
     }
@@ -305,33 +313,33 @@ impl<W: Word> Number for Steps<W> {
     /// Negates the number. The smallest word becomes the largest.
     #[inline]
     fn negative(self) -> Self {
-        W::note(|done| done.negations += 1);
+        W::record_operation(|done| done.negations += 1);
         let negative = -self.steps;
         Self::new(if negative > 0x7FFF { 0x7FFF } else { negative })
     }
 
     #[inline]
     fn sine_cosine(angle: Q1_14) -> [Self; 2] {
-        W::note(|done| (done.sines, done.cosines) = (done.sines + 1, done.cosines + 1));
+        W::record_operation(|done| (done.sines, done.cosines) = (done.sines + 1, done.cosines + 1));
         W::sine_cosine(angle).map(Self::new)
     }
 
     #[inline]
     fn plus_angle(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
-        W::note(|done| done.angle_additions += 1);
+        W::record_operation(|done| done.angle_additions += 1);
         lhs.wrapping_add(rhs)
     }
 
-    fn fine(word: Q1_14) -> i64 {
+    fn fine_from_word(word: Q1_14) -> i64 {
         i64::from(word.to_bits())
     }
 
-    fn fine_turn(angle: Q1_14) -> [i64; 3] {
+    fn fine_sine_cosine_one(angle: Q1_14) -> [i64; 3] {
         let [sine, cosine] = fine_sine_cosine(angle);
         [sine, cosine, 1 << FINE_FRACTION_BITS]
     }
 
     fn round_constant<const F: u32>(constant: i64) -> Self {
-        Self::word(Acc::<F>::from_steps(constant).round())
+        Self::from_word(Accumulator::<F>::from_steps(constant).round())
     }
 }

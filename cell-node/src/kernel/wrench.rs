@@ -23,12 +23,12 @@ mod range;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
-use self::fold::fold;
+use self::fold::constant_wrench;
 use self::range::bound;
 use super::joint::Joint;
 use super::rounding::{Bounded, Rounding, Saturating};
-use super::{Kernel, Number, Scalar, Twist, chain, cold_path, length, settled_turn};
-use crate::contact::{MAX_J, TorqueRounding};
+use super::{Kernel, Number, Scalar, Twist, chain, cold_path, constant_sine_cosine, length};
+use crate::contact::{MAX_JACOBIAN_STEPS, TorqueRounding};
 
 /// The wrench kernel of one cell.
 ///
@@ -93,16 +93,16 @@ struct ChainLink<N> {
 /// Bits for the values to compute for a row, because its element of J or a row further down reads them.
 mod due {
     /// Single results of the turn: the x and y components of force and moment.
-    pub(super) const FX: u32 = 1;
-    pub(super) const FY: u32 = 2;
-    pub(super) const MX: u32 = 4;
-    pub(super) const MY: u32 = 8;
+    pub(super) const TURNED_FX: u32 = 1;
+    pub(super) const TURNED_FY: u32 = 2;
+    pub(super) const TURNED_MX: u32 = 4;
+    pub(super) const TURNED_MY: u32 = 8;
     /// All results of the turn.
-    pub(super) const ALL_ROTATION: u32 = FX | FY | MX | MY;
+    pub(super) const ALL_ROTATION: u32 = TURNED_FX | TURNED_FY | TURNED_MX | TURNED_MY;
     /// The shift of moments by d.
-    pub(super) const D: u32 = 16;
+    pub(super) const SHIFT_BY_D: u32 = 16;
     /// The shift of moments by a.
-    pub(super) const A: u32 = 32;
+    pub(super) const SHIFT_BY_A: u32 = 32;
     /// Single results of a twist that is not a multiple of quarter turns.
     pub(super) const TWISTED_FY: u32 = 64;
     pub(super) const TWISTED_FZ: u32 = 128;
@@ -121,7 +121,7 @@ mod due {
 }
 
 impl<S: Scalar> Wrench<S> {
-    /// Returns an upper bound of |J| in steps of 2^-14, for any joint positions; [`MAX_J`] if it is unknown.
+    /// Returns an upper bound of |J| in steps of 2^-14, for any joint positions; [`MAX_JACOBIAN_STEPS`] if it is unknown.
     #[must_use]
     pub const fn bound(&self) -> u16 {
         self.bound
@@ -140,8 +140,8 @@ impl<S: Scalar> Wrench<S> {
             contact: PerComponent { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] },
             links: const { [ChainLink::NOTHING; MAX_ROWS] },
             rows: 0,
-            bound: MAX_J,
-            rounding: TorqueRounding::new(TorqueFormat::default(), MAX_J),
+            bound: MAX_JACOBIAN_STEPS,
+            rounding: TorqueRounding::new(TorqueFormat::default(), MAX_JACOBIAN_STEPS),
         }
     }
 
@@ -158,7 +158,7 @@ impl<S: Scalar> Wrench<S> {
             link.joint = joint.unwrap_or(Joint::J14);
         }
         let nothing = PerComponent { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
-        let mut contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
+        let mut contact = chain.last().map_or(nothing, |last| constant_wrench(&parameters.pose, last));
         // Fold fixed rows between the cell and the joint that moves it.
         let mut rows = chain.len();
         let is_fixed = |row: Option<&Row>| row.is_some_and(|row| row.kind == RowKind::Fixed);
@@ -176,7 +176,7 @@ impl<S: Scalar> Wrench<S> {
         self.links.get_mut(..rows).unwrap_or_default().reverse();
         let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
         let below = chain.get(..rows.saturating_sub(1)).unwrap_or_default();
-        self.bound = if slides { None } else { bound(&contact, below) }.unwrap_or(MAX_J);
+        self.bound = if slides { None } else { bound(&contact, below) }.unwrap_or(MAX_JACOBIAN_STEPS);
         self.rounding = TorqueRounding::new(parameters.torque_format, self.bound);
         self.joint = if rows == 0 { 0 } else { parameters.joint.into() };
         (self.contact, self.rows) = (contact, rows);
@@ -193,8 +193,8 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
         let links = self.links.get(..self.rows).unwrap_or_default();
-        if self.bound < MAX_J {
-            down_bounded(self.contact, links, joints, jacobian);
+        if self.bound < MAX_JACOBIAN_STEPS {
+            write_jacobian_bounded(self.contact, links, joints, jacobian);
         } else {
             let moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
             let positions = joints.get(..self.joint).unwrap_or_default().iter().rev();
@@ -207,7 +207,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
 /// Carries the wrench of the contact down to the base and writes J, without saturation. It is for chains of revolute
 /// joints and fixed rows in which no number can leave the range of a word.
 #[inline(always)]
-fn down_bounded<S: Scalar>(
+fn write_jacobian_bounded<S: Scalar>(
     mut wrench: PerComponent<S::Number>,
     links: &[ChainLink<S::Number>],
     joints: &[Q1_14; MAX_JOINTS],
@@ -253,12 +253,14 @@ fn down_saturating<'a, S: Scalar + 'a>(
         }
         let slide = (link.kind == RowKind::Prismatic).then_some(position);
         if index > 0 {
-            let d = slide
-                .map_or_else(|| link.own_d(), |slide| Some(S::Number::word(link.d.saturating_add(slide))));
+            let d = slide.map_or_else(
+                || link.own_d(),
+                |slide| Some(S::Number::from_word(link.d.saturating_add(slide))),
+            );
             link.twist_and_shift::<Saturating>(&mut wrench, d);
         } else if let Some(slide) = slide {
             // The own row is folded without the position of its joint.
-            let d = Some(S::Number::word(slide));
+            let d = Some(S::Number::from_word(slide));
             ChainLink::shift::<Saturating>(&mut wrench, d, None);
         }
         let PerComponent { force: [.., force], moment: [.., moment] } = wrench;
@@ -288,11 +290,12 @@ impl<N: Number> ChainLink<N> {
         let twist = Twist::new(row.alpha);
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
         let turns = row.kind == RowKind::Revolute;
-        let constant = (!turns && row.theta_offset != Q1_14::ZERO).then(|| settled_turn(row.theta_offset));
+        let constant =
+            (!turns && row.theta_offset != Q1_14::ZERO).then(|| constant_sine_cosine(row.theta_offset));
         let slides = row.kind == RowKind::Prismatic;
 
         // Backwards: the turn, the shift (whose m_z is J), the twist.
-        let shifted = if turns || constant.is_some() { read.map(before_turn) } else { read };
+        let shifted = if turns || constant.is_some() { read.map(needed_before_turn) } else { read };
         let ([fx, fy, mut fz], [mx, my, mut mz]) = (shifted.force, shifted.moment);
         (fz, mz) = (fz || slides, mz || turns);
         let moves = slides || d;
@@ -303,12 +306,12 @@ impl<N: Number> ChainLink<N> {
         let [_, twisted_fy, twisted_fz] = twisted.force;
         let ([turned_fx, turned_fy, _], [turned_mx, turned_my, _]) = (read.force, read.moment);
         let due = [
-            (turned_fx, due::FX),
-            (turned_fy, due::FY),
-            (turned_mx, due::MX),
-            (turned_my, due::MY),
-            ((mx || my) && moves, due::D),
-            ((my || mz) && a, due::A),
+            (turned_fx, due::TURNED_FX),
+            (turned_fy, due::TURNED_FY),
+            (turned_mx, due::TURNED_MX),
+            (turned_my, due::TURNED_MY),
+            ((mx || my) && moves, due::SHIFT_BY_D),
+            ((my || mz) && a, due::SHIFT_BY_A),
             (twisted_fy, due::TWISTED_FY),
             (twisted_fz, due::TWISTED_FZ),
             (my, due::TWISTED_MY),
@@ -323,7 +326,7 @@ impl<N: Number> ChainLink<N> {
         let due = due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all });
         let (kind, offset) = (row.kind, row.theta_offset);
         let link = Self { kind, joint: Joint::J1, due, twist, a: row.a, d: row.d, offset, constant };
-        (link, twisted.map(|live| before_twist(twist, live)))
+        (link, twisted.map(|live| needed_before_twist(twist, live)))
     }
 
     fn is_due(&self, bit: u32) -> bool {
@@ -333,13 +336,13 @@ impl<N: Number> ChainLink<N> {
     /// Returns the offset d; `None` if no row reads the shift by d, or if d includes the position of a prismatic joint.
     #[inline(always)]
     fn own_d(&self) -> Option<N> {
-        self.is_due(due::D).then(|| N::word(self.d))
+        self.is_due(due::SHIFT_BY_D).then(|| N::from_word(self.d))
     }
 
     /// Returns the length a; `None` if no row reads the shift by a.
     #[inline(always)]
     fn own_a(&self) -> Option<N> {
-        self.is_due(due::A).then(|| N::word(self.a))
+        self.is_due(due::SHIFT_BY_A).then(|| N::from_word(self.a))
     }
 
     /// Transforms the wrench by `Tz(d) Tx(a) Rx(alpha)`.
@@ -397,17 +400,17 @@ impl<N: Number> ChainLink<N> {
         match (d, a) {
             (None, None) => {}
             (Some(d), None) => {
-                *mx = R::less(*mx, d.times(*fy));
-                *my = R::more(*my, d.times(*fx));
+                *mx = R::subtract_product(*mx, d.times(*fy));
+                *my = R::add_product(*my, d.times(*fx));
             }
             (None, Some(a)) => {
-                *my = R::less(*my, a.times(*fz));
-                *mz = R::more(*mz, a.times(*fy));
+                *my = R::subtract_product(*my, a.times(*fz));
+                *mz = R::add_product(*mz, a.times(*fy));
             }
             (Some(d), Some(a)) => {
-                *mx = R::less(*mx, d.times(*fy));
-                *my = R::more_and_less(*my, d.times(*fx), a.times(*fz));
-                *mz = R::more(*mz, a.times(*fy));
+                *mx = R::subtract_product(*mx, d.times(*fy));
+                *my = R::add_and_subtract(*my, d.times(*fx), a.times(*fz));
+                *mz = R::add_product(*mz, a.times(*fy));
             }
         }
     }
@@ -446,13 +449,13 @@ struct Rotation<N>([N; 2]);
 
 impl<N: Number> Rotation<N> {
     #[inline(always)]
-    fn x<R: Rounding>(&self, x: N, y: N) -> N {
+    fn rotated_x<R: Rounding>(&self, x: N, y: N) -> N {
         let Self([sine, cosine]) = self;
         R::difference(cosine.times(x), sine.times(y))
     }
 
     #[inline(always)]
-    fn y<R: Rounding>(&self, x: N, y: N) -> N {
+    fn rotated_y<R: Rounding>(&self, x: N, y: N) -> N {
         let Self([sine, cosine]) = self;
         R::sum(sine.times(x), cosine.times(y))
     }
@@ -462,8 +465,8 @@ impl<N: Number> Rotation<N> {
         &self,
         PerComponent { force: [fx, fy, _], moment: [mx, my, _] }: &mut PerComponent<N>,
     ) {
-        (*fx, *fy) = (self.x::<R>(*fx, *fy), self.y::<R>(*fx, *fy));
-        (*mx, *my) = (self.x::<R>(*mx, *my), self.y::<R>(*mx, *my));
+        (*fx, *fy) = (self.rotated_x::<R>(*fx, *fy), self.rotated_y::<R>(*fx, *fy));
+        (*mx, *my) = (self.rotated_x::<R>(*mx, *my), self.rotated_y::<R>(*mx, *my));
     }
 
     /// Computes only the results of the turn whose bits are set in `due`.
@@ -471,23 +474,23 @@ impl<N: Number> Rotation<N> {
     fn apply_due<R: Rounding>(&self, wrench: &mut PerComponent<N>, due: u32) {
         let PerComponent { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
         let PerComponent { force: [new_fx, new_fy, _], moment: [new_mx, new_my, _] } = wrench;
-        if due & due::FX != 0 {
-            *new_fx = self.x::<R>(fx, fy);
+        if due & due::TURNED_FX != 0 {
+            *new_fx = self.rotated_x::<R>(fx, fy);
         }
-        if due & due::FY != 0 {
-            *new_fy = self.y::<R>(fx, fy);
+        if due & due::TURNED_FY != 0 {
+            *new_fy = self.rotated_y::<R>(fx, fy);
         }
-        if due & due::MX != 0 {
-            *new_mx = self.x::<R>(mx, my);
+        if due & due::TURNED_MX != 0 {
+            *new_mx = self.rotated_x::<R>(mx, my);
         }
-        if due & due::MY != 0 {
-            *new_my = self.y::<R>(mx, my);
+        if due & due::TURNED_MY != 0 {
+            *new_my = self.rotated_y::<R>(mx, my);
         }
     }
 }
 
 /// Returns the components before a twist that are needed to compute the given components after it.
-fn before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
+fn needed_before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
     match twist {
         Twist::None | Twist::Half => [x, y, z],
         Twist::Ahead | Twist::Back => [x, z, y],
@@ -496,6 +499,6 @@ fn before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
 }
 
 /// Returns the components before a turn about z that are needed to compute the given components after it.
-fn before_turn([x, y, z]: [bool; 3]) -> [bool; 3] {
+fn needed_before_turn([x, y, z]: [bool; 3]) -> [bool; 3] {
     [x || y, x || y, z]
 }

@@ -22,7 +22,7 @@ use heapless::Deque;
 use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::packet::Epoch;
-use protocol::port::{Hello, PORTS, PortMessage, Rank, UPLINK};
+use protocol::port::{Hello, PORTS, PortMessage, TreeRank, UPLINK};
 use protocol::time::{Micros, Span};
 
 use crate::phase;
@@ -57,7 +57,7 @@ pub(crate) enum LossReason {
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct Parent {
     port: usize,
-    rank: Rank,
+    rank: TreeRank,
 }
 
 /// A neighbour that was the parent until this cell left it.
@@ -73,10 +73,10 @@ struct FormerParent {
 
 impl FormerParent {
     const fn new(port: usize, heard: bool, now: Micros) -> Self {
-        Self { port, acknowledged: heard, since: now, resend_at: Self::next(port, now) }
+        Self { port, acknowledged: heard, since: now, resend_at: Self::next_resend_time(port, now) }
     }
 
-    const fn next(port: usize, now: Micros) -> Micros {
+    const fn next_resend_time(port: usize, now: Micros) -> Micros {
         Micros(now.0 + if port == UPLINK { LEAVE_INTERVAL.0 } else { HELLO_INTERVAL.0 })
     }
 }
@@ -91,9 +91,9 @@ pub(crate) struct Network {
     ports: [Port; ALL_PORTS],
     parent: Option<Parent>,
     /// The best rank that this cell has ever had. It accepts a parent only with a better rank.
-    best: Option<Rank>,
+    best: Option<TreeRank>,
     /// The rank that this cell announced last.
-    announced: Option<Rank>,
+    announced: Option<TreeRank>,
     joining: Option<(usize, Micros)>,
     /// True while sums are sent. The cell then keeps its parent unless it loses it.
     pub(crate) busy: bool,
@@ -124,7 +124,7 @@ impl Network {
     /// Sets the ports that have wires. The serial number spreads the hellos of many cells over time.
     pub(crate) fn set_wired_ports(&mut self, wired: u8, number: Option<CellId>, serial: u32) {
         (self.wired, self.node_ids.own) = (wired, number);
-        self.next_hello = self.next_hello + phase::by_serial(HELLO_INTERVAL, serial);
+        self.next_hello = self.next_hello + phase::offset_by_serial(HELLO_INTERVAL, serial);
     }
 
     /// Returns true if the cell has wires.
@@ -148,7 +148,7 @@ impl Network {
     }
 
     /// Returns the rank that this cell announces to cells below it.
-    fn rank(&self) -> Option<Rank> {
+    fn rank(&self) -> Option<TreeRank> {
         self.parent.map(|parent| parent.rank.child())
     }
 
@@ -195,12 +195,12 @@ impl Network {
     }
 
     /// Returns a mask of the children: bit p is set if the cell at port p is a child.
-    pub(crate) fn children(&self) -> u8 {
+    pub(crate) fn child_mask(&self) -> u8 {
         self.port_mask(Port::is_child)
     }
 
     /// Returns a mask of the working ports: bit p is set if port p works in both directions.
-    pub(crate) fn working(&self, now: Micros) -> u8 {
+    pub(crate) fn working_port_mask(&self, now: Micros) -> u8 {
         self.port_mask(|port| port.works(now))
     }
 
@@ -326,14 +326,14 @@ impl Network {
             Some(parent) if parent.port == port => match hello.rank {
                 _ if !hello.receives => self.lose_parent(now, LossReason::Unsure),
                 // The parent is as near as before, nearer, or of a later round.
-                Some(rank) if !parent.rank.is_better_than(rank) => self.follow(now, port, rank),
+                Some(rank) if !parent.rank.is_better_than(rank) => self.set_parent(now, port, rank),
                 // The parent is unreachable and repairs its route. This cell helps, and its sums are NACKed
                 // meanwhile.
                 None => self.forward_repair(now, port, parent.rank.round),
                 // The parent restarted.
                 Some(_) => self.lose_parent(now, LossReason::Unsure),
             },
-            Some(parent) => self.improve(now, port, parent),
+            Some(parent) => self.join_better_parent(now, port, parent),
             None => self.search(now),
         }
     }
@@ -341,10 +341,10 @@ impl Network {
     /// Sends now the hellos that would be due by the time `until`, so that the cell need not wake up for them.
     pub(crate) fn send_hellos_due_by(&mut self, now: Micros, until: Micros) {
         if self.has_wires() && until >= self.next_hello {
-            self.next_hello = phase::next(self.next_hello, HELLO_INTERVAL, now);
-            let before = self.children();
-            self.ports.iter_mut().for_each(|port| port.expire(now));
-            self.tree_changed |= before != self.children();
+            self.next_hello = phase::next_due(self.next_hello, HELLO_INTERVAL, now);
+            let before = self.child_mask();
+            self.ports.iter_mut().for_each(|port| port.expire_child(now));
+            self.tree_changed |= before != self.child_mask();
             self.send_hellos(now);
         }
     }
@@ -366,7 +366,7 @@ impl Network {
             self.unacknowledged_former_parent().filter(|former_parent| now >= former_parent.resend_at)
         {
             self.former_parent = Some(FormerParent {
-                resend_at: FormerParent::next(former_parent.port, now),
+                resend_at: FormerParent::next_resend_time(former_parent.port, now),
                 ..former_parent
             });
             self.send(former_parent.port, PortMessage::Leave);
@@ -388,7 +388,7 @@ impl Network {
     }
 
     /// Announces to the parent that it is to receive the sums from this epoch on.
-    pub(crate) fn state(&mut self, epoch: Epoch) {
+    pub(crate) fn send_state(&mut self, epoch: Epoch) {
         if let Some(up) = self.parent_port().filter(|up| *up != UPLINK) {
             self.send(up, PortMessage::State(epoch));
         }

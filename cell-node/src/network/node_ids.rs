@@ -1,7 +1,7 @@
 //! Assignment of node ids to cells without one, in a depth-first walk over the tree.
 
 use protocol::id::CellId;
-use protocol::port::{PORTS, PortMessage, Walk};
+use protocol::port::{NodeIdWalk, PORTS, PortMessage};
 use protocol::time::Micros;
 
 use super::Network;
@@ -15,7 +15,7 @@ pub(super) struct NodeIds {
     /// The node id that a walk has assigned to this cell and that has not been read yet.
     pub(super) given: Option<CellId>,
     /// The walk in progress below this cell, and the port of the child that it is at.
-    walking: Option<(Walk, usize)>,
+    walking: Option<(NodeIdWalk, usize)>,
     last_walk: Option<u8>,
     was_unnumbered: bool,
 }
@@ -27,7 +27,7 @@ impl Network {
 
     /// Starts a walk at this cell: the cell takes the first free node id if it has none. The walk then visits each
     /// child in turn.
-    pub(super) fn begin_walk(&mut self, now: Micros, mut walk: Walk) {
+    pub(super) fn begin_walk(&mut self, now: Micros, mut walk: NodeIdWalk) {
         if self.node_ids.last_walk.replace(walk.walk) == Some(walk.walk) {
             return;
         }
@@ -43,13 +43,13 @@ impl Network {
         self.walk_from(0, walk);
     }
 
-    pub(super) fn continue_walk(&mut self, port: usize, walk: Walk) {
+    pub(super) fn continue_walk(&mut self, port: usize, walk: NodeIdWalk) {
         if self.node_ids.walking.is_some_and(|(of, at)| at == port && of.walk == walk.walk) {
             self.walk_from(port + 1, walk);
         }
     }
 
-    fn walk_from(&mut self, first: usize, walk: Walk) {
+    fn walk_from(&mut self, first: usize, walk: NodeIdWalk) {
         let wants = |port: &usize| self.ports.get(*port).is_some_and(Port::is_unnumbered);
         let next = (first..PORTS).find(wants).filter(|_| walk.first <= walk.last);
         self.node_ids.walking = next.map(|at| (walk, at));

@@ -2,7 +2,7 @@
 
 use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
-use protocol::port::{Hello, Rank};
+use protocol::port::{Hello, TreeRank};
 use protocol::time::{Micros, Span};
 
 /// Time without a hello after which a port counts as disconnected: two hello intervals and some jitter.
@@ -51,7 +51,7 @@ impl Port {
     }
 
     /// Returns the rank of the cell at the other end; `None` if that cell cannot be a parent.
-    pub(super) fn rank(&self, now: Micros) -> Option<Rank> {
+    pub(super) fn rank(&self, now: Micros) -> Option<TreeRank> {
         let at = self.last_hello.map(|(_, at)| at)?;
         let trusted = self.distrusted.is_none_or(|since| at > since);
         self.hello(now).filter(|_| trusted && self.works(now) && self.child.is_none()).and_then(|it| it.rank)
@@ -80,7 +80,7 @@ impl Port {
     }
 
     /// Ends the role of the other end as a child if its hellos have stopped.
-    pub(super) fn expire(&mut self, now: Micros) {
+    pub(super) fn expire_child(&mut self, now: Micros) {
         if self.hello(now).is_none() {
             self.child = None;
         }

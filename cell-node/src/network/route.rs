@@ -1,6 +1,6 @@
 //! The route to the root: how a cell joins, follows and leaves a parent, and accepts joins of children.
 
-use protocol::port::{PortMessage, Rank, UPLINK};
+use protocol::port::{PortMessage, TreeRank, UPLINK};
 use protocol::time::{Micros, Span};
 
 use super::port::Port;
@@ -13,7 +13,7 @@ impl Network {
     }
 
     /// Sends a join to a port whose depth is less than the parent's, if the change loses no sums.
-    pub(super) fn improve(&mut self, now: Micros, port: usize, parent: Parent) {
+    pub(super) fn join_better_parent(&mut self, now: Micros, port: usize, parent: Parent) {
         let rank = self.ports.get(port).and_then(|port| port.rank(now));
         let nearer = rank.is_some_and(|rank| rank.is_better_than(parent.rank));
         if nearer && self.may_move() && self.joining.is_none() {
@@ -24,7 +24,7 @@ impl Network {
 
     /// Sets the parent and its rank. The cell announces a new depth on all ports, but a new round only to children and
     /// unreachable cells, so that a round costs one message per cell instead of one per port.
-    pub(super) fn follow(&mut self, now: Micros, port: usize, rank: Rank) {
+    pub(super) fn set_parent(&mut self, now: Micros, port: usize, rank: TreeRank) {
         let before = self.parent.replace(Parent { port, rank });
         if before == self.parent {
             return;
@@ -63,17 +63,17 @@ impl Network {
         self.send(port, PortMessage::Grant(rank));
     }
 
-    fn is_good(&self, rank: Rank) -> bool {
+    fn is_better_than_best(&self, rank: TreeRank) -> bool {
         self.best.is_none_or(|best| rank.is_better_than(best))
     }
 
     /// Handles a grant, with which the cell at a port becomes the parent.
-    pub(super) fn handle_grant(&mut self, now: Micros, port: usize, rank: Rank) {
+    pub(super) fn handle_grant(&mut self, now: Micros, port: usize, rank: TreeRank) {
         if self.parent_port() == Some(port) {
             return;
         }
         let moves = self.parent.is_none_or(|parent| self.may_move() && rank.is_better_than(parent.rank));
-        if !moves || !self.is_good(rank) {
+        if !moves || !self.is_better_than_best(rank) {
             return self.send(port, PortMessage::Leave);
         }
         if let Some(before) = self.parent {
@@ -83,7 +83,7 @@ impl Network {
         self.joining = None;
         self.repair = None;
         self.changes = self.changes.wrapping_add(1);
-        self.follow(now, port, rank);
+        self.set_parent(now, port, rank);
         if port == UPLINK {
             // The gateway's side accepts sums from then on.
             self.send_hello(now, port);
@@ -119,7 +119,7 @@ impl Network {
             self.reject_port(now, requested);
         }
         let ranked = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.rank(now)?)));
-        let good = ranked().filter(|(_, rank)| self.is_good(*rank));
+        let good = ranked().filter(|(_, rank)| self.is_better_than_best(*rank));
         let nearest =
             good.reduce(|nearest, next| if next.1.is_better_than(nearest.1) { next } else { nearest });
         if let Some((port, _)) = nearest {

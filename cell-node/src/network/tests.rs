@@ -1,5 +1,5 @@
 use super::*;
-use protocol::port::Walk;
+use protocol::port::NodeIdWalk;
 
 const MS: u64 = 1_000;
 
@@ -21,16 +21,16 @@ fn asked(network: &mut Network) -> Vec<(usize, PortMessage)> {
     messages
 }
 
-const fn rank(round: u8, depth: u8) -> Rank {
-    Rank { round, depth }
+const fn rank(round: u8, depth: u8) -> TreeRank {
+    TreeRank { round, depth }
 }
 
-fn neighbour(number: u8, rank: Option<Rank>) -> Hello {
+fn neighbour(number: u8, rank: Option<TreeRank>) -> Hello {
     Hello { version: VERSION, number, port: 3, receives: true, is_parent: false, unnumbered: false, rank }
 }
 
 /// Returns a cell that has joined a parent of this rank at port 0, at a time in ms.
-fn below(at: u64, parent: Rank) -> Network {
+fn below(at: u64, parent: TreeRank) -> Network {
     let mut network = network(0b1111);
     network.handle(Micros(at * MS), 0, PortMessage::Hello(neighbour(1, Some(parent))));
     assert_eq!(asked(&mut network), [(0, PortMessage::Join)]);
@@ -72,7 +72,7 @@ fn a_port_leads_to_the_cell_whose_hellos_come_there() {
 fn only_the_parent_refuses_a_child_and_begins_a_walk() {
     let now = Micros(100 * MS);
     let mut network = below(100, rank(1, 1));
-    let walk = Walk { walk: 1, first: 20, last: 30 };
+    let walk = NodeIdWalk { walk: 1, first: 20, last: 30 };
     network.handle(now, 1, PortMessage::Refuse);
     network.handle(now, 1, PortMessage::NodeId(walk));
     assert_eq!((said(&mut network), network.parent_port()), (vec![], Some(0)));
@@ -115,14 +115,14 @@ fn of_a_cell_that_is_wired_twice_the_latest_wire_counts() {
     let mut network = below(100, rank(1, 1));
     adopt(&mut network, now, 1, 7);
     adopt(&mut network, now, 2, 8);
-    assert_eq!(network.children(), 0b0110);
+    assert_eq!(network.child_mask(), 0b0110);
     adopt(&mut network, now, 3, 7);
-    assert_eq!(network.children(), 0b1100);
+    assert_eq!(network.child_mask(), 0b1100);
     // Cells without a node id count as different cells.
     let mut network = below(100, rank(1, 1));
     adopt(&mut network, now, 1, 0);
     adopt(&mut network, now, 2, 0);
-    assert_eq!(network.children(), 0b0110);
+    assert_eq!(network.child_mask(), 0b0110);
 }
 
 // JOIN-4
@@ -248,10 +248,10 @@ fn a_walk_goes_to_the_children_below_which_a_cell_has_no_node_id() {
     assert_eq!(unnumbered(&mut network, 2, false), (false, None));
     assert_eq!(unnumbered(&mut network, 3, true), (false, None), "no child");
     assert_eq!(unnumbered(&mut network, 2, true), (true, Some(true)));
-    let walk = Walk { walk: 1, first: 20, last: 30 };
+    let walk = NodeIdWalk { walk: 1, first: 20, last: 30 };
     network.handle(now, 0, PortMessage::NodeId(walk));
     assert_eq!(said(&mut network), [(2, PortMessage::NodeId(walk))]);
-    let rest = Walk { first: 21, ..walk };
+    let rest = NodeIdWalk { first: 21, ..walk };
     network.handle(now, 2, PortMessage::Return(rest));
     assert_eq!(said(&mut network), [(0, PortMessage::Return(rest))]);
     assert_eq!(unnumbered(&mut network, 2, false), (false, Some(false)));

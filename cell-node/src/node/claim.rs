@@ -44,7 +44,7 @@ pub(super) struct AddressClaim {
 impl AddressClaim {
     /// Starts a claim. Without a node id, the claim is never sent.
     pub(super) fn new(identity: Identity, now: Micros) -> Self {
-        let wait = phase::by_serial(FIRST_HEARTBEAT_SPREAD, identity.serial);
+        let wait = phase::offset_by_serial(FIRST_HEARTBEAT_SPREAD, identity.serial);
         let next_heartbeat = identity.cell.map_or(Micros(u64::MAX), |_| now + wait);
         Self {
             stage: ClaimStage::Unsent,
@@ -67,21 +67,21 @@ impl Node {
         let Some(cell) = self.identity.cell.filter(|_| now >= self.claim.next_heartbeat) else { return };
         if self.claim.stage == ClaimStage::Unsent {
             self.claim.stage = ClaimStage::Sent;
-            self.claim.next_heartbeat = now + CLAIM_TIME + phase::by_number(HEARTBEAT_INTERVAL, cell);
+            self.claim.next_heartbeat = now + CLAIM_TIME + phase::offset_by_node_id(HEARTBEAT_INTERVAL, cell);
             return self.push_heartbeat();
         }
         self.claim.stage = ClaimStage::Settled;
-        self.regular_heartbeat(now);
+        self.send_regular_heartbeat(now);
     }
 
     /// Sends a heartbeat, and all pages that have changed, four times a second.
-    pub(super) fn regular_heartbeat(&mut self, now: Micros) {
+    pub(super) fn send_regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
         self.report_with_heartbeat(now);
         let pages = self.sensing.heartbeat_pages(now);
         self.push_sensors(pages);
-        self.beat_zero();
-        self.claim.next_heartbeat = phase::next(self.claim.next_heartbeat, HEARTBEAT_INTERVAL, now);
+        self.report_zero_with_heartbeat();
+        self.claim.next_heartbeat = phase::next_due(self.claim.next_heartbeat, HEARTBEAT_INTERVAL, now);
     }
 
     /// Handles a frame that another cell has sent with this cell's node id. During its claim, this cell gives way,

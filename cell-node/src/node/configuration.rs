@@ -12,7 +12,7 @@ use crate::kernel::Wrench;
 
 /// The parameters in use, with the kernel prepared from them.
 #[derive(Debug)]
-pub(super) struct InUse {
+pub(super) struct ActiveParameters {
     /// The parameters.
     pub(super) parameters: Parameters,
     /// The kernel.
@@ -26,7 +26,7 @@ pub(super) struct Configuration {
     is_configured: bool,
     /// The parameters in use; valid only if the cell is configured. This is not an `Option`, because a new value of an
     /// `Option` would be built on the stack and copied.
-    in_use: InUse,
+    in_use: ActiveParameters,
     staged: Parameters,
 }
 
@@ -35,7 +35,7 @@ impl Configuration {
     #[inline(never)]
     pub(super) fn new() -> Self {
         let parameters = Parameters::default();
-        let in_use = InUse { parameters, kernel: Wrench::empty(), hash: 0 };
+        let in_use = ActiveParameters { parameters, kernel: Wrench::empty(), hash: 0 };
         Self { is_configured: false, in_use, staged: parameters }
     }
 
@@ -47,7 +47,7 @@ impl Configuration {
     }
 
     /// Returns the parameters in use; `None` if the cell is not configured.
-    pub(super) fn in_use(&self) -> Option<&InUse> {
+    pub(super) fn in_use(&self) -> Option<&ActiveParameters> {
         self.is_configured.then_some(&self.in_use)
     }
 
@@ -69,7 +69,7 @@ impl Configuration {
 
     /// Returns the staged parameters for a commit with this hash. Returns the reason of a refusal if they are invalid
     /// or have another hash.
-    pub(super) fn staged_with(&self, [hash, ..]: [i16; WORDS]) -> Result<&Parameters, i16> {
+    pub(super) fn staged_for_commit(&self, [hash, ..]: [i16; WORDS]) -> Result<&Parameters, i16> {
         self.staged.check().map_err(ParameterError::code)?;
         if self.staged.hash() == hash.cast_unsigned() { Ok(&self.staged) } else { Err(Answer::WRONG_HASH) }
     }
@@ -84,7 +84,7 @@ impl Configuration {
     }
 }
 
-impl InUse {
+impl ActiveParameters {
     /// Returns the packet length of joints, torques and sums for this chain.
     pub(super) fn length(&self) -> Length {
         Length::for_joints(self.parameters.joints.into())

@@ -24,7 +24,7 @@ use heapless::Deque;
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q7_8;
 use protocol::id::{Command, Id, Kind, Node as Address};
-use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, ReceivedCounts, SensorPage, State};
+use protocol::message::{Joints, Message, NetworkPage, ReceivedCounts, SensorPage, State, StimulusStart};
 use protocol::packet::{self, Epoch, Length, Lengths, Packet};
 use protocol::port::{PORTS, PortMessage};
 use protocol::time::{Micros, Span};
@@ -36,11 +36,11 @@ use crate::identity::{Identity, OWN_IDS};
 use crate::kernel::Kernel;
 use crate::sum::SumWords;
 use claim::AddressClaim;
-use configuration::{Configuration, InUse};
-use parameters::{PendingStore, Switches};
+use configuration::{ActiveParameters, Configuration};
+use parameters::{PendingStore, VolatileParameters};
 use receiver::Receiver;
-use rest::Rest;
-use sensing::{Pages, Sensing};
+use rest::RestState;
+use sensing::{DuePages, Sensing};
 use stimuli::{Arrival, Stimuli};
 use summing::Summing;
 use zero::ReportedBaseline;
@@ -59,7 +59,7 @@ pub struct Node {
     identity: Identity,
     claim: AddressClaim,
     configuration: Configuration,
-    switches: Switches,
+    switches: VolatileParameters,
     stimuli: Stimuli,
     baseline: Baseline,
     reported: ReportedBaseline,
@@ -72,7 +72,7 @@ pub struct Node {
     /// Epoch of the last joints that the cell accepted.
     epoch: Option<Epoch>,
     active: bool,
-    rest: Rest,
+    rest: RestState,
     storing: Option<PendingStore>,
     outbox: Deque<Message, OUTBOX_CAPACITY>,
     sent: u16,
@@ -98,7 +98,7 @@ impl Node {
             identity,
             claim: AddressClaim::new(identity, now),
             configuration: Configuration::new(),
-            switches: Switches::default(),
+            switches: VolatileParameters::default(),
             stimuli: Stimuli::default(),
             baseline: Baseline::default(),
             reported: ReportedBaseline::default(),
@@ -109,7 +109,7 @@ impl Node {
             flags: State::default().with(State::TEST_MODE, test_mode),
             epoch: None,
             active: false,
-            rest: Rest::default(),
+            rest: RestState::default(),
             storing: None,
             outbox: Deque::new(),
             sent: 0,
@@ -202,7 +202,7 @@ impl Node {
     /// Returns the identifiers that this cell receives in its present state. The caller reads them again whenever
     /// [`Node::poll_received_ids`] returns true.
     pub fn received_ids(&self) -> impl Iterator<Item = Id> + use<'_> {
-        self.slots().flatten()
+        self.received_id_slots().flatten()
     }
 
     /// Returns true if frames with an identifier need not wake the cell (deferred receive), provided that the cell gets
@@ -219,11 +219,11 @@ impl Node {
 
     /// Returns the packet length of joints, torques and sums; `None` if the cell is not configured.
     fn length(&self) -> Option<Length> {
-        self.configuration.in_use().map(InUse::length)
+        self.configuration.in_use().map(ActiveParameters::length)
     }
 
     /// Returns the identifier for each of the [`HEARD`] reassembly buffers.
-    fn slots(&self) -> impl Iterator<Item = Option<Id>> + use<'_> {
+    fn received_id_slots(&self) -> impl Iterator<Item = Option<Id>> + use<'_> {
         let sums = self.summing.received.iter().map(|cell| Some(Id::new(Kind::Sum, Address::Cell((*cell)?))));
         self.identity.received_ids().into_iter().chain(sums)
     }
@@ -231,7 +231,7 @@ impl Node {
     /// Handles timers that are due at `now`. Does nothing if called early.
     pub fn handle_timeout(&mut self, now: Micros) {
         self.summing.handle_time(now);
-        self.after_network(now);
+        self.apply_network_changes(now);
         self.handle_sums(now);
         self.send_due_pages(now);
         self.send_due_heartbeat(now);
@@ -244,7 +244,7 @@ impl Node {
             increment(&mut self.receiver.refused.foreign);
             return;
         };
-        let Some(slot) = self.slots().position(|heard| heard == Some(id)) else { return };
+        let Some(slot) = self.received_id_slots().position(|heard| heard == Some(id)) else { return };
         let lengths = Lengths::for_chain(self.length());
         let Some(packet) = self.receiver.receive(now - age, id, slot, lengths, frame) else { return };
         match Message::decode(&packet) {
@@ -255,7 +255,7 @@ impl Node {
 
     fn handle_message(&mut self, now: Micros, age: Span, message: Message) {
         if !matches!(message, Message::Joints { .. } | Message::Sync | Message::Report) {
-            self.rest.end();
+            self.rest.end_rest();
         }
         match message {
             Message::Joints { epoch, joints } => {
@@ -286,7 +286,7 @@ impl Node {
             Message::Report => {
                 self.push_network(NetworkPage::Received(self.received));
                 self.push_network(NetworkPage::Rejected(self.receiver.refused));
-                self.push_sensors(Pages::ALL);
+                self.push_sensors(DuePages::ALL);
                 self.push_zero();
                 if self.summing.network.has_wires() {
                     self.push_tree(now);
@@ -335,7 +335,7 @@ impl Node {
         }
         if in_use.is_some_and(|in_use| age > in_use.period()) {
             increment(&mut self.received.joints_late);
-            self.rest.end();
+            self.rest.end_rest();
             return self.summing.sum.skip_epoch();
         }
         increment(&mut self.received.joints);
@@ -353,7 +353,7 @@ impl Node {
         };
         if self.summing.sum.is_enabled() {
             self.active = torque.is_some();
-            self.summing.begin(now, age, (epoch, in_use.period()), torque);
+            self.summing.begin_epoch(now, age, (epoch, in_use.period()), torque);
             return self.handle_sums(now);
         }
         self.answer_joints(epoch, torque);
@@ -365,7 +365,7 @@ impl Node {
         let torque = match torque {
             Some(torque) => {
                 self.active = true;
-                torque.words_by(in_use.kernel.rounding())
+                torque.rounded_words(in_use.kernel.rounding())
             }
             None if core::mem::take(&mut self.active) => Default::default(),
             // A pending stimulus, or a zero that follows the sensor, may change the contact state at any
@@ -389,11 +389,11 @@ impl Node {
         self.summing.network.send_hellos_due_by(now, next_joints);
         self.report_tree(now);
         if self.claim.is_settled() && next_joints > self.claim.next_heartbeat {
-            self.regular_heartbeat(now);
+            self.send_regular_heartbeat(now);
         }
     }
 
-    fn handle_stimulus(&mut self, from: AppliesFrom, page: SensorPage) {
+    fn handle_stimulus(&mut self, from: StimulusStart, page: SensorPage) {
         let obeys = self.flags.has(State::TEST_MODE);
         let arrival = if obeys { self.stimuli.push(from, page, self.epoch) } else { Arrival::Refused };
         match arrival {

@@ -3,7 +3,7 @@
 use protocol::message::{Answer, Message, Request, State, VERSION};
 use protocol::packet::WORDS;
 use protocol::parameters::{
-    Abilities, Baseline, Events, LinksDown, Parameter, Parameters, Reply, Sensing, Tare,
+    Abilities, Baseline, Events, LinksDown, Parameter, Parameters, Reply, Sensing, TareCommand,
 };
 use protocol::time::Micros;
 
@@ -12,7 +12,7 @@ use crate::baseline::TareRefused;
 
 /// Volatile parameters that are set at run time: 6 to 9.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Switches {
+pub(super) struct VolatileParameters {
     /// The message with which the cell replies to joints.
     reply: Reply,
     /// The times at which the cell sends measurements.
@@ -44,7 +44,7 @@ impl Node {
             (None, _) => Err(Answer::UNKNOWN_PARAMETER),
             (Some(parameter), Request::Read { .. }) => Ok(self.read(parameter)),
             (Some(Parameter::Commit), Request::Write { words, .. }) => {
-                match self.configuration.staged_with(words) {
+                match self.configuration.staged_for_commit(words) {
                     Ok(parameters) => {
                         self.storing = Some(PendingStore::Parameters(*parameters, tag));
                         return;
@@ -70,7 +70,7 @@ impl Node {
             self.flags = self.flags.with(State::FLASH_DAMAGED, false);
         }
         self.storing = None;
-        let hash = || padded([self.configuration.hash().cast_signed()]);
+        let hash = || pad_with_zeros([self.configuration.hash().cast_signed()]);
         let words = written.then(hash).ok_or(Answer::FLASH_FAILED);
         self.answer(tag, Parameter::Commit.number(), true, words);
     }
@@ -88,13 +88,13 @@ impl Node {
     fn read(&self, parameter: Parameter) -> [i16; WORDS] {
         match parameter {
             Parameter::Identity => self.identity_words(),
-            Parameter::Mode => padded([self.flags.has(State::TEST_MODE).into()]),
+            Parameter::Mode => pad_with_zeros([self.flags.has(State::TEST_MODE).into()]),
             Parameter::Reply => self.switches.reply.words(),
             Parameter::Sensing => self.switches.sensing.words(),
             Parameter::Events => self.switches.events.words(),
             Parameter::LinksDown => self.switches.links_down.words(),
             Parameter::Baseline => self.baseline.rule().words(),
-            Parameter::Tare => padded([self.baseline.is_tared().into()]),
+            Parameter::Tare => pad_with_zeros([self.baseline.is_tared().into()]),
             Parameter::Mount
             | Parameter::Pose
             | Parameter::Contact
@@ -125,12 +125,12 @@ impl Node {
             }
             Parameter::Baseline => Baseline::from_words(words).map(|rule| self.baseline.set(rule)),
             Parameter::Tare => {
-                let how = Tare::from_words(words).ok_or(Answer::INVALID)?;
+                let how = TareCommand::from_words(words).ok_or(Answer::INVALID_WORDS)?;
                 let done = self.baseline.tare(&self.stimuli.sensed.skin, how);
                 return done.map(|()| self.read(parameter)).map_err(|why| match why {
-                    TareRefused::Off => Answer::INVALID,
-                    TareRefused::Touched => Answer::TOUCHED,
-                    TareRefused::Limit => Answer::BEYOND_LIMIT,
+                    TareRefused::Off => Answer::INVALID_WORDS,
+                    TareRefused::Touched => Answer::CELL_TOUCHED,
+                    TareRefused::Limit => Answer::ABOVE_BASELINE_LIMIT,
                 });
             }
             Parameter::Identity
@@ -146,13 +146,13 @@ impl Node {
             Reply::Torque => None,
             Reply::Sum(slots) => Some(slots),
         });
-        self.after_network(now);
-        set.ok_or(Answer::INVALID).map(|()| self.read(parameter))
+        self.apply_network_changes(now);
+        set.ok_or(Answer::INVALID_WORDS).map(|()| self.read(parameter))
     }
 
     fn identity_words(&self) -> [i16; WORDS] {
         let [a, b, c, d] = self.identity.serial.to_le_bytes();
-        padded([
+        pad_with_zeros([
             i16::from_le_bytes([a, b]),
             i16::from_le_bytes([c, d]),
             VERSION.into(),
@@ -164,7 +164,7 @@ impl Node {
 }
 
 /// Returns these words, padded with zeros.
-pub(super) fn padded<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
+pub(super) fn pad_with_zeros<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
     let mut first = first.into_iter();
     core::array::from_fn(|_| first.next().unwrap_or(0))
 }

@@ -6,21 +6,21 @@ const QUIET_JOINTS: u8 = 16;
 
 /// The state of a cell that may rest.
 #[derive(Debug, Default)]
-pub(super) struct Rest {
+pub(super) struct RestState {
     /// Number of consecutive joints without a reply, at most [`QUIET`].
     quiet: u8,
     /// True if the cell rested at the last poll.
     rests: bool,
 }
 
-impl Rest {
+impl RestState {
     /// Counts joints that arrived in time and needed no reply.
     pub(super) fn count_quiet(&mut self) {
         self.quiet = self.quiet.saturating_add(1).min(QUIET_JOINTS);
     }
 
     /// Ends the rest: joints wake the cell again.
-    pub(super) const fn end(&mut self) {
+    pub(super) const fn end_rest(&mut self) {
         self.quiet = 0;
     }
 

@@ -12,27 +12,27 @@
 
 use protocol::fixed::Q;
 use protocol::id::CellId;
-use protocol::message::{Message, Readings, SkinSensors};
+use protocol::message::{Message, SensorReadings, SkinSensors};
 use protocol::parameters::{Events, Sensing as Mode};
 use protocol::time::{Micros, Span};
-use protocol::touch::{Touch, contact_force};
+use protocol::touch::{TouchState, contact_force};
 
-use super::{Node, Switches};
+use super::{Node, VolatileParameters};
 use crate::phase;
 
 /// Number of heartbeats per page other than the skin's; such a page shows no touch and is rarely needed.
-const BEATS_PER_OTHER: u8 = 4;
+const HEARTBEATS_PER_OTHER_PAGE: u8 = 4;
 
 /// The sensor pages that are to be sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(super) struct Pages {
+pub(super) struct DuePages {
     skin: bool,
     acceleration: bool,
     /// All further pages.
     others: bool,
 }
 
-impl Pages {
+impl DuePages {
     const NONE: Self = Self { skin: false, acceleration: false, others: false };
     pub(super) const ALL: Self = Self { skin: true, acceleration: true, others: true };
 
@@ -53,28 +53,34 @@ pub(super) struct Sensing {
     /// The time of the next page in continuous mode.
     due: Option<Micros>,
     /// The last sent values, requested or not.
-    sent: Readings,
+    sent: SensorReadings,
     /// The time of the last page 0 sent without a request.
     last_sent_at: Option<Micros>,
-    contact: Touch,
-    proximity: Touch,
+    contact: TouchState,
+    proximity: TouchState,
     /// Number of heartbeats since the last page with the acceleration.
     beats: u8,
 }
 
 impl Sensing {
     /// Returns the pages to send after sensor values or the mode may have changed.
-    fn update(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Readings) -> Pages {
-        let Switches { sensing, events, .. } = switches;
+    fn update(
+        &mut self,
+        now: Micros,
+        switches: &VolatileParameters,
+        cell: CellId,
+        sensed: &SensorReadings,
+    ) -> DuePages {
+        let VolatileParameters { sensing, events, .. } = switches;
         if *sensing != self.mode {
             return self.switch(now, switches, cell, sensed);
         }
         if *sensing != Mode::Event {
-            return Pages::NONE;
+            return DuePages::NONE;
         }
-        let Readings { skin, acceleration, .. } = sensed;
+        let SensorReadings { skin, acceleration, .. } = sensed;
         let turned = self.track(skin, events);
-        let pages = Pages {
+        let pages = DuePages {
             skin: *skin != self.sent.skin && (turned || has_moved(skin, &self.sent.skin, events)),
             acceleration: is_far(acceleration, &self.sent.acceleration, events.acceleration),
             others: false,
@@ -83,20 +89,26 @@ impl Sensing {
     }
 
     /// Switches to another mode, which starts with the present contact state.
-    fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Readings) -> Pages {
+    fn switch(
+        &mut self,
+        now: Micros,
+        switches: &VolatileParameters,
+        cell: CellId,
+        sensed: &SensorReadings,
+    ) -> DuePages {
         let mode = switches.sensing;
         *self = Self { mode, sent: self.sent, ..Self::default() };
         match mode {
-            Mode::Off => return Pages::NONE,
+            Mode::Off => return DuePages::NONE,
             Mode::Continuous { period_ms } => {
                 let period = Span::from_millis(period_ms.into());
-                self.due = Some(now + period + phase::by_number(period, cell));
+                self.due = Some(now + period + phase::offset_by_node_id(period, cell));
             }
             Mode::Event => {
                 self.track(&sensed.skin, &switches.events);
             }
         }
-        self.mark_sent(now, Pages::ALL)
+        self.mark_sent(now, DuePages::ALL)
     }
 
     /// Updates the touch states of contact and proximity. Returns true if one of them was touched or released.
@@ -110,29 +122,31 @@ impl Sensing {
     }
 
     /// Returns the pages to send with a regular heartbeat. A page that was already sent at this time is not repeated.
-    pub(super) fn heartbeat_pages(&mut self, now: Micros) -> Pages {
+    pub(super) fn heartbeat_pages(&mut self, now: Micros) -> DuePages {
         if self.mode == Mode::Off {
-            return Pages::NONE;
+            return DuePages::NONE;
         }
-        self.beats = (self.beats + 1) % BEATS_PER_OTHER;
+        self.beats = (self.beats + 1) % HEARTBEATS_PER_OTHER_PAGE;
         let skin = self.mode == Mode::Event && self.last_sent_at != Some(now);
         let is_due = self.beats == 0;
-        self.mark_sent(now, Pages { skin, acceleration: is_due, others: is_due })
+        self.mark_sent(now, DuePages { skin, acceleration: is_due, others: is_due })
     }
 
     /// Returns the page that is due before `until` in continuous mode. Periods that have passed are skipped; the phase
     /// remains.
-    fn due_pages(&mut self, now: Micros, until: Micros) -> Pages {
-        let (Mode::Continuous { period_ms }, Some(due)) = (self.mode, self.due) else { return Pages::NONE };
+    fn due_pages(&mut self, now: Micros, until: Micros) -> DuePages {
+        let (Mode::Continuous { period_ms }, Some(due)) = (self.mode, self.due) else {
+            return DuePages::NONE;
+        };
         if due >= until {
-            return Pages::NONE;
+            return DuePages::NONE;
         }
         let period = Span::from_millis(period_ms.into());
-        self.due = Some(phase::next(due, period, now));
-        self.mark_sent(now, Pages { skin: true, ..Pages::NONE })
+        self.due = Some(phase::next_due(due, period, now));
+        self.mark_sent(now, DuePages { skin: true, ..DuePages::NONE })
     }
 
-    const fn mark_sent(&mut self, now: Micros, pages: Pages) -> Pages {
+    const fn mark_sent(&mut self, now: Micros, pages: DuePages) -> DuePages {
         if pages.skin {
             self.last_sent_at = Some(now);
         }
@@ -160,7 +174,7 @@ impl Node {
         // Pages are sent only once the cell owns its node id. The comparison with the last sent values
         // ensures that no change is lost.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
-        let pages = self.sensing.update(now, &self.switches, cell, &self.net());
+        let pages = self.sensing.update(now, &self.switches, cell, &self.net_readings());
         self.push_sensors(pages);
     }
 
@@ -191,9 +205,10 @@ impl Node {
     }
 
     /// Sends pages with the present contact state.
-    pub(super) fn push_sensors(&mut self, pages: Pages) {
+    pub(super) fn push_sensors(&mut self, pages: DuePages) {
         let Some(from) = self.identity.cell else { return };
-        for (_, page) in self.net().pages().into_iter().enumerate().filter(|(index, _)| pages.contain(*index))
+        for (_, page) in
+            self.net_readings().pages().into_iter().enumerate().filter(|(index, _)| pages.contain(*index))
         {
             self.sensing.sent.set(&page);
             self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });

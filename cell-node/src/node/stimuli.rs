@@ -4,7 +4,7 @@
 //! that it answers, and not on the order of other frames on the bus.
 
 use heapless::Vec;
-use protocol::message::{AppliesFrom, Readings, SensorPage};
+use protocol::message::{SensorPage, SensorReadings, StimulusStart};
 use protocol::packet::Epoch;
 
 /// Maximum number of stimuli that wait for their epoch.
@@ -24,20 +24,20 @@ pub(super) enum Arrival {
 /// The simulated sensors of a cell in test mode.
 #[derive(Debug, Default)]
 pub(super) struct Stimuli {
-    pending: Vec<(AppliesFrom, SensorPage), MAX_PENDING>,
+    pending: Vec<(StimulusStart, SensorPage), MAX_PENDING>,
     /// The present contact state.
-    pub(super) sensed: Readings,
+    pub(super) sensed: SensorReadings,
 }
 
 impl Stimuli {
     /// Queues a stimulus that applies from the given joints on. `last` is the epoch of the last joints that the cell
     /// accepted.
-    pub(super) fn push(&mut self, from: AppliesFrom, page: SensorPage, last: Option<Epoch>) -> Arrival {
+    pub(super) fn push(&mut self, from: StimulusStart, page: SensorPage, last: Option<Epoch>) -> Arrival {
         let (from, arrival) = match (from, last) {
-            (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0 => {
-                (AppliesFrom::Next, Arrival::Late)
+            (StimulusStart::Epoch(first), Some(last)) if last.epochs_since(first) >= 0 => {
+                (StimulusStart::Next, Arrival::Late)
             }
-            (from @ (AppliesFrom::Epoch(_) | AppliesFrom::Next), _) => (from, Arrival::InTime),
+            (from @ (StimulusStart::Epoch(_) | StimulusStart::Next), _) => (from, Arrival::InTime),
         };
         if self.pending.push((from, page)).is_ok() { arrival } else { Arrival::Refused }
     }
@@ -45,7 +45,7 @@ impl Stimuli {
     /// Applies all stimuli for `epoch` or earlier epochs, in order of arrival.
     pub(super) fn latch(&mut self, epoch: Epoch) {
         self.pending.retain(|(from, page)| {
-            let waits = matches!(from, AppliesFrom::Epoch(first) if epoch.epochs_since(*first) < 0);
+            let waits = matches!(from, StimulusStart::Epoch(first) if epoch.epochs_since(*first) < 0);
             if !waits {
                 self.sensed.set(page);
             }
@@ -83,8 +83,8 @@ mod tests {
     fn a_stimulus_waits_for_its_epoch_even_around_the_corner() {
         let mut stimuli = Stimuli::default();
         let last = Some(Epoch(253));
-        assert_eq!(stimuli.push(AppliesFrom::Epoch(Epoch(1)), press(2.0), last), Arrival::InTime);
-        assert_eq!(stimuli.push(AppliesFrom::Epoch(Epoch(255)), press(1.0), last), Arrival::InTime);
+        assert_eq!(stimuli.push(StimulusStart::Epoch(Epoch(1)), press(2.0), last), Arrival::InTime);
+        assert_eq!(stimuli.push(StimulusStart::Epoch(Epoch(255)), press(1.0), last), Arrival::InTime);
         let course = [254, 255, 0, 1, 2].map(|epoch| {
             stimuli.latch(Epoch(epoch));
             sensed(&stimuli)
@@ -97,7 +97,7 @@ mod tests {
     fn a_late_stimulus_holds_from_the_next_joints() {
         let mut stimuli = Stimuli::default();
         stimuli.latch(Epoch(7));
-        assert_eq!(stimuli.push(AppliesFrom::Epoch(Epoch(7)), press(1.0), Some(Epoch(7))), Arrival::Late);
+        assert_eq!(stimuli.push(StimulusStart::Epoch(Epoch(7)), press(1.0), Some(Epoch(7))), Arrival::Late);
         assert!(sensed(&stimuli) < 0.5, "not before the next joints");
         stimuli.latch(Epoch(40));
         assert!(sensed(&stimuli) > 0.5);
@@ -108,8 +108,8 @@ mod tests {
     fn the_ninth_waiting_stimulus_is_refused() {
         let mut stimuli = Stimuli::default();
         for _ in 0..MAX_PENDING {
-            assert_eq!(stimuli.push(AppliesFrom::Next, press(1.0), None), Arrival::InTime);
+            assert_eq!(stimuli.push(StimulusStart::Next, press(1.0), None), Arrival::InTime);
         }
-        assert_eq!(stimuli.push(AppliesFrom::Next, press(1.0), None), Arrival::Refused);
+        assert_eq!(stimuli.push(StimulusStart::Next, press(1.0), None), Arrival::Refused);
     }
 }

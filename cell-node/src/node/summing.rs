@@ -2,7 +2,7 @@
 
 use protocol::fixed::Q7_8;
 use protocol::id::CellId;
-use protocol::message::{Message, NetworkPage, Ports, Tree};
+use protocol::message::{Message, NetworkPage, PortsPage, TreePage};
 use protocol::packet::{self, Epoch};
 use protocol::port::{PORTS, PortMessage, UPLINK};
 use protocol::time::{Micros, Span};
@@ -101,12 +101,12 @@ impl Summing {
     }
 
     pub(super) fn poll_timeout(&self) -> Micros {
-        let look = self.waits_for_children.then(|| self.sum.late_at_next());
+        let look = self.waits_for_children.then(|| self.sum.next_late_send_time());
         [self.sum.poll_timeout(), look].into_iter().flatten().fold(self.network.poll_timeout(), Micros::min)
     }
 
     pub(super) fn handle_time(&mut self, now: Micros) {
-        if self.waits_for_children && now >= self.sum.late_at_next() {
+        if self.waits_for_children && now >= self.sum.next_late_send_time() {
             // No joints arrived: from now on they wake the cell again.
             self.steady = 0;
         }
@@ -167,7 +167,7 @@ impl Summing {
 
     /// Starts an epoch with joints that were on the bus `age` before `now`. The sums of the epoch use the tree as it is
     /// at this time.
-    pub(super) fn begin(
+    pub(super) fn begin_epoch(
         &mut self,
         now: Micros,
         age: Span,
@@ -191,9 +191,9 @@ impl Summing {
             period,
             depth: self.network.depth(),
             may_send: up.is_some() && self.network.is_released(),
-            children: self.network.children(),
+            children: self.network.child_mask(),
         };
-        self.sum.begin(&begin, own.map(|torque| torque.exact()).as_ref());
+        self.sum.begin(&begin, own.map(|torque| torque.exact_torques()).as_ref());
         // The age of deferred frames does not indicate a slow machine.
         if !self.waits_for_children {
             self.sum.note_delay(age);
@@ -303,12 +303,12 @@ impl Node {
     pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         if self.summing.network.receives(port) {
             self.summing.handle_port(now, age, port, message);
-            self.after_network(now);
+            self.apply_network_changes(now);
         }
     }
 
     /// Applies changes of the network to sums and node id, and reports them.
-    pub(super) fn after_network(&mut self, now: Micros) {
+    pub(super) fn apply_network_changes(&mut self, now: Micros) {
         if !self.summing.network.has_wires() {
             return;
         }
@@ -328,7 +328,7 @@ impl Node {
         let summing = &mut self.summing;
         if let Some((epoch, SumWords { torque, count }, restarted)) = summing.sum.poll_sum(now) {
             if restarted {
-                summing.network.state(epoch);
+                summing.network.send_state(epoch);
             }
             self.mark_saturated(torque.iter().any(|word| word.is_saturated()));
             let length = self.length().unwrap_or_default();
@@ -351,7 +351,7 @@ impl Node {
     /// Checks for missing sums of children in this epoch, once per epoch.
     pub(super) fn check_missing(&mut self, now: Micros) {
         if self.summing.check_missing(now) {
-            self.after_network(now);
+            self.apply_network_changes(now);
         }
     }
 
@@ -381,13 +381,13 @@ impl Node {
     pub(super) fn push_tree(&mut self, now: Micros) {
         let Summing { network, sum, report, .. } = &mut self.summing;
         report.round = network.round();
-        let tree = Tree {
+        let tree = TreePage {
             parent: network.parent_node(),
             parent_port: network.parent_port().map_or(0, |up| up.to_le_bytes()[0]),
             depth: network.depth().unwrap_or(0),
             round: report.round,
-            children: network.children(),
-            working_ports: network.working(now),
+            children: network.child_mask(),
+            working_ports: network.working_port_mask(now),
             sent: sum.sent,
             accepted: sum.taken,
             dropped: sum.dropped,
@@ -397,7 +397,7 @@ impl Node {
 
     pub(super) fn push_ports(&mut self, now: Micros) {
         let Summing { network, .. } = &self.summing;
-        let ports = Ports { ports: network.port_states(now), changes: network.changes };
+        let ports = PortsPage { ports: network.port_states(now), changes: network.changes };
         self.push_network(NetworkPage::Ports(ports));
     }
 }

@@ -1,4 +1,4 @@
-use super::parameters::padded;
+use super::parameters::pad_with_zeros;
 use super::*;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::CellId;
@@ -72,14 +72,14 @@ fn joints(epoch: u8) -> Message {
     Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 1, ..Joints::default() } }
 }
 
-fn press(newtons: f64, from: AppliesFrom) -> Message {
+fn press(newtons: f64, from: StimulusStart) -> Message {
     let contact = [Q5_10::nearest(newtons), Q5_10::ZERO, Q5_10::ZERO];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
     Message::Stimulus { to: Address::Cell(cell()), from, page }
 }
 
 fn torque(epoch: u8, nm: f64) -> Message {
-    let torque = Words::from(padded([Q3_12::nearest(nm).to_bits()]));
+    let torque = Words::from(pad_with_zeros([Q3_12::nearest(nm).to_bits()]));
     Message::Torque { from: cell(), epoch: Epoch(epoch), torque }
 }
 
@@ -107,12 +107,12 @@ fn heard(node: &mut Node) -> (ReceivedCounts, RejectedCounts) {
 fn a_pressed_cell_answers_each_joints_frame_and_the_end_of_contact_with_one_zero() {
     let mut node = settled(FlashState::Valid(wheel()));
     assert_eq!(tell(&mut node, &joints(0)), [], "quiet: nothing touches it");
-    assert_eq!(tell(&mut node, &press(4.0, AppliesFrom::Epoch(Epoch(2)))), []);
+    assert_eq!(tell(&mut node, &press(4.0, StimulusStart::Epoch(Epoch(2)))), []);
     assert_eq!(tell(&mut node, &joints(1)), [], "not yet");
     // A push of 4 N against the normal at 0.5 m turns the wheel.
     assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
     assert_eq!(tell(&mut node, &joints(3)), [torque(3, -2.0)]);
-    assert_eq!(tell(&mut node, &press(0.0, AppliesFrom::Next)), []);
+    assert_eq!(tell(&mut node, &press(0.0, StimulusStart::Next)), []);
     assert_eq!(tell(&mut node, &joints(4)), [torque(4, 0.0)]);
     assert_eq!(tell(&mut node, &joints(5)), []);
     let (heard, refused) = heard(&mut node);
@@ -124,7 +124,7 @@ fn a_pressed_cell_answers_each_joints_frame_and_the_end_of_contact_with_one_zero
 #[test]
 fn repeated_and_old_joints_are_counted_and_any_jump_is_followed() {
     let mut node = settled(FlashState::Valid(wheel()));
-    tell(&mut node, &press(4.0, AppliesFrom::Next));
+    tell(&mut node, &press(4.0, StimulusStart::Next));
     assert_eq!(tell(&mut node, &joints(7)).len(), 1);
     assert_eq!(tell(&mut node, &joints(7)), []);
     for frame in joints(8).encode().frames(Format::Fd) {
@@ -141,11 +141,11 @@ fn repeated_and_old_joints_are_counted_and_any_jump_is_followed() {
 #[test]
 fn a_cell_that_hung_latches_the_stimuli_that_came_meanwhile() {
     let mut node = settled(FlashState::Valid(wheel()));
-    tell(&mut node, &press(4.0, AppliesFrom::Next));
+    tell(&mut node, &press(4.0, StimulusStart::Next));
     assert_eq!(tell(&mut node, &joints(0)), [torque(0, -2.0)]);
     // Twenty stimuli and joints waited while it hung, more than can be pending; the last one releases.
     for epoch in 1..=20 {
-        tell(&mut node, &press(if epoch < 20 { 3.0 } else { 0.0 }, AppliesFrom::Epoch(Epoch(epoch))));
+        tell(&mut node, &press(if epoch < 20 { 3.0 } else { 0.0 }, StimulusStart::Epoch(Epoch(epoch))));
         for frame in joints(epoch).encode().frames(Format::Fd) {
             node.handle_frame(NOW, Span(50_000), &frame);
         }
@@ -160,7 +160,7 @@ fn a_cell_that_hung_latches_the_stimuli_that_came_meanwhile() {
 #[test]
 fn a_halted_cell_is_silent_until_a_resume() {
     let mut node = settled(FlashState::Valid(wheel()));
-    tell(&mut node, &press(4.0, AppliesFrom::Next));
+    tell(&mut node, &press(4.0, StimulusStart::Next));
     assert_eq!(tell(&mut node, &joints(0)).len(), 1);
     assert_eq!(tell(&mut node, &Message::Halt), []);
     assert_eq!(tell(&mut node, &joints(1)), []);
@@ -249,7 +249,7 @@ fn a_claiming_cell_listens_and_answers_nothing() {
     let (mut node, _) = claiming(identity());
     let to = Address::Everyone;
     let request = Message::Configure { to, tag: 0, request: Request::Read { number: 0 } };
-    for message in [Message::Sync, Message::Report, request, press(4.0, AppliesFrom::Next), joints(0)] {
+    for message in [Message::Sync, Message::Report, request, press(4.0, StimulusStart::Next), joints(0)] {
         assert_eq!(tell(&mut node, &message), []);
     }
     node.handle_timeout(node.poll_timeout());
@@ -261,7 +261,7 @@ fn a_claiming_cell_listens_and_answers_nothing() {
 #[test]
 fn a_cell_without_sound_flash_flags_it_and_sends_no_torque() {
     let mut node = settled(FlashState::Damaged);
-    tell(&mut node, &press(4.0, AppliesFrom::Next));
+    tell(&mut node, &press(4.0, StimulusStart::Next));
     assert_eq!(tell(&mut node, &joints(0)), []);
     let heartbeat = heartbeat(&tell(&mut node, &Message::Sync));
     assert!(heartbeat.state.has(State::FLASH_DAMAGED) && !heartbeat.state.has(State::CONFIGURED));
@@ -281,7 +281,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
             other => panic!("{other:?}"),
         }
     };
-    for parameter in Parameter::stored(1) {
+    for parameter in Parameter::stored_for_rows(1) {
         let (number, words) = (parameter.number(), wheel().words(parameter));
         let answer = request(&mut node, Request::Write { number, words });
         assert_eq!(answer, Some(Answer::Value { number, written: true, words }));
@@ -290,7 +290,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
             Some(Answer::Value { number, written: false, words })
         );
     }
-    let commit = |hash: u16| Request::Write { number: 127, words: padded([hash.cast_signed()]) };
+    let commit = |hash: u16| Request::Write { number: 127, words: pad_with_zeros([hash.cast_signed()]) };
     let refused = |reason| Some(Answer::Refused { number: 127, reason });
     assert_eq!(request(&mut node, commit(wheel().hash() ^ 1)), refused(Answer::WRONG_HASH));
     assert_eq!(tell(&mut node, &joints(0)), [], "still not configured");
@@ -306,7 +306,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     node.handle_stored(true);
     assert_eq!(drain(&mut node).len(), 1);
     assert_eq!(node.poll_store(), None);
-    tell(&mut node, &press(4.0, AppliesFrom::Next));
+    tell(&mut node, &press(4.0, StimulusStart::Next));
     assert_eq!(tell(&mut node, &joints(1)), [torque(1, -2.0)]);
     let state = heartbeat(&tell(&mut node, &Message::Sync)).state;
     assert!(state.has(State::CONFIGURED) && !state.has(State::FLASH_DAMAGED), "repaired");
@@ -334,12 +334,12 @@ fn a_write_that_is_refused_changes_nothing() {
         ref other => panic!("{other:?}"),
     };
     let number = Parameter::Mount.number();
-    let staged = padded([1, 7]);
+    let staged = pad_with_zeros([1, 7]);
     let value = |written| Answer::Value { number, written, words: staged };
     assert_eq!(mount(Request::Write { number, words: staged }), value(true), "it is looked at with the rest");
     for (words, reason) in [([300, 5], 3), ([2, -1], 2), ([300, 300], 2)] {
         let refused = Answer::Refused { number, reason };
-        assert_eq!(mount(Request::Write { number, words: padded(words) }), refused, "{words:?}");
+        assert_eq!(mount(Request::Write { number, words: pad_with_zeros(words) }), refused, "{words:?}");
         assert_eq!(mount(Request::Read { number }), value(false), "{words:?}");
     }
 }
@@ -352,7 +352,7 @@ fn a_cell_that_measures_refuses_stimuli() {
         &mut node,
         &Message::Configure { to, tag: 0, request: Request::Write { number: 5, words: [0; WORDS] } },
     );
-    tell(&mut node, &press(4.0, AppliesFrom::Next));
+    tell(&mut node, &press(4.0, StimulusStart::Next));
     assert_eq!(tell(&mut node, &joints(0)), []);
     assert_eq!(heard(&mut node).1.stimuli, 1);
 }
@@ -384,7 +384,7 @@ fn what_cannot_be_used_is_counted_by_its_reason() {
 #[test]
 fn a_torque_that_does_not_fit_is_marked_as_saturated() {
     let mut node = settled(FlashState::Valid(wheel()));
-    tell(&mut node, &press(31.0, AppliesFrom::Next));
+    tell(&mut node, &press(31.0, StimulusStart::Next));
     assert_eq!(tell(&mut node, &joints(0)), [torque(0, -100.0)]);
     assert!(heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::SATURATED));
     assert!(!heartbeat(&tell(&mut node, &Message::Sync)).state.has(State::SATURATED), "since the last one");
@@ -401,7 +401,7 @@ fn the_classic_format_works_in_segments() {
         }
         drain(node)
     };
-    assert_eq!(hear(&mut node, &press(4.0, AppliesFrom::Next)), []);
+    assert_eq!(hear(&mut node, &press(4.0, StimulusStart::Next)), []);
     assert_eq!(hear(&mut node, &joints(0)), [torque(0, -2.0)]);
     // A lost segment loses its packet but not the next one.
     let first = joints(1).encode().frames(Format::Classic).next().unwrap();
@@ -436,9 +436,9 @@ fn the_age_of_a_packet_is_that_of_its_last_segment() {
 fn skipped_joints_leave_active_as_it_is() {
     // STATE-1
     let mut node = settled(FlashState::Valid(wheel()));
-    tell(&mut node, &press(4.0, AppliesFrom::Next));
+    tell(&mut node, &press(4.0, StimulusStart::Next));
     assert_eq!(tell(&mut node, &joints(0)), [torque(0, -2.0)]);
-    tell(&mut node, &press(0.0, AppliesFrom::Next));
+    tell(&mut node, &press(0.0, StimulusStart::Next));
     for frame in joints(1).encode().frames(Format::Fd) {
         node.handle_frame(NOW, Span(16_001), &frame);
     }
@@ -461,12 +461,12 @@ fn joints_need_not_wake_a_cell_that_nothing_touches() {
     assert_eq!(hear(&mut node, 15), (false, false));
     assert_eq!(hear(&mut node, 1), (true, true));
     assert_eq!(hear(&mut node, 30), (false, true));
-    tell(&mut node, &press(4.0, AppliesFrom::Next));
+    tell(&mut node, &press(4.0, StimulusStart::Next));
     assert_eq!((node.poll_received_ids(), rests(&node)), (true, false), "before the joints that it answers");
     assert_eq!(hear(&mut node, 40), (false, false), "touched");
-    tell(&mut node, &press(0.0, AppliesFrom::Next));
+    tell(&mut node, &press(0.0, StimulusStart::Next));
     assert_eq!(hear(&mut node, 17), (true, true), "one answer of zero, and 16 joints");
-    tell(&mut node, &press(4.0, AppliesFrom::Epoch(Epoch(130))));
+    tell(&mut node, &press(4.0, StimulusStart::Epoch(Epoch(130))));
     assert_eq!(hear(&mut node, 20), (true, false), "a stimulus waits");
 }
 

@@ -1,6 +1,6 @@
 //! Reports of the zero of the force sensor (sensor page 3), which are sent when its state changes and once a second.
 
-use protocol::message::{Message, Readings, SensorPage};
+use protocol::message::{Message, SensorPage, SensorReadings};
 
 use super::Node;
 use crate::baseline::BaselineStatus;
@@ -17,9 +17,9 @@ pub(super) struct ReportedBaseline {
 
 impl Node {
     /// Returns the sensor values with the zero subtracted.
-    pub(super) fn net(&self) -> Readings {
+    pub(super) fn net_readings(&self) -> SensorReadings {
         let sensed = self.stimuli.sensed;
-        Readings { skin: self.baseline.subtract_zero(&sensed.skin), ..sensed }
+        SensorReadings { skin: self.baseline.subtract_zero(&sensed.skin), ..sensed }
     }
 
     /// Reports the zero if its state has changed since the last report, and the cell owns its node id.
@@ -30,7 +30,7 @@ impl Node {
     }
 
     /// Reports the zero with every fourth regular heartbeat.
-    pub(super) fn beat_zero(&mut self) {
+    pub(super) fn report_zero_with_heartbeat(&mut self) {
         self.reported.beats = (self.reported.beats + 1) % HEARTBEATS_PER_PAGE;
         if self.reported.beats == 0 {
             self.push_zero();

@@ -4,13 +4,13 @@ use core::f64::consts::FRAC_PI_2;
 
 use protocol::fixed::Q1_14;
 
-use super::{ONE, QUARTER, evaluate, odd_polynomial};
+use super::{ONE_Q16, QUARTER, evaluate, odd_polynomial};
 
 /// The paper's polynomial (Eq. 13, 16): `a z - b z^3 + c z^5` with a = pi/2, c = pi/2 - 3/2, and b such that
 /// the sum is one.
 const FIFTH_ORDER: [i32; 3] = {
     let (a, c) = (nearest(FRAC_PI_2), nearest(FRAC_PI_2 - 1.5));
-    [a, ONE - a - c, c]
+    [a, ONE_Q16 - a - c, c]
 };
 
 /// Rounds a positive constant to an integer with 16 fraction bits.

@@ -4,7 +4,7 @@ const PERIOD: Span = Span(16_000);
 
 fn sum(carry: bool) -> Sum {
     let mut sum = Sum::default();
-    sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 3, carry }));
+    sum.set_slots(Some(SumSchedule { slot_us: 1_000, deepest: 3, carry }));
     sum
 }
 
@@ -21,8 +21,8 @@ fn begin(epoch: u8, depth: u8) -> EpochStart {
 }
 
 /// Returns a torque of this many thousandths of a Q7.8 step, the same for every joint.
-fn own(thousandths: i64) -> [Acc<30>; MAX_JOINTS] {
-    [Acc::from_steps(thousandths * (1 << 22) / 1_000); MAX_JOINTS]
+fn own(thousandths: i64) -> [Accumulator<30>; MAX_JOINTS] {
+    [Accumulator::from_steps(thousandths * (1 << 22) / 1_000); MAX_JOINTS]
 }
 
 fn words(word: i16, count: u8) -> SumWords {
@@ -189,7 +189,7 @@ fn saturation_passes_upwards_word_by_word() {
 fn a_torque_beyond_the_32_bits_that_are_kept_of_it_saturates_at_its_end() {
     for (steps, end) in [(i64::MIN / 2, Q7_8::MIN), (i64::MAX / 2, Q7_8::MAX)] {
         let mut sum = sum(false);
-        sum.begin(&begin(1, 2), Some(&[Acc::from_steps(steps); MAX_JOINTS]));
+        sum.begin(&begin(1, 2), Some(&[Accumulator::from_steps(steps); MAX_JOINTS]));
         let (_, said, _) = sum.poll_sum(at(1, 1_000)).unwrap();
         assert_eq!(said.torque, [end; MAX_JOINTS]);
     }

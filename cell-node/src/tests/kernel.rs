@@ -2,8 +2,8 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use crate::contact::{Force, MAX_J, Torque};
-use crate::kernel::oracle::{Counted, PaperWord, Projection};
+use crate::contact::{Force, MAX_JACOBIAN_STEPS, Torque};
+use crate::kernel::oracle::{CountingWord, PaperWord, Projection};
 use crate::kernel::{Kernel, Operations, Wrench};
 use proptest::prelude::*;
 use protocol::fixed::{Q1_14, Q3_12, TorqueFormat};
@@ -31,7 +31,7 @@ fn the_bound_of_j_is_little_more_than_an_arms_reach_and_of_a_slide_not_known() {
         let bound = f64::from(Wrench::<Q1_14>::new(&parameters).bound()) / 16_384.0;
         assert!(bound <= 1.02 * reach, "{bound} m for an arm of {reach} m");
         parameters.rows[2].kind = RowKind::Prismatic;
-        assert_eq!(Wrench::<Q1_14>::new(&parameters).bound(), MAX_J);
+        assert_eq!(Wrench::<Q1_14>::new(&parameters).bound(), MAX_JACOBIAN_STEPS);
     }
 }
 
@@ -132,7 +132,7 @@ fn an_offset_is_added_to_the_position_and_wraps() {
 }
 
 /// Returns the operation counts for the UR5 and a cell on its last link.
-fn operations<K: Kernel<Counted>>() -> Operations {
+fn operations<K: Kernel<CountingWord>>() -> Operations {
     let last = Case::all().into_iter().find(|case| case.joint == 6).unwrap();
     let kernel = K::new(&last.parameters());
     Operations::count(|| kernel.jacobian(&last.words())).1
@@ -140,9 +140,9 @@ fn operations<K: Kernel<Counted>>() -> Operations {
 
 #[test]
 fn the_operations_on_a_ur5_are_what_the_docs_say() {
-    let wrench = operations::<Wrench<Counted>>();
+    let wrench = operations::<Wrench<CountingWord>>();
     assert_eq!((wrench.multiplications, wrench.additions, wrench.sines, wrench.cosines), (40, 24, 5, 5));
-    let projection = operations::<Projection<Counted>>();
+    let projection = operations::<Projection<CountingWord>>();
     assert_eq!(
         (projection.multiplications, projection.additions, projection.sines, projection.cosines),
         (103, 56, 6, 6)
@@ -154,7 +154,7 @@ fn unused_components_are_not_computed_behind_an_odd_twist_either() {
     // J_1 = sin(alpha) m_y + cos(alpha) m_z, and m_y takes two products after the turn of joint 2.
     let mut parameters = Case::all().into_iter().find(|case| case.joint == 2).unwrap().parameters();
     parameters.rows[0] = Row { alpha: Q1_14::nearest(0.3), ..Row::default() };
-    let kernel = Wrench::<Counted>::new(&parameters);
+    let kernel = Wrench::<CountingWord>::new(&parameters);
     let (_, done) = Operations::count(|| kernel.jacobian(&[Q1_14::nearest(0.7); MAX_JOINTS]));
     assert_eq!((done.multiplications, done.additions, done.sines, done.cosines), (4, 2, 1, 1));
 }

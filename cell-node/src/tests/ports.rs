@@ -8,11 +8,11 @@ use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
 use protocol::message::{
-    Answer, AppliesFrom, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors,
+    Answer, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, StimulusStart,
 };
 use protocol::packet::{Epoch, WORDS, padded_words};
 use protocol::parameters::{Contact, Parameter, Parameters, Pose};
-use protocol::port::{Hello, PortMessage, Rank, UPLINK, Walk};
+use protocol::port::{Hello, NodeIdWalk, PortMessage, TreeRank, UPLINK};
 use protocol::time::{Micros, Span};
 
 const REPLY: u8 = 6;
@@ -80,7 +80,7 @@ fn a_cell_without_ports_does_not_sum_and_one_with_ports_reads_back_what_it_was_t
             other => panic!("{other:?}"),
         }
     });
-    let refused = Answer::Refused { number: REPLY, reason: Answer::INVALID };
+    let refused = Answer::Refused { number: REPLY, reason: Answer::INVALID_WORDS };
     let taken = Answer::Value { number: REPLY, written: true, words: padded_words([1, 1_500, 6, 1]) };
     assert_eq!(answers, [refused, taken]);
 }
@@ -95,7 +95,7 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
     tell(&mut node, now, &sum_with([1, 1_500, 0, 1, 0, 0]));
     let contact = [Q5_10::nearest(4.0), Q5_10::ZERO, Q5_10::ZERO];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    tell(&mut node, now, &Message::Stimulus { to: Address::Everyone, from: AppliesFrom::Next, page });
+    tell(&mut node, now, &Message::Stimulus { to: Address::Everyone, from: StimulusStart::Next, page });
     let joints = Joints { in_use: 1, ..Joints::default() };
     let sent = tell(&mut node, now, &Message::Joints { epoch: Epoch(7), joints });
     assert!(sent.iter().any(|message| matches!(message, Message::Sum { count: 1, .. })), "{sent:?}");
@@ -107,7 +107,7 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
 
 /// Makes the cell a root, by a grant from the gateway's side.
 fn join_gateway(node: &mut Node, now: Micros) {
-    let rank = Rank { round: 1, depth: 0 };
+    let rank = TreeRank { round: 1, depth: 0 };
     let hello = Hello {
         version: 1,
         number: 0,
@@ -151,7 +151,7 @@ fn a_new_node_id_changes_once_what_a_cell_receives() {
     assert!(!node.poll_received_ids());
     join_gateway(&mut node, Micros(1_000));
     assert!(!node.poll_received_ids(), "the gateway sends no sums");
-    let walk = Walk { walk: 1, first: 3, last: 9 };
+    let walk = NodeIdWalk { walk: 1, first: 3, last: 9 };
     node.handle_port(Micros(2_000), Span(0), UPLINK, PortMessage::NodeId(walk));
     assert_eq!([node.poll_received_ids(), node.poll_received_ids()], [true, false]);
 }

@@ -5,7 +5,7 @@ use crate::sum::{EpochStart, Sum, SumWords};
 use protocol::fixed::Q7_8;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
-use protocol::parameters::Slots;
+use protocol::parameters::SumSchedule;
 use protocol::time::{Micros, Span};
 
 /// Starts an epoch of a cell without contact. The cell is the root of a tree of two, with its child at port 0.
@@ -34,7 +34,7 @@ fn said(sum: &mut Sum, after: u64) -> Option<SumWords> {
 #[test]
 fn a_sum_that_arrives_after_its_epoch_is_not_taken_for_another_epoch() {
     let mut sum = Sum::default();
-    sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
+    sum.set_slots(Some(SumSchedule { slot_us: 1_000, deepest: 1, carry: true }));
     begin(&mut sum, 129, 0);
     // A slow machine delivers it late; then the child's state message arrives.
     sum.receive(Micros(100), 0, Epoch(126), words(-154));
@@ -48,7 +48,7 @@ fn a_sum_that_arrives_after_its_epoch_is_not_taken_for_another_epoch() {
 #[test]
 fn a_sum_that_arrives_before_its_state_is_taken_when_the_state_arrives() {
     let mut sum = Sum::default();
-    sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
+    sum.set_slots(Some(SumSchedule { slot_us: 1_000, deepest: 1, carry: true }));
     begin(&mut sum, 7, 0);
     sum.receive(Micros(100), 0, Epoch(7), words(3));
     assert_eq!((said(&mut sum, 0), sum.dropped), (None, 1));

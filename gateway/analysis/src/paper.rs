@@ -1,9 +1,9 @@
 //! Figures of the paper: *Efficient Distributed Torque Computation for Large Scale Robot Skin*.
 
 /// Mean error of a single cell's torques, Q3.12, in Nm (Fig. 6).
-pub const SINGLE_NM: f64 = 0.0054;
+pub const SINGLE_CELL_ERROR_NM: f64 = 0.0054;
 /// Mean error of summed torques, Q7.8, in Nm (Fig. 6).
-pub const SUMMED_NM: f64 = 0.0356;
+pub const SUMMED_ERROR_NM: f64 = 0.0356;
 /// Duration of all work in a cycle except the central computation, in s (Fig. 8).
 pub const OTHER_WORK_S: f64 = 0.2e-3;
 /// Time of a cycle at 500 Hz, in s.
@@ -13,13 +13,13 @@ pub const CENTRAL_PER_CELL_S: f64 = 0.827e-6;
 /// Time of the central computation without cells, in s (Eq. 29).
 pub const CENTRAL_FIXED_S: f64 = 0.010_73e-3;
 /// Goodness of fit (R squared) of Eq. 29.
-pub const CELLS_QUALITY: f64 = 0.9995;
+pub const CENTRAL_CELLS_R_SQUARED: f64 = 0.9995;
 /// Time of the central computation per active cell, in s (Eq. 30).
 pub const CENTRAL_PER_ACTIVE_CELL_S: f64 = 0.798e-6;
 /// Time of the central computation of 253 inactive cells, in s (Eq. 30).
-pub const NONE_ACTIVE_S: f64 = 0.2e-3;
+pub const CENTRAL_NONE_ACTIVE_S: f64 = 0.2e-3;
 /// Goodness of fit (R squared) of Eq. 30.
-pub const ACTIVE_QUALITY: f64 = 0.939;
+pub const CENTRAL_ACTIVE_R_SQUARED: f64 = 0.939;
 /// Maximum number of cells at 500 Hz, none of them active.
 pub const MAX_CELLS: f64 = 2160.0;
 /// Maximum number of cells at 500 Hz, 100 of them active (Eq. 31).
@@ -29,7 +29,7 @@ pub const LIMIT_ACTIVE_CELLS: f64 = 100.0;
 /// Mean error of the fifth-order approximation of the sine.
 pub const SINE_MEAN_ERROR: f64 = 6.7e-4;
 /// Numbers of multiplications, additions, sines and cosines in one cell's Jacobian on the last link of six (Eq. 27).
-pub const OPERATIONS: [u32; 4] = [103, 57, 6, 6];
+pub const JACOBIAN_OPERATIONS: [u32; 4] = [103, 57, 6, 6];
 
 /// Returns the maximum number of cells whose central computation fits in a cycle beside the rest of the work, as the
 /// paper derives its limits: `(cycle - rest - fixed - active · per active) / per cell`, all in s. Returns NaN if cells

@@ -85,7 +85,7 @@ impl TimedCount {
     }
 
     /// Returns the packets per second from the first to the last; `None` if these have the same time.
-    fn per_s(self) -> Option<f64> {
+    fn packets_per_s(self) -> Option<f64> {
         rate(self.packets.saturating_sub(1), self.span())
     }
 }
@@ -299,14 +299,14 @@ impl Stats {
     }
 
     /// Declares that the times of frames are meaningless and only give the order. Rates are then omitted.
-    pub const fn without_times(&mut self) {
+    pub const fn mark_untimed(&mut self) {
         self.has_no_times = true;
     }
 
     /// Returns the statistics of all frames so far.
     #[must_use]
     pub fn report(&self) -> StatsReport {
-        let mut report = self.timed();
+        let mut report = self.timed_report();
         if self.has_no_times {
             for bus in &mut report.buses {
                 (bus.frames_per_s, bus.wires_per_s) = (None, None);
@@ -318,7 +318,7 @@ impl Stats {
         report
     }
 
-    fn timed(&self) -> StatsReport {
+    fn timed_report(&self) -> StatsReport {
         let span @ (earliest, latest) = self.span.unwrap_or_default();
         StatsReport {
             duration_s: seconds(latest - earliest),
@@ -384,14 +384,14 @@ impl BusStats {
             count.record(nanos);
         }
         if let Message::Joints { epoch, .. } = message {
-            self.take_joints(*epoch);
+            self.record_joints(*epoch);
         }
         if let Some(cell) = id.sender().and_then(|from| self.cells.get_mut(from.index())) {
             cell.get_or_insert_default().take(nanos, message, self.joints);
         }
     }
 
-    fn take_joints(&mut self, epoch: Epoch) {
+    fn record_joints(&mut self, epoch: Epoch) {
         let epochs = &mut self.counts.epochs;
         epochs.first.get_or_insert(epoch.0);
         epochs.last = Some(epoch.0);
@@ -415,14 +415,14 @@ impl BusStats {
         let kinds = kinds.map(|(kind, count)| KindReport {
             kind,
             packets: count.packets,
-            packets_per_s: count.per_s(),
+            packets_per_s: count.packets_per_s(),
             span_s: seconds(count.span()),
         });
         let cells = CellId::all().zip(&self.cells);
         BusReport {
-            frames_per_s: self.all.per_s().and_then(|_| rate(self.counts.frames, latest - earliest)),
+            frames_per_s: self.all.packets_per_s().and_then(|_| rate(self.counts.frames, latest - earliest)),
             wires: self.wires.packets,
-            wires_per_s: self.wires.per_s(),
+            wires_per_s: self.wires.packets_per_s(),
             wires_span_s: seconds(self.wires.span()),
             kinds: kinds.collect(),
             foreign: self.foreign.report(earliest),
@@ -439,7 +439,7 @@ impl CellStats {
         if let Message::Torque { epoch, torque, .. } = message {
             let still = !torque.is_zero();
             self.counts.saturated += u64::from(torque.is_saturated());
-            self.torque(nanos, *epoch, still, joints);
+            self.record_torque(nanos, *epoch, still, joints);
         } else if let Message::Sum { epoch, torque, .. } = message {
             self.counts.saturated += u64::from(torque.is_saturated());
             self.counts.sums += 1;
@@ -457,7 +457,7 @@ impl CellStats {
         }
     }
 
-    fn torque(&mut self, nanos: u64, epoch: Epoch, still: bool, joints: Option<LastJoints>) {
+    fn record_torque(&mut self, nanos: u64, epoch: Epoch, still: bool, joints: Option<LastJoints>) {
         self.counts.torques += 1;
         let [first, last] = self.torque_span.unwrap_or([(nanos, epoch); 2]);
         let again = self.counts.torques > 1

@@ -4,8 +4,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use model::decode::Decoded;
-use model::listing::Listing;
-use protocol::bus::{Bus, BusError, BusOptions, Filter, GATEWAY_RECEIVE_BUFFER, KindChoice};
+use model::listing::CellListing;
+use protocol::bus::{Bus, BusError, BusOptions, Filter, GATEWAY_RECEIVE_BUFFER_BYTES, KindChoice};
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::message::Message;
@@ -25,7 +25,7 @@ const POLL_TIMEOUT: Duration = Duration::from_millis(50);
 pub struct CellWatch {
     listener: Listener,
     began: Instant,
-    listing: Listing,
+    listing: CellListing,
     non_packets: u64,
     /// Format of packets, if known before the first frame.
     format: Option<Format>,
@@ -42,10 +42,10 @@ impl CellWatch {
         let kinds = Kind::ALL.into_iter().filter(|kind| kind.is_from_cells());
         let mut filters: Vec<_> = kinds.map(Filter::for_kind).collect();
         filters.push(Filter::exact(Id::command(Command::Joints)));
-        let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
+        let receive_buffer = GATEWAY_RECEIVE_BUFFER_BYTES as usize;
         let options = BusOptions { filters, receive_buffer, ..BusOptions::default() };
         let listener = Listener::new(listen::open(name, kind, None, options)?, None);
-        let listing = Listing::new();
+        let listing = CellListing::new();
         Ok(Self { listener, began: Instant::now(), listing, non_packets: 0, format, requested: None })
     }
 
@@ -57,7 +57,7 @@ impl CellWatch {
 
     /// The reports received so far.
     #[must_use]
-    pub const fn listing(&self) -> &Listing {
+    pub const fn listing(&self) -> &CellListing {
         &self.listing
     }
 
@@ -84,7 +84,7 @@ impl CellWatch {
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus is gone or closed.
-    pub fn request(&mut self, again: bool) -> Result<(), BusError> {
+    pub fn query_cells(&mut self, again: bool) -> Result<(), BusError> {
         let due = self.requested.is_none_or(|requested| again && requested.elapsed() >= QUERY_INTERVAL);
         let waited = (self.elapsed() >= FORMAT_TIMEOUT).then_some(Format::Fd);
         let Some(format) = self.format.or_else(|| self.listing.format()).or(waited).filter(|_| due) else {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use model::commission::{Commission, CommissionOptions, Progress, Report};
 use model::decode::Decoded;
-use protocol::bus::{BusError, BusOptions, Filter, GATEWAY_RECEIVE_BUFFER, KindChoices};
+use protocol::bus::{BusError, BusOptions, Filter, GATEWAY_RECEIVE_BUFFER_BYTES, KindChoices};
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::skin::Skin;
@@ -22,7 +22,7 @@ const POLL_TIMEOUT: Duration = Duration::from_millis(50);
 /// Interval between progress reports.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(20);
 /// Pause while an interface is down.
-const DOWN_PAUSE: Duration = Duration::from_millis(20);
+const INTERFACE_DOWN_PAUSE: Duration = Duration::from_millis(20);
 /// Bytes that the kernel counts in a socket's buffer for each waiting frame.
 const FRAME_BYTES: usize = 1_024;
 
@@ -64,7 +64,7 @@ pub fn open(skin: &Skin, index: usize, kinds: &KindChoices) -> Result<BusCommiss
     let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::for_kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
     filters.extend(roots.iter().flat_map(RootWires::filters));
-    let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
+    let receive_buffer = GATEWAY_RECEIVE_BUFFER_BYTES as usize;
     let options = BusOptions { filters, receive_buffer, ..BusOptions::default() };
     let bus = listen::open(name, kinds.kind_of(name), Some(format), options)?;
     if roots.is_some() && !bus.is_virtual()? {
@@ -86,7 +86,7 @@ pub fn commission(
     let waiting: Vec<_> = benches.into_iter().map(|bench| Mutex::new(Some(bench))).collect();
     let work = |(place, bench): (usize, &Mutex<Option<BusCommissioner>>)| {
         let bench = bench.lock().ok()?.take()?;
-        Some(bench.work(skin, wish, stopped, |progress| {
+        Some(bench.commission_cells(skin, wish, stopped, |progress| {
             if let Some(own) = progress_by_bus.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
                 *own = Some(progress);
             }
@@ -118,7 +118,7 @@ pub fn commission(
 
 impl BusCommissioner {
     /// Commissions the cells of the bus until done or stopped, and reports the progress.
-    fn work(
+    fn commission_cells(
         mut self,
         skin: &Skin,
         wish: CommissionOptions,
@@ -168,13 +168,13 @@ impl BusCommissioner {
             }
             while let Some(message) = commission.poll_transmit() {
                 // A packet that was not sent gets no answer, and is sent again.
-                tolerate_transient(send(listener.bus(), &message, *format), DOWN_PAUSE)?;
+                tolerate_transient(send(listener.bus(), &message, *format), INTERFACE_DOWN_PAUSE)?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
             let quiet =
                 roots.as_ref().filter(|_| commission.may_send()).map_or(POLL_TIMEOUT, RootWires::timeout);
             let wait = Duration::from_micros(next.elapsed_since(clock()).0).min(quiet).min(POLL_TIMEOUT);
-            tolerate_transient(listener.receive(wait), DOWN_PAUSE)?;
+            tolerate_transient(listener.receive(wait), INTERFACE_DOWN_PAUSE)?;
             for (received, decoded) in listener.decoded() {
                 if roots.as_mut().is_some_and(|roots| roots.handle_frame(&received.frame)) {
                     continue;

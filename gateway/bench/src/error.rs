@@ -15,7 +15,7 @@ use crate::bus::served::ServeError;
 use crate::emulate::EmulateError;
 use crate::processes::{LaunchError, MemoryError};
 use crate::record::OutputError;
-use crate::run::TooDeep;
+use crate::run::TreeTooDeep;
 use crate::signals::SignalError;
 use crate::threads::ThreadError;
 use control::external::SocketError;
@@ -44,7 +44,7 @@ pub enum RunError {
     Controller(#[from] SocketError),
     /// The tree of cells is too deep for their slots.
     #[error(transparent)]
-    TooDeep(#[from] TooDeep),
+    TooDeep(#[from] TreeTooDeep),
     /// The directory for the cells' parameters cannot be used.
     #[error("--flash {}: there is no such directory; make it first", .0.display())]
     NoFlash(PathBuf),

@@ -8,7 +8,7 @@ use protocol::usage::{eprint_line, printable};
 use rustix::termios::tcgetwinsize;
 
 /// Interval between updates on a terminal, and elsewhere.
-const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
+const UPDATE_INTERVALS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
 
 /// The progress line, on standard error.
 #[derive(Debug)]
@@ -24,12 +24,15 @@ impl Progress {
     #[must_use]
     pub fn new(quiet: bool) -> Self {
         let terminal = std::io::stderr().is_terminal() && !quiet;
-        Self { bar: if terminal { line() } else { ProgressBar::hidden() }, ..Self::lines(quiet) }
+        Self {
+            bar: if terminal { progress_line() } else { ProgressBar::hidden() },
+            ..Self::notes_only(quiet)
+        }
     }
 
     /// Creates a progress display that shows only notes until [`Progress::bar`] is called.
     #[must_use]
-    pub fn lines(quiet: bool) -> Self {
+    pub fn notes_only(quiet: bool) -> Self {
         Self { bar: ProgressBar::hidden(), quiet, due: Instant::now() }
     }
 
@@ -52,7 +55,7 @@ impl Progress {
         if self.quiet || now < self.due {
             return;
         }
-        let [here, elsewhere] = PERIODS;
+        let [here, elsewhere] = UPDATE_INTERVALS;
         if self.bar.is_hidden() {
             self.due = now + elsewhere;
             return eprint_line(&text(None));
@@ -87,7 +90,7 @@ fn columns() -> Option<usize> {
 }
 
 /// A progress line that is cut at the terminal's width.
-fn line() -> ProgressBar {
+fn progress_line() -> ProgressBar {
     styled(ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr()), "{wide_msg}")
 }
 

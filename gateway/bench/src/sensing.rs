@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-use model::repeat::Repeats;
+use model::repeat::RepeatedRequests;
 use protocol::bus::{Bus, BusError, BusOptions, Filter, KindChoice};
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
@@ -77,7 +77,12 @@ pub enum SensingError {
 ///
 /// # Errors
 /// Returns [`SensingError`] if a cell does not confirm, or the bus fails.
-pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> Result<String, SensingError> {
+pub fn switch_sensing(
+    bus: Bus,
+    format: Format,
+    only: Option<CellId>,
+    mode: Sensing,
+) -> Result<String, SensingError> {
     let mut answers = Answers::new(only, Some(REQUEST_TAG));
     let mut listener = Listener::new(bus, Some(format));
     let request = |bus: &Bus, to| {
@@ -86,16 +91,16 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     };
     request(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
     let began = Instant::now();
-    let mut requests = Repeats::new(RETRY_INTERVAL);
+    let mut requests = RepeatedRequests::new(RETRY_INTERVAL);
     requests.mark_all_sent(Micros::since_start(began.elapsed()));
     while began.elapsed() < ANSWER_TIMEOUT && !are_complete(&answers, only, began.elapsed() >= DISCOVERY_TIME)
     {
         answers.receive(&mut listener)?;
-        for cell in requests.due(Micros::since_start(began.elapsed()), answers.missing()) {
+        for cell in requests.due_requests(Micros::since_start(began.elapsed()), answers.missing()) {
             request(listener.bus(), Node::Cell(cell))?;
         }
     }
-    verdict(&answers, only, listener.bus().name(), format)
+    switch_result(&answers, only, listener.bus().name(), format)
 }
 
 /// Returns true if all expected cells have answered. Before `listened` is true, further cells may appear.
@@ -104,7 +109,7 @@ fn are_complete(answers: &Answers, only: Option<CellId>, listened: bool) -> bool
 }
 
 /// Returns the switched cells as text, or an error if some were not switched.
-fn verdict(
+fn switch_result(
     answers: &Answers,
     only: Option<CellId>,
     bus: &str,
@@ -113,7 +118,7 @@ fn verdict(
     let (bus, missing) = (bus.to_owned(), answers.missing());
     if answers.received().is_empty() {
         let who = only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
-        return Err(SensingError::NoAnswer { who, bus, other: format.other().name() });
+        return Err(SensingError::NoAnswer { who, bus, other: format.other_format().name() });
     }
     let (mut confirmed, mut refused) = (BTreeSet::new(), BTreeMap::new());
     for &(cell, answer) in answers.received() {
@@ -152,7 +157,7 @@ mod tests {
 
     /// Final verdict on an FD bus, as text.
     fn says(answers: &Answers, only: Option<CellId>) -> Result<String, String> {
-        verdict(answers, only, "vcan0", Format::Fd).map_err(|error| error.to_string())
+        switch_result(answers, only, "vcan0", Format::Fd).map_err(|error| error.to_string())
     }
 
     fn cell(node: i64) -> CellId {

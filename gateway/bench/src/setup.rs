@@ -20,7 +20,7 @@ impl Timeout {
 
     /// Takes the progress so far, as a number that grows. Returns true if it has not grown for the length of the
     /// timeout.
-    pub(crate) fn is_over(&mut self, far: usize) -> bool {
+    pub(crate) fn has_stalled(&mut self, far: usize) -> bool {
         if far > self.best {
             (self.best, self.since) = (far, Instant::now());
         }

@@ -14,7 +14,7 @@ pub use self::outcome::{CellError, ErrorCells, HaltSummary, Outcome, TickSummary
 pub(crate) use self::verdict::count_noun;
 pub use self::verdict::{CELL_ERROR_NM, Verdict};
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, CellStatus, Contributions, Event, SumCounts, Table};
+use model::table::{Accuracy, BusTable, CellStatus, Contributions, Event, SumCounts};
 pub use trace::recording::account::{RecordingAccount, WrittenFile};
 
 mod cells;
@@ -85,7 +85,7 @@ impl Summary {
 
     /// Creates the summary of a run that failed before any bus was opened.
     #[must_use]
-    pub fn of_no_run(skin: &Skin, why: String) -> Self {
+    pub fn for_failed_start(skin: &Skin, why: String) -> Self {
         Self::empty(skin).with_verdict(Some(why))
     }
 
@@ -248,7 +248,7 @@ pub struct UplinkSummary {
 
 impl UplinkSummary {
     /// Attributes up to `at_most` of the unknown losses to links between hosts.
-    pub fn explain_by_hosts(&mut self, at_most: u64) {
+    pub fn attribute_to_hosts(&mut self, at_most: u64) {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
         self.hosts += explained;
@@ -256,7 +256,7 @@ impl UplinkSummary {
 
     /// Attributes up to `at_most` of the unknown losses to the kernel's backlog. Returns the number of packets
     /// attributed.
-    pub fn explain_by_backlog(&mut self, at_most: u64) -> u64 {
+    pub fn attribute_to_backlog(&mut self, at_most: u64) -> u64 {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
         self.backlog += explained;
@@ -398,7 +398,7 @@ impl BusSummary {
         name: &str,
         kind: &str,
         receive_buffer: usize,
-        table: &Table,
+        table: &BusTable,
         dropped: u64,
         now: Micros,
     ) -> Self {
@@ -445,7 +445,7 @@ impl BusSummary {
     }
 }
 
-fn sensors(table: &Table) -> SensorsSummary {
+fn sensors(table: &BusTable) -> SensorsSummary {
     let sensed = || table.cells().iter().map(|cell| cell.sensed);
     let rates: Vec<f64> = sensed().filter_map(|sensed| sensed.rate_hz()).collect();
     let cells = u32::try_from(rates.len()).ok().filter(|&cells| cells > 0);
@@ -459,7 +459,7 @@ fn sensors(table: &Table) -> SensorsSummary {
     }
 }
 
-fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
+fn uplink(table: &BusTable, dropped_by_bus: u64) -> UplinkSummary {
     let total = table.uplink();
     let unexplained = total.lost - total.outage;
     let dropped = unexplained.min(dropped_by_bus);
@@ -481,13 +481,13 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
     }
 }
 
-fn sums(table: &Table) -> Option<SumsSummary> {
+fn sums(table: &BusTable) -> Option<SumsSummary> {
     let (counts, contributions) = table.sums()?;
     let roots = table.cells().iter().filter(|cell| cell.root).count();
     Some(SumsSummary { roots, counts, contributions })
 }
 
-fn replies(table: &Table) -> RepliesSummary {
+fn replies(table: &BusTable) -> RepliesSummary {
     let mut summary = RepliesSummary::default();
     table.cells().iter().for_each(|cell| summary.add(cell));
     summary

@@ -5,7 +5,7 @@ use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 
 use model::network::check::ObservedCell;
-use model::table::{CellState, CellStatus, Responded, SWITCHES, Switch};
+use model::table::{CellState, CellStatus, ResponseFlags, SWITCHES, Switch};
 
 /// State of a bus's cells, updated every 20 ms.
 #[derive(Clone, Debug, Default)]
@@ -45,7 +45,7 @@ pub struct CellView {
     /// Epoch of the last joints that the cell received.
     pub last_joints: Epoch,
     /// Reports that the cell has sent since the last request for them.
-    pub responded: Responded,
+    pub responded: ResponseFlags,
     /// Reply mode of the cell by its last report, as the words of the parameter.
     pub reply: Option<[i16; WORDS]>,
     /// Ports whose links the cell holds down, by its last report; one bit per port.
@@ -87,7 +87,7 @@ impl CellView {
             ready,
             halted: ready && !cell.is_ready(),
             unconfigured: settled.is_some() && !ready,
-            measures: ready && cell.measures() == Some(true),
+            measures: ready && cell.is_measuring() == Some(true),
             other_configuration: cell
                 .heartbeat()
                 .is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),

@@ -6,12 +6,12 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 
 use crate::each::parallel_map;
-use crate::estimate::{Ages, Estimate, Guess, estimate};
+use crate::estimate::{AgeCovariance, Estimate, PoseGuess, estimate};
 use crate::help::{MotionAdvice, suggest_motion};
 use crate::lag::Lags;
-use crate::neighbors::{LocatedCell, improve};
+use crate::neighbors::{LocatedCell, improve_positions};
 use crate::observe::{Observations, Reading};
-use crate::refusal::{Disturbance, Refusal};
+use crate::refusal::{GapSummary, Refusal};
 use crate::result::{Calibration, CellResult, Diagnosis, Pose, SensorResult, Summary};
 use crate::rounded::rounded;
 use crate::table::MotionTable;
@@ -45,7 +45,7 @@ const NEARER_PLACE_FACTOR: f64 = 2.0;
 /// Returns [`Refusal`] if the recording does not match the skin or its sensors, or is too disturbed; nothing is
 /// estimated then.
 pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<Calibration, Refusal> {
-    let (seen_by, disturbance) = estimated(skin, seen, settings)?;
+    let (seen_by, disturbance) = estimate_cells(skin, seen, settings)?;
     let CellEstimates { tables, lags, estimates } = seen_by;
     let mut cells: Vec<_> = skin
         .cells
@@ -56,11 +56,11 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Resul
             let table = tables.get(cell.bus).and_then(Option::as_ref);
             let usable = table.map_or(0, |table| readings.iter().filter(|it| table.is_known(it)).count());
             let share = as_f64(usable) / as_f64(table.map_or(0, MotionTable::known_count)).max(1.0);
-            result(skin, cell, estimate.as_ref(), readings, share)
+            cell_result(skin, cell, estimate.as_ref(), readings, share)
         })
         .collect();
     mark_scattering_cells(&mut cells, &estimates);
-    let wires = with_neighbors(skin, &mut cells, settings);
+    let wires = improve_by_neighbors(skin, &mut cells, settings);
     find_swaps(skin, &mut cells);
     advise(skin, &estimates, &mut cells, settings);
     for (result, cell) in cells.iter_mut().zip(&skin.cells) {
@@ -82,17 +82,17 @@ struct CellEstimates {
 }
 
 /// Estimates each cell from its own readings, and the shifts of stretches between gaps from the cells of a bus.
-fn estimated(
+fn estimate_cells(
     skin: &Skin,
     seen: &Observations,
     settings: &Settings,
-) -> Result<(CellEstimates, Disturbance), Refusal> {
+) -> Result<(CellEstimates, GapSummary), Refusal> {
     check_joints(skin, seen)?;
-    let mut lags: Vec<_> = seen.buses.iter().map(Lags::none).collect();
+    let mut lags: Vec<_> = seen.buses.iter().map(Lags::zero_lags).collect();
     let period = settings.sheet.period_s();
     for round in 0..=SHIFT_ROUNDS {
-        let now = each_alone(skin, seen, settings, lags);
-        let disturbance = disturbed(skin, seen, &now.tables)?;
+        let now = estimate_each_cell(skin, seen, settings, lags);
+        let disturbance = check_gaps(skin, seen, &now.tables)?;
         let more: Vec<_> = now
             .tables
             .iter()
@@ -114,18 +114,18 @@ fn estimated(
             return Ok((now, disturbance));
         };
         if round == SHIFT_ROUNDS {
-            return Err(shifted(skin, seen, (bus, most), disturbance));
+            return Err(shift_refusal(skin, seen, (bus, most), disturbance));
         }
         lags = now.lags.into_iter().zip(more).map(|(before, more)| more.unwrap_or(before)).collect();
     }
     unreachable!("the last round returns")
 }
 
-fn shifted(
+fn shift_refusal(
     skin: &Skin,
     seen: &Observations,
     (bus, (place, lag)): (usize, (usize, f64)),
-    disturbance: Disturbance,
+    disturbance: GapSummary,
 ) -> Refusal {
     let gap = seen.buses.get(bus).and_then(|bus| bus.gaps.iter().rev().find(|gap| gap.place <= place));
     let (from, from_s) = gap.map_or((0, 0.0), |gap| (gap.place, gap.at_s));
@@ -140,12 +140,12 @@ fn check_shifts(
     skin: &Skin,
     seen: &Observations,
     lags: &[Lags],
-    disturbance: Disturbance,
+    disturbance: GapSummary,
 ) -> Result<(), Refusal> {
     for (bus, (lags, observed)) in lags.iter().zip(&seen.buses).enumerate() {
         let length_s = as_f64(observed.joints.len()) / skin.timing.broadcast_hz();
         if lags.range() > MAX_SHIFTED_SHARE * length_s {
-            return Err(shifted(skin, seen, (bus, lags.largest()), disturbance));
+            return Err(shift_refusal(skin, seen, (bus, lags.largest()), disturbance));
         }
     }
     Ok(())
@@ -175,15 +175,15 @@ fn check_joints(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
 }
 
 /// Returns the gaps of a recording, or an error if the motion is known for too few of its broadcasts.
-fn disturbed(
+fn check_gaps(
     skin: &Skin,
     seen: &Observations,
     tables: &[Option<MotionTable>],
-) -> Result<Disturbance, Refusal> {
-    let mut all = Disturbance::default();
+) -> Result<GapSummary, Refusal> {
+    let mut all = GapSummary::default();
     for (bus, (observed, table)) in seen.buses.iter().zip(tables).enumerate() {
         let Some(table) = table else { continue };
-        let disturbance = Disturbance::from_bus(observed, table.known_count());
+        let disturbance = GapSummary::from_bus(observed, table.known_count());
         if table.known_count() < MIN_READINGS {
             return Err(Refusal::Disturbed { bus: name(skin, bus), disturbance });
         }
@@ -196,7 +196,7 @@ fn disturbed(
 fn check_scatter(
     estimates: &[Option<Estimate>],
     sheet: &DataSheet,
-    disturbance: Disturbance,
+    disturbance: GapSummary,
 ) -> Result<(), Refusal> {
     let middle = |pick: fn(&Estimate) -> f64| {
         let mut all: Vec<_> = estimates.iter().flatten().map(pick).collect();
@@ -215,7 +215,12 @@ fn check_scatter(
     })
 }
 
-fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<Lags>) -> CellEstimates {
+fn estimate_each_cell(
+    skin: &Skin,
+    seen: &Observations,
+    settings: &Settings,
+    lags: Vec<Lags>,
+) -> CellEstimates {
     let buses: Vec<_> = (0..skin.buses.len()).collect();
     let tables: Vec<_> = parallel_map(buses.len(), settings.threads, |bus| {
         let is_used = skin.cells_on_bus(bus).next().is_some();
@@ -224,7 +229,7 @@ fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<L
             .filter(|_| is_used)
             .map(|lags| MotionTable::new(skin, bus, seen, sheet, gravity, &[0.0; MAX_JOINTS], lags))
     });
-    let ages = Ages::for_sheet(&settings.sheet, 1.0 / skin.timing.broadcast_hz());
+    let ages = AgeCovariance::for_sheet(&settings.sheet, 1.0 / skin.timing.broadcast_hz());
     let estimates = parallel_map(skin.cells.len(), settings.threads, |index| {
         let cell = skin.cells.get(index)?;
         let table = tables.get(cell.bus)?.as_ref()?;
@@ -235,7 +240,7 @@ fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<L
         let own = table
             .arm
             .transform_between(cell.row, skin.chain(cell.bus).row_of(cell.joint).unwrap_or_default());
-        let guess = Guess {
+        let guess = PoseGuess {
             joint: cell.joint,
             rotation: own.rotation * rotation(cell.orientation, cell.normal),
             position: own.transform_point(&cell.position.into()).coords,
@@ -253,14 +258,14 @@ fn is_stuck(readings: &[Reading]) -> bool {
 }
 
 /// Returns the result for one cell, from its own readings only.
-fn result(
+fn cell_result(
     skin: &Skin,
     cell: &Cell,
     estimate: Option<&Estimate>,
     readings: &[Reading],
     share: f64,
 ) -> CellResult {
-    let mut result = CellResult::unknown(skin, cell, readings.len());
+    let mut result = CellResult::without_estimate(skin, cell, readings.len());
     if readings.is_empty() {
         result.troubles.push(Diagnosis::Dead);
     } else if is_stuck(readings) {
@@ -315,7 +320,7 @@ fn mark_scattering_cells(cells: &mut [CellResult], estimates: &[Option<Estimate>
 }
 
 /// Improves the positions of the cells by the lengths of wires, link by link, and returns the number of wires used.
-fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) -> usize {
+fn improve_by_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) -> usize {
     let Some(spacing) = settings.spacing else { return 0 };
     let mut used = 0;
     for bus in 0..skin.buses.len() {
@@ -344,7 +349,7 @@ fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) ->
                 let others = cell.neighbors.iter().flatten().filter_map(|node| place(*node));
                 wires.extend(others.filter(|other| one < *other).map(|other| (one, other)));
             }
-            used += improve(&mut known, &wires, &spacing);
+            used += improve_positions(&mut known, &wires, &spacing);
             for (index, known) in members.into_iter().zip(known) {
                 if let Some(pose) = cells.get_mut(index).and_then(|cell| cell.pose.as_mut()) {
                     (pose.position, pose.position_covariance) = (known.position, known.covariance);
@@ -387,7 +392,7 @@ fn other_cell_at(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize>
     distances.sort_by(|one, other| one.0.total_cmp(&other.0));
     let (nearest, index) = *distances.first()?;
     let next = distances.get(1).map_or(f64::INFINITY, |(next, _)| *next);
-    let certain = 2.0 * pose.position_95() + 0.002;
+    let certain = 2.0 * pose.position_radius_95_m() + 0.002;
     (nearest * NEARER_PLACE_FACTOR < own && nearest * NEARER_PLACE_FACTOR < next + 2e-3 && own > certain)
         .then_some(index)
 }
@@ -407,7 +412,8 @@ fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult],
             known.push((key, help.clone()));
             help
         });
-        let [position_mm, orientation_deg] = [pose.position_95() * 1e3, pose.turn_95().to_degrees()];
+        let [position_mm, orientation_deg] =
+            [pose.position_radius_95_m() * 1e3, pose.rotation_angle_95_rad().to_degrees()];
         result.troubles.push(Diagnosis::NotObservable {
             position_mm: rounded(position_mm, 1),
             orientation_deg: rounded(orientation_deg, 1),

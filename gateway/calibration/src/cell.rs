@@ -17,35 +17,35 @@ use model::accelerometer::kinematics::RowMotion;
 use model::accelerometer::sensor::DataSheet;
 
 /// The count of the numbers that describe the motion of a row: the force (3), and the gradient by columns (9).
-pub(crate) const ROW: usize = 12;
+pub(crate) const ROW_NUMBERS: usize = 12;
 /// The number of ages of readings for which motions are computed.
-pub(crate) const AGES: usize = 3;
+pub(crate) const AGE_COUNT: usize = 3;
 /// The interval between two of the [`AGES`], in s.
-pub(crate) const AGE_STEP: f64 = 0.006;
+pub(crate) const AGE_STEP_S: f64 = 0.006;
 /// The count of the numbers of a [`Moment`].
-pub(crate) const MOMENT: usize = AGES * ROW + 1;
+pub(crate) const MODEL_INPUTS: usize = AGE_COUNT * ROW_NUMBERS + 1;
 /// The number of unknowns of a cell.
 pub(crate) const UNKNOWNS: usize = 19;
 
 /// The unknowns of the orientation: a rotation vector, in the frame of the cell, from the present estimate.
-pub(crate) const TURN: Range<usize> = 0..3;
+pub(crate) const ROTATION_UNKNOWNS: Range<usize> = 0..3;
 /// The unknowns of the position in the frame of the row.
-pub(crate) const POSITION: Range<usize> = 3..6;
-pub(crate) const BIAS: Range<usize> = 6..9;
-pub(crate) const GAIN: Range<usize> = 9..12;
+pub(crate) const POSITION_UNKNOWNS: Range<usize> = 3..6;
+pub(crate) const BIAS_UNKNOWNS: Range<usize> = 6..9;
+pub(crate) const GAIN_UNKNOWNS: Range<usize> = 9..12;
 /// The unknowns of the cross-sensitivity between axes.
-const CROSS: Range<usize> = 12..18;
-pub(crate) const AGE: usize = 18;
+const CROSS_AXIS_UNKNOWNS: Range<usize> = 12..18;
+pub(crate) const AGE_UNKNOWN: usize = 18;
 
 /// Row and column of each element of [`CROSS`].
 const OFF_DIAGONAL: [(usize, usize); 6] = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)];
 
 /// The input of the linear model at one moment: the motion of a row at all ages, and 1.
-pub(crate) type Moment = [f64; MOMENT];
+pub(crate) type ModelInput = [f64; MODEL_INPUTS];
 /// The coefficients by which each axis of a sensor depends on the numbers of a [`Moment`].
-pub(crate) type Coefficients = SMatrix<f64, MOMENT, 3>;
+pub(crate) type Coefficients = SMatrix<f64, MODEL_INPUTS, 3>;
 pub(crate) type Unknowns = SVector<f64, UNKNOWNS>;
-pub(crate) type Information = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
+pub(crate) type InformationMatrix = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
 
 /// The pose, the sensor errors and the age of readings that are assumed for a cell.
 #[derive(Clone, Debug, PartialEq)]
@@ -68,9 +68,11 @@ impl CellModel {
     /// Returns the coefficients by which each axis depends on the numbers of a moment.
     pub(crate) fn coefficients(&self) -> Coefficients {
         let rotation = self.rotation.to_rotation_matrix().matrix().to_owned();
-        let mut all =
-            spread(&row(&(self.matrix * rotation.transpose()), &self.position), &parabola(self.age));
-        all.row_mut(MOMENT - 1).copy_from(&self.bias.transpose());
+        let mut all = spread_over_ages(
+            &row_coefficients(&(self.matrix * rotation.transpose()), &self.position),
+            &interpolation_weights(self.age),
+        );
+        all.row_mut(MODEL_INPUTS - 1).copy_from(&self.bias.transpose());
         all
     }
 
@@ -78,56 +80,56 @@ impl CellModel {
     pub(crate) fn derivatives(&self) -> [Coefficients; UNKNOWNS] {
         let turned = self.rotation.to_rotation_matrix().matrix().transpose();
         let axes = self.matrix * turned;
-        let ages = parabola(self.age);
+        let ages = interpolation_weights(self.age);
         let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
         core::array::from_fn(|unknown| {
-            if let Some(axis) = within(&TURN, unknown) {
+            if let Some(axis) = within(&ROTATION_UNKNOWNS, unknown) {
                 let axes = -self.matrix * unit(axis).cross_matrix() * turned;
-                spread(&row(&axes, &self.position), &ages)
-            } else if let Some(axis) = within(&POSITION, unknown) {
-                let mut part = row(&axes, &unit(axis));
+                spread_over_ages(&row_coefficients(&axes, &self.position), &ages)
+            } else if let Some(axis) = within(&POSITION_UNKNOWNS, unknown) {
+                let mut part = row_coefficients(&axes, &unit(axis));
                 part.fixed_rows_mut::<3>(0).fill(0.0);
-                spread(&part, &ages)
-            } else if let Some(axis) = within(&BIAS, unknown) {
+                spread_over_ages(&part, &ages)
+            } else if let Some(axis) = within(&BIAS_UNKNOWNS, unknown) {
                 let mut all = Coefficients::zeros();
-                all.row_mut(MOMENT - 1).copy_from(&unit(axis).transpose());
+                all.row_mut(MODEL_INPUTS - 1).copy_from(&unit(axis).transpose());
                 all
-            } else if unknown == AGE {
-                spread(&row(&axes, &self.position), &slope(self.age))
+            } else if unknown == AGE_UNKNOWN {
+                spread_over_ages(&row_coefficients(&axes, &self.position), &interpolation_slopes(self.age))
             } else {
                 let (to, from) = matrix_entry(unknown);
                 let mut one = Matrix3::zeros();
                 one.set_row(to, &turned.row(from));
-                spread(&row(&one, &self.position), &ages)
+                spread_over_ages(&row_coefficients(&one, &self.position), &ages)
             }
         })
     }
 
     /// Returns the model with this step added to its unknowns.
-    pub(crate) fn moved(&self, step: &Unknowns) -> Self {
+    pub(crate) fn with_step(&self, step: &Unknowns) -> Self {
         let part = |range: &Range<usize>| Vector3::from_fn(|at, _| step[range.start + at]);
         let mut matrix = self.matrix;
-        for unknown in GAIN.start..CROSS.end {
+        for unknown in GAIN_UNKNOWNS.start..CROSS_AXIS_UNKNOWNS.end {
             matrix[matrix_entry(unknown)] += step[unknown];
         }
         Self {
-            rotation: self.rotation * UnitQuaternion::from_scaled_axis(part(&TURN)),
-            position: self.position + part(&POSITION),
-            bias: self.bias + part(&BIAS),
+            rotation: self.rotation * UnitQuaternion::from_scaled_axis(part(&ROTATION_UNKNOWNS)),
+            position: self.position + part(&POSITION_UNKNOWNS),
+            bias: self.bias + part(&BIAS_UNKNOWNS),
             matrix,
-            age: self.age + step[AGE],
+            age: self.age + step[AGE_UNKNOWN],
         }
     }
 
     /// Returns the deviations of the unknowns from the values that the data sheet expects.
-    pub(crate) fn unexpected(&self) -> Unknowns {
+    pub(crate) fn deviations_from_sheet(&self) -> Unknowns {
         Unknowns::from_fn(|unknown, _| {
-            if let Some(axis) = within(&BIAS, unknown) {
+            if let Some(axis) = within(&BIAS_UNKNOWNS, unknown) {
                 self.bias[axis]
-            } else if (GAIN.start..CROSS.end).contains(&unknown) {
+            } else if (GAIN_UNKNOWNS.start..CROSS_AXIS_UNKNOWNS.end).contains(&unknown) {
                 let (to, from) = matrix_entry(unknown);
                 self.matrix[(to, from)] - if to == from { 1.0 } else { 0.0 }
-            } else if unknown == AGE {
+            } else if unknown == AGE_UNKNOWN {
                 self.age
             } else {
                 0.0
@@ -138,40 +140,40 @@ impl CellModel {
 
 /// Returns the prior of the unknowns by the data sheet, as inverse variances. The prior of the pose is very weak: it
 /// only keeps the information matrix regular in directions that no motion reveals.
-pub(crate) fn expected(sheet: &DataSheet) -> Unknowns {
+pub(crate) fn prior_inverse_variances(sheet: &DataSheet) -> Unknowns {
     // The standard deviation of a uniform distribution with this limit; never 0.
     let even = |limit: f64| (limit / 3.0_f64.sqrt()).max(1e-6);
     let deviation = |unknown: usize| {
-        if TURN.contains(&unknown) {
-            WEAK_TURN
-        } else if POSITION.contains(&unknown) {
-            WEAK_POSITION
-        } else if BIAS.contains(&unknown) {
+        if ROTATION_UNKNOWNS.contains(&unknown) {
+            PRIOR_ROTATION_SD_RAD
+        } else if POSITION_UNKNOWNS.contains(&unknown) {
+            PRIOR_POSITION_SD_M
+        } else if BIAS_UNKNOWNS.contains(&unknown) {
             even(sheet.bias_g)
-        } else if GAIN.contains(&unknown) {
+        } else if GAIN_UNKNOWNS.contains(&unknown) {
             even(sheet.gain)
-        } else if CROSS.contains(&unknown) {
+        } else if CROSS_AXIS_UNKNOWNS.contains(&unknown) {
             even(sheet.cross_axis)
         } else {
-            sheet.age().1.max(1e-6)
+            sheet.age_mean_and_deviation_s().1.max(1e-6)
         }
     };
     Unknowns::from_fn(|unknown, _| deviation(unknown).powi(-2))
 }
 
 /// The prior standard deviation of the orientation, in rad.
-pub(crate) const WEAK_TURN: f64 = 1.0;
+pub(crate) const PRIOR_ROTATION_SD_RAD: f64 = 1.0;
 /// The prior standard deviation of the position, in m.
-pub(crate) const WEAK_POSITION: f64 = 0.5;
+pub(crate) const PRIOR_POSITION_SD_M: f64 = 0.5;
 
 /// Returns the 12 numbers of a row's motion: its force, and its gradient by columns.
-pub(crate) fn numbers(motion: &RowMotion) -> [f64; ROW] {
+pub(crate) fn motion_numbers(motion: &RowMotion) -> [f64; ROW_NUMBERS] {
     let mut all = motion.force.iter().chain(motion.gradient.iter());
     core::array::from_fn(|_| all.next().copied().unwrap_or_default())
 }
 
 /// Returns the coefficients by which the axes depend on a row's motion, for a sensor at a position on the row.
-fn row(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64, ROW, 3> {
+fn row_coefficients(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64, ROW_NUMBERS, 3> {
     SMatrix::from_fn(|number, axis| {
         let (block, part) = (number / 3, number % 3);
         let scale = if block == 0 { 1.0 } else { position[block - 1] };
@@ -179,12 +181,12 @@ fn row(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64, ROW, 3> {
     })
 }
 
-fn spread(row: &SMatrix<f64, ROW, 3>, ages: &[f64; AGES]) -> Coefficients {
+fn spread_over_ages(row: &SMatrix<f64, ROW_NUMBERS, 3>, ages: &[f64; AGE_COUNT]) -> Coefficients {
     let mut all = Coefficients::zeros();
     for (at, age) in ages.iter().enumerate() {
         for axis in 0..3 {
-            for number in 0..ROW {
-                all[(at * ROW + number, axis)] = row[(number, axis)] * age;
+            for number in 0..ROW_NUMBERS {
+                all[(at * ROW_NUMBERS + number, axis)] = row[(number, axis)] * age;
             }
         }
     }
@@ -193,8 +195,8 @@ fn spread(row: &SMatrix<f64, ROW, 3>, ages: &[f64; AGES]) -> Coefficients {
 
 /// Returns the entry of the sensor's matrix that an unknown stands for.
 fn matrix_entry(unknown: usize) -> (usize, usize) {
-    within(&GAIN, unknown).map_or_else(
-        || OFF_DIAGONAL.get(unknown.wrapping_sub(CROSS.start)).copied().unwrap_or((0, 0)),
+    within(&GAIN_UNKNOWNS, unknown).map_or_else(
+        || OFF_DIAGONAL.get(unknown.wrapping_sub(CROSS_AXIS_UNKNOWNS.start)).copied().unwrap_or((0, 0)),
         |axis| (axis, axis),
     )
 }
@@ -204,15 +206,15 @@ fn within(range: &Range<usize>, unknown: usize) -> Option<usize> {
 }
 
 /// Returns the weights of the motions at the three ages that interpolate a motion at `age`.
-fn parabola(age: f64) -> [f64; AGES] {
-    let x = age / AGE_STEP;
+fn interpolation_weights(age: f64) -> [f64; AGE_COUNT] {
+    let x = age / AGE_STEP_S;
     [x * (x - 1.0) / 2.0, 1.0 - x * x, x * (x + 1.0) / 2.0]
 }
 
 /// Returns the derivatives of the weights of [`parabola`] with respect to the age, in 1/s.
-fn slope(age: f64) -> [f64; AGES] {
-    let x = age / AGE_STEP;
-    [(x - 0.5) / AGE_STEP, -2.0 * x / AGE_STEP, (x + 0.5) / AGE_STEP]
+fn interpolation_slopes(age: f64) -> [f64; AGE_COUNT] {
+    let x = age / AGE_STEP_S;
+    [(x - 0.5) / AGE_STEP_S, -2.0 * x / AGE_STEP_S, (x + 0.5) / AGE_STEP_S]
 }
 
 #[cfg(test)]
@@ -237,7 +239,7 @@ mod tests {
             let at = |step: f64| {
                 let mut moved = Unknowns::zeros();
                 moved[unknown] = step;
-                model.moved(&moved).coefficients()
+                model.with_step(&moved).coefficients()
             };
             let difference = (at(step) - at(-step)) / (2.0 * step);
             let off = (difference - derivative).norm();
@@ -247,17 +249,17 @@ mod tests {
 
     #[test]
     fn coefficients_and_numbers_make_the_reading() {
-        let model = CellModel { age: AGE_STEP, ..model() };
+        let model = CellModel { age: AGE_STEP_S, ..model() };
         let motion = |seed: f64| RowMotion {
             force: Vector3::new(seed, 0.2, -1.0),
             gradient: Matrix3::from_fn(|row, column| seed + 0.3 * (row + 2 * column) as f64),
         };
         let motions = [0.1, 0.2, 0.3].map(motion);
-        let mut moment = [1.0; MOMENT];
-        for (to, from) in moment.iter_mut().zip(motions.iter().flat_map(numbers)) {
+        let mut moment = [1.0; MODEL_INPUTS];
+        for (to, from) in moment.iter_mut().zip(motions.iter().flat_map(motion_numbers)) {
             *to = from;
         }
-        let shown = model.coefficients().transpose() * SVector::<f64, MOMENT>::from(moment);
+        let shown = model.coefficients().transpose() * SVector::<f64, MODEL_INPUTS>::from(moment);
         let force = model.rotation.inverse() * motions[2].force_at(&model.position);
         assert!((shown - (model.matrix * force + model.bias)).norm() < 1e-12);
     }

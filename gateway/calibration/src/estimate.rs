@@ -4,27 +4,30 @@
 
 use nalgebra::{Cholesky, Matrix3, UnitQuaternion, Vector3};
 
-use crate::cell::{AGE, CellModel, Coefficients, Information, Moment, POSITION, TURN, Unknowns, expected};
+use crate::cell::{
+    AGE_UNKNOWN, CellModel, Coefficients, InformationMatrix, ModelInput, POSITION_UNKNOWNS,
+    ROTATION_UNKNOWNS, Unknowns, prior_inverse_variances,
+};
 use crate::lag::Lags;
 use crate::observe::Reading;
-use crate::sums::{Fit, FreeCoefficients, ReadingSums, at_middle_age};
+use crate::sums::{Fit, FreeCoefficients, ReadingSums, expand_middle_age};
 use crate::table::MotionTable;
 use model::accelerometer::sensor::DataSheet;
 
 /// The number of readings that are used in the first search for the joint.
 const SEARCH_READINGS: usize = 1_500;
 /// The number of joints that are fitted completely after the first search.
-const SHORTLIST: usize = 3;
+const SHORTLIST_JOINTS: usize = 3;
 /// The number of times that the weights of readings are recomputed.
-const ROUNDS: usize = 2;
+const REWEIGHT_ROUNDS: usize = 2;
 /// Residuals beyond this many standard deviations get a lower weight; see [`weight`].
 const HUBER_THRESHOLD: f64 = 3.5;
 /// The number of broadcasts in a batch, over which scores are summed before their correlation is computed.
-const BATCH: u32 = 4;
+const BATCH_BROADCASTS: u32 = 4;
 /// The maximum distance of batches whose correlation is included, about 16 s.
 const CORRELATED_BATCHES: u32 = 256;
 /// The number of assumed sensor clock rates over which the correlation of ages is averaged.
-const CLOCKS: u32 = 101;
+const ASSUMED_CLOCK_RATES: u32 = 101;
 /// The minimum number of readings for an estimate.
 const MIN_READINGS: f64 = 100.0;
 /// The median of the squared length of three standard normal numbers.
@@ -32,9 +35,9 @@ const MEDIAN_SQUARE: f64 = 2.366;
 /// The 90 % quantile of the squared length of three standard normal numbers.
 const NINETY_PERCENT_SQUARE: f64 = 6.251;
 /// The error of predicted readings from the rounding and smoothing of joint positions, in g.
-const SMOOTHED_G: f64 = 1e-3;
+const SMOOTHING_ERROR_G: f64 = 1e-3;
 /// The standard deviation of a position along each axis from smoothed accelerations, in m.
-const SMOOTHED_M: f64 = 1e-4;
+const SMOOTHING_DEVIATION_M: f64 = 1e-4;
 
 /// The estimate of a cell from its readings.
 #[derive(Clone, Debug)]
@@ -45,7 +48,7 @@ pub(crate) struct Estimate {
     pub(crate) margin: f64,
     pub(crate) model: CellModel,
     /// The covariance of the unknowns of the cell's model, in the order of [`Unknowns`].
-    pub(crate) covariance: Information,
+    pub(crate) covariance: InformationMatrix,
     /// The root mean square of an axis' residuals, in g, derived from their median.
     pub(crate) noise_g: f64,
     /// The root mean square of an axis' residuals, in g, derived from their 90 % quantile.
@@ -61,19 +64,19 @@ impl Estimate {
     /// Returns the covariance of the position, in m².
     pub(crate) fn position_covariance(&self) -> Matrix3<f64> {
         let own: Matrix3<f64> =
-            self.covariance.fixed_view::<3, 3>(POSITION.start, POSITION.start).into_owned();
-        own + Matrix3::identity() * (SMOOTHED_M * SMOOTHED_M)
+            self.covariance.fixed_view::<3, 3>(POSITION_UNKNOWNS.start, POSITION_UNKNOWNS.start).into_owned();
+        own + Matrix3::identity() * (SMOOTHING_DEVIATION_M * SMOOTHING_DEVIATION_M)
     }
 
     /// Returns the covariance of the orientation, as a rotation vector in the frame of the cell, in rad².
     pub(crate) fn turn_covariance(&self) -> Matrix3<f64> {
-        self.covariance.fixed_view::<3, 3>(TURN.start, TURN.start).into_owned()
+        self.covariance.fixed_view::<3, 3>(ROTATION_UNKNOWNS.start, ROTATION_UNKNOWNS.start).into_owned()
     }
 }
 
 /// A pose from which least squares may start.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Guess {
+pub(crate) struct PoseGuess {
     pub(crate) joint: u8,
     pub(crate) rotation: UnitQuaternion<f64>,
     pub(crate) position: Vector3<f64>,
@@ -83,25 +86,25 @@ pub(crate) struct Guess {
 pub(crate) fn estimate(
     table: &MotionTable,
     readings: &[Reading],
-    guess: &Guess,
+    guess: &PoseGuess,
     sheet: &DataSheet,
-    ages: &Ages,
+    ages: &AgeCovariance,
 ) -> Option<Estimate> {
-    let expected = expected(sheet);
+    let expected = prior_inverse_variances(sheet);
     // At the end of its range a sensor saturates.
     let within = |reading: &&Reading| reading.g.iter().all(|axis| axis.abs() < 0.98 * sheet.range_g);
     let readings: &[Reading] = &readings.iter().filter(within).copied().collect::<Vec<_>>();
     // The age of readings varies from one to the next, which looks like noise while the robot moves.
     let variance = (sheet.reading_deviation().powi(2) + 0.002_f64.powi(2)).max(1e-8);
-    let (joint, margin, start) = identify(table, readings, guess, &expected, variance)?;
+    let (joint, margin, start) = identify_joint(table, readings, guess, &expected, variance)?;
     let link = table.link(joint);
     let mut spread = variance;
     let mut fit: Option<Fit> = None;
     let mut sums = ReadingSums::default();
-    for _ in 0..=ROUNDS {
+    for _ in 0..=REWEIGHT_ROUNDS {
         let coefficients = fit.as_ref().map(|fit| fit.model.coefficients());
         sums = ReadingSums::default();
-        for (moment, reading) in paired(link, readings) {
+        for (moment, reading) in readings_with_motion(link, readings) {
             let weight =
                 coefficients.as_ref().map_or(1.0, |it| weight(&residual(it, moment, &reading.g), spread));
             sums.add(moment, &reading.g, weight);
@@ -111,22 +114,22 @@ pub(crate) fn estimate(
         }
         let from = fit.take().map_or_else(|| start.clone(), |fit| fit.model);
         let next = sums.fit(from, &expected, spread);
-        [spread, _] = spreads(link, readings, &next.model, None);
+        [spread, _] = residual_variances(link, readings, &next.model, None);
         spread = spread.max(1e-10);
         fit = Some(next);
     }
     let model = fit?.model;
-    let [noise_g, rough_g] = spreads(link, readings, &model, None).map(f64::sqrt);
-    let [noise_times, rough_times] = spreads(link, readings, &model, Some(sheet)).map(f64::sqrt);
+    let [noise_g, rough_g] = residual_variances(link, readings, &model, None).map(f64::sqrt);
+    let [noise_times, rough_times] = residual_variances(link, readings, &model, Some(sheet)).map(f64::sqrt);
     let covariance = covariance(link, readings, &model, &sums, &expected, (spread, ages, &table.lags))?;
     Some(Estimate { joint, margin, model, covariance, noise_g, rough_g, noise_times, rough_times })
 }
 
 /// Finds the joint whose motion explains the readings best, with its margin over the next best one and a fitted model.
-fn identify(
+fn identify_joint(
     table: &MotionTable,
     readings: &[Reading],
-    guess: &Guess,
+    guess: &PoseGuess,
     expected: &Unknowns,
     variance: f64,
 ) -> Option<(u8, f64, CellModel)> {
@@ -137,14 +140,14 @@ fn identify(
     let mut looks = Vec::new();
     for joint in 0..=table.joints() {
         let mut sums = ReadingSums::default();
-        for (moment, reading) in paired(table.link(joint), &few) {
+        for (moment, reading) in readings_with_motion(table.link(joint), &few) {
             sums.add(moment, &reading.g, 1.0);
         }
-        let free = sums.unconstrained(sums.weight * 1e-5)?;
-        looks.push((sums.residual(&at_middle_age(&free)), joint, sums, free));
+        let free = sums.fit_unconstrained(sums.weight * 1e-5)?;
+        looks.push((sums.residual(&expand_middle_age(&free)), joint, sums, free));
     }
     looks.sort_by(|one, other| one.0.total_cmp(&other.0));
-    looks.truncate(SHORTLIST);
+    looks.truncate(SHORTLIST_JOINTS);
     let mut fits = Vec::new();
     for (_, joint, sums, free) in looks {
         let found = initial_model(&free).map(|start| sums.fit(start, expected, variance));
@@ -195,10 +198,10 @@ fn initial_model(free: &FreeCoefficients) -> Option<CellModel> {
 }
 
 /// Returns the readings at whose time the motion is known, each with that motion.
-pub(crate) fn paired<'a>(
-    link: &'a [Option<Moment>],
+pub(crate) fn readings_with_motion<'a>(
+    link: &'a [Option<ModelInput>],
     readings: &'a [Reading],
-) -> impl Iterator<Item = (&'a Moment, &'a Reading)> {
+) -> impl Iterator<Item = (&'a ModelInput, &'a Reading)> {
     readings.iter().filter_map(|reading| {
         let index = usize::try_from(reading.epoch).ok()?;
         Some((link.get(index)?.as_ref()?, reading))
@@ -206,7 +209,7 @@ pub(crate) fn paired<'a>(
 }
 
 /// Returns the difference between a reading and the reading that the coefficients predict, by axis in g.
-pub(crate) fn residual(coefficients: &Coefficients, moment: &Moment, shown: &[f64; 3]) -> [f64; 3] {
+pub(crate) fn residual(coefficients: &Coefficients, moment: &ModelInput, shown: &[f64; 3]) -> [f64; 3] {
     let mut left = *shown;
     for (left, column) in left.iter_mut().zip(coefficients.column_iter()) {
         *left -= column.iter().zip(moment).map(|(one, other)| one * other).sum::<f64>();
@@ -227,18 +230,20 @@ pub(crate) fn weight(residual: &[f64; 3], variance: f64) -> f64 {
 /// Returns the variance of the axes' residuals, once from the median of their squares and once from the 90 % quantile.
 /// Single readings that were late or corrupted affect neither. With a data sheet, each residual is in units of the
 /// value that the sheet predicts.
-fn spreads(
-    link: &[Option<Moment>],
+fn residual_variances(
+    link: &[Option<ModelInput>],
     readings: &[Reading],
     model: &CellModel,
     sheet: Option<&DataSheet>,
 ) -> [f64; 2] {
     let (coefficients, derivatives) = (model.coefficients(), model.derivatives());
-    let squares = paired(link, readings).map(|(moment, reading)| {
+    let squares = readings_with_motion(link, readings).map(|(moment, reading)| {
         let own = square(&residual(&coefficients, moment, &reading.g));
         own / sheet.map_or(1.0, |sheet| {
-            let aged = square(&change(&derivatives[AGE], moment)) * sheet.period_s().powi(2) / 12.0;
-            sheet.reading_deviation().powi(2) + SMOOTHED_G * SMOOTHED_G + aged / 3.0
+            let aged = square(&reading_derivative(&derivatives[AGE_UNKNOWN], moment))
+                * sheet.period_s().powi(2)
+                / 12.0;
+            sheet.reading_deviation().powi(2) + SMOOTHING_ERROR_G * SMOOTHING_ERROR_G + aged / 3.0
         })
     });
     let mut squares: Vec<_> = squares.collect();
@@ -257,16 +262,16 @@ fn spreads(
 /// clock drifts against the broadcasts. Such ages are correlated over seconds, so that noise alone gives too small a
 /// value.
 fn covariance(
-    link: &[Option<Moment>],
+    link: &[Option<ModelInput>],
     readings: &[Reading],
     model: &CellModel,
     sums: &ReadingSums,
     expected: &Unknowns,
-    (variance, ages, lags): (f64, &Ages, &Lags),
-) -> Option<Information> {
+    (variance, ages, lags): (f64, &AgeCovariance, &Lags),
+) -> Option<InformationMatrix> {
     let (information, _) = sums.information(model);
     let information = information / variance;
-    let inverse = Cholesky::new(information + Information::from_diagonal(expected))?.inverse();
+    let inverse = Cholesky::new(information + InformationMatrix::from_diagonal(expected))?.inverse();
     let (coefficients, derivatives) = (model.coefficients(), model.derivatives());
     let mut scores: Vec<(u32, Unknowns)> = Vec::new();
     let mut sum = Coefficients::zeros();
@@ -276,20 +281,20 @@ fn covariance(
         scores.push((batch, Unknowns::from_fn(|unknown, _| derivatives[unknown].dot(sum))));
         sum.fill(0.0);
     };
-    for (moment, reading) in paired(link, readings) {
-        let now = reading.epoch / BATCH;
+    for (moment, reading) in readings_with_motion(link, readings) {
+        let now = reading.epoch / BATCH_BROADCASTS;
         if batch != Some(now) {
             close(batch, &mut sum);
         }
         batch = Some(now);
         let weight = weight(&residual(&coefficients, moment, &reading.g), variance) / variance;
-        let change = change(&derivatives[AGE], moment);
+        let change = reading_derivative(&derivatives[AGE_UNKNOWN], moment);
         for (column, change) in sum.as_mut_slice().chunks_exact_mut(moment.len()).zip(change) {
             column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += weight * change * number);
         }
     }
     close(batch, &mut sum);
-    let mut scatter = information + Information::from_diagonal(expected);
+    let mut scatter = information + InformationMatrix::from_diagonal(expected);
     for (at, (batch, score)) in scores.iter().enumerate() {
         // The sum over later batches first: one product of vectors instead of one for each pair.
         let mut beside = score * (ages.covariance(0) / 2.0);
@@ -303,8 +308,8 @@ fn covariance(
     // The estimated lag of a stretch is wrong by the same amount for all of it.
     let mut by_stretch = vec![Unknowns::zeros(); lags.deviations().len()];
     for (batch, score) in &scores {
-        let index = usize::try_from(batch * BATCH).unwrap_or(usize::MAX);
-        by_stretch.get_mut(lags.stretch(index)).into_iter().for_each(|sum| *sum += score);
+        let index = usize::try_from(batch * BATCH_BROADCASTS).unwrap_or(usize::MAX);
+        by_stretch.get_mut(lags.stretch_index(index)).into_iter().for_each(|sum| *sum += score);
     }
     for (score, deviation) in by_stretch.iter().zip(lags.deviations()) {
         scatter.ger(deviation * deviation, score, score, 1.0);
@@ -313,7 +318,7 @@ fn covariance(
 }
 
 /// Returns the derivative of each axis' reading with respect to its age, in g/s.
-pub(crate) fn change(by_age: &Coefficients, moment: &Moment) -> [f64; 3] {
+pub(crate) fn reading_derivative(by_age: &Coefficients, moment: &ModelInput) -> [f64; 3] {
     let mut all = [0.0; 3];
     for (change, column) in all.iter_mut().zip(by_age.column_iter()) {
         *change = column.iter().zip(moment).map(|(one, other)| one * other).sum();
@@ -324,12 +329,12 @@ pub(crate) fn change(by_age: &Coefficients, moment: &Moment) -> [f64; 3] {
 /// The covariance of the ages of readings. A sensor samples at the rate of a clock with an unknown error, so that the
 /// age of its newest sample runs through the sample period again and again.
 #[derive(Clone, Debug)]
-pub(crate) struct Ages {
+pub(crate) struct AgeCovariance {
     /// The covariance by distance in batches, in s².
     covariance: Vec<f64>,
 }
 
-impl Ages {
+impl AgeCovariance {
     /// Returns the covariance for sensors that are read with broadcasts at this interval.
     pub(crate) fn for_sheet(sheet: &DataSheet, broadcast_s: f64) -> Self {
         let period = sheet.period_s();
@@ -338,13 +343,15 @@ impl Ages {
         }
         let covariance = (0..CORRELATED_BATCHES).map(|distance| {
             let mut sum = 0.0;
-            for clock in 0..CLOCKS {
-                let off = sheet.rate_error * ((2.0 * f64::from(clock) + 1.0) / f64::from(CLOCKS) - 1.0);
-                let periods = broadcast_s * f64::from(distance * BATCH) * sheet.rate_hz * (1.0 + off);
+            for clock in 0..ASSUMED_CLOCK_RATES {
+                let off = sheet.rate_error
+                    * ((2.0 * f64::from(clock) + 1.0) / f64::from(ASSUMED_CLOCK_RATES) - 1.0);
+                let periods =
+                    broadcast_s * f64::from(distance * BATCH_BROADCASTS) * sheet.rate_hz * (1.0 + off);
                 let part = periods.rem_euclid(1.0);
                 sum += 1.0 / 12.0 - part * (1.0 - part) / 2.0;
             }
-            period * period * sum / f64::from(CLOCKS)
+            period * period * sum / f64::from(ASSUMED_CLOCK_RATES)
         });
         Self { covariance: covariance.collect() }
     }

@@ -4,10 +4,10 @@ use nalgebra::{Cholesky, Matrix3};
 use protocol::skin::Skin;
 use serde::Serialize;
 
-use crate::cell::{Information, POSITION, TURN};
+use crate::cell::{InformationMatrix, POSITION_UNKNOWNS, ROTATION_UNKNOWNS};
 use crate::estimate::Estimate;
 use crate::motion::MotionStep;
-use crate::plan::{AIM, ProbeCell, SWING_S, Swings, poses, step_information};
+use crate::plan::{ProbeCell, SWING_S, SwingAmplitudes, TARGET_DEVIATIONS, poses, step_information};
 use crate::settings::Settings;
 use model::accelerometer::kinematics::Arm;
 
@@ -46,7 +46,7 @@ pub(crate) fn suggest_motion(
     estimate: &Estimate,
     settings: &Settings,
 ) -> MotionAdvice {
-    let swings = Swings::new(skin, &settings.bounds);
+    let swings = SwingAmplitudes::new(skin, &settings.bounds);
     let arms = [(bus, Arm::new(skin, bus, settings.gravity))];
     let row = usize::from(skin.chain(bus).row_of(estimate.joint).unwrap_or_default());
     let supposed = [ProbeCell { bus, row, model: estimate.model.clone() }];
@@ -54,11 +54,11 @@ pub(crate) fn suggest_motion(
     let before = worst_uncertainty(&known);
     let mut best = (HELPFUL_RATIO, MotionAdvice::Nothing);
     for pose in poses(skin, &settings.bounds, &swings).iter().step_by(3) {
-        let steps = core::iter::once(MotionStep::Hold { at: pose.clone() }).chain(swings.about(pose));
+        let steps = core::iter::once(MotionStep::Hold { at: pose.clone() }).chain(swings.swings_about(pose));
         for step in steps {
             let informed = step_information(skin, &arms, &supposed, &step, SWING_S, &settings.sheet);
             // As many repetitions as fit into a plan.
-            let more = informed.first().copied().unwrap_or_else(Information::zeros)
+            let more = informed.first().copied().unwrap_or_else(InformationMatrix::zeros)
                 * (settings.bounds.length_s / SWING_S);
             let left = worst_uncertainty(&(known + more)) / before;
             if left >= best.0 {
@@ -83,11 +83,12 @@ pub(crate) fn suggest_motion(
 }
 
 /// Returns the standard deviation of a pose in its least certain direction, relative to [`AIM`](crate::plan::AIM).
-fn worst_uncertainty(information: &Information) -> f64 {
+fn worst_uncertainty(information: &InformationMatrix) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return f64::INFINITY };
     let part = |start: usize, aim: f64| {
         let part: Matrix3<f64> = covariance.fixed_view::<3, 3>(start, start).into_owned();
         part.symmetric_eigenvalues().max().max(0.0).sqrt() / aim
     };
-    part(POSITION.start, AIM[0]).max(part(TURN.start, AIM[1]))
+    part(POSITION_UNKNOWNS.start, TARGET_DEVIATIONS[0])
+        .max(part(ROTATION_UNKNOWNS.start, TARGET_DEVIATIONS[1]))
 }

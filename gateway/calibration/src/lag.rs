@@ -23,7 +23,7 @@ pub(crate) struct Lags {
 
 impl Lags {
     /// Returns lags of zero for all stretches of a bus.
-    pub(crate) fn none(bus: &BusObservations) -> Self {
+    pub(crate) fn zero_lags(bus: &BusObservations) -> Self {
         let mut starts = Vec::new();
         let mut begin = 0;
         for end in bus.gaps.iter().map(|gap| gap.place).chain([bus.joints.len()]) {
@@ -38,13 +38,13 @@ impl Lags {
     }
 
     /// Returns the index of the stretch that contains a broadcast.
-    pub(crate) fn stretch(&self, index: usize) -> usize {
+    pub(crate) fn stretch_index(&self, index: usize) -> usize {
         self.starts.partition_point(|start| *start <= index)
     }
 
     /// Returns the lag of the stretch that contains a broadcast, in s.
     pub(crate) fn lag_at(&self, index: usize) -> f64 {
-        self.by_stretch.get(self.stretch(index)).copied().unwrap_or_default()
+        self.by_stretch.get(self.stretch_index(index)).copied().unwrap_or_default()
     }
 
     /// Returns the standard deviation of the lag of each stretch, in s.

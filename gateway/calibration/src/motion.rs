@@ -81,7 +81,7 @@ impl MotionPlan {
         match step {
             MotionStep::Hold { at } => joints.zip(at).for_each(|([position, ..], at)| *position = *at),
             MotionStep::Move { from, to } => {
-                let [share, rate, change] = rise(time, *for_s);
+                let [share, rate, change] = rising_curve(time, *for_s);
                 for ([position, speed, acceleration], (from, to)) in joints.zip(from.iter().zip(to)) {
                     *position = (to - from).mul_add(share, *from);
                     *speed = (to - from) * rate;
@@ -92,7 +92,7 @@ impl MotionPlan {
                 let envelope = envelope(time, *for_s);
                 let each = about.iter().zip(amplitude).zip(rate_hz);
                 for ([position, speed, acceleration], ((about, amplitude), rate)) in joints.zip(each) {
-                    let [value, first, second] = swing(envelope, TAU * rate, time);
+                    let [value, first, second] = enveloped_sine(envelope, TAU * rate, time);
                     *position = amplitude.mul_add(value, *about);
                     *speed = amplitude * first;
                     *acceleration = amplitude * second;
@@ -105,7 +105,7 @@ impl MotionPlan {
 
 /// Returns a curve that rises from 0 to 1 within `length`, with speed, acceleration and jerk zero at both ends: its
 /// value and its first two derivatives at `time`.
-fn rise(time: f64, length: f64) -> [f64; 3] {
+fn rising_curve(time: f64, length: f64) -> [f64; 3] {
     if length <= 0.0 {
         return [1.0, 0.0, 0.0];
     }
@@ -119,22 +119,22 @@ fn rise(time: f64, length: f64) -> [f64; 3] {
 }
 
 /// The maximum speed and acceleration of [`rise`] for a length of 1 s.
-pub(crate) const RISE_PEAKS: [f64; 2] = [2.187_5, 7.513_2];
+pub(crate) const RISING_CURVE_PEAKS: [f64; 2] = [2.187_5, 7.513_2];
 
 /// Returns a curve that rises from 0 to 1 and falls to 0 within `length`: its value and its first two derivatives at
 /// `time`.
 fn envelope(time: f64, length: f64) -> [f64; 3] {
     let ramp = RAMP_S.min(length / 2.0);
     if time < length / 2.0 {
-        rise(time, ramp)
+        rising_curve(time, ramp)
     } else {
-        let [value, first, second] = rise(length - time, ramp);
+        let [value, first, second] = rising_curve(length - time, ramp);
         [value, -first, second]
     }
 }
 
 /// Returns a sine that is multiplied by an envelope: its value and its first two derivatives at `time`.
-fn swing([value, first, second]: [f64; 3], rate: f64, time: f64) -> [f64; 3] {
+fn enveloped_sine([value, first, second]: [f64; 3], rate: f64, time: f64) -> [f64; 3] {
     let (sin, cos) = (rate * time).sin_cos();
     [
         value * sin,
@@ -172,10 +172,10 @@ mod tests {
 
     #[test]
     fn a_move_is_as_quick_as_its_peaks_say() {
-        let samples = || (0..=10_000).map(|at| rise(f64::from(at) * 1e-4, 1.0));
+        let samples = || (0..=10_000).map(|at| rising_curve(f64::from(at) * 1e-4, 1.0));
         let peak = |index: usize| samples().map(|it| it[index].abs()).fold(0.0, f64::max);
         assert!(
-            (peak(1) - RISE_PEAKS[0]).abs() < 1e-4 && (peak(2) - RISE_PEAKS[1]).abs() < 1e-3,
+            (peak(1) - RISING_CURVE_PEAKS[0]).abs() < 1e-4 && (peak(2) - RISING_CURVE_PEAKS[1]).abs() < 1e-3,
             "{}",
             peak(2)
         );

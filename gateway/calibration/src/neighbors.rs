@@ -32,10 +32,14 @@ pub(crate) struct LocatedCell {
 /// cables or lead to mistaken cells.
 const MAX_LENGTH_DEVIATIONS: f64 = 4.0;
 /// The number of times that the positions are recomputed.
-const ROUNDS: usize = 3;
+const POSITION_ROUNDS: usize = 3;
 
 /// Improves the positions of the cells on one link; `wires` has pairs of indices. Returns the number of wires used.
-pub(crate) fn improve(cells: &mut [LocatedCell], wires: &[(usize, usize)], spacing: &Spacing) -> usize {
+pub(crate) fn improve_positions(
+    cells: &mut [LocatedCell],
+    wires: &[(usize, usize)],
+    spacing: &Spacing,
+) -> usize {
     let pair =
         |cells: &[LocatedCell], &(one, other): &(usize, usize)| Some((*cells.get(one)?, *cells.get(other)?));
     let fits = |wire: &&(usize, usize)| {
@@ -54,7 +58,7 @@ pub(crate) fn improve(cells: &mut [LocatedCell], wires: &[(usize, usize)], spaci
     let size = 3 * cells.len();
     let measured: Vec<_> = cells.iter().map(|cell| cell.position).collect();
     let mut covariance = None;
-    for _ in 0..ROUNDS {
+    for _ in 0..POSITION_ROUNDS {
         let mut information = DMatrix::<f64>::zeros(size, size);
         let mut gradient = DVector::<f64>::zeros(size);
         for (index, (cell, measured)) in cells.iter().zip(&measured).enumerate() {
@@ -114,7 +118,7 @@ mod tests {
         };
         let mut cells = [cell(0.0, 0.0), cell(0.030, 0.001), cell(0.057, -0.001), cell(0.5, 0.0)];
         let spacing = Spacing { distance: 0.028, deviation: 0.2e-3 };
-        let used = improve(&mut cells, &[(0, 1), (1, 2), (2, 3)], &spacing);
+        let used = improve_positions(&mut cells, &[(0, 1), (1, 2), (2, 3)], &spacing);
         assert_eq!(used, 2);
         for (one, other) in [(0, 1), (1, 2)] {
             let way = cells[other].position - cells[one].position;

@@ -4,7 +4,7 @@
 //! of the previous one. Where a control loop skipped ticks, or frames are missing, a gap without positions remains, and
 //! no polynomial is fitted across it.
 
-use model::central::Central;
+use model::central::CentralComputation;
 use protocol::fixed::Q;
 use protocol::id::CellId;
 use protocol::message::{Message, SensorPage};
@@ -37,10 +37,10 @@ pub struct BusObservations {
     /// The positions at each broadcast in rad or m; `None` for a missing broadcast and at irregular times.
     pub joints: Vec<Option<[f64; MAX_JOINTS]>>,
     /// The gaps after which the next broadcast was not in time, in the order of time.
-    pub gaps: Vec<Gap>,
+    pub gaps: Vec<BroadcastGap>,
     /// The number of joints in the frames, if it differs from that of the chain.
     pub(crate) other_joints: Option<u8>,
-    reference: Central,
+    reference: CentralComputation,
     revolute: Vec<bool>,
     nodes: Vec<Option<usize>>,
     /// The newest broadcast with each epoch number.
@@ -56,7 +56,7 @@ pub struct BusObservations {
 
 /// A gap in the broadcasts of a bus, after which the next one did not come in time.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Gap {
+pub struct BroadcastGap {
     /// The time of the broadcast before the gap, in s since the first broadcast.
     pub at_s: f64,
     /// The time from that broadcast to the next one, in ms.
@@ -90,7 +90,7 @@ impl Observations {
                 joints: Vec::new(),
                 gaps: Vec::new(),
                 other_joints: None,
-                reference: Central::unquantised(&skin.with_cells_of_bus(bus)),
+                reference: CentralComputation::unquantised(&skin.with_cells_of_bus(bus)),
                 revolute: rows
                     .filter(|kind| *kind != RowKind::Fixed)
                     .map(|kind| kind == RowKind::Revolute)
@@ -115,7 +115,7 @@ impl Observations {
             if usize::from(joints.in_use) != bus.revolute.len() {
                 bus.other_joints = Some(joints.in_use);
             }
-            bus.broadcast(*epoch, at, &joints.positions);
+            bus.add_broadcast(*epoch, at, &joints.positions);
         } else if let Message::Sensors { from, epoch, page: SensorPage::Acceleration(words) } = message {
             let cell = bus.nodes.get(usize::from(from.get())).copied().flatten();
             let cell = cell.and_then(|cell| self.cells.get_mut(cell));
@@ -132,9 +132,9 @@ impl Observations {
 }
 
 impl BusObservations {
-    fn broadcast(&mut self, epoch: Epoch, at: Micros, words: &[protocol::fixed::Q1_14]) {
+    fn add_broadcast(&mut self, epoch: Epoch, at: Micros, words: &[protocol::fixed::Q1_14]) {
         if let Some((last, before)) = self.last {
-            let periods = real(at.0.saturating_sub(before.0)) / self.period_us;
+            let periods = as_f64(at.0.saturating_sub(before.0)) / self.period_us;
             let steps = epoch.epochs_since(last);
             // Epoch numbers repeat after 256 broadcasts.
             if steps < 1 && periods < f64::from(MAX_READING_DELAY) {
@@ -144,12 +144,12 @@ impl BusObservations {
             let is_regular = steps >= 1 && (periods - f64::from(steps)).abs() <= MAX_JITTER_PERIODS;
             if is_regular {
                 self.joints.extend((1..steps).map(|_| None));
-                self.follow(at, steps == 1);
+                self.measure_period(at, steps == 1);
             } else {
                 let (at_s, took_ms) = (self.seconds(before), periods * self.period_us * 1e-3);
-                self.gaps.push(Gap { at_s, took_ms, place: self.joints.len() });
+                self.gaps.push(BroadcastGap { at_s, took_ms, place: self.joints.len() });
                 self.joints.push(None);
-                self.follow(at, false);
+                self.measure_period(at, false);
             }
         }
         let mut positions = self.reference.positions(words);
@@ -173,7 +173,7 @@ impl BusObservations {
     }
 
     /// Measures the period over consecutive broadcasts.
-    fn follow(&mut self, at: Micros, is_next: bool) {
+    fn measure_period(&mut self, at: Micros, is_next: bool) {
         if !is_next {
             self.times.clear();
         }
@@ -187,12 +187,12 @@ impl BusObservations {
         let mut spans = self.spans.clone();
         spans.sort_unstable();
         let middle = spans.get(spans.len() / 2)?;
-        Some(real(*middle) * 1e-6 / f64::from(u8::try_from(PERIOD_SPAN).unwrap_or(1)))
+        Some(as_f64(*middle) * 1e-6 / f64::from(u8::try_from(PERIOD_SPAN).unwrap_or(1)))
     }
 
     /// Returns the time since the first broadcast, in s.
     fn seconds(&self, at: Micros) -> f64 {
-        real(at.0.saturating_sub(self.first.map_or(at.0, |first| first.0))) * 1e-6
+        as_f64(at.0.saturating_sub(self.first.map_or(at.0, |first| first.0))) * 1e-6
     }
 
     /// Returns the newest broadcast with this epoch number.
@@ -204,6 +204,6 @@ impl BusObservations {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
-const fn real(us: u64) -> f64 {
+const fn as_f64(us: u64) -> f64 {
     us as f64
 }

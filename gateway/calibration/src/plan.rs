@@ -13,8 +13,11 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use thiserror::Error;
 
-use crate::cell::{AGE_STEP, CellModel, Information, MOMENT, POSITION, TURN, expected, numbers};
-use crate::motion::{MotionPlan, MotionStep, RISE_PEAKS};
+use crate::cell::{
+    AGE_STEP_S, CellModel, InformationMatrix, MODEL_INPUTS, POSITION_UNKNOWNS, ROTATION_UNKNOWNS,
+    motion_numbers, prior_inverse_variances,
+};
+use crate::motion::{MotionPlan, MotionStep, RISING_CURVE_PEAKS};
 use crate::sums::ReadingSums;
 use model::accelerometer::kinematics::{Arm, STANDARD_GRAVITY};
 use model::accelerometer::sensor::DataSheet;
@@ -70,7 +73,7 @@ pub enum PlanError {
 }
 
 /// The number of candidate poses.
-const POSES: usize = 24;
+const CANDIDATE_POSES: usize = 24;
 /// The time that the robot stands at a pose, in s.
 const HOLD_S: f64 = 0.6;
 /// The duration of a swing, in s.
@@ -78,13 +81,13 @@ pub(crate) const SWING_S: f64 = 3.2;
 /// The assumed duration of a move to another pose, in s.
 const MOVE_S: f64 = 1.6;
 /// The frequency of a joint that swings alone.
-const RATE_HZ: f64 = 1.1;
+const SINGLE_SWING_HZ: f64 = 1.1;
 /// The frequencies of joints that swing together; they differ, so that the joints can be separated.
-const RATES_HZ: [f64; 7] = [0.8, 1.3, 1.0, 1.5, 0.9, 1.2, 1.4];
+const JOINT_SWING_HZ: [f64; 7] = [0.8, 1.3, 1.0, 1.5, 0.9, 1.2, 1.4];
 /// The interval between the moments at which a candidate's information is computed, in s.
 const SAMPLE_INTERVAL_S: f64 = 1.0 / 15.0;
 /// The standard deviations at which an estimate counts as good: of the position in m, and of the orientation in rad.
-pub(crate) const AIM: [f64; 2] = [0.5e-3, 0.2 * TAU / 360.0];
+pub(crate) const TARGET_DEVIATIONS: [f64; 2] = [0.5e-3, 0.2 * TAU / 360.0];
 
 impl Bounds {
     /// Returns limits about the middle of each joint's range, or about 0 if it turns by more than half a turn each way.
@@ -126,12 +129,12 @@ impl Bounds {
 }
 
 /// A candidate step: a hold at a pose, or a swing about it.
-struct Candidate {
+struct CandidateStep {
     pose: usize,
     step: MotionStep,
     seconds: f64,
     /// The information that the step adds on each assumed cell.
-    information: Vec<Information>,
+    information: Vec<InformationMatrix>,
 }
 
 /// A cell that the planner assumes at some place of a link, to rate candidates by it.
@@ -152,7 +155,7 @@ pub fn plan(
     gravity: [f64; 3],
 ) -> Result<MotionPlan, PlanError> {
     bounds.check(skin)?;
-    let swings = Swings::new(skin, bounds);
+    let swings = SwingAmplitudes::new(skin, bounds);
     let poses = poses(skin, bounds, &swings);
     let buses = (0..skin.buses.len()).filter(|&bus| skin.cells_on_bus(bus).next().is_some());
     let arms: Vec<_> = buses.map(|bus| (bus, Arm::new(skin, bus, gravity))).collect();
@@ -160,26 +163,28 @@ pub fn plan(
     let mut candidates = Vec::new();
     for (pose, at) in poses.iter().enumerate() {
         let hold = (HOLD_S, MotionStep::Hold { at: at.clone() });
-        for (seconds, step) in core::iter::once(hold).chain(swings.about(at).map(|step| (SWING_S, step))) {
+        for (seconds, step) in
+            core::iter::once(hold).chain(swings.swings_about(at).map(|step| (SWING_S, step)))
+        {
             let information = step_information(skin, &arms, &supposed, &step, seconds, sheet);
-            candidates.push(Candidate { pose, step, seconds, information });
+            candidates.push(CandidateStep { pose, step, seconds, information });
         }
     }
-    let chosen = choose(&candidates, &supposed, bounds, sheet);
-    Ok(ordered(skin, bounds, &poses, &candidates, &chosen))
+    let chosen = choose_candidates(&candidates, &supposed, bounds, sheet);
+    Ok(order_steps(skin, bounds, &poses, &candidates, &chosen))
 }
 
 /// The amplitudes with which joints may swing.
-pub(crate) struct Swings {
+pub(crate) struct SwingAmplitudes {
     amplitudes: Vec<f64>,
 }
 
-impl Swings {
+impl SwingAmplitudes {
     pub(crate) fn new(skin: &Skin, bounds: &Bounds) -> Self {
-        let rate = TAU * RATE_HZ;
+        let rate = TAU * SINGLE_SWING_HZ;
         let joints = skin.robot.joints.iter().zip(&skin.controller.max_speed).enumerate();
         let amplitudes = joints.map(|(index, (joint, max_speed))| {
-            let reach = reach(skin, index);
+            let reach = reach_m(skin, index);
             let [min, max] = joint.limits;
             let force = bounds.force_g * STANDARD_GRAVITY
                 / if joint.kind == JointKind::Revolute { reach } else { 1.0 };
@@ -191,7 +196,7 @@ impl Swings {
     }
 
     /// Returns swings about a pose: of each joint alone, and of all joints together.
-    pub(crate) fn about<'a>(&'a self, pose: &'a [f64]) -> impl Iterator<Item = MotionStep> + 'a {
+    pub(crate) fn swings_about<'a>(&'a self, pose: &'a [f64]) -> impl Iterator<Item = MotionStep> + 'a {
         let joints = self.amplitudes.len();
         let swing = |amplitude: Vec<f64>, rate_hz: Vec<f64>| MotionStep::Swing {
             about: pose.to_vec(),
@@ -200,10 +205,11 @@ impl Swings {
         };
         let alone = (0..joints).map(move |joint| {
             let own = |(at, amplitude): (usize, &f64)| if at == joint { *amplitude } else { 0.0 };
-            swing(self.amplitudes.iter().enumerate().map(own).collect(), vec![RATE_HZ; joints])
+            swing(self.amplitudes.iter().enumerate().map(own).collect(), vec![SINGLE_SWING_HZ; joints])
         });
-        let rates: Vec<_> = RATES_HZ.iter().cycle().take(joints).copied().collect();
-        let share = |(amplitude, rate): (&f64, &f64)| amplitude * 0.4 * (RATE_HZ / rate).powi(2).min(1.0);
+        let rates: Vec<_> = JOINT_SWING_HZ.iter().cycle().take(joints).copied().collect();
+        let share =
+            |(amplitude, rate): (&f64, &f64)| amplitude * 0.4 * (SINGLE_SWING_HZ / rate).powi(2).min(1.0);
         let together = swing(self.amplitudes.iter().zip(&rates).map(share).collect(), rates);
         alone.chain(core::iter::once(together))
     }
@@ -211,7 +217,7 @@ impl Swings {
 
 /// Returns the total length of the links behind a joint, in m and at least 0.1: no point of the robot is farther from
 /// the joint's axis.
-fn reach(skin: &Skin, joint: usize) -> f64 {
+fn reach_m(skin: &Skin, joint: usize) -> f64 {
     let of_chain = |chain: &protocol::skin::Chain| {
         let at = chain.joints.iter().position(|&it| it == joint)?;
         let row = chain.row_of(u8::try_from(at + 1).ok()?)?;
@@ -222,7 +228,7 @@ fn reach(skin: &Skin, joint: usize) -> f64 {
 }
 
 /// Returns the center and random poses, all of which leave room for every swing within the limits.
-pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &Swings) -> Vec<Vec<f64>> {
+pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &SwingAmplitudes) -> Vec<Vec<f64>> {
     let mut dice = Pcg64Mcg::seed_from_u64(bounds.seed);
     let ranges = skin.robot.joints.iter().zip(&bounds.center).zip(&swings.amplitudes);
     let ranges: Vec<_> = ranges
@@ -238,7 +244,7 @@ pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &Swings) -> Vec<Vec<f6
     let center = bounds.center.iter().zip(&ranges).map(|(at, (low, high))| at.clamp(*low, *high)).collect();
     let mut drawn = || ranges.iter().map(|(low, high)| low + (high - low) * dice.random::<f64>()).collect();
     let mut poses = vec![center];
-    poses.extend((1..POSES).map(|_| drawn()));
+    poses.extend((1..CANDIDATE_POSES).map(|_| drawn()));
     poses
 }
 
@@ -269,7 +275,7 @@ pub(crate) fn step_information(
     step: &MotionStep,
     seconds: f64,
     sheet: &DataSheet,
-) -> Vec<Information> {
+) -> Vec<InformationMatrix> {
     let mut motion = MotionPlan::default();
     motion.push_step(seconds, step.clone());
     let mut sums: Vec<Option<ReadingSums>> = vec![None; supposed.len()];
@@ -277,7 +283,7 @@ pub(crate) fn step_information(
     while time < seconds {
         for (bus, arm) in arms {
             let joints = &skin.chain(*bus).joints;
-            let ages = [-AGE_STEP, 0.0, AGE_STEP];
+            let ages = [-AGE_STEP_S, 0.0, AGE_STEP_S];
             let motions =
                 ages.map(|age| arm.rows(&motion.state_at((time - age).max(0.0)).chain_state(joints)));
             // The cells of one link see the same motion: they share the sums of the first one.
@@ -287,8 +293,9 @@ pub(crate) fn step_information(
                     continue;
                 }
                 seen = one.row;
-                let mut moment = [1.0; MOMENT];
-                let all = motions.iter().flat_map(|rows| rows.get(one.row).map(numbers).unwrap_or_default());
+                let mut moment = [1.0; MODEL_INPUTS];
+                let all =
+                    motions.iter().flat_map(|rows| rows.get(one.row).map(motion_numbers).unwrap_or_default());
                 moment.iter_mut().zip(all).for_each(|(to, from)| *to = from);
                 sum.get_or_insert_with(ReadingSums::default).add(&moment, &[0.0; 3], look);
             }
@@ -299,19 +306,19 @@ pub(crate) fn step_information(
     let mut last = None;
     let each = supposed.iter().zip(&sums).map(|(one, sum)| {
         last = sum.as_ref().or(last);
-        last.map_or_else(Information::zeros, |sum| sum.information(&one.model).0 / variance)
+        last.map_or_else(InformationMatrix::zeros, |sum| sum.information(&one.model).0 / variance)
     });
     each.collect()
 }
 
 /// Returns the chosen candidates, in the order in which they were chosen.
-fn choose(
-    candidates: &[Candidate],
+fn choose_candidates(
+    candidates: &[CandidateStep],
     supposed: &[ProbeCell],
     bounds: &Bounds,
     sheet: &DataSheet,
 ) -> Vec<usize> {
-    let prior = Information::from_diagonal(&expected(sheet));
+    let prior = InformationMatrix::from_diagonal(&prior_inverse_variances(sheet));
     let mut known = vec![prior; supposed.len()];
     let mut scores: Vec<_> = known.iter().map(score).collect();
     let mut chosen: Vec<usize> = Vec::new();
@@ -320,7 +327,7 @@ fn choose(
     loop {
         let visited =
             |pose: usize| chosen.iter().any(|&it| candidates.get(it).is_some_and(|it| it.pose == pose));
-        let rate = |(index, candidate): (usize, &Candidate)| {
+        let rate = |(index, candidate): (usize, &CandidateStep)| {
             let seconds = candidate.seconds + if visited(candidate.pose) { 0.0 } else { MOVE_S + HOLD_S };
             // Repeating a step adds the same information only.
             if seconds > left || chosen.contains(&index) {
@@ -345,21 +352,21 @@ fn choose(
 }
 
 /// Returns a measure of the uncertainty that remains with this information: 0 for a cell that is known exactly.
-fn score(information: &Information) -> f64 {
+fn score(information: &InformationMatrix) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return 1e3 };
     let part = |start: usize, aim: f64| {
         let part: Matrix3<f64> = covariance.fixed_view::<3, 3>(start, start).into_owned();
         part.diagonal().iter().map(|variance| (variance / (aim * aim)).ln_1p()).sum::<f64>()
     };
-    part(POSITION.start, AIM[0]) + part(TURN.start, AIM[1])
+    part(POSITION_UNKNOWNS.start, TARGET_DEVIATIONS[0]) + part(ROTATION_UNKNOWNS.start, TARGET_DEVIATIONS[1])
 }
 
 /// Returns the motion of the chosen steps, pose by pose; each next pose is the nearest one to the previous pose.
-fn ordered(
+fn order_steps(
     skin: &Skin,
     bounds: &Bounds,
     poses: &[Vec<f64>],
-    candidates: &[Candidate],
+    candidates: &[CandidateStep],
     chosen: &[usize],
 ) -> MotionPlan {
     let mut left: Vec<_> = (0..poses.len()).collect();
@@ -368,7 +375,7 @@ fn ordered(
     let mut at = bounds.center.clone();
     motion.push_step(HOLD_S, MotionStep::Hold { at: at.clone() });
     let distance = |from: &[f64], pose: usize| {
-        poses.get(pose).map_or(f64::INFINITY, |to| travel(skin, bounds, from, to))
+        poses.get(pose).map_or(f64::INFINITY, |to| move_duration_s(skin, bounds, from, to))
     };
     while let Some((place, &pose)) = left
         .iter()
@@ -380,7 +387,7 @@ fn ordered(
         push_move(skin, bounds, &mut motion, &mut at, to);
         motion.push_step(HOLD_S, MotionStep::Hold { at: to.clone() });
         let swings = chosen.iter().filter_map(|&it| candidates.get(it)).filter(|it| it.pose == pose);
-        for Candidate { step, seconds, .. } in swings {
+        for CandidateStep { step, seconds, .. } in swings {
             if matches!(step, MotionStep::Swing { .. }) {
                 motion.push_step(*seconds, step.clone());
             }
@@ -392,7 +399,7 @@ fn ordered(
 }
 
 fn push_move(skin: &Skin, bounds: &Bounds, motion: &mut MotionPlan, at: &mut Vec<f64>, to: &[f64]) {
-    let seconds = travel(skin, bounds, at, to);
+    let seconds = move_duration_s(skin, bounds, at, to);
     if seconds > 0.0 {
         motion.push_step(seconds, MotionStep::Move { from: at.clone(), to: to.to_vec() });
         *at = to.to_vec();
@@ -400,8 +407,8 @@ fn push_move(skin: &Skin, bounds: &Bounds, motion: &mut MotionPlan, at: &mut Vec
 }
 
 /// Returns the duration of a move, in s.
-fn travel(skin: &Skin, bounds: &Bounds, from: &[f64], to: &[f64]) -> f64 {
-    let [speed_peak, acceleration_peak] = RISE_PEAKS;
+fn move_duration_s(skin: &Skin, bounds: &Bounds, from: &[f64], to: &[f64]) -> f64 {
+    let [speed_peak, acceleration_peak] = RISING_CURVE_PEAKS;
     let joints = from.iter().zip(to).zip(&skin.controller.max_speed);
     let longest = joints.map(|((from, to), max_speed)| {
         let way = (to - from).abs();

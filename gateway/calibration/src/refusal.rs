@@ -3,12 +3,12 @@
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::observe::{BusObservations, Gap};
+use crate::observe::{BroadcastGap, BusObservations};
 use crate::rounded::rounded;
 
 /// The gaps in the broadcasts of a recording.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Disturbance {
+pub struct GapSummary {
     /// The number of broadcasts, in time or not.
     pub broadcasts: usize,
     /// The number of broadcasts whose readings are left out because their motion is unknown: around gaps, and where
@@ -22,7 +22,7 @@ pub struct Disturbance {
     pub longest_at_s: Option<f64>,
 }
 
-impl Disturbance {
+impl GapSummary {
     /// Returns the gaps of one bus; `known` is the number of broadcasts whose motion is known.
     pub(crate) fn from_bus(bus: &BusObservations, known: usize) -> Self {
         let broadcasts = bus.joints.iter().flatten().count();
@@ -31,8 +31,8 @@ impl Disturbance {
             broadcasts,
             left_out: broadcasts.saturating_sub(known),
             gaps: bus.gaps.len(),
-            longest_ms: longest.map(|Gap { took_ms, .. }| rounded(*took_ms, 1)),
-            longest_at_s: longest.map(|Gap { at_s, .. }| rounded(*at_s, 3)),
+            longest_ms: longest.map(|BroadcastGap { took_ms, .. }| rounded(*took_ms, 1)),
+            longest_at_s: longest.map(|BroadcastGap { at_s, .. }| rounded(*at_s, 3)),
         }
     }
 
@@ -54,7 +54,7 @@ impl Disturbance {
     }
 }
 
-impl core::fmt::Display for Disturbance {
+impl core::fmt::Display for GapSummary {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let Self { broadcasts, left_out, gaps, .. } = self;
         match (gaps, self.longest_ms.zip(self.longest_at_s)) {
@@ -108,7 +108,7 @@ pub enum Refusal {
         /// The bus.
         bus: String,
         /// The gaps in the broadcasts on the bus.
-        disturbance: Disturbance,
+        disturbance: GapSummary,
     },
     /// The readings scatter more than the data sheet allows for sensors on this robot.
     #[error(
@@ -123,7 +123,7 @@ pub enum Refusal {
         /// The noise in the data sheet, in mg.
         sheet_mg: f64,
         /// The gaps of the recording.
-        disturbance: Disturbance,
+        disturbance: GapSummary,
     },
     /// Readings before and after a gap were not taken at the times of their joints.
     #[error(
@@ -138,6 +138,6 @@ pub enum Refusal {
         /// The shift of readings against their joints, in ms.
         ms: f64,
         /// The gaps of the recording.
-        disturbance: Disturbance,
+        disturbance: GapSummary,
     },
 }

@@ -5,7 +5,7 @@ use protocol::skin::{Cell, Skin};
 use serde::Serialize;
 
 use crate::help::MotionAdvice;
-use crate::refusal::Disturbance;
+use crate::refusal::GapSummary;
 use crate::rounded::rounded;
 use crate::zero::ZeroOffset;
 use model::accelerometer::kinematics::Arm;
@@ -41,7 +41,7 @@ pub struct Summary {
     /// The median of the scatter of readings, in mg.
     pub noise_mg: Option<f64>,
     /// The gaps in the broadcasts of joints.
-    pub joints: Disturbance,
+    pub joints: GapSummary,
     /// The number of wires whose length improved positions.
     pub wires: usize,
 }
@@ -199,7 +199,7 @@ impl core::fmt::Display for Diagnosis {
 }
 
 impl CellResult {
-    pub(crate) fn unknown(skin: &Skin, cell: &Cell, readings: usize) -> Self {
+    pub(crate) fn without_estimate(skin: &Skin, cell: &Cell, readings: usize) -> Self {
         Self {
             bus: skin.buses.get(cell.bus).map_or_else(String::new, |bus| bus.name.clone()),
             node: cell.node.get(),
@@ -214,7 +214,7 @@ impl CellResult {
 
     /// Returns true if the cell's new pose is written to a skin file.
     #[must_use]
-    pub fn is_written(&self) -> bool {
+    pub fn is_pose_written(&self) -> bool {
         let kept = |trouble: &Diagnosis| {
             matches!(
                 trouble,
@@ -245,7 +245,7 @@ impl CellResult {
         let own = skin.chain(cell.bus).row_of(pose.joint).unwrap_or_default();
         let row = if cell.joint == pose.joint { cell.row } else { own };
         let change = arm.transform_between(own, row);
-        let placed = pose.seen_from((&change.rotation, &change.translation.vector));
+        let placed = pose.transformed_by((&change.rotation, &change.translation.vector));
         let quaternion = placed.rotation.quaternion();
         let sign = if quaternion.w < 0.0 { -1.0 } else { 1.0 };
         let same_link = cell.joint == pose.joint;
@@ -257,8 +257,8 @@ impl CellResult {
             position: placed.position.map(|part| rounded(part, 5)).into(),
             orientation: [quaternion.i, quaternion.j, quaternion.k, quaternion.w]
                 .map(|part| rounded(part * sign, 6)),
-            position_mm: rounded(pose.position_95() * 1e3, 2),
-            orientation_deg: rounded(pose.turn_95().to_degrees(), 2),
+            position_mm: rounded(pose.position_radius_95_m() * 1e3, 2),
+            orientation_deg: rounded(pose.rotation_angle_95_rad().to_degrees(), 2),
             moved_mm: same_link.then(|| rounded(way * 1e3, 2)),
             turned_deg: same_link.then(|| rounded(turn.to_degrees(), 2)),
         });
@@ -268,13 +268,13 @@ impl CellResult {
 impl Pose {
     /// Returns the 95 % radius of the position, in m.
     #[must_use]
-    pub fn position_95(&self) -> f64 {
+    pub fn position_radius_95_m(&self) -> f64 {
         radius_95(&self.position_covariance)
     }
 
     /// Returns the 95 % angle of the orientation, in rad.
     #[must_use]
-    pub fn turn_95(&self) -> f64 {
+    pub fn rotation_angle_95_rad(&self) -> f64 {
         radius_95(&self.turn_covariance)
     }
 
@@ -282,11 +282,11 @@ impl Pose {
     #[must_use]
     pub fn is_determined(&self) -> bool {
         let [position, turn] = MAX_UNCERTAINTY;
-        self.position_95() < position && self.turn_95() < turn
+        self.position_radius_95_m() < position && self.rotation_angle_95_rad() < turn
     }
 
     /// Returns the same pose, seen from another frame of the same link.
-    pub(crate) fn seen_from(&self, (turn, shift): (&UnitQuaternion<f64>, &Vector3<f64>)) -> Self {
+    pub(crate) fn transformed_by(&self, (turn, shift): (&UnitQuaternion<f64>, &Vector3<f64>)) -> Self {
         let matrix: Matrix3<f64> = turn.to_rotation_matrix().matrix().to_owned();
         Self {
             position: turn * self.position + shift,
@@ -311,15 +311,16 @@ fn radius_95(covariance: &Matrix3<f64>) -> f64 {
 }
 
 impl Summary {
-    pub(crate) fn from_cells(cells: &[CellResult], wires: usize, joints: Disturbance) -> Self {
+    pub(crate) fn from_cells(cells: &[CellResult], wires: usize, joints: GapSummary) -> Self {
         let median = |pick: &dyn Fn(&CellResult) -> Option<f64>| {
-            let mut all: Vec<_> = cells.iter().filter(|cell| cell.is_written()).filter_map(pick).collect();
+            let mut all: Vec<_> =
+                cells.iter().filter(|cell| cell.is_pose_written()).filter_map(pick).collect();
             all.sort_by(f64::total_cmp);
             all.get(all.len() / 2).copied()
         };
         Self {
             cells: cells.len(),
-            determined: cells.iter().filter(|cell| cell.is_written()).count(),
+            determined: cells.iter().filter(|cell| cell.is_pose_written()).count(),
             troubled: cells.iter().filter(|cell| !cell.troubles.is_empty()).count(),
             position_mm: median(&|cell| Some(cell.found?.position_mm)),
             orientation_deg: median(&|cell| Some(cell.found?.orientation_deg)),

@@ -1,7 +1,7 @@
 //! The estimate of the shifts of a bus' stretches, from the readings of all of its cells.
 
-use crate::cell::AGE;
-use crate::estimate::{Estimate, change, paired, residual, weight};
+use crate::cell::AGE_UNKNOWN;
+use crate::estimate::{Estimate, reading_derivative, readings_with_motion, residual, weight};
 use crate::lag::Lags;
 use crate::observe::Reading;
 use crate::table::MotionTable;
@@ -31,10 +31,10 @@ impl Lags {
             (ages, count) = (ages + estimate.model.age, count + 1.0);
             let (coefficients, derivatives) = (estimate.model.coefficients(), estimate.model.derivatives());
             let mut own = vec![StretchSums::default(); all.len()];
-            for (moment, reading) in paired(table.link(estimate.joint), readings) {
+            for (moment, reading) in readings_with_motion(table.link(estimate.joint), readings) {
                 let index = usize::try_from(reading.epoch).unwrap_or_default();
-                let Some(sum) = own.get_mut(self.stretch(index)) else { continue };
-                let change = change(&derivatives[AGE], moment);
+                let Some(sum) = own.get_mut(self.stretch_index(index)) else { continue };
+                let change = reading_derivative(&derivatives[AGE_UNKNOWN], moment);
                 let off = residual(&coefficients, moment, &reading.g);
                 // Large shifts cause large residuals.
                 let weight = weight(&off, RESIDUAL_LIMIT * RESIDUAL_LIMIT);

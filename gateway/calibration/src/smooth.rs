@@ -13,12 +13,12 @@ use model::accelerometer::kinematics::JointState;
 pub(crate) const HALF_WINDOW: usize = 10;
 const WINDOW: usize = 2 * HALF_WINDOW + 1;
 /// The number of coefficients of the polynomial.
-const TERMS: usize = 7;
+const POLYNOMIAL_TERMS: usize = 7;
 
 /// The resolution of a broadcast position, in rad.
-pub(crate) const STEP_RAD: f64 = core::f64::consts::TAU / 65_536.0;
+pub(crate) const POSITION_STEP_RAD: f64 = core::f64::consts::TAU / 65_536.0;
 /// The resolution of a broadcast position, in m.
-pub(crate) const STEP_M: f64 = 1.0 / 16_384.0;
+pub(crate) const POSITION_STEP_M: f64 = 1.0 / 16_384.0;
 
 /// The positions of the joints of a chain at one broadcast.
 pub(crate) type Positions = [f64; MAX_JOINTS];
@@ -28,7 +28,7 @@ pub(crate) type Positions = [f64; MAX_JOINTS];
 pub(crate) struct Smoother {
     /// The matrix that maps the positions in a window to the polynomial's coefficients, with time in units of [`HALF`]
     /// periods.
-    fit: SMatrix<f64, TERMS, WINDOW>,
+    fit: SMatrix<f64, POLYNOMIAL_TERMS, WINDOW>,
     /// The matrix that maps the positions in a window to the residuals of the polynomial.
     left: SMatrix<f64, WINDOW, WINDOW>,
     /// The duration of half a window, in s.
@@ -39,15 +39,15 @@ impl Smoother {
     /// Creates the fit for positions at intervals of `period_s`.
     #[must_use]
     pub(crate) fn new(period_s: f64) -> Self {
-        let powers = SMatrix::<f64, WINDOW, TERMS>::from_fn(|at, power| {
-            let x = (real(at) - real(HALF_WINDOW)) / real(HALF_WINDOW);
+        let powers = SMatrix::<f64, WINDOW, POLYNOMIAL_TERMS>::from_fn(|at, power| {
+            let x = (as_f64(at) - as_f64(HALF_WINDOW)) / as_f64(HALF_WINDOW);
             x.powi(i32::try_from(power).unwrap_or_default())
         });
         let normal = powers.tr_mul(&powers);
         // The inverse exists: the times differ, and there are fewer terms than times.
         let fit = normal.try_inverse().map_or_else(SMatrix::zeros, |inverse| inverse * powers.transpose());
         let left = SMatrix::identity() - powers * fit;
-        Self { fit, left, half_s: period_s * real(HALF_WINDOW) }
+        Self { fit, left, half_s: period_s * as_f64(HALF_WINDOW) }
     }
 
     /// Returns the root mean square distance of each of the first `joints` in a window from a smooth motion, or `None`
@@ -62,7 +62,7 @@ impl Smoother {
                 *value = positions.as_ref()?.get(joint)? - middle;
             }
             if series.amax() > 0.0 {
-                *rough = (self.left * series).norm() / real(WINDOW).sqrt();
+                *rough = (self.left * series).norm() / as_f64(WINDOW).sqrt();
             }
         }
         Some(roughness)
@@ -71,7 +71,7 @@ impl Smoother {
     /// Returns the motion of the first `joints` at `earlier_s` before the middle of a window of positions, or `None` if
     /// the window is incomplete.
     #[must_use]
-    pub(crate) fn state(
+    pub(crate) fn joint_state(
         &self,
         window: &[Option<Positions>],
         joints: usize,
@@ -83,8 +83,8 @@ impl Smoother {
         let x = -earlier_s / self.half_s;
         let mut weights = [SVector::<f64, WINDOW>::zeros(); 3];
         let powers = |order: usize| {
-            SVector::<f64, TERMS>::from_fn(|power, _| {
-                let factor: f64 = (0..order).map(|less| real(power) - real(less)).product();
+            SVector::<f64, POLYNOMIAL_TERMS>::from_fn(|power, _| {
+                let factor: f64 = (0..order).map(|less| as_f64(power) - as_f64(less)).product();
                 let left = power.checked_sub(order).and_then(|left| i32::try_from(left).ok());
                 left.map_or(0.0, |left| factor * x.powi(left))
                     / self.half_s.powi(i32::try_from(order).unwrap_or(0))
@@ -111,7 +111,7 @@ impl Smoother {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "small counts")]
-const fn real(count: usize) -> f64 {
+const fn as_f64(count: usize) -> f64 {
     count as f64
 }
 
@@ -133,8 +133,9 @@ mod tests {
             .collect();
         let mut worst = [0.0_f64; 3];
         for middle in HALF_WINDOW..words.len() - HALF_WINDOW {
-            let state =
-                smoother.state(&words[middle - HALF_WINDOW..=middle + HALF_WINDOW], 1, earlier).unwrap();
+            let state = smoother
+                .joint_state(&words[middle - HALF_WINDOW..=middle + HALF_WINDOW], 1, earlier)
+                .unwrap();
             let at = middle as f64 * period - earlier;
             let speed = amplitude * rate * (rate * at).cos();
             let acceleration = -rate * rate * position(at);
@@ -170,18 +171,18 @@ mod tests {
     fn a_window_with_a_gap_has_no_state() {
         let mut window = vec![Some([0.5; MAX_JOINTS]); WINDOW];
         let smoother = Smoother::new(0.016);
-        let state = smoother.state(&window, 2, 0.0).unwrap();
+        let state = smoother.joint_state(&window, 2, 0.0).unwrap();
         assert!((state.position[1] - 0.5).abs() < 1e-9 && state.speed[1].abs() < 1e-9);
         assert!(state.position[2].abs() < 1e-12, "not in use");
         window[3] = None;
-        assert!(smoother.state(&window, 2, 0.0).is_none());
-        assert!(smoother.state(&window[1..], 2, 0.0).is_none());
+        assert!(smoother.joint_state(&window, 2, 0.0).is_none());
+        assert!(smoother.joint_state(&window[1..], 2, 0.0).is_none());
         assert!(smoother.roughness(&window, 2).is_none());
     }
 
     #[test]
     fn one_position_that_lags_is_rough_and_rounding_is_not() {
-        let (smoother, step) = (Smoother::new(0.016), STEP_RAD);
+        let (smoother, step) = (Smoother::new(0.016), POSITION_STEP_RAD);
         let position = |at: usize| 0.12 * (TAU * 0.016 * at as f64).sin();
         let words: Vec<_> =
             (0..400).map(|at| Some([(position(at) / step).round() * step; MAX_JOINTS])).collect();

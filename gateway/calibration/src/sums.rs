@@ -4,7 +4,9 @@
 
 use nalgebra::{Cholesky, SMatrix};
 
-use crate::cell::{CellModel, Coefficients, Information, MOMENT, Moment, ROW, UNKNOWNS, Unknowns};
+use crate::cell::{
+    CellModel, Coefficients, InformationMatrix, MODEL_INPUTS, ModelInput, ROW_NUMBERS, UNKNOWNS, Unknowns,
+};
 
 /// The maximum number of least-squares steps.
 const MAX_STEPS: usize = 60;
@@ -13,7 +15,7 @@ const MAX_STEPS: usize = 60;
 #[derive(Clone, Debug)]
 pub(crate) struct ReadingSums {
     /// The sums of products of two numbers of a moment.
-    moments: SMatrix<f64, MOMENT, MOMENT>,
+    moments: SMatrix<f64, MODEL_INPUTS, MODEL_INPUTS>,
     /// The sums of products of a number of a moment and the reading of each axis.
     shown: Coefficients,
     /// The sum of the squares of the readings.
@@ -26,15 +28,15 @@ pub(crate) struct ReadingSums {
 pub(crate) type FreeCoefficients = SMatrix<f64, 13, 3>;
 
 /// Converts an index into [`Free`] to the index among all numbers of a moment.
-const fn place(number: usize) -> usize {
-    if number < ROW { ROW + number } else { MOMENT - 1 }
+const fn model_input_index(number: usize) -> usize {
+    if number < ROW_NUMBERS { ROW_NUMBERS + number } else { MODEL_INPUTS - 1 }
 }
 
 /// Converts coefficients for the middle age to coefficients for all ages, with zeros for the others.
-pub(crate) fn at_middle_age(free: &FreeCoefficients) -> Coefficients {
+pub(crate) fn expand_middle_age(free: &FreeCoefficients) -> Coefficients {
     let mut all = Coefficients::zeros();
-    for number in 0..=ROW {
-        all.row_mut(place(number)).copy_from(&free.row(number));
+    for number in 0..=ROW_NUMBERS {
+        all.row_mut(model_input_index(number)).copy_from(&free.row(number));
     }
     all
 }
@@ -55,13 +57,13 @@ impl Default for ReadingSums {
 
 impl ReadingSums {
     /// Adds a reading at a moment, with a weight.
-    pub(crate) fn add(&mut self, moment: &Moment, shown: &[f64; 3], weight: f64) {
+    pub(crate) fn add(&mut self, moment: &ModelInput, shown: &[f64; 3], weight: f64) {
         // Columns of static matrices are contiguous: both loops become vector instructions.
-        for (column, number) in self.moments.as_mut_slice().chunks_exact_mut(MOMENT).zip(moment) {
+        for (column, number) in self.moments.as_mut_slice().chunks_exact_mut(MODEL_INPUTS).zip(moment) {
             let scale = weight * number;
             column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += scale * number);
         }
-        for (column, value) in self.shown.as_mut_slice().chunks_exact_mut(MOMENT).zip(shown) {
+        for (column, value) in self.shown.as_mut_slice().chunks_exact_mut(MODEL_INPUTS).zip(shown) {
             let scale = weight * value;
             column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += scale * number);
             self.squares += scale * value;
@@ -80,10 +82,10 @@ impl ReadingSums {
 
     /// Returns the information of the readings on the unknowns, for noise of variance 1, and the gradient of half of
     /// [`Self::residual`].
-    pub(crate) fn information(&self, model: &CellModel) -> (Information, Unknowns) {
+    pub(crate) fn information(&self, model: &CellModel) -> (InformationMatrix, Unknowns) {
         let derivatives = model.derivatives();
         let coefficients = model.coefficients();
-        let mut information = Information::zeros();
+        let mut information = InformationMatrix::zeros();
         let mut gradient = Unknowns::zeros();
         for axis in 0..3 {
             let left = self.moments * coefficients.column(axis) - self.shown.column(axis);
@@ -103,7 +105,7 @@ impl ReadingSums {
     /// Finds the most likely model, by the method of Levenberg and Marquardt.
     pub(crate) fn fit(&self, start: CellModel, expected: &Unknowns, variance: f64) -> Fit {
         let cost = |model: &CellModel| {
-            let unexpected = model.unexpected();
+            let unexpected = model.deviations_from_sheet();
             self.residual(&model.coefficients()) / variance
                 + unexpected.component_mul(expected).dot(&unexpected)
         };
@@ -113,13 +115,13 @@ impl ReadingSums {
             let (mut information, mut gradient) = self.information(&best.model);
             information /= variance;
             gradient /= variance;
-            gradient += expected.component_mul(&best.model.unexpected());
+            gradient += expected.component_mul(&best.model.deviations_from_sheet());
             for unknown in 0..UNKNOWNS {
                 information[(unknown, unknown)] += expected[unknown];
                 information[(unknown, unknown)] *= 1.0 + damping;
             }
             let Some(step) = Cholesky::new(information).map(|it| -it.solve(&gradient)) else { break };
-            let model = best.model.moved(&step);
+            let model = best.model.with_step(&step);
             let now = cost(&model);
             if now < best.cost {
                 let gained = best.cost - now;
@@ -140,10 +142,11 @@ impl ReadingSums {
 
     /// Returns the coefficients at the middle age that fit the readings best without constraints, as a start for least
     /// squares. `ridge` regularises the coefficients on which the readings have no information.
-    pub(crate) fn unconstrained(&self, ridge: f64) -> Option<FreeCoefficients> {
-        let mut moments =
-            SMatrix::<f64, 13, 13>::from_fn(|row, column| self.moments[(place(row), place(column))]);
-        let shown = SMatrix::<f64, 13, 3>::from_fn(|row, axis| self.shown[(place(row), axis)]);
+    pub(crate) fn fit_unconstrained(&self, ridge: f64) -> Option<FreeCoefficients> {
+        let mut moments = SMatrix::<f64, 13, 13>::from_fn(|row, column| {
+            self.moments[(model_input_index(row), model_input_index(column))]
+        });
+        let shown = SMatrix::<f64, 13, 3>::from_fn(|row, axis| self.shown[(model_input_index(row), axis)]);
         for number in 0..13 {
             moments[(number, number)] += ridge;
         }

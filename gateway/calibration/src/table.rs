@@ -3,10 +3,10 @@
 use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::{Chain, Skin};
 
-use crate::cell::{AGE_STEP, AGES, MOMENT, Moment, numbers};
+use crate::cell::{AGE_COUNT, AGE_STEP_S, MODEL_INPUTS, ModelInput, motion_numbers};
 use crate::lag::Lags;
 use crate::observe::{BusObservations, Observations, Reading};
-use crate::smooth::{HALF_WINDOW, Positions, STEP_M, STEP_RAD, Smoother};
+use crate::smooth::{HALF_WINDOW, POSITION_STEP_M, POSITION_STEP_RAD, Positions, Smoother};
 use model::accelerometer::kinematics::Arm;
 use model::accelerometer::sensor::DataSheet;
 
@@ -17,7 +17,7 @@ pub(crate) struct MotionTable {
     /// The ages of readings relative to their joints.
     pub(crate) lags: Lags,
     /// The motion by joint (0 is the base), then by broadcast; `None` where positions around the broadcast are missing.
-    links: Vec<Vec<Option<Moment>>>,
+    links: Vec<Vec<Option<ModelInput>>>,
 }
 
 /// The factor by which the roughness of a joint in a window may exceed that of rounding; rougher windows are left out.
@@ -34,7 +34,7 @@ fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
     let mut limits = [f64::INFINITY; MAX_JOINTS];
     let kinds = chain.rows.iter().map(|row| row.kind).filter(|kind| *kind != RowKind::Fixed);
     for (joint, (limit, kind)) in limits.iter_mut().zip(kinds).enumerate() {
-        let step = if kind == RowKind::Prismatic { STEP_M } else { STEP_RAD };
+        let step = if kind == RowKind::Prismatic { POSITION_STEP_M } else { POSITION_STEP_RAD };
         let of_joint = roughness.iter().flatten().filter_map(|all| all.get(joint).copied());
         let mut all: Vec<_> = of_joint.collect();
         all.sort_by(f64::total_cmp);
@@ -63,7 +63,7 @@ impl MotionTable {
         // Time stamps are not more accurate than the clock of the loop.
         let period = if (period / nominal - 1.0).abs() < PERIOD_TOLERANCE { nominal } else { period };
         let smoother = Smoother::new(period);
-        let (middle, _) = sheet.age();
+        let (middle, _) = sheet.age_mean_and_deviation_s();
         let joints = chain.joints.len();
         let last = u8::try_from(joints).unwrap_or_default();
         let rows: Vec<_> =
@@ -80,24 +80,24 @@ impl MotionTable {
             let lag = lags.lag_at(index);
             let periods = (lag / period).round();
             let Some(first) = (0..roughness.len())
-                .nth(index.wrapping_sub(HALF_WINDOW).wrapping_add_signed(-whole(periods)))
+                .nth(index.wrapping_sub(HALF_WINDOW).wrapping_add_signed(-as_isize(periods)))
             else {
                 continue;
             };
             let known = roughness.get(first).copied().flatten().is_some_and(|it| is_smooth(&it));
             let (Some(window), true) = (series.get(first..=first + 2 * HALF_WINDOW), known) else { continue };
             let middle = middle + lag - periods * period;
-            let mut moments = vec![[1.0; MOMENT]; rows.len()];
+            let mut moments = vec![[1.0; MODEL_INPUTS]; rows.len()];
             let mut complete = true;
-            for (at, age) in [-AGE_STEP, 0.0, AGE_STEP].into_iter().enumerate() {
-                let Some(mut state) = smoother.state(window, joints, middle + age) else {
+            for (at, age) in [-AGE_STEP_S, 0.0, AGE_STEP_S].into_iter().enumerate() {
+                let Some(mut state) = smoother.joint_state(window, joints, middle + age) else {
                     complete = false;
                     break;
                 };
                 state.position.iter_mut().zip(offsets).for_each(|(position, offset)| *position += offset);
                 let motions = arm.rows(&state);
                 for (moment, &row) in moments.iter_mut().zip(&rows) {
-                    let numbers = motions.get(row).map(numbers).unwrap_or_default();
+                    let numbers = motions.get(row).map(motion_numbers).unwrap_or_default();
                     let places = moment.chunks_exact_mut(numbers.len()).nth(at);
                     places.into_iter().for_each(|places| places.copy_from_slice(&numbers));
                 }
@@ -110,7 +110,7 @@ impl MotionTable {
                 }
             }
         }
-        debug_assert_eq!(AGES, 3, "as many as the loop above has");
+        debug_assert_eq!(AGE_COUNT, 3, "as many as the loop above has");
         Self { arm, lags: lags.clone(), links }
     }
 
@@ -126,7 +126,7 @@ impl MotionTable {
     }
 
     /// Returns the motion of the link behind a joint, at each broadcast.
-    pub(crate) fn link(&self, joint: u8) -> &[Option<Moment>] {
+    pub(crate) fn link(&self, joint: u8) -> &[Option<ModelInput>] {
         self.links.get(usize::from(joint)).map_or(&[], Vec::as_slice)
     }
 
@@ -138,6 +138,6 @@ impl MotionTable {
 
 /// Converts a small number of periods to an integer.
 #[expect(clippy::cast_possible_truncation, reason = "casts to integers saturate")]
-const fn whole(periods: f64) -> isize {
+const fn as_isize(periods: f64) -> isize {
     periods as isize
 }

@@ -1,7 +1,7 @@
 //! The text of a skin file with the calibrated poses.
 
 use protocol::skin::Skin;
-use protocol::skin::file::{Edit, Value};
+use protocol::skin::file::{SkinEdit, Value};
 use thiserror::Error;
 
 use crate::result::{Calibration, FoundPlace};
@@ -20,9 +20,9 @@ pub enum WriteError {
 /// # Errors
 /// Returns [`WriteError`] if the text does not belong to the skin.
 pub fn calibrated_text(skin: &Skin, text: &str, calibration: &Calibration) -> Result<String, WriteError> {
-    let mut edit = Edit::new(skin, text).map_err(|error| WriteError::Text(error.to_string()))?;
+    let mut edit = SkinEdit::new(skin, text).map_err(|error| WriteError::Text(error.to_string()))?;
     for (index, (cell, result)) in skin.cells.iter().zip(&calibration.cells).enumerate() {
-        let Some(found) = result.found.filter(|_| result.is_written()) else { continue };
+        let Some(found) = result.found.filter(|_| result.is_pose_written()) else { continue };
         let FoundPlace { joint, row, position, orientation, .. } = found;
         if joint != cell.joint {
             set_or_insert(&mut edit, index, "joint", Value::Integer(i64::from(joint)), "node");
@@ -41,7 +41,7 @@ pub fn calibrated_text(skin: &Skin, text: &str, calibration: &Calibration) -> Re
 }
 
 /// Sets the value of a cell's key. Inserts the key after another one if the cell does not have it.
-fn set_or_insert(edit: &mut Edit<'_>, cell: usize, key: &str, value: Value<'_>, after: &str) {
+fn set_or_insert(edit: &mut SkinEdit<'_>, cell: usize, key: &str, value: Value<'_>, after: &str) {
     if edit.has(cell, key) {
         edit.set(cell, key, value);
     } else {
@@ -86,7 +86,7 @@ orientation = [0.0, 0.0, 0.0, 1.0]
             turned_deg: None,
         };
         let mut cells: Vec<_> =
-            skin.cells.iter().map(|cell| CellResult::unknown(&skin, cell, 9_000)).collect();
+            skin.cells.iter().map(|cell| CellResult::without_estimate(&skin, cell, 9_000)).collect();
         cells[0].found = Some(found);
         let calibration = |cells: &[CellResult]| Calibration {
             summary: Default::default(),

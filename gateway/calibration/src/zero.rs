@@ -11,9 +11,9 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{JointKind, Skin};
 use serde::Serialize;
 
-use crate::cell::{Information, MOMENT, UNKNOWNS, Unknowns, expected};
+use crate::cell::{InformationMatrix, MODEL_INPUTS, UNKNOWNS, Unknowns, prior_inverse_variances};
 use crate::each::parallel_map;
-use crate::estimate::{Estimate, paired, residual};
+use crate::estimate::{Estimate, readings_with_motion, residual};
 use crate::lag::Lags;
 use crate::observe::{Observations, Reading};
 use crate::rounded::rounded;
@@ -25,9 +25,9 @@ const PRIOR_DEVIATION: f64 = 0.1;
 /// An offset with a larger standard deviation than this is not observable: 1 degree, or 2 cm.
 const MAX_DEVIATION: f64 = 0.0175;
 /// The step of numerical derivatives.
-const STEP: f64 = 1e-5;
+const DERIVATIVE_STEP: f64 = 1e-5;
 /// The interval of the readings that are used: one of this many.
-const STRIDE: usize = 4;
+const READING_STRIDE: usize = 4;
 /// The fraction of an independent reading that each reading counts as, because errors of readings close in time are
 /// correlated.
 const READING_WEIGHT: f64 = 0.5;
@@ -60,7 +60,7 @@ impl core::fmt::Display for ZeroOffset {
 
 /// The information of a cell's readings on the offsets and the gradient, without the part that the cell's own unknowns
 /// explain.
-struct Remainder {
+struct OffsetInformation {
     information: DMatrix<f64>,
     gradient: DVector<f64>,
 }
@@ -82,7 +82,7 @@ pub(crate) fn zero_offsets(
         let moved: Vec<_> = parallel_map(joints.len(), settings.threads, |joint| {
             let mut offsets = [0.0; MAX_JOINTS];
             if let Some(offset) = offsets.get_mut(joint) {
-                *offset = STEP;
+                *offset = DERIVATIVE_STEP;
             }
             MotionTable::new(skin, bus, seen, &settings.sheet, settings.gravity, &offsets, lags)
         });
@@ -123,28 +123,28 @@ fn cell_remainder(
     estimate: &Estimate,
     readings: &[Reading],
     settings: &Settings,
-) -> Option<Remainder> {
-    let few: Vec<_> = readings.iter().step_by(STRIDE).copied().collect();
+) -> Option<OffsetInformation> {
+    let few: Vec<_> = readings.iter().step_by(READING_STRIDE).copied().collect();
     let model = &estimate.model;
     let (coefficients, derivatives) = (model.coefficients(), model.derivatives());
     let size = moved.len();
-    let mut own = Information::from_diagonal(&expected(&settings.sheet));
+    let mut own = InformationMatrix::from_diagonal(&prior_inverse_variances(&settings.sheet));
     let mut shared = DMatrix::<f64>::zeros(UNKNOWNS, size);
     let mut information = DMatrix::<f64>::zeros(size, size);
     let (mut of_own, mut gradient) = (Unknowns::zeros(), DVector::<f64>::zeros(size));
-    let weight =
-        READING_WEIGHT * f64::from(u8::try_from(STRIDE).unwrap_or(1)) / estimate.noise_g.powi(2).max(1e-10);
+    let weight = READING_WEIGHT * f64::from(u8::try_from(READING_STRIDE).unwrap_or(1))
+        / estimate.noise_g.powi(2).max(1e-10);
     let links: Vec<_> = moved.iter().map(|table| table.link(estimate.joint)).collect();
-    for (moment, reading) in paired(table.link(estimate.joint), &few) {
+    for (moment, reading) in readings_with_motion(table.link(estimate.joint), &few) {
         let at = usize::try_from(reading.epoch).ok()?;
         let off = residual(&coefficients, moment, &reading.g);
         let mut changes = Vec::with_capacity(size);
         for link in &links {
             let Some(Some(other)) = link.get(at) else { return None };
-            let numbers = other.iter().zip(moment).map(|(other, one)| (other - one) / STEP);
-            changes.push(coefficients.tr_mul(&SVector::<f64, MOMENT>::from_iterator(numbers)));
+            let numbers = other.iter().zip(moment).map(|(other, one)| (other - one) / DERIVATIVE_STEP);
+            changes.push(coefficients.tr_mul(&SVector::<f64, MODEL_INPUTS>::from_iterator(numbers)));
         }
-        let now = SVector::<f64, MOMENT>::from(*moment);
+        let now = SVector::<f64, MODEL_INPUTS>::from(*moment);
         for (axis, off) in off.into_iter().enumerate() {
             let mine = Unknowns::from_fn(|unknown, _| {
                 derivatives.get(unknown).map_or(0.0, |derivative| derivative.column(axis).dot(&now))
@@ -161,5 +161,5 @@ fn cell_remainder(
     let own = solved.inverse();
     information -= shared.transpose() * own * &shared;
     gradient -= shared.transpose() * (own * of_own);
-    Some(Remainder { information, gradient })
+    Some(OffsetInformation { information, gradient })
 }

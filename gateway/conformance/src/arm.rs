@@ -1,6 +1,6 @@
 //! Test configurations, and the values that the documents require for them: F_z, torque words, and J in floating point.
 
-use model::central::Central;
+use model::central::CentralComputation;
 use model::decode::Decoded;
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10, TorqueFormat};
 use protocol::id::CellId;
@@ -26,12 +26,12 @@ impl TestRandom {
     }
 
     /// Returns a random number below a bound, or 0 if the bound is 0.
-    pub(crate) fn below(&mut self, bound: u32) -> u32 {
+    pub(crate) fn random_below(&mut self, bound: u32) -> u32 {
         self.0.random_range(0..bound.max(1))
     }
 
     /// Returns a random number in [-1, 1).
-    fn unit(&mut self) -> f64 {
+    fn random_signed_unit(&mut self) -> f64 {
         f64::from(self.word()) / 32_768.0
     }
 
@@ -46,7 +46,7 @@ impl TestRandom {
 const PERIOD_US: u16 = 60_000;
 
 /// Gain 1, no proximity, no thresholds: the force is the sum of the three contact words.
-pub(crate) const PLAIN: Contact = Contact {
+pub(crate) const PLAIN_CONTACT: Contact = Contact {
     alpha_c: Q3_12::from_bits(4096),
     alpha_p: Q5_10::ZERO,
     contact_threshold: Q5_10::ZERO,
@@ -83,7 +83,7 @@ pub(crate) fn example_parameters(joint: u8) -> Parameters {
             position: [0x0666, 0x0333, 0x03D7].map(Q1_14::from_bits),
             normal: [0, 0x3333, 0x2666].map(Q1_14::from_bits),
         },
-        contact: PLAIN,
+        contact: PLAIN_CONTACT,
         period_us: PERIOD_US,
         rows,
     }
@@ -109,7 +109,7 @@ pub(crate) fn distinct_parameters(abilities: Abilities) -> Parameters {
     for (row, step) in all.rows.iter_mut().zip(1..=6) {
         row.theta_offset = Q1_14::from_bits(0x0107 * step);
     }
-    let (joints, rows) = (abilities.joints(), abilities.rows());
+    let (joints, rows) = (abilities.max_joints(), abilities.max_rows());
     let mut large = Parameters { torque_format: TorqueFormat::Q7_8, ..all };
     let (mut moving, mut word) = (0, 0);
     for (place, row) in large.rows.iter_mut().take(rows).enumerate() {
@@ -168,10 +168,10 @@ pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Par
     let share = 1.9 / f64::from(u32::try_from(2 * shape.rows + 4).unwrap_or(u32::MAX));
     let mut left = (shape.joints, fixed);
     for row in rows.iter_mut().take(shape.rows) {
-        let is_fixed = left.0 == 0 || left.1 > 0 && dice.below(2) == 0;
+        let is_fixed = left.0 == 0 || left.1 > 0 && dice.random_below(2) == 0;
         let kind = match is_fixed {
             true => RowKind::Fixed,
-            false if shape.prismatic && dice.below(3) == 0 => RowKind::Prismatic,
+            false if shape.prismatic && dice.random_below(3) == 0 => RowKind::Prismatic,
             false => RowKind::Revolute,
         };
         if is_fixed {
@@ -182,8 +182,10 @@ pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Par
         let twist = [0x4000, -0x4000, 0, dice.word(), dice.word()];
         *row = Row {
             kind,
-            a: Q1_14::nearest(dice.unit() * share),
-            d: Q1_14::nearest(dice.unit() * share / if kind == RowKind::Prismatic { 2.0 } else { 1.0 }),
+            a: Q1_14::nearest(dice.random_signed_unit() * share),
+            d: Q1_14::nearest(
+                dice.random_signed_unit() * share / if kind == RowKind::Prismatic { 2.0 } else { 1.0 },
+            ),
             alpha: Q1_14::from_bits(dice.choose(&twist)),
             theta_offset: Q1_14::from_bits(dice.word()),
         };
@@ -192,28 +194,29 @@ pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Par
     // The cell is on the last row, or on one after the first joint.
     let first = rows.iter().position(Row::has_joint).unwrap_or(0);
     let span = u32::try_from(shape.rows - first).unwrap_or(1);
-    let place = if dice.below(2) == 0 { shape.rows } else { first + 1 + dice.below(span) as usize };
+    let place =
+        if dice.random_below(2) == 0 { shape.rows } else { first + 1 + dice.random_below(span) as usize };
     let joint = rows.iter().take(place).filter(|row| row.has_joint()).count();
     let byte = |number: usize| u8::try_from(number).unwrap_or_default();
     let (row, table_rows) = if plain { (0, 0) } else { (byte(place), byte(shape.rows)) };
-    let position = [0; 3].map(|_| Q1_14::nearest(dice.unit() * share));
+    let position = [0; 3].map(|_| Q1_14::nearest(dice.random_signed_unit() * share));
     Parameters {
         joint: byte(joint),
         joints: byte(shape.joints),
         row,
         table_rows,
         torque_format: TorqueFormat::Q3_12,
-        pose: Pose { position, normal: normal(dice) },
-        contact: PLAIN,
+        pose: Pose { position, normal: random_unit_vector(dice) },
+        contact: PLAIN_CONTACT,
         period_us: PERIOD_US,
         rows,
     }
 }
 
 /// Returns a random vector of length 1.
-fn normal(dice: &mut TestRandom) -> [Q1_14; 3] {
+fn random_unit_vector(dice: &mut TestRandom) -> [Q1_14; 3] {
     loop {
-        let any = [0; 3].map(|_| dice.unit());
+        let any = [0; 3].map(|_| dice.random_signed_unit());
         let length = any.iter().map(|x| x * x).sum::<f64>().sqrt();
         if (0.1..=1.0).contains(&length) {
             return any.map(|x| Q1_14::nearest(x / length));
@@ -229,7 +232,7 @@ pub(crate) fn positions(dice: &mut TestRandom, parameters: &Parameters) -> [i16;
     core::array::from_fn(|index| match moving.get(index) {
         None => 0,
         Some(RowKind::Prismatic) => dice.word() % share,
-        Some(RowKind::Revolute | RowKind::Fixed) => match dice.below(8) {
+        Some(RowKind::Revolute | RowKind::Fixed) => match dice.random_below(8) {
             0 => dice.choose(&[0, 0x4000, -0x4000, i16::MIN, i16::MAX]),
             _ => dice.word(),
         },
@@ -250,13 +253,13 @@ pub(crate) fn force(contact: &Contact, skin: &SkinSensors) -> i64 {
 
 /// Computes a torque word from a word of J and a force in steps of 2^-16 N.
 pub(crate) fn torque_word(j: i16, force: i64, format: TorqueFormat) -> i16 {
-    let bits = 30 - i64::from(format.fraction());
+    let bits = 30 - i64::from(format.fraction_bits());
     let held = ((i64::from(j) * force + (1 << (bits - 1))) >> bits).clamp(i16::MIN.into(), i16::MAX.into());
     i16::try_from(held).unwrap_or_default()
 }
 
 /// Splits a sum into three contact words.
-pub(crate) fn contact(sum: i32) -> [Q5_10; 3] {
+pub(crate) fn contact_words(sum: i32) -> [Q5_10; 3] {
     let first = (sum / 3).clamp(i16::MIN.into(), i16::MAX.into());
     let second = ((sum - first) / 2).clamp(i16::MIN.into(), i16::MAX.into());
     [first, second, sum - first - second]
@@ -281,23 +284,26 @@ pub(crate) fn format_skin(skin: Option<SkinSensors>) -> String {
 }
 
 /// Returns a press with this sum of contact words, and no other values.
-pub(crate) fn press(sum: i32) -> SkinSensors {
-    SkinSensors { contact: contact(sum), ..SkinSensors::default() }
+pub(crate) fn press_with_sum(sum: i32) -> SkinSensors {
+    SkinSensors { contact: contact_words(sum), ..SkinSensors::default() }
 }
 
 /// Returns the sum of contact words for which, with [`PLAIN`], a torque word equals the word of J.
-pub(crate) fn unit_press(format: TorqueFormat) -> i32 {
-    1 << (24 - format.fraction())
+pub(crate) fn unit_press_sum(format: TorqueFormat) -> i32 {
+    1 << (24 - format.fraction_bits())
 }
 
 /// Computes J in m (without a unit for prismatic joints), from the words of the parameters and of the joints.
-pub(crate) fn exact_jacobian(central: &Central, positions: &[i16; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
+pub(crate) fn exact_jacobian(
+    central: &CentralComputation,
+    positions: &[i16; MAX_JOINTS],
+) -> [f64; MAX_JOINTS] {
     let words = positions.map(Q1_14::from_bits);
     central.torque(0, &central.frames(&words), 1.0)
 }
 
 /// Returns the distance of a word of J from the nearest word to the exact value, in steps.
-pub(crate) fn steps_off(j: i16, exact: f64) -> u32 {
+pub(crate) fn steps_from_exact(j: i16, exact: f64) -> u32 {
     let nearest = Q::<14>::nearest(exact).to_bits();
     i32::from(j).abs_diff(nearest.into())
 }

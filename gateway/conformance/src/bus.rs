@@ -21,7 +21,7 @@ pub trait TestBus {
     fn now(&self) -> Micros;
 
     /// Returns true if frames of this format can be sent, also if the cell uses the other format.
-    fn carries(&self, format: Format) -> bool;
+    fn supports_format(&self, format: Format) -> bool;
 
     /// Sends frames, in order. [`TestBus::receive`] returns each one, marked as own, once it was on the bus.
     ///

@@ -10,12 +10,12 @@ use std::time::Duration;
 
 use bench::bus::follow::receive_batch;
 use bench::bus::listen;
-use protocol::bus::{Bus as Socket, BusError, BusOptions, GATEWAY_RECEIVE_BUFFER, Inbox, KindChoice};
+use protocol::bus::{Bus as Socket, BusError, BusOptions, GATEWAY_RECEIVE_BUFFER_BYTES, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
 use protocol::time::{Micros, Span};
 
 use crate::bus::{ObservedFrame, StopReason, TestBus};
-use probe::Probe;
+use probe::LatenessProbe;
 
 /// The interval at which a termination signal is checked.
 const SIGNAL_POLL_INTERVAL: Span = Span::from_millis(50);
@@ -32,7 +32,7 @@ pub struct SocketBus {
     obeys_signals: bool,
     late: Span,
     /// Measures this computer's lateness, if the cell may be a process on it.
-    probe: Option<Probe>,
+    probe: Option<LatenessProbe>,
     command: Option<String>,
     child: Option<(Child, Micros)>,
 }
@@ -48,11 +48,11 @@ impl SocketBus {
         stopped: Arc<AtomicBool>,
         command: Option<String>,
     ) -> Result<Self, BusError> {
-        let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
+        let receive_buffer = GATEWAY_RECEIVE_BUFFER_BYTES as usize;
         let options = BusOptions { own_frames: true, receive_buffer, ..BusOptions::default() };
         let socket = listen::open(name, kind, None, options)?;
         let (inbox, waiting, late) = (Inbox::new(), VecDeque::new(), Span(0));
-        let probe = socket.is_virtual().unwrap_or(false).then(Probe::new).transpose();
+        let probe = socket.is_virtual().unwrap_or(false).then(LatenessProbe::new).transpose();
         let probe = probe.map_err(|source| BusError::Io {
             name: name.to_owned(),
             doing: "start a thread beside",
@@ -66,7 +66,7 @@ impl SocketBus {
     }
 }
 
-fn lost(error: impl ToString) -> StopReason {
+fn bus_failure(error: impl ToString) -> StopReason {
     StopReason::Bus(error.to_string())
 }
 
@@ -75,13 +75,13 @@ impl TestBus for SocketBus {
         listen::now()
     }
 
-    fn carries(&self, format: Format) -> bool {
+    fn supports_format(&self, format: Format) -> bool {
         // FD frames would disturb a real classic bus.
         format == Format::Classic || self.socket.carries_fd() && self.probe.is_some()
     }
 
     fn send(&mut self, frames: &[Frame]) -> Result<(), StopReason> {
-        self.socket.send(frames).map_err(lost)
+        self.socket.send(frames).map_err(bus_failure)
     }
 
     fn receive(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason> {
@@ -95,7 +95,7 @@ impl TestBus for SocketBus {
             let before = self.now();
             let wait = until.elapsed_since(before).min(SIGNAL_POLL_INTERVAL);
             let wait_time = Duration::from_micros(wait.0);
-            let count = receive_batch(&self.socket, &mut self.inbox, wait_time).map_err(lost)?;
+            let count = receive_batch(&self.socket, &mut self.inbox, wait_time).map_err(bus_failure)?;
             let now = self.now();
             if self.inbox.dropped() > 0 {
                 let name = self.socket.name();
@@ -117,7 +117,7 @@ impl TestBus for SocketBus {
     }
 
     fn lateness(&mut self) -> Span {
-        let probed = self.probe.as_ref().map_or(Span(0), Probe::lateness);
+        let probed = self.probe.as_ref().map_or(Span(0), LatenessProbe::lateness);
         core::mem::take(&mut self.late).max(probed)
     }
 

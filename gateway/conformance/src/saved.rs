@@ -14,12 +14,12 @@ use crate::session::{Reply, Session};
 /// The time limit for restoring the state.
 const RESTORE_TIMEOUT: Span = Span::from_millis(8_000);
 /// The time after which no more answers to requests of the test come.
-const SETTLE: Span = Span::from_millis(60);
+const SETTLE_TIME: Span = Span::from_millis(60);
 /// The number of attempts to restore a value.
 const ATTEMPTS: usize = 3;
 
 /// The volatile parameters, which are saved and restored.
-const SWITCHES: [Parameter; 6] = [
+const VOLATILE_PARAMETERS: [Parameter; 6] = [
     Parameter::Reply,
     Parameter::Sensing,
     Parameter::Events,
@@ -59,7 +59,7 @@ impl Session<'_> {
         let serial = u32::from(low) | u32::from(high) << 16;
         let abilities = protocol::parameters::Abilities::from_word(abilities.cast_signed());
         let mut parameters = BTreeMap::new();
-        let all = Parameter::stored(abilities.rows()).chain(SWITCHES);
+        let all = Parameter::stored_for_rows(abilities.max_rows()).chain(VOLATILE_PARAMETERS);
         for parameter in all.collect::<Vec<_>>() {
             let number = parameter.number();
             match self.read(number)? {
@@ -86,7 +86,7 @@ impl Session<'_> {
         let mut left = Vec::new();
         self.extend(RESTORE_TIMEOUT);
         // Lets late answers to the test pass, so that they do not count as answers to this.
-        self.idle(SETTLE)?;
+        self.idle(SETTLE_TIME)?;
         self.begin_expected_exchange();
         self.send_messages(&[Message::Resume])?;
         if saved.hash == 0 {
@@ -94,7 +94,7 @@ impl Session<'_> {
         } else if !self.put_back_stored(saved)? {
             left.push(format!("its configuration {:04X}", saved.hash));
         }
-        for parameter in SWITCHES {
+        for parameter in VOLATILE_PARAMETERS {
             let Some(words) = saved.parameters.get(&parameter.number()) else { continue };
             // Links are written in test mode only, and the test does not change them.
             if parameter == Parameter::LinksDown && *words == [0; WORDS] {

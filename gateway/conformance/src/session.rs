@@ -200,12 +200,12 @@ impl<'a> Session<'a> {
     }
 
     /// Notes that the cell was allowed to be silent until now.
-    pub(crate) fn extend_life(&mut self) {
+    pub(crate) fn excuse_silence(&mut self) {
         self.clock.last = self.bus.now();
     }
 
-    pub(crate) fn carries(&self, format: Format) -> bool {
-        self.bus.carries(format)
+    pub(crate) fn supports_format(&self, format: Format) -> bool {
+        self.bus.supports_format(format)
     }
 
     pub(crate) fn can_restart(&self) -> bool {
@@ -229,7 +229,7 @@ impl<'a> Session<'a> {
     pub(crate) fn begin_exchange(&mut self) {
         let strays: Vec<_> = self.packets.get(self.consumed..).unwrap_or_default().to_vec();
         for stray in strays {
-            if let Some(id) = self.known.unexpected(&stray.message) {
+            if let Some(id) = self.known.violated_requirement(&stray.message) {
                 let kind = stray.message.id().kind.name();
                 self.check(id, false, || {
                     format!("the cell must not send a {kind} packet unrequested, but one came")
@@ -249,13 +249,13 @@ impl<'a> Session<'a> {
     }
 
     /// Marks the packets since the exchange began as expected.
-    pub(crate) fn consume(&mut self) {
+    pub(crate) fn mark_expected(&mut self) {
         self.consumed = self.packets.len();
         self.log.ended = self.log.frames.len();
     }
 
     /// Returns the packets since the last exchange ended.
-    pub(crate) fn unmarked(&self) -> Vec<CellPacket> {
+    pub(crate) fn packets_since_exchange(&self) -> Vec<CellPacket> {
         self.packets.get(self.consumed..).unwrap_or_default().to_vec()
     }
 
@@ -383,13 +383,13 @@ impl<'a> Session<'a> {
     }
 
     /// Measures the mean time from a request to its answer.
-    pub(crate) fn measure(&mut self) -> Result<(), StopReason> {
-        const TIMES: u64 = 8;
+    pub(crate) fn measure_round_trip(&mut self) -> Result<(), StopReason> {
+        const MEASURED_READS: u64 = 8;
         let began = self.now();
-        for _ in 0..TIMES {
+        for _ in 0..MEASURED_READS {
             self.read(0)?;
         }
-        self.clock.round_trip = Span(self.now().elapsed_since(began).0 / TIMES);
+        self.clock.round_trip = Span(self.now().elapsed_since(began).0 / MEASURED_READS);
         Ok(())
     }
 
@@ -399,7 +399,7 @@ impl<'a> Session<'a> {
     }
 
     /// Returns the number of attempts of a check: `many`, or a quarter of it if answers are slow.
-    pub(crate) fn attempts(&self, many: usize) -> usize {
+    pub(crate) fn reduced_attempts(&self, many: usize) -> usize {
         if self.is_slow() { many.div_ceil(4) } else { many }
     }
 
@@ -425,7 +425,7 @@ impl<'a> Session<'a> {
 
 /// Formats a frame in candump's notation, with T for frames of the bench and R for others.
 fn frame_line(name: &str, seen: &ObservedFrame) -> String {
-    let time = Timestamp::six_digits(seen.at.0 * 1_000);
+    let time = Timestamp::with_six_digits(seen.at.0 * 1_000);
     let record = Record { time, interface: name, frame: seen.frame, direction: None };
     format!("{record} {}", if seen.own { 'T' } else { 'R' })
 }

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use model::decode::{Decoded, Decoder, Foreign};
+use model::decode::{Decoded, Decoder, ForeignReason};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id};
 use protocol::message::{Message, NetworkPage};
@@ -60,7 +60,7 @@ impl Survey {
             let message = match decoder.decode(seen.at, name, &seen.frame) {
                 Decoded::Message(message) => message,
                 // Frames before the first packet may belong to other devices.
-                Decoded::Damaged { fault, .. } | Decoded::Foreign(Foreign::Data(fault)) => {
+                Decoded::Damaged { fault, .. } | Decoded::Foreign(ForeignReason::Data(fault)) => {
                     survey.note_damaged(id, &seen.frame, Some(fault.to_string()));
                     continue;
                 }
@@ -161,7 +161,7 @@ impl Survey {
 
 impl DamagedFrames {
     /// Returns a description of the common implementation mistake that explains the frames, if there is one.
-    fn mistake(&self) -> Option<&'static str> {
+    fn likely_mistake(&self) -> Option<&'static str> {
         let bytes = |frames: &[&Frame]| -> Vec<u8> {
             frames.iter().flat_map(|frame| frame.data()).copied().collect()
         };
@@ -201,7 +201,7 @@ impl core::fmt::Display for DamagedFrames {
             self.count,
             frames.join(" ")
         )?;
-        if let Some(mistake) = self.mistake() {
+        if let Some(mistake) = self.likely_mistake() {
             write!(f, "; {mistake}")?;
         }
         f.write_str("; docs/reference/protocol.md has the layout and examples")

@@ -8,7 +8,7 @@ use protocol::time::Span;
 const MAX_BENCH_LATENESS: Span = Span::from_millis(1);
 
 /// The kinds of answers that TIME-2 limits, each with its limit in ms.
-pub(crate) const LIMITS: [(&str, u64); 6] = [
+pub(crate) const ANSWER_LIMITS_MS: [(&str, u64); 6] = [
     ("torque", 4),
     ("heartbeat to sync", 10),
     ("heartbeat to a claimant", 20),
@@ -19,7 +19,7 @@ pub(crate) const LIMITS: [(&str, u64); 6] = [
 
 /// The numbers of timely and late answers of one kind.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Times {
+pub(crate) struct AnswerTimes {
     pub(crate) in_time: usize,
     pub(crate) late: usize,
     /// The number of late answers while the bench was late too.
@@ -29,13 +29,13 @@ pub(crate) struct Times {
 
 /// The times of answers, by kind.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Timings(pub(crate) BTreeMap<&'static str, Times>);
+pub(crate) struct Timings(pub(crate) BTreeMap<&'static str, AnswerTimes>);
 
 impl Timings {
     /// Records the time of an answer, with the lateness of the bench meanwhile.
     pub(crate) fn record(&mut self, what: &'static str, took: Span, bench: Span) {
         let times = self.0.entry(what).or_default();
-        let limit = LIMITS.iter().find(|(name, _)| *name == what);
+        let limit = ANSWER_LIMITS_MS.iter().find(|(name, _)| *name == what);
         let is_late = limit.is_some_and(|(_, limit)| took > Span::from_millis(*limit));
         match (is_late, bench > MAX_BENCH_LATENESS) {
             (false, _) => times.in_time += 1,
@@ -48,9 +48,9 @@ impl Timings {
     }
 }
 
-impl Times {
+impl AnswerTimes {
     /// Returns true if at most one in 50 answers was late.
-    pub(crate) const fn are_right(self) -> bool {
+    pub(crate) const fn are_in_time(self) -> bool {
         self.late * 50 <= self.in_time + self.late || self.late == 1 && self.in_time > 0
     }
 }

@@ -5,19 +5,19 @@
 //!                                                                  └─> Bad(reason)
 //! ```
 //!
-//! [`Kinesthetic`] moves the arm with the torque of a push. [`Planned`] follows a motion that is known in advance and
-//! ignores torques. [`crate::external::External`] asks another program for each command.
+//! [`KinestheticController`] moves the arm with the torque of a push. [`PlannedController`] follows a motion that is known in advance and
+//! ignores torques. [`crate::external::ExternalController`] asks another program for each command.
 
 use protocol::packet::padded;
 use protocol::skin::{ControllerKind, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::Micros;
 use thiserror::Error;
 
-use crate::external::Absence;
+use crate::external::ControllerAbsence;
 
 /// Input of a controller in one tick. The values of joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Input {
+pub struct ControllerInput {
     /// Number of the tick.
     pub tick: u64,
     /// Nominal start of the tick since the start of the run.
@@ -71,7 +71,7 @@ pub enum BadCycle {
 /// A controller, which turns torques into joint velocities.
 pub trait Controller: Send {
     /// Computes the command of one tick. Must not block, allocate, lock or log.
-    fn step(&mut self, input: &Input) -> ControllerOutput;
+    fn step(&mut self, input: &ControllerInput) -> ControllerOutput;
 
     /// Returns the controller's counters, each with its name. To be called at the end of a run, not in a tick.
     fn counts(&self) -> Vec<(String, u64)> {
@@ -81,7 +81,7 @@ pub trait Controller: Send {
     /// Returns the reason for which the controller counts as absent at the end of a run; `None` if it does not.
     /// `silent` is the number of consecutive bad cycles at the end, if these are enough to halt a robot. To be called
     /// at the end of a run, not in a tick. A controller within this program is never absent.
-    fn absence(&self, silent: Option<u32>) -> Option<Absence> {
+    fn absence(&self, silent: Option<u32>) -> Option<ControllerAbsence> {
         let _ = silent;
         None
     }
@@ -95,7 +95,7 @@ pub trait Controller: Send {
 /// The equation is integrated exactly for a torque that is constant over the tick, which is stable for any M, D and
 /// tick: `v' = tau/D + (v - tau/D) e^(-D/M T)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Kinesthetic {
+pub struct KinestheticController {
     joints: [Admittance; MAX_ROBOT_JOINTS],
 }
 
@@ -109,7 +109,7 @@ struct Admittance {
     max_speed: f64,
 }
 
-impl Kinesthetic {
+impl KinestheticController {
     /// Creates the controller of the skin; `None` if the skin has a controller of another kind.
     #[must_use]
     pub fn new(skin: &Skin) -> Option<Self> {
@@ -136,8 +136,8 @@ impl Kinesthetic {
     }
 }
 
-impl Controller for Kinesthetic {
-    fn step(&mut self, input: &Input) -> ControllerOutput {
+impl Controller for KinestheticController {
+    fn step(&mut self, input: &ControllerInput) -> ControllerOutput {
         if input.halted {
             return ControllerOutput::Move([0.0; MAX_ROBOT_JOINTS]);
         }
@@ -157,12 +157,12 @@ impl Controller for Kinesthetic {
 
 /// A controller that follows positions known for all times, as fast as the speed limits allow.
 #[derive(Clone, Copy, Debug)]
-pub struct Planned<F> {
+pub struct PlannedController<F> {
     at: F,
     pace: SpeedLimits,
 }
 
-impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
+impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> PlannedController<F> {
     /// Creates a controller that follows the positions `at(t)` in rad or m, where t is the time in s since the start of
     /// the run. `at` must not block, allocate, lock or log.
     #[must_use]
@@ -171,12 +171,12 @@ impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
     }
 }
 
-impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS] + Send> Controller for Planned<F> {
+impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS] + Send> Controller for PlannedController<F> {
     /// Computes the velocities that reach the position planned for the start of the next tick, so that the robot
     /// neither lags nor drifts.
-    fn step(&mut self, input: &Input) -> ControllerOutput {
+    fn step(&mut self, input: &ControllerInput) -> ControllerOutput {
         let next = (self.at)(seconds(input.time) + self.pace.tick);
-        ControllerOutput::Move(self.pace.towards(&next, input))
+        ControllerOutput::Move(self.pace.velocities_towards(&next, input))
     }
 }
 
@@ -195,19 +195,23 @@ impl SpeedLimits {
 
     /// Returns the joint velocities that bring the robot to `goal` by the next tick, as far as the speed limits allow;
     /// zero while the robot is halted.
-    pub(crate) fn towards(&self, goal: &[f64; MAX_ROBOT_JOINTS], input: &Input) -> [f64; MAX_ROBOT_JOINTS] {
+    pub(crate) fn velocities_towards(
+        &self,
+        goal: &[f64; MAX_ROBOT_JOINTS],
+        input: &ControllerInput,
+    ) -> [f64; MAX_ROBOT_JOINTS] {
         let mut velocity = *goal;
         for (velocity, q) in velocity.iter_mut().zip(input.q) {
             *velocity = (*velocity - q) / self.tick;
         }
-        self.limited(velocity, input)
+        self.limit_velocities(velocity, input)
     }
 
     /// Returns the velocities clamped to the speed limits; zero while the robot is halted.
-    pub(crate) fn limited(
+    pub(crate) fn limit_velocities(
         &self,
         mut velocity: [f64; MAX_ROBOT_JOINTS],
-        input: &Input,
+        input: &ControllerInput,
     ) -> [f64; MAX_ROBOT_JOINTS] {
         for (velocity, max_speed) in velocity.iter_mut().zip(self.max_speed) {
             *velocity = if input.halted { 0.0 } else { velocity.clamp(-max_speed, max_speed) };
@@ -231,8 +235,8 @@ mod tests {
 
     const TICK: f64 = 0.002;
 
-    fn kinesthetic() -> Kinesthetic {
-        Kinesthetic::new(&skin()).unwrap()
+    fn kinesthetic() -> KinestheticController {
+        KinestheticController::new(&skin()).unwrap()
     }
 
     fn moved(step: ControllerOutput) -> [f64; MAX_ROBOT_JOINTS] {
@@ -242,8 +246,8 @@ mod tests {
         }
     }
 
-    fn pushed(torque: [f64; MAX_ROBOT_JOINTS]) -> Input {
-        Input { torque, valid: true, ..Input::default() }
+    fn pushed(torque: [f64; MAX_ROBOT_JOINTS]) -> ControllerInput {
+        ControllerInput { torque, valid: true, ..ControllerInput::default() }
     }
 
     /// Runs the controller on a simulated arm for `ticks` ticks with a constant torque. Returns the arm.
@@ -251,7 +255,8 @@ mod tests {
         let mut arm = SimulatedArm::new(&skin(), padded(&start));
         for tick in 0..ticks {
             let (q, qdot) = (arm.positions(), arm.velocities());
-            let input = Input { tick, time: Micros(tick * 2_000), q, qdot, ..pushed(padded(&torque)) };
+            let input =
+                ControllerInput { tick, time: Micros(tick * 2_000), q, qdot, ..pushed(padded(&torque)) };
             arm.step(&moved(controller.step(&input)), TICK);
         }
         arm
@@ -273,7 +278,7 @@ mod tests {
     #[test]
     fn without_torque_the_arm_comes_to_rest() {
         let mut controller = kinesthetic();
-        let input = Input { qdot: padded(&[1.0; 6]), ..pushed(padded(&[0.0; 6])) };
+        let input = ControllerInput { qdot: padded(&[1.0; 6]), ..pushed(padded(&[0.0; 6])) };
         for velocity in moved(controller.step(&input)).into_iter().take(6) {
             assert!(velocity > 0.99 && velocity < 1.0);
         }
@@ -282,18 +287,21 @@ mod tests {
     #[test]
     fn a_torque_that_must_not_be_used_is_a_bad_cycle() {
         let mut controller = kinesthetic();
-        assert_eq!(controller.step(&Input::default()), ControllerOutput::Bad(BadCycle::Torque));
+        assert_eq!(controller.step(&ControllerInput::default()), ControllerOutput::Bad(BadCycle::Torque));
         assert_eq!(controller.step(&pushed(padded(&[f64::NAN; 6]))), ControllerOutput::Bad(BadCycle::Torque));
-        let halted = Input { halted: true, qdot: padded(&[1.0; 6]), ..pushed(padded(&[5.0; 6])) };
+        let halted = ControllerInput { halted: true, qdot: padded(&[1.0; 6]), ..pushed(padded(&[5.0; 6])) };
         assert_eq!(controller.step(&halted), ControllerOutput::Move(padded(&[0.0; 6])));
     }
 
     #[test]
     fn a_robot_that_holds_returns_no_quicker_than_it_may() {
         let at = [0.1, -0.2, 0.3, 0.0, 0.0, 0.0];
-        let mut hold = Planned::new(&skin(), |_| padded(&at));
-        assert_eq!(moved(hold.step(&Input { q: padded(&at), ..Input::default() })), [0.0; MAX_ROBOT_JOINTS]);
-        assert_eq!(moved(hold.step(&Input::default()))[..3], [2.0, -2.0, 2.0]);
+        let mut hold = PlannedController::new(&skin(), |_| padded(&at));
+        assert_eq!(
+            moved(hold.step(&ControllerInput { q: padded(&at), ..ControllerInput::default() })),
+            [0.0; MAX_ROBOT_JOINTS]
+        );
+        assert_eq!(moved(hold.step(&ControllerInput::default()))[..3], [2.0, -2.0, 2.0]);
         let arm = run(&mut hold, [0.0; 6], 200, [50.0; 6]);
         for (got, target) in arm.positions().iter().zip(at) {
             assert!((got - target).abs() < 1e-12, "torques do not move it");
@@ -304,7 +312,7 @@ mod tests {
     fn a_planned_motion_is_where_it_should_be_at_every_tick() {
         let start = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
         let swings = |seconds: f64| padded(&start.map(|start| start + 0.2 * (1.5 * seconds).sin()));
-        let mut planned = Planned::new(&skin(), swings);
+        let mut planned = PlannedController::new(&skin(), swings);
         for ticks in [1_u32, 7, 500, 4_321] {
             let arm = run(&mut planned, start, ticks.into(), [0.0; 6]);
             let target = swings(f64::from(ticks) * TICK);
@@ -320,7 +328,7 @@ mod tests {
             torque in any::<[f64; 6]>(), qdot in proptest::array::uniform6(-5.0..5.0),
         ) {
             let mut controller = kinesthetic();
-            let input = Input { qdot: padded(&qdot), ..pushed(padded(&torque)) };
+            let input = ControllerInput { qdot: padded(&qdot), ..pushed(padded(&torque)) };
             match controller.step(&input) {
                 ControllerOutput::Bad(why) => {
                     prop_assert_eq!(why, BadCycle::Torque);

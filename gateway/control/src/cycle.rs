@@ -11,7 +11,7 @@
 //! ([`carried`]), and the loop continues with the other buses.
 //!
 //! A tick does not allocate, lock or log. Its cost does not grow with the number of cells, unless torques are also
-//! computed centrally ([`Cycle::central`]).
+//! computed centrally ([`Cycle::central_torque`]).
 
 pub mod carried;
 mod chain;
@@ -21,15 +21,15 @@ use protocol::id::Command;
 use protocol::message::Joints;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{ControllerKind, LostBus, MAX_ROBOT_JOINTS, Safety, Skin};
+use protocol::skin::{ControllerKind, LostBusReaction, MAX_ROBOT_JOINTS, SafetyLimits, Skin};
 use protocol::time::Micros;
 
-use crate::controller::{BadCycle, Controller, ControllerOutput, Input};
-use crate::external::Absence;
+use crate::controller::{BadCycle, Controller, ControllerInput, ControllerOutput};
+use crate::external::ControllerAbsence;
 use crate::robot::{Robot, StepResult};
 use carried::{BusInput, CarriedBroadcasts, bit};
 use chain::Chain;
-use model::central::Central;
+use model::central::CentralComputation;
 use model::table::Snapshot;
 
 /// Number and start time of a tick.
@@ -115,14 +115,14 @@ pub struct TickOutcome {
 pub struct Cycle {
     controller: Box<dyn Controller>,
     robot: Box<dyn Robot + Send>,
-    central: Vec<Central>,
+    central: Vec<CentralComputation>,
     /// The distinct chains of the skin. Several buses may share one.
     chains: Vec<Chain>,
     /// Index in `chains` of each bus's chain.
     chain_of: Vec<usize>,
     tick_seconds: f64,
     ticks_per_broadcast: u64,
-    safety: Safety,
+    safety: SafetyLimits,
     /// The broadcasts that each bus has carried.
     carried: Vec<CarriedBroadcasts>,
     epoch: Epoch,
@@ -162,7 +162,9 @@ impl Cycle {
         Self {
             controller,
             robot,
-            central: (0..skin.buses.len()).map(|bus| Central::new(&skin.with_cells_of_bus(bus))).collect(),
+            central: (0..skin.buses.len())
+                .map(|bus| CentralComputation::new(&skin.with_cells_of_bus(bus)))
+                .collect(),
             chains,
             chain_of,
             tick_seconds: 1.0 / skin.timing.control_hz,
@@ -205,7 +207,7 @@ impl Cycle {
     /// Returns the reason for which the controller counts as absent; `None` if it does not. The robot of an absent
     /// controller stands still without a halt, because the controller still has time to start or has never answered.
     #[must_use]
-    pub fn absence(&self) -> Option<Absence> {
+    pub fn absence(&self) -> Option<ControllerAbsence> {
         if self.bad_in_a_row == 0 || self.halted.is_some() {
             return None;
         }
@@ -227,12 +229,12 @@ impl Cycle {
         skipped: u64,
         buses: impl IntoIterator<Item = BusInput<'a>>,
     ) -> TickOutcome {
-        let mut input = Input {
+        let mut input = ControllerInput {
             tick: tick.number,
             time: tick.time,
             q: self.robot.positions(),
             qdot: self.robot.velocities(),
-            ..Input::default()
+            ..ControllerInput::default()
         };
         let (mut stale, mut dead, mut halts, mut resumes) = (0, 0, 0, 0);
         let mut some_bus_works = false;
@@ -261,8 +263,8 @@ impl Cycle {
             (halts, resumes) = (halts + bus.halts, resumes + bus.resumes);
         }
         input.valid = match self.safety.lost_bus {
-            LostBus::Continue => some_bus_works,
-            LostBus::Halt => input.missing == 0,
+            LostBusReaction::Continue => some_bus_works,
+            LostBusReaction::Halt => input.missing == 0,
         };
         let heard = self.handle_commands(halts, resumes);
         input.halted = self.halted.is_some();
@@ -285,7 +287,7 @@ impl Cycle {
         };
         let moved = self.robot.step(&velocity, self.tick_seconds);
         let (broadcast, broadcasts_skipped) = self.broadcast(tick);
-        let Input { q, qdot, torque, valid, contributing, age, missing, .. } = input;
+        let ControllerInput { q, qdot, torque, valid, contributing, age, missing, .. } = input;
         let record = TickRecord {
             tick,
             skipped,
@@ -311,11 +313,12 @@ impl Cycle {
     /// latched at it. The cost grows with the number of cells; with distributed computation this work is not part of
     /// the tick.
     #[must_use]
-    pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> CentralTorque {
+    pub fn central_torque<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> CentralTorque {
         let mut reference = CentralTorque::default();
         let chains = self.chain_of.iter().filter_map(|&chain| self.chains.get(chain));
         for ((central, chain), bus) in self.central.iter().zip(chains).zip(buses) {
-            let part = central.total(&central.frames(&chain.broadcast_joints().positions), &bus.sensors);
+            let part =
+                central.total_torque(&central.frames(&chain.broadcast_joints().positions), &bus.sensors);
             chain.add(1.0, &part.torque, &mut reference.torque);
             reference.active += part.active;
         }

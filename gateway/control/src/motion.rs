@@ -4,8 +4,8 @@ use std::path::Path;
 
 use protocol::skin::{ControllerKind, Skin};
 
-use crate::controller::{Controller, Kinesthetic, Planned};
-use crate::external::{External, SocketError};
+use crate::controller::{Controller, KinestheticController, PlannedController};
+use crate::external::{ExternalController, SocketError};
 use model::scenario::{Motion, MotionKind};
 
 /// Creates the controller for the motion of a scenario: hold, sine, or the skin's own controller.
@@ -15,14 +15,16 @@ use model::scenario::{Motion, MotionKind};
 pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
     let motion = *motion;
     Ok(match (motion.kind, &skin.controller.kind) {
-        (MotionKind::Hold | MotionKind::Sine { .. }, _) => Box::new(Planned::new(skin, move |seconds| {
-            motion.state_at(seconds).map_or(motion.start, |state| state.position)
-        })),
+        (MotionKind::Hold | MotionKind::Sine { .. }, _) => {
+            Box::new(PlannedController::new(skin, move |seconds| {
+                motion.state_at(seconds).map_or(motion.start, |state| state.position)
+            }))
+        }
         (MotionKind::Kinesthetic, ControllerKind::Kinesthetic { inertia, damping }) => {
-            Box::new(Kinesthetic::from_parameters(skin, inertia, damping))
+            Box::new(KinestheticController::from_parameters(skin, inertia, damping))
         }
         (MotionKind::Kinesthetic, ControllerKind::External { socket, .. }) => {
-            Box::new(External::listen(Path::new(socket), skin)?)
+            Box::new(ExternalController::listen(Path::new(socket), skin)?)
         }
     })
 }
@@ -31,7 +33,7 @@ pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>
 #[expect(clippy::float_cmp, reason = "what does not move is exactly where it was")]
 mod tests {
     use super::*;
-    use crate::controller::{ControllerOutput, Input};
+    use crate::controller::{ControllerInput, ControllerOutput};
     use model::testing::skin;
     use protocol::packet::padded;
 
@@ -40,11 +42,11 @@ mod tests {
         let mut motion = Motion { start: padded(&[0.25; 6]), kind: MotionKind::Hold };
         let mut step = |kind, torque| {
             motion.kind = kind;
-            let input = Input {
+            let input = ControllerInput {
                 q: padded(&[0.25; 6]),
                 torque: padded(&[torque; 6]),
                 valid: true,
-                ..Input::default()
+                ..ControllerInput::default()
             };
             match controller_of(&skin(), &motion).unwrap().step(&input) {
                 ControllerOutput::Move(velocities) => velocities[0],

@@ -2,11 +2,11 @@
 
 use crate::grid::Grid;
 use crate::place::{CellPosition, spacing};
-use crate::surface::{Sample, Surface, real};
+use crate::surface::{Sample, Surface, count_to_f64};
 use crate::{LinkFigures, RobotLink};
 
 /// Computes how well the cells at `spots` cover a link.
-pub(crate) fn figures(
+pub(crate) fn coverage_figures(
     link: &RobotLink,
     surface: &Surface<'_>,
     spots: &[CellPosition],
@@ -21,12 +21,14 @@ pub(crate) fn figures(
         })
     };
     let count = surface.samples.len();
-    let share = |samples: usize| if count == 0 { 0.0 } else { real(samples) / real(count) };
+    let share = |samples: usize| if count == 0 { 0.0 } else { count_to_f64(samples) / count_to_f64(count) };
     LinkFigures {
         name: link.name.clone(),
         cells: spots.len(),
-        outer_area: real(count) * surface.share,
-        kept_out: share(surface.samples.iter().filter(|sample| surface.keeps_out(&sample.point)).count()),
+        outer_area: count_to_f64(count) * surface.share,
+        kept_out: share(
+            surface.samples.iter().filter(|sample| surface.is_in_keep_out_box(&sample.point)).count(),
+        ),
         covered: share(surface.samples.iter().filter(covered).count()),
         spacing: spacing(spots, pitch),
         tilt: spots.iter().map(|spot| spot.tilt).fold(0.0, f64::max),

@@ -246,7 +246,7 @@ pub fn cover(links: &[RobotLink], others: &[RobotLink], options: &CoverOptions) 
     for (index, link) in links.iter().enumerate() {
         let surface = Surface::new(index, links, others, options)?;
         let spots = place::place_cells(&surface, options, index);
-        figures.push(figures::figures(link, &surface, &spots, options.pitch));
+        figures.push(figures::coverage_figures(link, &surface, &spots, options.pitch));
         placed.push(spots);
     }
     let (cells, buses) = wire::wire_cells(&placed, options);

@@ -9,15 +9,15 @@ use rand_pcg::Pcg64Mcg;
 
 use crate::CoverOptions;
 use crate::grid::Grid;
-use crate::relax::{Field, Site};
-use crate::surface::{Sample, Surface, cell_area, real};
+use crate::relax::{SampleField, Site};
+use crate::surface::{Sample, Surface, cell_area, count_to_f64};
 
 /// The maximum angle between the normal of a cell and that of the mesh at its center, in rad: 9 degrees.
-const MAX_TILT: f64 = 0.157;
+const MAX_TILT_RAD: f64 = 0.157;
 
 /// The distance between cells before relaxation, in pitches. It is larger than 1, because relaxation adds further cells
 /// between them.
-const INITIAL_SPACING: f64 = 1.15;
+const INITIAL_SPACING_PITCHES: f64 = 1.15;
 
 /// The maximum number of attempts to reach a median distance of one pitch, each with another initial distance.
 const MAX_ATTEMPTS: usize = 4;
@@ -32,10 +32,10 @@ const TILT_COST: f64 = 3.0;
 
 /// The minimum distance between two cells on the same side, in pitches. Relaxation leaves a few cells closer together
 /// where a surface is folded or narrow.
-const MIN_SPACING: f64 = 0.6;
+const MIN_SPACING_PITCHES: f64 = 0.6;
 
 /// The cosine of the largest angle between the normals of two cells that count as being on the same side.
-const SAME_SIDE: f64 = 0.5;
+const MIN_SAME_SIDE_COSINE: f64 = 0.5;
 
 /// The place of a cell, in the frame of its link.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -49,20 +49,20 @@ pub(crate) struct CellPosition {
 /// Returns the places of the cells on a link.
 pub(crate) fn place_cells(surface: &Surface<'_>, options: &CoverOptions, link: usize) -> Vec<CellPosition> {
     let pitch = options.pitch;
-    let field = Field::new(surface.samples.iter().filter(|sample| sample.free).collect(), 1.2 * pitch);
-    if real(field.samples.len()) * surface.share < cell_area(pitch) / 4.0 {
+    let field = SampleField::new(surface.samples.iter().filter(|sample| sample.free).collect(), 1.2 * pitch);
+    if count_to_f64(field.samples.len()) * surface.share < cell_area(pitch) / 4.0 {
         return Vec::new();
     }
     let stream = u64::try_from(link).unwrap_or_default().wrapping_mul(0x9e37_79b9_7f4a_7c15);
     let mut dice = Pcg64Mcg::seed_from_u64(options.seed ^ stream);
     let mut order: Vec<_> = (0..field.samples.len()).collect();
     order.shuffle(&mut dice);
-    let mut apart = INITIAL_SPACING * pitch;
+    let mut apart = INITIAL_SPACING_PITCHES * pitch;
     let mut best: Option<(f64, Vec<CellPosition>)> = None;
     for _ in 0..MAX_ATTEMPTS {
-        let mut sites = field.grow(&order, apart, dice.random_range(0.0..FRAC_PI_3));
+        let mut sites = field.grow_honeycomb(&order, apart, dice.random_range(0.0..FRAC_PI_3));
         field.relax(&mut sites, apart);
-        let spots = thinned(spots(surface, &field, &sites, pitch), pitch);
+        let spots = remove_close_cells(cell_positions(surface, &field, &sites, pitch), pitch);
         let Some(spacing) = spacing(&spots, pitch) else {
             return spots;
         };
@@ -79,13 +79,13 @@ pub(crate) fn place_cells(surface: &Surface<'_>, options: &CoverOptions, link: u
 }
 
 /// Removes places that are closer than [`CLOSEST`] to an earlier place on the same side.
-fn thinned(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition> {
-    let apart = MIN_SPACING * pitch;
+fn remove_close_cells(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition> {
+    let apart = MIN_SPACING_PITCHES * pitch;
     let mut grid = Grid::new(apart);
     let mut kept: Vec<CellPosition> = Vec::new();
     for spot in spots {
         let near = |other: &CellPosition| {
-            other.normal.dot(&spot.normal) > SAME_SIDE && (other.point - spot.point).norm() < apart
+            other.normal.dot(&spot.normal) > MIN_SAME_SIDE_COSINE && (other.point - spot.point).norm() < apart
         };
         let is_crowded =
             grid.points_around(grid.cube(&spot.point)).filter_map(|index| kept.get(index)).any(near);
@@ -119,7 +119,12 @@ fn median(values: &mut [f64]) -> Option<f64> {
 }
 
 /// Returns the places of cells on the mesh, one for each site that relaxation has found.
-fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -> Vec<CellPosition> {
+fn cell_positions(
+    surface: &Surface<'_>,
+    field: &SampleField<'_>,
+    sites: &[Site],
+    pitch: f64,
+) -> Vec<CellPosition> {
     let mut best: Vec<Option<(f64, &Sample)>> = vec![None; sites.len()];
     for (owner, sample) in field.nearest_sites(sites).into_iter().zip(&field.samples) {
         let Some((site, best)) = owner.and_then(|owner| Some((sites.get(owner)?, best.get_mut(owner)?)))
@@ -135,21 +140,21 @@ fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -
     let spot = |(site, best): (&Site, Option<(f64, &Sample)>)| {
         let (_, sample) = best?;
         let projected = surface.project(&site.point, sample);
-        let straight = projected.filter(|(_, face)| face.angle(&sample.smooth) < MAX_TILT);
+        let straight = projected.filter(|(_, face)| face.angle(&sample.smooth) < MAX_TILT_RAD);
         let (point, face) = straight.unwrap_or((sample.point, sample.face));
-        let normal = limited(&face, &sample.smooth);
+        let normal = limit_tilt(&face, &sample.smooth);
         Some(CellPosition { point, normal, tilt: normal.angle(&face) })
     };
     sites.iter().zip(best).filter_map(spot).collect()
 }
 
 /// Returns the unit vector that is nearest to `requested` and at most [`MAX_TILT`] away from `face`.
-fn limited(face: &Vector3<f64>, requested: &Vector3<f64>) -> Vector3<f64> {
+fn limit_tilt(face: &Vector3<f64>, requested: &Vector3<f64>) -> Vector3<f64> {
     let angle = face.angle(requested);
-    if angle <= MAX_TILT {
+    if angle <= MAX_TILT_RAD {
         return *requested;
     }
     // Opposite vectors would have no rotation axis, but the vectors of samples are never opposite.
     let axis = Unit::try_new(face.cross(requested), 0.0);
-    axis.map_or(*face, |axis| Rotation3::from_axis_angle(&axis, MAX_TILT) * face)
+    axis.map_or(*face, |axis| Rotation3::from_axis_angle(&axis, MAX_TILT_RAD) * face)
 }

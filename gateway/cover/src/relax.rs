@@ -15,10 +15,10 @@ const MIN_NORMAL_COSINE: f64 = 0.3;
 
 /// The minimum distance between sites while they grow, in steps. It matters where a honeycomb that grows around a tube
 /// meets itself.
-const MIN_GROWTH_DISTANCE: f64 = 0.75;
+const MIN_GROWTH_DISTANCE_STEPS: f64 = 0.75;
 
 /// The number of rounds in which all sites are moved.
-const ROUNDS: usize = 60;
+const RELAXATION_ROUNDS: usize = 60;
 
 /// The number of rounds after which new sites are added at samples that are far from every site.
 const ROUNDS_PER_ADDITION: usize = 15;
@@ -32,7 +32,7 @@ pub(crate) struct Site {
 
 impl Site {
     /// Returns the squared distance to a sample in m²; `None` if the sample faces another way.
-    pub(crate) fn distance(&self, sample: &Sample) -> Option<f64> {
+    pub(crate) fn squared_distance(&self, sample: &Sample) -> Option<f64> {
         (self.normal.dot(&sample.smooth) > MIN_NORMAL_COSINE)
             .then(|| (self.point - sample.point).norm_squared())
     }
@@ -40,13 +40,13 @@ impl Site {
 
 /// The samples at which cells may be placed, and the maximum distance from a site to its samples.
 #[derive(Debug)]
-pub(crate) struct Field<'a> {
+pub(crate) struct SampleField<'a> {
     pub(crate) samples: Vec<&'a Sample>,
     grid: Grid,
     reach: f64,
 }
 
-impl<'a> Field<'a> {
+impl<'a> SampleField<'a> {
     pub(crate) fn new(samples: Vec<&'a Sample>, reach: f64) -> Self {
         let grid = Grid::with_points(reach, samples.iter().map(|sample| &sample.point));
         Self { samples, grid, reach }
@@ -57,8 +57,9 @@ impl<'a> Field<'a> {
         let mut grid = Grid::with_points(apart, sites.iter().map(|site| &site.point));
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
             let near = grid.points_around(grid.cube(&sample.point)).filter_map(|index| sites.get(index));
-            let free =
-                !near.filter_map(|site| site.distance(sample)).any(|distance| distance < apart * apart);
+            let free = !near
+                .filter_map(|site| site.squared_distance(sample))
+                .any(|distance| distance < apart * apart);
             if free {
                 grid.insert(&sample.point, sites.len());
                 sites.push(Site { point: sample.point, normal: sample.smooth });
@@ -68,7 +69,7 @@ impl<'a> Field<'a> {
 
     /// Grows a honeycomb of sites whose distance is `step`, in m. Growth begins at those samples, in the given order,
     /// that have no site nearby. `turn` is the direction of the first row, in rad.
-    pub(crate) fn grow(&self, order: &[usize], step: f64, turn: f64) -> Vec<Site> {
+    pub(crate) fn grow_honeycomb(&self, order: &[usize], step: f64, turn: f64) -> Vec<Site> {
         let mut sites: Vec<Site> = Vec::new();
         let mut grid = Grid::new(step);
         let free = |site: &Site, apart: f64, sites: &[Site], grid: &Grid| {
@@ -86,7 +87,7 @@ impl<'a> Field<'a> {
             let (s, t) = tangents(&first.normal);
             let mut open = VecDeque::from([(first, s * turn.cos() + t * turn.sin())]);
             while let Some((site, row)) = open.pop_front() {
-                if !free(&site, MIN_GROWTH_DISTANCE * step, &sites, &grid) {
+                if !free(&site, MIN_GROWTH_DISTANCE_STEPS * step, &sites, &grid) {
                     continue;
                 }
                 grid.insert(&site.point, sites.len());
@@ -98,7 +99,7 @@ impl<'a> Field<'a> {
                     );
                     let direction = turn * row;
                     let next = Site { point: site.point + direction * step, normal: site.normal };
-                    let Some(next) = self.snapped(&next, 0.4 * step) else { continue };
+                    let Some(next) = self.snap_to_surface(&next, 0.4 * step) else { continue };
                     let flat = Unit::try_new(direction - next.normal * direction.dot(&next.normal), 0.0);
                     open.extend(flat.map(|flat| (next, flat.into_inner())));
                 }
@@ -108,10 +109,10 @@ impl<'a> Field<'a> {
     }
 
     /// Moves a site onto the surface at the nearest sample; `None` if no sample is within `within`, in m.
-    fn snapped(&self, site: &Site, within: f64) -> Option<Site> {
+    fn snap_to_surface(&self, site: &Site, within: f64) -> Option<Site> {
         let near =
             self.grid.points_around(self.grid.cube(&site.point)).filter_map(|index| self.samples.get(index));
-        let near = near.filter_map(|sample| Some((site.distance(sample)?, sample)));
+        let near = near.filter_map(|sample| Some((site.squared_distance(sample)?, sample)));
         let (distance, sample) = near.min_by(|a, b| a.0.total_cmp(&b.0))?;
         let height = (site.point - sample.point).dot(&sample.smooth);
         let point = site.point - sample.smooth * height;
@@ -130,7 +131,9 @@ impl<'a> Field<'a> {
                 let mut best = None;
                 let mut within = self.reach * self.reach;
                 for &(index, site) in &near {
-                    if let Some(distance) = site.distance(sample).filter(|&distance| distance <= within) {
+                    if let Some(distance) =
+                        site.squared_distance(sample).filter(|&distance| distance <= within)
+                    {
                         within = distance;
                         best = Some(index);
                     }
@@ -146,7 +149,7 @@ impl<'a> Field<'a> {
     /// Moves the sites until they are distributed evenly. Removes those that have no samples. New sites are at least
     /// `apart` (in m) from others.
     pub(crate) fn relax(&self, sites: &mut Vec<Site>, apart: f64) {
-        for round in 1..=ROUNDS {
+        for round in 1..=RELAXATION_ROUNDS {
             let owners = self.nearest_sites(sites);
             let mut sums = vec![(0.0, Vector3::zeros(), Vector3::zeros()); sites.len()];
             let mut alone = Vec::new();
@@ -168,7 +171,7 @@ impl<'a> Field<'a> {
                     Some(Site { point: Point3::from(points / count), normal })
                 })
                 .collect();
-            if round % ROUNDS_PER_ADDITION == 0 && round < ROUNDS {
+            if round % ROUNDS_PER_ADDITION == 0 && round < RELAXATION_ROUNDS {
                 self.add_sites(&alone, apart, sites);
             }
         }

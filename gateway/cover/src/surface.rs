@@ -19,32 +19,32 @@ const MAX_CELLS: usize = 6000;
 const MIN_SAMPLES: f64 = 2000.0;
 
 /// The number of rays from a side of a sample. Further rays are not cast if the first [`FEW`] all agree.
-const RAYS: u32 = 32;
-const FIRST_RAYS: u32 = 8;
+const RAYS_PER_TEST: u32 = 32;
+const MIN_RAYS_PER_TEST: u32 = 8;
 
 /// The minimum share of rays that leave the link from a side that is part of the outer surface. It is higher than
 /// through a screw hole, and lower than from between the arms of a fork.
-const MIN_ESCAPING_SHARE: f64 = 0.3;
+const MIN_ESCAPING_RAY_SHARE: f64 = 0.3;
 
 /// The maximum share of rays that leave another link from its inside, through gaps of its mesh.
-const MAX_LEAKING_SHARE: f64 = 0.1;
+const MAX_LEAKING_RAY_SHARE: f64 = 0.1;
 
 /// The minimum share of rays that leave the whole robot from a side on which cells are placed. A smaller share leaves
 /// only through the gap between two links, where nothing can touch a cell.
-const MIN_REACHED_SHARE: f64 = 0.05;
+const MIN_REACHED_RAY_SHARE: f64 = 0.05;
 
 /// The number of rays by which [`REACHED`] is tested. Further rays are not cast if half of the first [`FEW`] leave.
-const REACH_RAYS: u32 = 128;
+const REACH_TEST_RAYS: u32 = 128;
 
 /// The height above the surface from which rays start, in pitches.
 const RAY_START_HEIGHT: f64 = 1e-3;
 
 /// The distance up to which other links hide a surface from rays, in pitches.
-const HIDING_DISTANCE: f64 = 2.0;
+const HIDING_DISTANCE_PITCHES: f64 = 2.0;
 
 /// The minimum share of the disc below a cell that must be surface of a similar direction. The share is about a half at
 /// a straight edge, and near zero on the rim of a sheet.
-const MIN_SUPPORT: f64 = 0.4;
+const MIN_SUPPORT_SHARE: f64 = 0.4;
 
 /// A point of the outer surface. Each sample represents the same area.
 #[derive(Clone, Copy, Debug)]
@@ -98,7 +98,7 @@ impl<'a> Surface<'a> {
         let pitch = options.pitch;
         let area: f64 = own.iter().map(area).sum();
         let cells = area / cell_area(pitch);
-        if cells.is_nan() || cells > real(MAX_CELLS) {
+        if cells.is_nan() || cells > count_to_f64(MAX_CELLS) {
             let link = links.get(index).map_or_else(String::new, |link| link.name.clone());
             return Err(CoverError::TooLarge { link, area, cells, pitch, most: MAX_CELLS });
         }
@@ -112,14 +112,14 @@ impl<'a> Surface<'a> {
             share: 0.0,
         };
         if area > 0.0 {
-            surface.sample(area, (cells * SAMPLES_PER_CELL).max(MIN_SAMPLES));
-            surface.smooth();
+            surface.sample_triangles(area, (cells * SAMPLES_PER_CELL).max(MIN_SAMPLES));
+            surface.smooth_normals();
         }
         Ok(surface)
     }
 
     /// Samples all triangles with equal density, and keeps the samples on the outer surface.
-    fn sample(&mut self, area: f64, count: f64) {
+    fn sample_triangles(&mut self, area: f64, count: f64) {
         self.share = area / count;
         // The first sample is placed in the middle of its share, so that rounding errors do not add a sample at the
         // end.
@@ -132,13 +132,13 @@ impl<'a> Surface<'a> {
             while due > 0.0 {
                 due -= 1.0;
                 taken += 1;
-                let (mut u, mut v) = scattered(taken);
+                let (mut u, mut v) = quasirandom_point(taken);
                 if u + v > 1.0 {
                     (u, v) = (1.0 - u, 1.0 - v);
                 }
                 let point = a + (b - a) * u + (c - a) * v;
-                if let Some(face) = self.outward(&point, &face) {
-                    let free = self.allowed(&point);
+                if let Some(face) = self.outward_normal(&point, &face) {
+                    let free = self.is_allowed(&point);
                     self.samples.push(Sample { point, face, smooth: face, free });
                 }
             }
@@ -147,35 +147,35 @@ impl<'a> Surface<'a> {
 
     /// Returns the outward normal at a point of a triangle whose normal is `face`. Returns `None` if the point is not
     /// on the outer surface.
-    fn outward(&self, point: &Point3<f64>, face: &Vector3<f64>) -> Option<Vector3<f64>> {
-        let front = self.escaping(point, face);
+    fn outward_normal(&self, point: &Point3<f64>, face: &Vector3<f64>) -> Option<Vector3<f64>> {
+        let front = self.escaping_ray_share(point, face);
         // Both sides of a thin sheet are outer sides. The side from which more rays leave is chosen, and the front if
         // both are equal.
-        let back = if front < 0.95 { self.escaping(point, &-face) } else { 0.0 };
+        let back = if front < 0.95 { self.escaping_ray_share(point, &-face) } else { 0.0 };
         let (side, share) = if back > front { (-face, back) } else { (*face, front) };
-        let is_outer = share >= MIN_ESCAPING_SHARE
-            && !self.inside_another(&(point + side * (RAY_START_HEIGHT * self.pitch)))
+        let is_outer = share >= MIN_ESCAPING_RAY_SHARE
+            && !self.is_inside_other_link(&(point + side * (RAY_START_HEIGHT * self.pitch)))
             && self.is_reached(point, &side);
         is_outer.then_some(side)
     }
 
     /// Returns the share of rays that leave the link from just above a point. Rays are weighted by the cosine of the
     /// angle to the normal.
-    fn escaping(&self, point: &Point3<f64>, side: &Vector3<f64>) -> f64 {
+    fn escaping_ray_share(&self, point: &Point3<f64>, side: &Vector3<f64>) -> f64 {
         let rays = self.rays(point, side);
-        share(|ray| self.escapes(&rays(*ray), HIDING_DISTANCE * self.pitch))
+        share_of_rays(|ray| self.escapes(&rays(*ray), HIDING_DISTANCE_PITCHES * self.pitch))
     }
 
     /// Returns true if something could touch the point from this side, because enough rays leave the robot.
     fn is_reached(&self, point: &Point3<f64>, side: &Vector3<f64>) -> bool {
         let rays = self.rays(point, side);
         let leaves = |ray: &u32| self.escapes(&rays(*ray), f64::INFINITY);
-        let few = count((0..FIRST_RAYS).filter(leaves));
-        if 2 * few >= FIRST_RAYS {
+        let few = count((0..MIN_RAYS_PER_TEST).filter(leaves));
+        if 2 * few >= MIN_RAYS_PER_TEST {
             return true;
         }
-        let mut needed = (MIN_REACHED_SHARE * f64::from(REACH_RAYS)).ceil() - f64::from(few);
-        let left = (FIRST_RAYS..REACH_RAYS).filter(leaves).find(|_| {
+        let mut needed = (MIN_REACHED_RAY_SHARE * f64::from(REACH_TEST_RAYS)).ceil() - f64::from(few);
+        let left = (MIN_RAYS_PER_TEST..REACH_TEST_RAYS).filter(leaves).find(|_| {
             needed -= 1.0;
             needed <= 0.0
         });
@@ -188,7 +188,7 @@ impl<'a> Surface<'a> {
         let origin = point + side * (RAY_START_HEIGHT * self.pitch);
         let ((s, t), side) = (tangents(side), *side);
         move |ray| {
-            let (u, v) = scattered(ray);
+            let (u, v) = quasirandom_point(ray);
             let (radius, (sin, cos)) = (u.sqrt(), (TAU * v).sin_cos());
             Ray::new(origin, s * (radius * cos) + t * (radius * sin) + side * (1.0 - u).sqrt())
         }
@@ -199,17 +199,17 @@ impl<'a> Surface<'a> {
         !self.own.blocks(ray, f64::INFINITY) && !self.others.blocks(ray, until)
     }
 
-    fn inside_another(&self, point: &Point3<f64>) -> bool {
+    fn is_inside_other_link(&self, point: &Point3<f64>) -> bool {
         let mut leaking = 0;
-        for ray in 0..RAYS {
-            let (u, v) = scattered(ray);
+        for ray in 0..RAYS_PER_TEST {
+            let (u, v) = quasirandom_point(ray);
             let (height, (sin, cos)) = (2.0 * u - 1.0, (TAU * v).sin_cos());
             let radius = (1.0 - height * height).sqrt();
             let ray = Ray::new(*point, Vector3::new(radius * cos, radius * sin, height));
             if !self.others.blocks(&ray, f64::INFINITY) {
                 leaking += 1;
             }
-            if f64::from(leaking) > MAX_LEAKING_SHARE * f64::from(RAYS) {
+            if f64::from(leaking) > MAX_LEAKING_RAY_SHARE * f64::from(RAYS_PER_TEST) {
                 return false;
             }
         }
@@ -217,12 +217,12 @@ impl<'a> Surface<'a> {
     }
 
     /// Returns true if cells are allowed at a point, because it is in no keep-out box and far enough from other links.
-    fn allowed(&self, point: &Point3<f64>) -> bool {
-        !self.keeps_out(point) && !self.others.near(point, self.clearance)
+    fn is_allowed(&self, point: &Point3<f64>) -> bool {
+        !self.is_in_keep_out_box(point) && !self.others.is_near(point, self.clearance)
     }
 
     /// Returns true if a point is in a keep-out box.
-    pub(crate) fn keeps_out(&self, point: &Point3<f64>) -> bool {
+    pub(crate) fn is_in_keep_out_box(&self, point: &Point3<f64>) -> bool {
         let inside = |keep_out: &&KeepOut| {
             let sides = keep_out.min.iter().zip(&keep_out.max);
             sides.zip(point.iter()).all(|((min, max), at)| (min..=max).contains(&at))
@@ -231,10 +231,10 @@ impl<'a> Surface<'a> {
     }
 
     /// Computes the mean normal around each sample, and checks that a cell there would have enough surface below it.
-    fn smooth(&mut self) {
+    fn smooth_normals(&mut self) {
         let radius = self.pitch / 2.0;
         let grid = Grid::with_points(radius, self.samples.iter().map(|sample| &sample.point));
-        let min = MIN_SUPPORT * PI * radius * radius / self.share;
+        let min = MIN_SUPPORT_SHARE * PI * radius * radius / self.share;
         let mut smoothed = Vec::new();
         for (cube, members) in grid.cubes() {
             let near: Vec<_> = grid.points_around(cube).filter_map(|index| self.samples.get(index)).collect();
@@ -270,20 +270,20 @@ impl<'a> Surface<'a> {
         let up = sample.smooth;
         let reach = self.pitch / 4.0;
         let origin = point + up * ((sample.point - point).dot(&up) + reach);
-        let (at, triangle) = self.own.first(&Ray::new(origin, -up), 2.0 * reach)?;
+        let (at, triangle) = self.own.first_hit(&Ray::new(origin, -up), 2.0 * reach)?;
         let point = origin - up * at;
-        let face = self.outward(&point, &normal(self.own.triangle(triangle)?)?)?;
-        (face.dot(&up) > 0.0 && self.allowed(&point)).then_some((point, face))
+        let face = self.outward_normal(&point, &normal(self.own.triangle(triangle)?)?)?;
+        (face.dot(&up) > 0.0 && self.is_allowed(&point)).then_some((point, face))
     }
 }
 
 /// Returns the share of rays for which `escapes` is true. Only the first [`FEW`] rays are cast if they all agree.
-fn share(escapes: impl Fn(&u32) -> bool) -> f64 {
-    let few = count((0..FIRST_RAYS).filter(&escapes));
-    if few == 0 || few == FIRST_RAYS {
-        return f64::from(few) / f64::from(FIRST_RAYS);
+fn share_of_rays(escapes: impl Fn(&u32) -> bool) -> f64 {
+    let few = count((0..MIN_RAYS_PER_TEST).filter(&escapes));
+    if few == 0 || few == MIN_RAYS_PER_TEST {
+        return f64::from(few) / f64::from(MIN_RAYS_PER_TEST);
     }
-    f64::from(few + count((FIRST_RAYS..RAYS).filter(&escapes))) / f64::from(RAYS)
+    f64::from(few + count((MIN_RAYS_PER_TEST..RAYS_PER_TEST).filter(&escapes))) / f64::from(RAYS_PER_TEST)
 }
 
 /// Counts the rays of an iterator.
@@ -293,7 +293,7 @@ fn count(rays: impl Iterator<Item = u32>) -> u32 {
 
 /// Returns the point with this number of a sequence (by Roberts) whose beginnings are all distributed evenly over the
 /// unit square.
-fn scattered(index: u32) -> (f64, f64) {
+fn quasirandom_point(index: u32) -> (f64, f64) {
     let at = f64::from(index);
     ((0.5 + at * 0.754_877_666_246_692_8).fract(), (0.5 + at * 0.569_840_290_998_053_3).fract())
 }
@@ -354,6 +354,6 @@ fn remove_duplicates(triangles: &mut Vec<Triangle>) {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "counts")]
-pub(crate) const fn real(count: usize) -> f64 {
+pub(crate) const fn count_to_f64(count: usize) -> f64 {
     count as f64
 }

@@ -32,7 +32,7 @@ impl Bounds {
     }
 
     /// Returns the position at which a ray enters the box, if it is before `until`.
-    fn entered(&self, ray: &Ray, until: f64) -> Option<f64> {
+    fn entry_position(&self, ray: &Ray, until: f64) -> Option<f64> {
         let near = (self.min - ray.origin).component_mul(&ray.inverse);
         let far = (self.max - ray.origin).component_mul(&ray.inverse);
         // `f64::min` and `max` prefer a number to the NaN of a ray that lies in a side of the box.
@@ -59,9 +59,9 @@ impl Ray {
     }
 
     /// Returns the position at which the ray meets a triangle, from either side (Möller and Trumbore).
-    fn meets(&self, [a, b, c]: &Triangle) -> Option<f64> {
+    fn intersect_triangle(&self, [a, b, c]: &Triangle) -> Option<f64> {
         // Rays through an edge between two triangles must hit at least one of them.
-        const MARGIN: f64 = 1e-9;
+        const EDGE_MARGIN: f64 = 1e-9;
         let (ab, ac) = (b - a, c - a);
         let p = self.direction.cross(&ac);
         let inverse = ab.dot(&p).recip();
@@ -70,7 +70,8 @@ impl Ray {
         let q = from.cross(&ab);
         let v = self.direction.dot(&q) * inverse;
         let at = ac.dot(&q) * inverse;
-        (u >= -MARGIN && v >= -MARGIN && u + v <= 1.0 + MARGIN && at >= 0.0 && at.is_finite()).then_some(at)
+        (u >= -EDGE_MARGIN && v >= -EDGE_MARGIN && u + v <= 1.0 + EDGE_MARGIN && at >= 0.0 && at.is_finite())
+            .then_some(at)
     }
 }
 
@@ -140,29 +141,29 @@ impl TriangleTree {
 
     /// Returns true if a ray meets a triangle within `until`.
     pub(crate) fn blocks(&self, ray: &Ray, until: f64) -> bool {
-        self.meets(ray, until, true).is_some()
+        self.find_hit(ray, until, true).is_some()
     }
 
     /// Returns the position at which a ray first meets a triangle within `until`, and the index of the triangle.
-    pub(crate) fn first(&self, ray: &Ray, until: f64) -> Option<(f64, usize)> {
-        self.meets(ray, until, false)
+    pub(crate) fn first_hit(&self, ray: &Ray, until: f64) -> Option<(f64, usize)> {
+        self.find_hit(ray, until, false)
     }
 
     /// Returns the first triangle that a ray meets within `until`; with `any`, the first one found.
-    fn meets(&self, ray: &Ray, until: f64, any: bool) -> Option<(f64, usize)> {
+    fn find_hit(&self, ray: &Ray, until: f64, any: bool) -> Option<(f64, usize)> {
         let mut best = None;
         let mut until = until;
         let mut open = vec![0];
         while let Some(node) = open.pop() {
             let Some((bounds, kind)) = self.nodes.get(node) else { continue };
-            if bounds.entered(ray, until).is_none() {
+            if bounds.entry_position(ray, until).is_none() {
                 continue;
             }
             match *kind {
                 NodeKind::Fork(first, second) => open.extend([second, first]),
                 NodeKind::Leaf(from, to) => {
                     for (index, triangle) in self.leaf(from, to) {
-                        if let Some(at) = ray.meets(triangle).filter(|&at| at <= until) {
+                        if let Some(at) = ray.intersect_triangle(triangle).filter(|&at| at <= until) {
                             until = at;
                             best = Some((at, index));
                             if any {
@@ -177,7 +178,7 @@ impl TriangleTree {
     }
 
     /// Returns true if a triangle is closer to a point than `within`, in m.
-    pub(crate) fn near(&self, point: &Point3<f64>, within: f64) -> bool {
+    pub(crate) fn is_near(&self, point: &Point3<f64>, within: f64) -> bool {
         let mut open = vec![0];
         while let Some(node) = open.pop() {
             let Some((bounds, kind)) = self.nodes.get(node) else { continue };
@@ -240,12 +241,12 @@ mod tests {
             let ray = Ray::new(from, (to - from).normalize());
             let tree = TriangleTree::new(triangles.clone());
             prop_assert_eq!(tree.triangles().len(), triangles.len());
-            let hits = triangles.iter().filter_map(|triangle| ray.meets(triangle));
+            let hits = triangles.iter().filter_map(|triangle| ray.intersect_triangle(triangle));
             let first = hits.filter(|&at| at <= until).min_by(f64::total_cmp);
-            prop_assert_eq!(tree.first(&ray, until).map(|(at, _)| at), first);
+            prop_assert_eq!(tree.first_hit(&ray, until).map(|(at, _)| at), first);
             prop_assert_eq!(tree.blocks(&ray, until), first.is_some());
             let nearest = triangles.iter().map(|triangle| distance(&from, triangle)).min_by(f64::total_cmp);
-            prop_assert_eq!(tree.near(&from, until), nearest.is_some_and(|nearest| nearest < until));
+            prop_assert_eq!(tree.is_near(&from, until), nearest.is_some_and(|nearest| nearest < until));
         }
 
         #[test]
@@ -264,7 +265,7 @@ mod tests {
         let point = Point3::new(0.0, 0.0, 1.0);
         let tree = TriangleTree::new(vec![[point; 3]; 10]);
         assert!(!tree.blocks(&Ray::new(Point3::origin(), Vector3::z()), 9.0));
-        assert!(tree.near(&Point3::origin(), 1.5));
-        assert!(!tree.near(&Point3::origin(), 0.5));
+        assert!(tree.is_near(&Point3::origin(), 1.5));
+        assert!(!tree.is_near(&Point3::origin(), 0.5));
     }
 }

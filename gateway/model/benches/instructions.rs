@@ -14,13 +14,13 @@ use std::hint::black_box;
 
 use gungraun::{library_benchmark, library_benchmark_group};
 use model::generate::{SkinRequest, generate};
-use model::latched::{LatchedPackets, ReceivedFrame};
-use model::table::Table;
+use model::latched::{LatchedFrame, LatchedPackets};
+use model::table::BusTable;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+    Answer, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart,
 };
 use protocol::packet::{self, Epoch, WORDS, padded};
 use protocol::parameters::Parameter;
@@ -32,12 +32,12 @@ mod counted;
 
 const CELLS: usize = 253;
 /// Time of the first epoch in ns since 1970.
-const BEGAN: u64 = 1_700_000_000_000_000_000;
+const FIRST_EPOCH_NANOS: u64 = 1_700_000_000_000_000_000;
 /// Time between two epochs, in ns.
 const EPOCH_NANOS: u64 = 16_000_000;
 
 /// The frames of one epoch, by its number.
-type Frames = fn(u8, Format) -> Vec<ReceivedFrame>;
+type Frames = fn(u8, Format) -> Vec<LatchedFrame>;
 
 fn skin(format: Format) -> Skin {
     let text = generate(&SkinRequest { cells: CELLS, ..SkinRequest::default() }).expect("a UR5 has room");
@@ -57,14 +57,14 @@ fn frames(
     format: Format,
     from_gateway: &[Message],
     others: impl Iterator<Item = Message>,
-) -> Vec<ReceivedFrame> {
+) -> Vec<LatchedFrame> {
     let messages =
         from_gateway.iter().map(|message| (true, *message)).chain(others.map(|message| (false, message)));
     let frames = messages.flat_map(|(from_gateway, message)| {
         message.encode().frames(format).map(move |it| (from_gateway, it))
     });
-    let began = BEGAN + u64::from(number) * EPOCH_NANOS;
-    let received = |(at, (from_gateway, frame)): (u64, _)| ReceivedFrame {
+    let began = FIRST_EPOCH_NANOS + u64::from(number) * EPOCH_NANOS;
+    let received = |(at, (from_gateway, frame)): (u64, _)| LatchedFrame {
         at_nanos: began + at * 22_000,
         from_gateway,
         frame,
@@ -77,7 +77,7 @@ fn cells() -> impl Iterator<Item = CellId> {
 }
 
 /// Returns the joints and the torques of an epoch.
-fn torques(number: u8, format: Format) -> Vec<ReceivedFrame> {
+fn torques(number: u8, format: Format) -> Vec<LatchedFrame> {
     let epoch = Epoch(number);
     let positions = padded(&[0.3, -1.2, 1.0, -1.4, -0.6, 0.2_f64].map(Q1_14::nearest));
     let joints = Message::Joints { epoch, joints: Joints { positions, in_use: 6 } };
@@ -87,7 +87,7 @@ fn torques(number: u8, format: Format) -> Vec<ReceivedFrame> {
 }
 
 /// Returns a heartbeat of each cell.
-fn heartbeats(number: u8, format: Format) -> Vec<ReceivedFrame> {
+fn heartbeats(number: u8, format: Format) -> Vec<LatchedFrame> {
     let state = State::CONFIGURED.with(State::TEST_MODE, true).with(State::ACTIVE, true);
     let heartbeat = |cell: CellId| {
         let serial = u32::from(cell.get());
@@ -99,7 +99,7 @@ fn heartbeats(number: u8, format: Format) -> Vec<ReceivedFrame> {
 }
 
 /// Returns the stimulus that presses all cells, after the write of the mode that each of them confirms.
-fn presses(number: u8, format: Format) -> Vec<ReceivedFrame> {
+fn presses(number: u8, format: Format) -> Vec<LatchedFrame> {
     let (mode, words) = (Parameter::Mode.number(), packet::padded_words([1]));
     let request = Request::Write { number: mode, words };
     let write = Message::Configure { to: Node::Everyone, tag: 0, request };
@@ -108,25 +108,25 @@ fn presses(number: u8, format: Format) -> Vec<ReceivedFrame> {
     let contact = [Q5_10::nearest(0.5); 3];
     let skin = SkinSensors { contact, proximity: Q1_14::nearest(0.9), ..SkinSensors::default() };
     let page = SensorPage::Skin(skin);
-    let press = Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page };
+    let press = Message::Stimulus { to: Node::Everyone, from: StimulusStart::Next, page };
     let press = frames(number, format, &[press], std::iter::empty());
     [frames(number, format, &[write], confirmed), press].concat()
 }
 
 /// Returns an epoch of pressed cells.
-fn epoch_before(format: Format) -> Vec<ReceivedFrame> {
+fn epoch_before(format: Format) -> Vec<LatchedFrame> {
     [heartbeats(0, format), presses(1, format), torques(2, format)].concat()
 }
 
 /// A table that has received an epoch, and the next frames of its bus.
 struct Receiver {
-    table: Table,
-    next: Vec<ReceivedFrame>,
+    table: BusTable,
+    next: Vec<LatchedFrame>,
 }
 
 impl Receiver {
     fn new(format: Format, comparing: bool, next: Frames) -> &'static mut Self {
-        let mut table = Table::new(&skin(format), 0);
+        let mut table = BusTable::new(&skin(format), 0);
         table.set_comparing(comparing);
         receive(&mut table, &epoch_before(format));
         leaked(Self { table, next: next(3, format) })
@@ -139,8 +139,8 @@ impl Receiver {
     }
 }
 
-fn receive(table: &mut Table, frames: &[ReceivedFrame]) {
-    for ReceivedFrame { at_nanos, from_gateway, frame } in black_box(frames) {
+fn receive(table: &mut BusTable, frames: &[LatchedFrame]) {
+    for LatchedFrame { at_nanos, from_gateway, frame } in black_box(frames) {
         table.handle_frame(Micros(at_nanos / 1_000), *from_gateway, frame, &mut |_| None);
     }
 }
@@ -159,7 +159,7 @@ fn table(receiver: &mut Receiver) -> u32 {
 /// The latched packets of an epoch, and the next frames of their bus.
 struct Latching {
     latched: LatchedPackets,
-    next: Vec<ReceivedFrame>,
+    next: Vec<LatchedFrame>,
 }
 
 impl Latching {
@@ -172,7 +172,7 @@ impl Latching {
     /// Latches the next frames, and returns true if the last of them is not the end of a packet.
     fn is_within_a_packet_after_next(&mut self) -> bool {
         black_box(&self.next).iter().for_each(|&frame| self.latched.receive(frame));
-        self.latched.is_within_a_packet(BEGAN)
+        self.latched.is_within_a_packet(FIRST_EPOCH_NANOS)
     }
 }
 
@@ -190,7 +190,7 @@ fn latch(latching: &mut Latching) -> bool {
 library_benchmark_group!(name = received; benchmarks = table, latch);
 
 /// Runs each benchmark once and checks its result.
-fn once() {
+fn check_benchmarks() {
     for format in [Format::Fd, Format::Classic] {
         for next in [torques, heartbeats] {
             assert_eq!(Receiver::new(format, true, next).contributing_after_next(), 253);
@@ -214,5 +214,5 @@ mod all {
 }
 
 fn main() {
-    counted::main(once, all::run);
+    counted::main(check_benchmarks, all::run);
 }

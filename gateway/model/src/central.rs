@@ -8,8 +8,8 @@
 //!  sensor words ─> Central::force  ─> F_z ────┘
 //! ```
 //!
-//! [`Central::new`] computes with the quantised parameters, as the cells do, so that a difference is the error of the
-//! cells' arithmetic. [`Central::unquantised`] computes with the numbers of the file: the difference then includes the
+//! [`CentralComputation::new`] computes with the quantised parameters, as the cells do, so that a difference is the error of the
+//! cells' arithmetic. [`CentralComputation::unquantised`] computes with the numbers of the file: the difference then includes the
 //! rounding of poses, lengths and angles to words.
 //!
 //! A contact pushes against the outward normal: force = -F_z * normal.
@@ -22,7 +22,7 @@ use protocol::skin::{Cell, Chain, ChainBase, Skin};
 
 /// The central computation for the cells of one chain. Cells are named by their index in [`Skin::cells`].
 #[derive(Clone, Debug)]
-pub struct Central {
+pub struct CentralComputation {
     /// Pose of frame 0 in the robot's base frame.
     base: IsometryMatrix3<f64>,
     links: Vec<ChainLink>,
@@ -53,7 +53,7 @@ struct CellGeometry {
 /// Poses of all links for one set of joint positions: frame 0 (the base), then one frame per row, all in the robot's
 /// base frame.
 #[derive(Clone, Debug)]
-pub struct Frames {
+pub struct LinkFrames {
     frames: [IsometryMatrix3<f64>; MAX_ROWS + 1],
     kinds: [RowKind; MAX_ROWS],
 }
@@ -67,7 +67,7 @@ pub struct ReferenceTorque {
     pub active: u32,
 }
 
-impl Central {
+impl CentralComputation {
     /// Builds the reference from the quantised words that the cells compute with. All cells of the skin must sit on one
     /// chain; for a skin with several buses, pass [`Skin::with_cells_of_bus`] of one bus.
     #[must_use]
@@ -115,7 +115,7 @@ impl Central {
 
     /// Returns the poses of all links for these joint words. Bounded work, no allocation.
     #[must_use]
-    pub fn frames(&self, joints: &[Q1_14]) -> Frames {
+    pub fn frames(&self, joints: &[Q1_14]) -> LinkFrames {
         self.chain_frames(joints, |link, word| match (link.kind, word) {
             (RowKind::Revolute, Some(word)) => (word.wrapping_add(link.offset_word).to_radians(), 0.0),
             (RowKind::Prismatic, Some(word)) => (link.offset_word.to_radians(), word.to_f64()),
@@ -125,7 +125,7 @@ impl Central {
 
     /// Returns the poses of all links for these joint positions, in rad or m. Bounded work, no allocation.
     #[must_use]
-    pub fn frames_at_positions(&self, q: &[f64]) -> Frames {
+    pub fn frames_at_positions(&self, q: &[f64]) -> LinkFrames {
         self.chain_frames(q, |link, q| match (link.kind, q) {
             (RowKind::Revolute, Some(angle)) => (angle + link.offset, 0.0),
             (RowKind::Prismatic, Some(slide)) => (link.offset, *slide),
@@ -146,9 +146,13 @@ impl Central {
 
     /// Multiplies the transforms of the rows, base to tip. `place` returns the joint angle in rad and the displacement
     /// in m of a row.
-    fn chain_frames<T>(&self, joints: &[T], place: impl Fn(&ChainLink, Option<&T>) -> (f64, f64)) -> Frames {
+    fn chain_frames<T>(
+        &self,
+        joints: &[T],
+        place: impl Fn(&ChainLink, Option<&T>) -> (f64, f64),
+    ) -> LinkFrames {
         let mut tip = self.base;
-        let mut frames = Frames { frames: [tip; MAX_ROWS + 1], kinds: [RowKind::Fixed; MAX_ROWS] };
+        let mut frames = LinkFrames { frames: [tip; MAX_ROWS + 1], kinds: [RowKind::Fixed; MAX_ROWS] };
         let mut joints = joints.iter();
         let each = frames.frames.iter_mut().skip(1).zip(&mut frames.kinds);
         for ((frame, kind), link) in each.zip(&self.links) {
@@ -172,7 +176,7 @@ impl Central {
 
     /// Returns the position of a cell in the base frame, in m; zero for an unknown cell.
     #[must_use]
-    pub fn position(&self, cell: usize, frames: &Frames) -> [f64; 3] {
+    pub fn position(&self, cell: usize, frames: &LinkFrames) -> [f64; 3] {
         let place =
             self.cells.get(cell).and_then(|place| Some(frames.frames.get(place.row)? * place.position));
         place.map_or([0.0; 3], |position| position.coords.into())
@@ -181,7 +185,7 @@ impl Central {
     /// Returns the joint torques in Nm (forces in N for prismatic joints) of one cell with the force `f_z` on it
     /// (paper, Eq. 8). Joints that do not move the cell get zero, as does an unknown cell. Bounded work, no allocation.
     #[must_use]
-    pub fn torque(&self, cell: usize, frames: &Frames, f_z: f64) -> [f64; MAX_JOINTS] {
+    pub fn torque(&self, cell: usize, frames: &LinkFrames, f_z: f64) -> [f64; MAX_JOINTS] {
         let mut torque = [0.0; MAX_JOINTS];
         if let Some(place) = self.cells.get(cell) {
             frames.add_torque(place, f_z, &mut torque);
@@ -193,7 +197,7 @@ impl Central {
     /// gateway whose cells do not compute torques must do this work in every tick. The work grows with the number of
     /// cells and with the number of active ones. No allocation.
     #[must_use]
-    pub fn total(&self, frames: &Frames, sensors: &[SkinSensors]) -> ReferenceTorque {
+    pub fn total_torque(&self, frames: &LinkFrames, sensors: &[SkinSensors]) -> ReferenceTorque {
         let mut reference_torque = ReferenceTorque::default();
         for (place, sensors) in self.cells.iter().zip(sensors) {
             let f_z = force(&place.contact, sensors);
@@ -213,7 +217,7 @@ fn base_pose(skin: &Skin) -> IsometryMatrix3<f64> {
     Translation3::from(base.position) * Rotation3::from_matrix_unchecked(turn)
 }
 
-impl Frames {
+impl LinkFrames {
     /// Returns the frame of a row, counted from 1, in the robot's base frame; row 0 is frame 0 of the chain.
     #[must_use]
     pub fn row(&self, row: usize) -> Option<&IsometryMatrix3<f64>> {

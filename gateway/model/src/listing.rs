@@ -63,13 +63,13 @@ impl ListedCell {
 
 /// All cells that were seen on a bus.
 #[derive(Clone, Debug, Default)]
-pub struct Listing {
+pub struct CellListing {
     cells: BTreeMap<u8, ListedCell>,
     gateway: bool,
     format: Option<Format>,
 }
 
-impl Listing {
+impl CellListing {
     /// Creates an empty list.
     #[must_use]
     pub fn new() -> Self {
@@ -134,7 +134,7 @@ mod tests {
 
     #[test]
     fn only_reports_of_a_cell_are_listed() {
-        let mut listing = Listing::new();
+        let mut listing = CellListing::new();
         let heartbeat = Heartbeat { serial: 7, state: State(0x1101), ..Heartbeat::default() };
         listing.receive(Micros(10), Format::Classic, &says(3, NetworkPage::Heartbeat(heartbeat)));
         listing.receive(
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn another_cell_with_a_node_id_has_no_reports_of_the_one_before_it() {
-        let mut listing = Listing::new();
+        let mut listing = CellListing::new();
         let of = |serial| NetworkPage::Heartbeat(Heartbeat { serial, ..Heartbeat::default() });
         for page in [of(7), NetworkPage::Received(ReceivedCounts::default()), of(8)] {
             listing.receive(Micros(0), Format::Fd, &says(3, page));
@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn a_cell_that_takes_a_node_id_is_as_old_as_its_last_packet() {
-        let mut listing = Listing::new();
+        let mut listing = CellListing::new();
         let beat = |serial| NetworkPage::Heartbeat(Heartbeat { serial, sent: 9, ..Heartbeat::default() });
         listing.receive(Micros(10), Format::Fd, &says(3, beat(7)));
         listing.receive(Micros(900_000), Format::Fd, &says(3, beat(8)));

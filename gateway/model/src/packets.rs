@@ -30,13 +30,13 @@ enum ChainLength {
 
 /// A frame of a bus, with the packet that it is or completes.
 #[derive(Clone, Copy, Debug)]
-pub struct Received<'f> {
+pub struct FrameWithPacket<'f> {
     /// The frame.
     pub frame: &'f Frame,
     /// The packet, with its message unless this version cannot decode it.
     pub packet: Result<(Packet, Result<Message, MessageError>), NoPacket>,
     /// Pending segments with the identifier of the frame.
-    pub pending: Pending,
+    pub pending: PendingSegments,
 }
 
 /// The reason why a frame neither is nor completes a packet.
@@ -55,14 +55,14 @@ pub enum NoPacket {
 
 /// Number of pending segments of an identifier.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Pending {
+pub struct PendingSegments {
     /// Segments that were pending before a frame.
     pub before: usize,
     /// Segments that are pending after it.
     pub after: usize,
 }
 
-impl Received<'_> {
+impl FrameWithPacket<'_> {
     /// Returns the message that the frame is or completes.
     #[must_use]
     pub const fn message(&self) -> Option<&Message> {
@@ -129,18 +129,22 @@ impl PacketReader {
     }
 
     /// Reads the next frame, which arrived `at`. Never panics.
-    pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> Received<'f> {
+    pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> FrameWithPacket<'f> {
         let (packet, pending) = self.packet(at, frame);
         let packet = packet.map(|packet| (packet, self.decode(&packet)));
-        Received { frame, packet, pending }
+        FrameWithPacket { frame, packet, pending }
     }
 
     /// Does the first half of [`read`](Self::read): returns the packet that the frame is or completes, for
     /// [`decode`](Self::decode).
     // Inlined, as `reassemble`: the receiver of a bus calls them for every frame, and copies each packet once less.
     #[inline(always)]
-    pub(crate) fn packet(&mut self, at: Micros, frame: &Frame) -> (Result<Packet, NoPacket>, Pending) {
-        let Ok(id) = data_id(frame) else { return (Err(NoPacket::NotData), Pending::default()) };
+    pub(crate) fn packet(
+        &mut self,
+        at: Micros,
+        frame: &Frame,
+    ) -> (Result<Packet, NoPacket>, PendingSegments) {
+        let Ok(id) = data_id(frame) else { return (Err(NoPacket::NotData), PendingSegments::default()) };
         let packet = match self.format.unwrap_or_else(|| frame.format()) {
             Format::Fd => Packet::from_fd(frame).and_then(|packet| self.check_length(packet)),
             Format::Classic if frame.format() == Format::Fd => {
@@ -148,7 +152,7 @@ impl PacketReader {
             }
             Format::Classic => return self.reassemble(at, id, frame),
         };
-        (packet.map_err(|error| NoPacket::Damaged(id, error)), Pending::default())
+        (packet.map_err(|error| NoPacket::Damaged(id, error)), PendingSegments::default())
     }
 
     /// Does the second half of [`read`](Self::read): decodes a packet.
@@ -176,7 +180,12 @@ impl PacketReader {
     }
 
     #[inline(always)]
-    fn reassemble(&mut self, at: Micros, id: Id, frame: &Frame) -> (Result<Packet, NoPacket>, Pending) {
+    fn reassemble(
+        &mut self,
+        at: Micros,
+        id: Id,
+        frame: &Frame,
+    ) -> (Result<Packet, NoPacket>, PendingSegments) {
         let lengths = match self.length {
             ChainLength::Described(length) => Lengths::only(length),
             // Joints packets contain their own length.
@@ -192,7 +201,7 @@ impl PacketReader {
             Ok(Reassembly::Ambiguous) => Err(NoPacket::Damaged(id, PacketError::Ambiguous)),
             Err(error) => Err(NoPacket::Damaged(id, error)),
         };
-        (packet, Pending { before, after: segments.waiting() })
+        (packet, PendingSegments { before, after: segments.waiting() })
     }
 
     /// Drops the pending segments with this identifier.

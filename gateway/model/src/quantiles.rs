@@ -12,18 +12,18 @@ pub fn histogram() -> Histogram<u64> {
 
 /// A histogram of times in ns that also keeps the exact maximum.
 #[derive(Clone, Debug)]
-pub struct Times {
+pub struct TimeHistogram {
     histogram: Histogram<u64>,
     longest: u64,
 }
 
-impl Default for Times {
+impl Default for TimeHistogram {
     fn default() -> Self {
         Self { histogram: histogram(), longest: 0 }
     }
 }
 
-impl Times {
+impl TimeHistogram {
     /// Adds a time in ns.
     pub fn record(&mut self, nanos: u64) {
         // Recording cannot fail: the histogram resizes itself.

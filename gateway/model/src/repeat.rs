@@ -65,12 +65,12 @@ impl Attempt {
             return RetryAction::GiveUp;
         }
         self.transmissions += 1;
-        self.extend(now);
+        self.extend_timeout(now);
         RetryAction::Resend
     }
 
     /// Restarts the timeout, because one cell has answered and others may still answer.
-    pub fn extend(&mut self, now: Micros) {
+    pub fn extend_timeout(&mut self, now: Micros) {
         let doubled = self.limits.first_timeout.0.saturating_mul(1 << (self.transmissions - 1).min(32));
         self.due = now + Span(doubled.min(self.limits.max_timeout.0));
     }
@@ -78,14 +78,14 @@ impl Attempt {
 
 /// Requests to many cells that are repeated without a limit. Each is sent at most once per interval.
 #[derive(Clone, Debug)]
-pub struct Repeats<K> {
+pub struct RepeatedRequests<K> {
     interval: Span,
     /// Time of the last transmission of each request, and of the last message to all cells.
     sent: BTreeMap<K, Micros>,
     all_sent: Option<Micros>,
 }
 
-impl<K: Copy + Ord> Repeats<K> {
+impl<K: Copy + Ord> RepeatedRequests<K> {
     /// Creates an empty set of requests with this repeat interval.
     #[must_use]
     pub const fn new(every: Span) -> Self {
@@ -93,7 +93,7 @@ impl<K: Copy + Ord> Repeats<K> {
     }
 
     /// Returns the requests among `open` whose interval has passed, and records them as sent.
-    pub fn due(&mut self, now: Micros, open: impl IntoIterator<Item = K>) -> Vec<K> {
+    pub fn due_requests(&mut self, now: Micros, open: impl IntoIterator<Item = K>) -> Vec<K> {
         let last = |key: &K| self.sent.get(key).copied().max(self.all_sent);
         let is_due = |key: &K| last(key).is_none_or(|at| now.elapsed_since(at) >= self.interval);
         let due: Vec<_> = open.into_iter().filter(is_due).collect();
@@ -130,7 +130,7 @@ mod tests {
             assert_eq!(attempt.handle_timeout(Micros(due)), RetryAction::Resend);
         }
         assert_eq!((attempt.transmissions(), attempt.due()), (4, Micros(900)));
-        attempt.extend(Micros(800));
+        attempt.extend_timeout(Micros(800));
         assert_eq!(
             (attempt.handle_timeout(Micros(1_099)), attempt.handle_timeout(Micros(1_100))),
             (RetryAction::Wait, RetryAction::GiveUp)
@@ -139,14 +139,14 @@ mod tests {
 
     #[test]
     fn an_open_request_is_due_at_once_and_then_once_per_interval() {
-        let mut repeats = Repeats::<u8>::new(Span(100));
-        assert_eq!(repeats.due(Micros(0), [1, 2]), [1, 2]);
-        assert_eq!(repeats.due(Micros(99), [1, 2, 3]), [3]);
-        assert_eq!(repeats.due(Micros(100), [2, 3]), [2]);
+        let mut repeats = RepeatedRequests::<u8>::new(Span(100));
+        assert_eq!(repeats.due_requests(Micros(0), [1, 2]), [1, 2]);
+        assert_eq!(repeats.due_requests(Micros(99), [1, 2, 3]), [3]);
+        assert_eq!(repeats.due_requests(Micros(100), [2, 3]), [2]);
         repeats.mark_all_sent(Micros(200));
-        assert!(repeats.due(Micros(299), [1, 2, 3, 4]).is_empty());
-        assert_eq!(repeats.due(Micros(300), [1, 4]), [1, 4]);
+        assert!(repeats.due_requests(Micros(299), [1, 2, 3, 4]).is_empty());
+        assert_eq!(repeats.due_requests(Micros(300), [1, 4]), [1, 4]);
         repeats.make_due(4);
-        assert_eq!(repeats.due(Micros(301), [1, 4]), [4], "it has changed");
+        assert_eq!(repeats.due_requests(Micros(301), [1, 4]), [4], "it has changed");
     }
 }

@@ -1,7 +1,7 @@
 //! Experiments on the arithmetic of the cells: the error of the sine over the whole circle, and the operations that one
 //! Jacobian takes.
 
-use cell_node::kernel::oracle::{Counted, Projection};
+use cell_node::kernel::oracle::{CountingWord, Projection};
 use cell_node::kernel::{Kernel, Operations, Wrench};
 use cell_node::sine::{paper_sine, sine};
 use protocol::fixed::Q1_14;
@@ -9,7 +9,7 @@ use protocol::packet::padded;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::skin::Skin;
 
-use super::line::count;
+use super::line::count_to_f64;
 use super::ticks::POSE;
 use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table};
@@ -47,7 +47,7 @@ impl SineError {
                 points.push((angle.to_f64(), error));
             }
             if let Some((middle, max)) = parts.get_mut(place / ANGLES_PER_PART) {
-                *middle += angle.to_f64() / count(ANGLES_PER_PART);
+                *middle += angle.to_f64() / count_to_f64(ANGLES_PER_PART);
                 *max = max.max(error.abs());
             }
         }
@@ -70,7 +70,7 @@ pub fn sine_section() -> Section {
     let mean = |what: &str, error: &SineError, bar: f64| {
         Finding::less_is_better(what, paper::SINE_MEAN_ERROR, error.mean).at_most(bar)
     };
-    let max = |what: &str, error: &SineError, bar: f64| Finding::stated(what, error.max).at_most(bar);
+    let max = |what: &str, error: &SineError, bar: f64| Finding::new_unrated(what, error.max).at_most(bar);
     Section::new("sine", "The sine in 16 bits")
         .text(
             "The difference to the sine in double precision, over all 65 536 angles of a word. Of the \
@@ -93,7 +93,7 @@ pub fn sine_section() -> Section {
             max("sine of fifth order, maximum error", &fifth, 4.6e-4),
             mean("sine of seventh order, mean error", &seventh, 2e-5),
             max("sine of seventh order, maximum error", &seventh, 1e-4),
-            Finding::stated("rounding to Q1.14 alone, mean error", rounded.mean),
+            Finding::new_unrated("rounding to Q1.14 alone, mean error", rounded.mean),
         ])
 }
 
@@ -119,22 +119,27 @@ impl JacobianCosts {
         let words: [Q1_14; MAX_JOINTS] =
             padded(&POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default()));
         Self {
-            wrench: (1..=joints).map(|joint| jacobian::<Wrench<Counted>>(&on(joint), &words)).collect(),
+            wrench: (1..=joints)
+                .map(|joint| count_jacobian_operations::<Wrench<CountingWord>>(&on(joint), &words))
+                .collect(),
             projection: (1..=joints)
-                .map(|joint| jacobian::<Projection<Counted>>(&on(joint), &words))
+                .map(|joint| count_jacobian_operations::<Projection<CountingWord>>(&on(joint), &words))
                 .collect(),
         }
     }
 }
 
 /// Counts the operations of one Jacobian at these joint positions.
-fn jacobian<K: Kernel<Counted>>(cell: &Parameters, words: &[Q1_14; MAX_JOINTS]) -> Operations {
+fn count_jacobian_operations<K: Kernel<CountingWord>>(
+    cell: &Parameters,
+    words: &[Q1_14; MAX_JOINTS],
+) -> Operations {
     let kernel = K::new(cell);
     Operations::count(|| kernel.jacobian(words)).1
 }
 
 /// Returns the counts of operations with their names, in the order of the paper.
-fn named(done: &Operations) -> [(&'static str, u32); 4] {
+fn named_counts(done: &Operations) -> [(&'static str, u32); 4] {
     let Operations { multiplications, additions, sines, cosines, .. } = *done;
     [("multiplications", multiplications), ("additions", additions), ("sines", sines), ("cosines", cosines)]
 }
@@ -151,13 +156,13 @@ pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
             |(link, done): (u8, Operations)| (link.into(), (done.multiplications + done.additions).into());
         links(costs).into_iter().map(of_link).collect::<Vec<_>>()
     };
-    let last = |costs: &[Operations]| named(&costs.last().copied().unwrap_or_default());
+    let last = |costs: &[Operations]| named_counts(&costs.last().copied().unwrap_or_default());
     let finding = |((name, ours), paper): ((&str, u32), u32), kernel: &str| {
         let what = format!("{name} of {kernel}, cell on the last link");
         Finding::less_is_better(what, f64::from(paper), f64::from(ours))
     };
-    let wrench = last(&costs.wrench).into_iter().zip(paper::OPERATIONS).zip(MAX_WRENCH_OPERATIONS);
-    let projection = last(&costs.projection).into_iter().zip(paper::OPERATIONS);
+    let wrench = last(&costs.wrench).into_iter().zip(paper::JACOBIAN_OPERATIONS).zip(MAX_WRENCH_OPERATIONS);
+    let projection = last(&costs.projection).into_iter().zip(paper::JACOBIAN_OPERATIONS);
     let figure = Figure::new(
         "kernels",
         "Multiplications and additions over the link that the cell is on",
@@ -167,7 +172,7 @@ pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
     let rows = [("wrench", &costs.wrench), ("projections", &costs.projection)];
     let rows = rows.into_iter().flat_map(|(kernel, costs)| {
         links(costs).into_iter().map(move |(link, done)| {
-            let counts = named(&done).map(|(_, count)| count.to_string());
+            let counts = named_counts(&done).map(|(_, count)| count.to_string());
             [kernel.to_owned(), link.to_string()].into_iter().chain(counts).collect::<Vec<_>>()
         })
     });

@@ -21,9 +21,9 @@ const CELLS: usize = 253;
 /// The number of cells on the arm in a quick run.
 const QUICK_CELLS: usize = 24;
 /// A scenario with strokes, palms, a grip and a poke. The central computation is switched off at 5.7 s.
-const TOUCHES: &str = include_str!("../../examples/demo.toml");
+const TOUCHES_SCENARIO: &str = include_str!("../../examples/demo.toml");
 /// A scenario in which all cells are touched at once. The central computation is switched off at 1.2 s.
-const TOUCH: &str = "# A hand closes around the arm and opens again.
+const TOUCH_SCENARIO: &str = "# A hand closes around the arm and opens again.
 version = 1
 duration_s = 2.4
 seed = 1
@@ -53,7 +53,7 @@ profile = \"half-sine\"
 /// # Panics
 /// Never panics in practice, because this number of cells fits on the arm.
 #[must_use]
-pub fn skin(reply: Reply, effort: Effort) -> String {
+pub fn skin_toml(reply: Reply, effort: Effort) -> String {
     let cells = match effort {
         Effort::Quick => QUICK_CELLS,
         Effort::Full => CELLS,
@@ -66,16 +66,16 @@ pub fn skin(reply: Reply, effort: Effort) -> String {
 /// # Panics
 /// Never panics in practice, because a generated skin is valid.
 #[must_use]
-pub fn paper() -> Skin {
-    Skin::parse("skin.toml", &skin(Reply::Torque, Effort::Full)).expect("it has been generated")
+pub fn paper_skin() -> Skin {
+    Skin::parse("skin.toml", &skin_toml(Reply::Torque, Effort::Full)).expect("it has been generated")
 }
 
 /// Returns the text of the arm's `scenario.toml`.
 #[must_use]
-pub const fn scenario(effort: Effort) -> &'static str {
+pub const fn scenario_toml(effort: Effort) -> &'static str {
     match effort {
-        Effort::Quick => TOUCH,
-        Effort::Full => TOUCHES,
+        Effort::Quick => TOUCH_SCENARIO,
+        Effort::Full => TOUCHES_SCENARIO,
     }
 }
 
@@ -87,7 +87,7 @@ mod tests {
 
     #[test]
     fn the_arm_is_that_of_the_demonstration_and_its_scenarios_fit_it() {
-        let text = skin(Reply::Torque, Effort::Full);
+        let text = skin_toml(Reply::Torque, Effort::Full);
         assert_eq!(text, include_str!("../../examples/ur5-253.toml"));
         for (reply, effort) in [
             (Reply::Torque, Effort::Full),
@@ -95,8 +95,8 @@ mod tests {
             (Reply::Torque, Effort::Quick),
             (Reply::Sum, Effort::Quick),
         ] {
-            let skin = Skin::parse("skin.toml", &skin(reply, effort)).unwrap();
-            let scenario = Scenario::parse("scenario.toml", scenario(effort), &skin).unwrap();
+            let skin = Skin::parse("skin.toml", &skin_toml(reply, effort)).unwrap();
+            let scenario = Scenario::parse("scenario.toml", scenario_toml(effort), &skin).unwrap();
             let switched = if effort == Effort::Full { 5_700_000 } else { 1_200_000 };
             assert_eq!(scenario.mode_at(Micros(switched - 1)), TorqueSource::Compare);
             assert_eq!(scenario.mode_at(Micros(switched)), TorqueSource::Distributed);

@@ -1,6 +1,6 @@
 //! Fig. 9 and 10: the time of the central computation, as a function of the number of cells and of active cells.
 //!
-//! The functions [`Central::frames`] and [`Central::total`] are timed. In a bench, a tick that compares runs them for
+//! The functions [`CentralComputation::frames`] and [`CentralComputation::total_torque`] are timed. In a bench, a tick that compares runs them for
 //! each bus; here they run for one list of cells. Each measurement covers several computations in a row, so that the
 //! time for reading the clock is negligible and code and data are mostly in the caches.
 
@@ -12,15 +12,15 @@ use protocol::skin::Skin;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::line::{LinearFit, WeightedPoint, count, quantile};
+use super::line::{LinearFit, WeightedPoint, count_to_f64, quantile};
 use super::samples;
 use super::ticks::{POSE, nanos, touch};
 use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Shape, Table, number};
-use model::central::Central;
+use model::central::CentralComputation;
 
 /// The number of computations between two readings of the clock.
-const IN_A_ROW: u32 = 16;
+const COMPUTATIONS_PER_SAMPLE: u32 = 16;
 /// The number of measurements of each touch. The shortest time is used.
 const MEASUREMENTS_PER_TOUCH: usize = 5;
 
@@ -37,7 +37,7 @@ pub struct CentralExtent {
 
 /// The time T_skin of the central computation for different numbers of cells, none of which is active.
 #[derive(Clone, Debug)]
-pub struct OverCells {
+pub struct TimesOverCells {
     /// For each number of cells: that number, and the median, the 25th and the 75th percentile of T_skin in ns.
     pub points: Vec<[f64; 4]>,
     /// The line fitted to T_skin in ns as a function of the number of cells.
@@ -46,7 +46,7 @@ pub struct OverCells {
 
 /// The time T_skin of the central computation for different numbers of active cells on one skin.
 #[derive(Clone, Debug)]
-pub struct OverActive {
+pub struct TimesOverActive {
     /// The number of cells of the skin.
     pub cells: usize,
     /// For each number of active cells: that number, the median of T_skin in ns, and as weight the number of touches.
@@ -57,41 +57,49 @@ pub struct OverActive {
 }
 
 /// Returns the time of one computation in ns, as the mean over several in a row.
-fn timed(central: &Central, sensors: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
+fn computation_time_ns(central: &CentralComputation, sensors: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
     let joints = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
     let began = now();
-    for _ in 0..IN_A_ROW {
+    for _ in 0..COMPUTATIONS_PER_SAMPLE {
         let frames = central.frames(black_box(&joints));
-        black_box(central.total(&frames, black_box(sensors)));
+        black_box(central.total_torque(&frames, black_box(sensors)));
     }
-    nanos(now().saturating_sub(began)) / f64::from(IN_A_ROW)
+    nanos(now().saturating_sub(began)) / f64::from(COMPUTATIONS_PER_SAMPLE)
 }
 
 /// Measures T_skin for parts of a skin with 0 to all cells, none of which is active. Returns `None` for fewer than
 /// three different numbers of cells.
 #[must_use]
-pub fn over_cells(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> Option<OverCells> {
-    let central = Central::new(skin);
+pub fn measure_over_cells(
+    skin: &Skin,
+    extent: CentralExtent,
+    now: impl Fn() -> u64,
+) -> Option<TimesOverCells> {
+    let central = CentralComputation::new(skin);
     let sensors = vec![SkinSensors::default(); skin.cells.len()];
     let cells: Vec<usize> = (0..=skin.cells.len()).step_by(extent.step.max(1)).collect();
-    let measured = samples::interleaved(cells.len(), extent.rounds, 9, |place| {
+    let measured = samples::measure_interleaved(cells.len(), extent.rounds, 9, |place| {
         let sensors = cells.get(place).and_then(|&cells| sensors.get(..cells)).unwrap_or_default();
-        timed(&central, sensors, &now)
+        computation_time_ns(&central, sensors, &now)
     });
     let points = cells.iter().zip(&measured).map(|(&cells, values)| {
         let at = |part| quantile(&mut values.clone(), part);
-        [count(cells), at(0.5), at(0.25), at(0.75)]
+        [count_to_f64(cells), at(0.5), at(0.25), at(0.75)]
     });
     let points: Vec<_> = points.collect();
     let line = LinearFit::fit_unweighted(&points.iter().map(|[x, y, ..]| (*x, *y)).collect::<Vec<_>>())?;
-    Some(OverCells { points, line })
+    Some(TimesOverCells { points, line })
 }
 
 /// Measures T_skin for different numbers of active cells on a skin. A touch is of consecutive cells in the order of the
 /// skin, which are neighbours. Its first cell and its size are random.
 #[must_use]
-pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> Option<OverActive> {
-    let central = Central::new(skin);
+pub fn measure_over_active(
+    skin: &Skin,
+    extent: CentralExtent,
+    now: impl Fn() -> u64,
+) -> Option<TimesOverActive> {
+    let central = CentralComputation::new(skin);
     let cells = skin.cells.len();
     let mut dice = Pcg64Mcg::seed_from_u64(10);
     let mut by_active = vec![Vec::new(); cells + 1];
@@ -101,7 +109,7 @@ pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) ->
         sensors.iter_mut().take(active).for_each(|reference_torque| *reference_torque = touch());
         sensors.rotate_right(first);
         let min = (0..MEASUREMENTS_PER_TOUCH)
-            .map(|_| timed(&central, &sensors, &now))
+            .map(|_| computation_time_ns(&central, &sensors, &now))
             .fold(f64::INFINITY, f64::min);
         if let Some(values) = by_active.get_mut(active) {
             values.push(min);
@@ -109,8 +117,8 @@ pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) ->
     }
     let points = by_active.iter_mut().enumerate().filter(|(_, values)| !values.is_empty());
     let points: Vec<_> =
-        points.map(|(active, values)| WeightedPoint::median(count(active), values)).collect();
-    Some(OverActive { cells, line: LinearFit::fit(&points)?, points })
+        points.map(|(active, values)| WeightedPoint::median(count_to_f64(active), values)).collect();
+    Some(TimesOverActive { cells, line: LinearFit::fit(&points)?, points })
 }
 
 /// The minimum R² at which a fitted line counts as a good description.
@@ -127,7 +135,7 @@ fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     let ratio = ours.value / (paper_s * 1e9);
     [
         Finding::less_is_better(what, paper_s * 1e9, ours),
-        Finding::stated(format!("{what}: ours by the paper's"), ratio),
+        Finding::new_unrated(format!("{what}: ours by the paper's"), ratio),
     ]
 }
 
@@ -144,7 +152,7 @@ fn figure(name: &str, title: impl Into<String>, x: &str) -> Figure {
 
 /// Returns a figure with a logarithmic axis that ends at the largest x, and with the paper's line, whose coefficients
 /// are in s. The line is drawn with many points, because it is curved on a logarithmic axis.
-fn beside(
+fn logarithmic_figure(
     figure: &Figure,
     equation: &str,
     measured: Vec<(f64, f64)>,
@@ -160,14 +168,14 @@ fn beside(
 }
 
 /// Returns two points that draw a line, from 0 to `most`. The line is in ns and the points are in µs.
-fn law(line: &LinearFit, most: f64) -> Vec<(f64, f64)> {
+fn line_points(line: &LinearFit, most: f64) -> Vec<(f64, f64)> {
     [0.0, most].map(|x| (x, line.value_at(x) * 1e-3)).into()
 }
 
 /// Writes the section on Fig. 9, with the line of Eq. 29.
 #[must_use]
-pub fn fig9(over: &OverCells) -> Section {
-    let OverCells { points, line } = over;
+pub fn fig9(over: &TimesOverCells) -> Section {
+    let TimesOverCells { points, line } = over;
     let most = points.last().map_or(0.0, |point| point[0]);
     let micros = |place: fn(&[f64; 4]) -> f64| {
         points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
@@ -177,8 +185,8 @@ pub fn fig9(over: &OverCells) -> Section {
     let fig9 = figure("fig9", "T_skin over cells, none active", "cells, none active")
         .draw("middle half", Shape::Band, band.collect())
         .draw("median", Shape::Points, median.clone())
-        .draw("linear fit", Shape::Line, law(line, most));
-    let papers = beside(&fig9, "Eq. 29", median, most, |cells| {
+        .draw("linear fit", Shape::Line, line_points(line, most));
+    let papers = logarithmic_figure(&fig9, "Eq. 29", median, most, |cells| {
         paper::CENTRAL_PER_CELL_S * cells + paper::CENTRAL_FIXED_S
     });
     let cells = paper::max_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
@@ -203,15 +211,15 @@ pub fn fig9(over: &OverCells) -> Section {
         .figures([fig9, papers])
         .findings(cost("T_skin for each cell (slope of Eq. 29)", line.slope_in("ns"), paper::CENTRAL_PER_CELL_S))
         .findings(cost("T_skin without a cell", (line.intercept, "ns"), paper::CENTRAL_FIXED_S))
-        .findings([quality(line, paper::CELLS_QUALITY), limit("none", paper::MAX_CELLS, cells)])
+        .findings([quality(line, paper::CENTRAL_CELLS_R_SQUARED), limit("none", paper::MAX_CELLS, cells)])
 }
 
 /// Writes the section on Fig. 10, with the lines of Eq. 30 and 31, and the number of cells at which each line reaches
 /// one cycle.
 #[must_use]
-pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
-    let OverActive { points, line, cells: of } = over;
-    let most = count(*of);
+pub fn fig10(over: &TimesOverActive, cells: &TimesOverCells) -> Section {
+    let TimesOverActive { points, line, cells: of } = over;
+    let most = count_to_f64(*of);
     let of_cells = cells.line;
     let limits = [(0.0, paper::MAX_CELLS), (paper::LIMIT_ACTIVE_CELLS, paper::MAX_CELLS_WITH_ACTIVE)].map(
         |(active, paper)| {
@@ -222,11 +230,11 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
     let micros: Vec<_> = points.iter().map(|point| (point.x, point.y * 1e-3)).collect();
     let fig10 = figure("fig10", format!("T_skin over active cells, of {of}"), "active cells")
         .draw("median of touches", Shape::Points, micros.clone())
-        .draw("linear fit", Shape::Line, law(line, most));
-    let papers = beside(&fig10, "Eq. 30", micros, most, |active| {
-        paper::CENTRAL_PER_ACTIVE_CELL_S * active + paper::NONE_ACTIVE_S
+        .draw("linear fit", Shape::Line, line_points(line, most));
+    let papers = logarithmic_figure(&fig10, "Eq. 30", micros, most, |active| {
+        paper::CENTRAL_PER_ACTIVE_CELL_S * active + paper::CENTRAL_NONE_ACTIVE_S
     });
-    let all = Finding::stated(
+    let all = Finding::new_unrated(
         format!("T_skin of {of} cells, all active (Eq. 31)"),
         ((of_cells.value_at(most) + line.slope * most) * 1e-3, "µs"),
     );
@@ -259,9 +267,9 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
         .findings(cost(
             &format!("T_skin of {of} cells, none active"),
             (line.intercept, "ns"),
-            paper::NONE_ACTIVE_S,
+            paper::CENTRAL_NONE_ACTIVE_S,
         ))
-        .findings([quality(line, paper::ACTIVE_QUALITY), all.with_paper_value(all_papers)])
+        .findings([quality(line, paper::CENTRAL_ACTIVE_R_SQUARED), all.with_paper_value(all_papers)])
         .findings(limits)
         .tables([Table::new("Laws", ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"], laws)])
 }
@@ -282,10 +290,10 @@ mod tests {
         let law = line(paper::CENTRAL_PER_CELL_S * 1e9, paper::CENTRAL_FIXED_S * 1e9);
         let points = [0.0, 1500.0, 3000.0]
             .map(|cells| [cells, law.value_at(cells), law.value_at(cells), law.value_at(cells)]);
-        let cells = OverCells { points: points.to_vec(), line: law };
-        let over = line(paper::CENTRAL_PER_ACTIVE_CELL_S * 1e9, paper::NONE_ACTIVE_S * 1e9);
+        let cells = TimesOverCells { points: points.to_vec(), line: law };
+        let over = line(paper::CENTRAL_PER_ACTIVE_CELL_S * 1e9, paper::CENTRAL_NONE_ACTIVE_S * 1e9);
         let points = [0.0, 100.0, 253.0].map(|x| WeightedPoint { x, y: over.value_at(x), weight: 3.0 });
-        let active = OverActive { cells: 253, points: points.to_vec(), line: over };
+        let active = TimesOverActive { cells: 253, points: points.to_vec(), line: over };
         let (nine, ten) = (fig9(&cells), fig10(&active, &cells));
         let all = || nine.findings.iter().chain(&ten.findings);
         for finding in all().filter(|finding| finding.what.ends_with("ours by the paper's")) {
@@ -300,7 +308,7 @@ mod tests {
         let of = |what: &str| all().find(|finding| finding.what.starts_with(what)).unwrap();
         assert_eq!(of("T_skin for each cell").verdict, FindingVerdict::Same);
         assert_eq!(of("quality").verdict, FindingVerdict::Better, "above the bar");
-        let steep = OverCells { line: LinearFit { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
+        let steep = TimesOverCells { line: LinearFit { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
         let worse =
             fig9(&steep).findings.iter().filter(|finding| finding.verdict == FindingVerdict::Worse).count();
         assert_eq!(worse, 3, "slope, quality and limit");
@@ -316,17 +324,17 @@ mod tests {
             clock.get()
         };
         let extent = CentralExtent { step: 10, rounds: 3, touches: 200 };
-        let cells = over_cells(&skin, extent, now).unwrap();
+        let cells = measure_over_cells(&skin, extent, now).unwrap();
         assert_eq!(
             cells.points.iter().map(|point| point[0].to_string()).collect::<Vec<_>>(),
             ["0", "10", "20", "30", "40"]
         );
         assert!(cells.points.iter().all(|point| (point[1] - 1.0).abs() < 1e-9));
-        let active = over_active(&skin, extent, now).unwrap();
+        let active = measure_over_active(&skin, extent, now).unwrap();
         assert!((active.points.iter().map(|point| point.weight).sum::<f64>() - 200.0).abs() < 1e-9);
         assert!(active.points.iter().all(|point| (point.y - 1.0).abs() < 1e-9 && point.x <= 40.0));
         assert!(
-            over_cells(&skin, CentralExtent { step: 40, ..extent }, now).is_none(),
+            measure_over_cells(&skin, CentralExtent { step: 40, ..extent }, now).is_none(),
             "two numbers make no law"
         );
     }

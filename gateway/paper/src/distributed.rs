@@ -14,12 +14,12 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use super::line::{LinearFit, count};
+use super::line::{LinearFit, count_to_f64};
 use super::samples;
-use super::ticks::{BUSES, Ticks, nanos, spread};
+use super::ticks::{BUSES, TickBench, nanos, skin_with_fewer_cells};
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, number};
 use model::scenario::TorqueSource;
-use model::table::Table;
+use model::table::BusTable;
 
 /// The number of measurements.
 #[derive(Clone, Copy, Debug)]
@@ -46,14 +46,14 @@ impl TickTimes {
     /// Returns the upper end of the 95 % interval of the distributed line's slope, divided by the slope of the central
     /// line.
     #[must_use]
-    pub fn share(&self) -> f64 {
+    pub fn slope_ratio_at_most(&self) -> f64 {
         self.distributed.slope_at_most() / self.central.slope
     }
 }
 
 /// All measurements of the experiment.
 #[derive(Clone, Debug)]
-pub struct Distributed {
+pub struct DistributedTimes {
     /// Times for different numbers of cells, none of which is active.
     pub cells: TickTimes,
     /// Times for different numbers of active cells on the whole skin.
@@ -68,26 +68,30 @@ pub struct Distributed {
 
 /// Measures times on parts of a skin. Returns `None` if `extent` has fewer than two steps.
 #[must_use]
-pub fn measure(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Copy) -> Option<Distributed> {
+pub fn measure(
+    skin: &Skin,
+    extent: DistributedExtent,
+    now: impl Fn() -> u64 + Copy,
+) -> Option<DistributedTimes> {
     let most = skin.cells.len();
     let step = |step| most * step / extent.steps.max(1);
     // Each bus has at least one cell, because a bus without cells has no chain to be computed.
     let min = skin.buses.len().min(most);
     let cells: Vec<usize> = (0..=extent.steps).map(|place| step(place).max(min)).collect();
     let active: Vec<usize> = (0..=extent.steps).map(step).collect();
-    let parts: Vec<Skin> = cells.iter().map(|&cells| spread(skin, cells)).collect();
-    let of_part = |place: usize, mode| Ticks::new(parts.get(place).unwrap_or(skin), 0, mode);
-    let of_touch = |place: usize, mode| Ticks::new(skin, active.get(place).copied().unwrap_or(0), mode);
+    let parts: Vec<Skin> = cells.iter().map(|&cells| skin_with_fewer_cells(skin, cells)).collect();
+    let of_part = |place: usize, mode| TickBench::new(parts.get(place).unwrap_or(skin), 0, mode);
+    let of_touch = |place: usize, mode| TickBench::new(skin, active.get(place).copied().unwrap_or(0), mode);
     let (cells, active) = (
         tick_times(&cells, extent.rounds, 11, of_part, now)?,
         tick_times(&active, extent.rounds, 12, of_touch, now)?,
     );
-    Some(Distributed {
+    Some(DistributedTimes {
         cells,
         active,
-        buses: over_buses(skin, extent, now)?,
+        buses: measure_over_buses(skin, extent, now)?,
         of: most,
-        receiving: receiving(&skin.with_cells_of_bus(0), extent.rounds, now),
+        receiving: receiving_time_ns(&skin.with_cells_of_bus(0), extent.rounds, now),
     })
 }
 
@@ -97,22 +101,23 @@ pub(super) fn tick_times(
     numbers: &[usize],
     rounds: usize,
     seed: u64,
-    ticks: impl Fn(usize, TorqueSource) -> Ticks,
+    ticks: impl Fn(usize, TorqueSource) -> TickBench,
     now: impl Fn() -> u64 + Copy,
 ) -> Option<TickTimes> {
     let (distributed, central) = (TorqueSource::Distributed, TorqueSource::Compare);
     let things = (0..numbers.len()).flat_map(|place| [(place, distributed), (place, central)]);
     let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
-    let measured = samples::interleaved(loops.len(), rounds, seed, |thing| {
+    let measured = samples::measure_interleaved(loops.len(), rounds, seed, |thing| {
         let Some((ticks, mode)) = loops.get_mut(thing) else { return f64::NAN };
         // The first epoch is not measured. It fills the caches with the code and data of this loop.
-        ticks.epoch(now);
-        let took = ticks.epoch(now);
+        ticks.run_epoch(now);
+        let took = ticks.run_epoch(now);
         if *mode == distributed { took.tick } else { took.central }
     });
     let medians = samples::medians(&measured);
     let pairs = numbers.iter().zip(medians.as_chunks().0);
-    let points: Vec<_> = pairs.map(|(&number, &[tick, central])| [count(number), tick, central]).collect();
+    let points: Vec<_> =
+        pairs.map(|(&number, &[tick, central])| [count_to_f64(number), tick, central]).collect();
     let line = |place: fn(&[f64; 3]) -> f64| {
         LinearFit::fit_unweighted(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
     };
@@ -120,7 +125,11 @@ pub(super) fn tick_times(
 }
 
 /// Measures distributed ticks of a skin without cells, for different numbers of buses.
-fn over_buses(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Copy) -> Option<LinearFit> {
+fn measure_over_buses(
+    skin: &Skin,
+    extent: DistributedExtent,
+    now: impl Fn() -> u64 + Copy,
+) -> Option<LinearFit> {
     let bare = |buses: usize| Skin {
         buses: skin.buses.iter().take(buses).cloned().collect(),
         cells: Vec::new(),
@@ -128,20 +137,22 @@ fn over_buses(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Co
     };
     let numbers: Vec<usize> = (1..=skin.buses.len()).collect();
     let mut loops: Vec<_> =
-        numbers.iter().map(|&buses| Ticks::new(&bare(buses), 0, TorqueSource::Distributed)).collect();
-    let measured = samples::interleaved(loops.len(), extent.rounds, 13, |thing| {
+        numbers.iter().map(|&buses| TickBench::new(&bare(buses), 0, TorqueSource::Distributed)).collect();
+    let measured = samples::measure_interleaved(loops.len(), extent.rounds, 13, |thing| {
         let Some(ticks) = loops.get_mut(thing) else { return f64::NAN };
-        ticks.epoch(now);
-        ticks.epoch(now).tick
+        ticks.run_epoch(now);
+        ticks.run_epoch(now).tick
     });
     let medians = samples::medians(&measured);
-    LinearFit::fit_unweighted(&numbers.iter().map(|&buses| count(buses)).zip(medians).collect::<Vec<_>>())
+    LinearFit::fit_unweighted(
+        &numbers.iter().map(|&buses| count_to_f64(buses)).zip(medians).collect::<Vec<_>>(),
+    )
 }
 
 /// Measures the time for handling a torque, in ns: its packet is checked and decoded, and the torque replaces the
 /// previous one of the cell in the sum. Every cell of a bus replies in every epoch, each time with a different torque.
-fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
-    let mut table = Table::new(skin, 0);
+fn receiving_time_ns(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
+    let mut table = BusTable::new(skin, 0);
     let mut epoch = Epoch(0);
     let mut took = Vec::with_capacity(rounds);
     for round in 0..rounds {
@@ -160,7 +171,7 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
         for frame in &replies {
             table.handle_frame(at, false, black_box(frame), &mut |_| None);
         }
-        took.push(nanos(now().saturating_sub(began)) / count(replies.len()));
+        took.push(nanos(now().saturating_sub(began)) / count_to_f64(replies.len()));
         debug_assert_eq!(
             table.snapshot().sums.contributing as usize,
             skin.cells.len(),
@@ -173,24 +184,27 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
 /// The maximum slope of the distributed line, relative to that of the central line.
 const MAX_SLOPE_RATIO: f64 = 0.01;
 
-pub(super) fn of_share(what: &str, over: &TickTimes) -> [Finding; 3] {
+pub(super) fn slope_findings(what: &str, over: &TickTimes) -> [Finding; 3] {
     let TickTimes { distributed, central, .. } = over;
     [
-        Finding::stated(format!("central T_skin for each {what}"), central.slope_in("ns")),
-        Finding::stated(format!("distributed tick for each {what}"), distributed.slope_in("ns"))
+        Finding::new_unrated(format!("central T_skin for each {what}"), central.slope_in("ns")),
+        Finding::new_unrated(format!("distributed tick for each {what}"), distributed.slope_in("ns"))
             .with_paper_value(0.0),
-        Finding::stated(
+        Finding::new_unrated(
             format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
-            (over.share() * 100.0, "%"),
+            (over.slope_ratio_at_most() * 100.0, "%"),
         )
-        .with_requirement(format!("at most {} %", MAX_SLOPE_RATIO * 100.0), over.share() <= MAX_SLOPE_RATIO),
+        .with_requirement(
+            format!("at most {} %", MAX_SLOPE_RATIO * 100.0),
+            over.slope_ratio_at_most() <= MAX_SLOPE_RATIO,
+        ),
     ]
 }
 
 /// Writes the section on the times of the distributed computation.
 #[must_use]
-pub fn section(measured: &Distributed) -> Section {
-    let Distributed { cells, active, buses, of, receiving } = measured;
+pub fn section(measured: &DistributedTimes) -> Section {
+    let DistributedTimes { cells, active, buses, of, receiving } = measured;
     let figure = |name: &str, title: String, what: &str, over: &TickTimes| {
         let micros = |place: fn(&[f64; 3]) -> f64| {
             over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
@@ -204,13 +218,16 @@ pub fn section(measured: &Distributed) -> Section {
             .draw("", Shape::Line, law(&over.distributed))
     };
     let findings = [
-        Finding::stated("distributed tick for each further bus", buses.slope_in("ns")),
-        Finding::stated("the same by the most cells that a bus has numbers for", (buses.slope / 254.0, "ns")),
-        Finding::stated(
+        Finding::new_unrated("distributed tick for each further bus", buses.slope_in("ns")),
+        Finding::new_unrated(
+            "the same by the most cells that a bus has numbers for",
+            (buses.slope / 254.0, "ns"),
+        ),
+        Finding::new_unrated(
             "receiving a torque: checked, read and added by the receiver's thread, which no paper counts",
             (*receiving, "ns"),
         ),
-        Finding::stated(
+        Finding::new_unrated(
             "receiving an active cell's torques, by computing it centrally in the 8 ticks of an epoch",
             receiving / (8.0 * active.central.slope),
         ),
@@ -233,8 +250,8 @@ pub fn section(measured: &Distributed) -> Section {
             figure("distributed-cells", "Over cells, none active".to_owned(), "cells", cells),
             figure("distributed-active", format!("Over active cells, of {of}"), "active cells", active),
         ])
-        .findings(of_share("cell", cells))
-        .findings(of_share("active cell", active))
+        .findings(slope_findings("cell", cells))
+        .findings(slope_findings("active cell", active))
         .findings(findings)
 }
 

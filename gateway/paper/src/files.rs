@@ -17,7 +17,7 @@ pub fn csv(figure: &Figure) -> String {
     for (place, (_, points)) in columns.iter().enumerate() {
         let mut again: BTreeMap<u64, usize> = BTreeMap::new();
         for &(x, y) in *points {
-            let key = ordered(x);
+            let key = float_to_ordered(x);
             let again = again.entry(key).or_default();
             let row = rows.entry((key, *again)).or_insert_with(|| vec![None; columns.len()]);
             *again += 1;
@@ -26,15 +26,15 @@ pub fn csv(figure: &Figure) -> String {
             }
         }
     }
-    let mut text = quoted(&figure.x.to_string());
+    let mut text = csv_quoted(&figure.x.to_string());
     for (caption, _) in &columns {
         let axis =
             Axis::new(if caption.is_empty() { figure.y.caption.as_str() } else { caption }, &figure.y.unit);
-        let _ = write!(text, ",{}", quoted(&axis.to_string()));
+        let _ = write!(text, ",{}", csv_quoted(&axis.to_string()));
     }
     text.push('\n');
     for ((x, _), row) in rows {
-        let _ = write!(text, "{}", back(x));
+        let _ = write!(text, "{}", ordered_to_float(x));
         for y in row {
             let _ = match y.filter(|y| y.is_finite()) {
                 Some(y) => write!(text, ",{y}"),
@@ -56,16 +56,16 @@ fn columns(series: &Series) -> Vec<(String, &[(f64, f64)])> {
 }
 
 /// Maps a number to an integer, so that integers compare as the numbers do.
-fn ordered(x: f64) -> u64 {
+fn float_to_ordered(x: f64) -> u64 {
     let bits = x.to_bits();
     if bits >> 63 == 0 { bits | 1 << 63 } else { !bits }
 }
 
-fn back(ordered: u64) -> f64 {
+fn ordered_to_float(ordered: u64) -> f64 {
     f64::from_bits(if ordered >> 63 == 1 { ordered & !(1 << 63) } else { !ordered })
 }
 
-fn quoted(text: &str) -> String {
+fn csv_quoted(text: &str) -> String {
     if text.contains(['"', ',', '\n']) {
         format!("\"{}\"", text.replace('"', "\"\""))
     } else {
@@ -110,8 +110,12 @@ mod tests {
     #[test]
     fn a_number_keeps_its_place() {
         let numbers = [-1e9, -2.0, -0.0, 0.0, 1e-300, 3.0, f64::INFINITY];
-        assert!(numbers.windows(2).all(|pair| ordered(pair[0]) < ordered(pair[1])));
-        assert!(numbers.iter().all(|&number| back(ordered(number)).to_bits() == number.to_bits()));
+        assert!(numbers.windows(2).all(|pair| float_to_ordered(pair[0]) < float_to_ordered(pair[1])));
+        assert!(
+            numbers
+                .iter()
+                .all(|&number| ordered_to_float(float_to_ordered(number)).to_bits() == number.to_bits())
+        );
     }
 
     #[test]

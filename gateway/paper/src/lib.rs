@@ -36,7 +36,7 @@ use serde_json::Value;
 
 use analysis::report::figure::Section;
 use arm::Reply;
-use moving::Run;
+use moving::BenchRun;
 
 /// An experiment that can be performed.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
@@ -184,13 +184,13 @@ pub trait Lab {
     ///
     /// # Errors
     /// Returns an error if the bench failed, or if its recording is incomplete.
-    fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Self::Error>;
+    fn run_bench(&mut self, reply: Reply, effort: Effort) -> Result<BenchRun, Self::Error>;
 
     /// Runs a bench with the given numbers of cells and buses. Returns its summary as JSON, even if the run failed.
     ///
     /// # Errors
     /// Returns an error if the bench could not be started.
-    fn scaled(&mut self, bench: &scale::ScaleBench) -> Result<Value, Self::Error>;
+    fn run_scaled_bench(&mut self, bench: &scale::ScaleBench) -> Result<Value, Self::Error>;
 
     /// Checks, between two measurements, that the experiments are to continue.
     ///
@@ -203,8 +203,8 @@ pub trait Lab {
 #[derive(Debug)]
 pub struct Session {
     effort: Effort,
-    single: Option<Run>,
-    over_cells: Option<central::OverCells>,
+    single: Option<BenchRun>,
+    over_cells: Option<central::TimesOverCells>,
     large: Option<Skin>,
 }
 
@@ -226,32 +226,32 @@ impl Session {
         lab.check_stopped()?;
         Ok(match experiment {
             Experiment::Fig6 => {
-                let single = self.single(lab)?.clone();
+                let single = self.single_run(lab)?.clone();
                 lab.check_stopped()?;
-                moving::fig6(&single, &lab.bench(Reply::Sum, self.effort)?)
+                moving::fig6(&single, &lab.run_bench(Reply::Sum, self.effort)?)
             }
-            Experiment::Fig7 => moving::fig7(self.single(lab)?),
-            Experiment::Fig8 => moving::fig8(self.single(lab)?),
+            Experiment::Fig7 => moving::fig7(self.single_run(lab)?),
+            Experiment::Fig8 => moving::fig8(self.single_run(lab)?),
             Experiment::Fig9 => central::fig9(self.over_cells(lab)),
             Experiment::Fig10 => {
                 let cells = self.over_cells(lab).clone();
                 lab.check_stopped()?;
                 let (cells_of_arm, extent) = (self.arm(), self.extent());
-                let active = central::over_active(&cells_of_arm, extent, || lab.now());
+                let active = central::measure_over_active(&cells_of_arm, extent, || lab.now());
                 central::fig10(&active.expect("more than two numbers of active cells"), &cells)
             }
             Experiment::Distributed => {
-                let (steps, rounds) = self.pick((4, 10), (30, 200));
+                let (steps, rounds) = self.by_effort((4, 10), (30, 200));
                 let extent = distributed::DistributedExtent { steps, rounds };
                 let now = || lab.now();
-                let measured = distributed::measure(self.large(), extent, now);
+                let measured = distributed::measure(self.large_skin(), extent, now);
                 distributed::section(&measured.expect("more than two numbers of cells"))
             }
             Experiment::Sums => {
-                let (touches, epochs) = self.pick((2, 5), (20, 50));
+                let (touches, epochs) = self.by_effort((2, 5), (20, 50));
                 let arm = self.arm();
                 let mut errors = Vec::new();
-                for active in sums::numbers(&arm) {
+                for active in sums::active_cell_counts(&arm) {
                     lab.check_stopped()?;
                     errors.push(sums::errors(&arm, active, sums::SumsExtent { touches, epochs }));
                 }
@@ -267,7 +267,7 @@ impl Session {
         })
     }
 
-    fn pick<T>(&self, quick: T, full: T) -> T {
+    fn by_effort<T>(&self, quick: T, full: T) -> T {
         match self.effort {
             Effort::Quick => quick,
             Effort::Full => full,
@@ -275,7 +275,7 @@ impl Session {
     }
 
     fn extent(&self) -> central::CentralExtent {
-        self.pick(
+        self.by_effort(
             central::CentralExtent { step: 24, rounds: 20, touches: 100 },
             central::CentralExtent { step: 100, rounds: 1_000, touches: 8_000 },
         )
@@ -283,29 +283,29 @@ impl Session {
 
     /// Returns the skin of the paper's arm, or of a smaller one for a quick measurement.
     fn arm(&self) -> Skin {
-        ticks::skin(self.pick(24, 253), 1).expect("so many cells fit on the arm")
+        ticks::skin(self.by_effort(24, 253), 1).expect("so many cells fit on the arm")
     }
 
     /// Returns a skin with the maximum number of cells in Fig. 9, or fewer for a quick measurement.
-    fn large(&mut self) -> &Skin {
-        let cells = self.pick(240, ticks::MAX_CELLS);
+    fn large_skin(&mut self) -> &Skin {
+        let cells = self.by_effort(240, ticks::MAX_CELLS);
         self.large.get_or_insert_with(|| {
             ticks::skin(cells, ticks::BUSES).expect("so many cells fit on the arm and on so many buses")
         })
     }
 
-    fn over_cells<L: Lab>(&mut self, lab: &L) -> &central::OverCells {
+    fn over_cells<L: Lab>(&mut self, lab: &L) -> &central::TimesOverCells {
         let extent = self.extent();
         if self.over_cells.is_none() {
-            self.over_cells = central::over_cells(self.large(), extent, || lab.now());
+            self.over_cells = central::measure_over_cells(self.large_skin(), extent, || lab.now());
         }
         self.over_cells.as_ref().expect("more than two numbers of cells")
     }
 
-    fn single<L: Lab>(&mut self, lab: &mut L) -> Result<&Run, L::Error> {
+    fn single_run<L: Lab>(&mut self, lab: &mut L) -> Result<&BenchRun, L::Error> {
         Ok(match &mut self.single {
             Some(run) => run,
-            none => none.insert(lab.bench(Reply::Torque, self.effort)?),
+            none => none.insert(lab.run_bench(Reply::Torque, self.effort)?),
         })
     }
 }

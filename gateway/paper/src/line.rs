@@ -17,7 +17,7 @@ impl WeightedPoint {
     /// Returns a point at `x` whose y is the median of the measurements, weighted by their number.
     #[must_use]
     pub fn median(x: f64, measured: &mut [f64]) -> Self {
-        Self { x, y: quantile(measured, 0.5), weight: count(measured.len()) }
+        Self { x, y: quantile(measured, 0.5), weight: count_to_f64(measured.len()) }
     }
 }
 
@@ -70,7 +70,7 @@ impl LinearFit {
         let residual: f64 = points.iter().map(left).sum();
         // If all y are equal, there is no variance that the line could explain, so the quality is 0.
         let quality = if syy > 0.0 { (1.0 - residual / syy).max(0.0) } else { 0.0 };
-        let freedom = count(points.len() - 2);
+        let freedom = count_to_f64(points.len() - 2);
         let slope_half = student_t(freedom) * (residual / freedom / sxx).sqrt();
         Some(Self { slope, intercept, quality, slope_half })
     }
@@ -102,7 +102,7 @@ impl LinearFit {
 
     /// Returns the x at which a rising line reaches `y`; NaN for a line that does not rise.
     #[must_use]
-    pub fn reaches(&self, y: f64) -> f64 {
+    pub fn x_reaching(&self, y: f64) -> f64 {
         if self.slope > 0.0 { (y - self.intercept) / self.slope } else { f64::NAN }
     }
 }
@@ -110,7 +110,7 @@ impl LinearFit {
 /// Converts a count to a floating-point number.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "counts of what is in memory, below 2^53")]
-pub fn count(count: usize) -> f64 {
+pub fn count_to_f64(count: usize) -> f64 {
     count as f64
 }
 
@@ -118,15 +118,15 @@ pub fn count(count: usize) -> f64 {
 /// expansion about the normal distribution (Abramowitz and Stegun 26.7.5), which is up to 5 % too small below 10
 /// degrees of freedom.
 fn student_t(freedom: f64) -> f64 {
-    const Z: f64 = 1.959_963_984_540_054;
-    let z = |power: i32| Z.powi(power);
+    const Z_95_PERCENT: f64 = 1.959_963_984_540_054;
+    let z = |power: i32| Z_95_PERCENT.powi(power);
     let terms = [
-        (z(3) + Z) / 4.0,
-        (5.0 * z(5) + 16.0 * z(3) + 3.0 * Z) / 96.0,
-        (3.0 * z(7) + 19.0 * z(5) + 17.0 * z(3) - 15.0 * Z) / 384.0,
-        (79.0 * z(9) + 776.0 * z(7) + 1482.0 * z(5) - 1920.0 * z(3) - 945.0 * Z) / 92_160.0,
+        (z(3) + Z_95_PERCENT) / 4.0,
+        (5.0 * z(5) + 16.0 * z(3) + 3.0 * Z_95_PERCENT) / 96.0,
+        (3.0 * z(7) + 19.0 * z(5) + 17.0 * z(3) - 15.0 * Z_95_PERCENT) / 384.0,
+        (79.0 * z(9) + 776.0 * z(7) + 1482.0 * z(5) - 1920.0 * z(3) - 945.0 * Z_95_PERCENT) / 92_160.0,
     ];
-    terms.into_iter().zip(1..).fold(Z, |sum, (term, power)| sum + term / freedom.powi(power))
+    terms.into_iter().zip(1..).fold(Z_95_PERCENT, |sum, (term, power)| sum + term / freedom.powi(power))
 }
 
 /// Returns the quantile of the values: the value below which the share `part`, in [0, 1], of them lies. Returns NaN if
@@ -136,7 +136,7 @@ fn student_t(freedom: f64) -> f64 {
 pub fn quantile(values: &mut [f64], part: f64) -> f64 {
     values.sort_by(f64::total_cmp);
     let last = values.len().saturating_sub(1);
-    let place = (part * count(last)).round() as usize;
+    let place = (part * count_to_f64(last)).round() as usize;
     values.get(place).copied().unwrap_or(f64::NAN)
 }
 
@@ -150,7 +150,7 @@ mod tests {
         let line = LinearFit::fit_unweighted(&points).unwrap();
         assert!((line.slope - 3.0).abs() < 1e-12 && (line.intercept + 2.0).abs() < 1e-12);
         assert!((line.quality - 1.0).abs() < 1e-12 && line.slope_half < 1e-6);
-        assert!((line.reaches(25.0) - 9.0).abs() < 1e-12 && (line.value_at(9.0) - 25.0).abs() < 1e-12);
+        assert!((line.x_reaching(25.0) - 9.0).abs() < 1e-12 && (line.value_at(9.0) - 25.0).abs() < 1e-12);
     }
 
     /// A common example in textbooks: x is 1 to 5 and y is 2, 4, 5, 4, 5. Slope 0.6, intercept 2.2, R² 0.6, standard
@@ -191,7 +191,7 @@ mod tests {
         assert_eq!(LinearFit::fit_unweighted(&[(0.0, 1.0), (1.0, 2.0)]), None);
         assert_eq!(LinearFit::fit_unweighted(&[(1.0, 1.0), (1.0, 2.0), (1.0, 3.0)]), None);
         let level = LinearFit::fit_unweighted(&[(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]).unwrap();
-        assert!(level.reaches(5.0).is_nan(), "a line that does not rise has no limit");
+        assert!(level.x_reaching(5.0).is_nan(), "a line that does not rise has no limit");
     }
 
     #[test]

@@ -2,11 +2,11 @@
 //! It is computed by [`analysis::fit`].
 
 use super::arm;
-use super::line::count;
+use super::line::count_to_f64;
 use analysis::fit::limits::MAX_NODES;
 use analysis::fit::verdict::FitSummary;
 use analysis::fit::{self, COMPUTATION_NS, RatesRow};
-use analysis::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table};
+use analysis::report::figure::{Axis, Figure, Finding, MarkLine, Section, Series, Shape, Table};
 
 /// The maximum number of cells in the figure.
 const MAX_CELLS: u32 = 300;
@@ -14,7 +14,7 @@ const MAX_CELLS: u32 = 300;
 /// Writes the section on the load of a bus over the number of cells.
 #[must_use]
 pub fn section() -> Section {
-    let skin = arm::paper();
+    let skin = arm::paper_skin();
     let rows = fit::table(&skin, None, COMPUTATION_NS);
     let cells = skin.cells.len();
     let series = |row: &RatesRow| {
@@ -27,7 +27,7 @@ pub fn section() -> Section {
     let finding = |row: &RatesRow| {
         let FitSummary { load, rates, cells, verdict } = FitSummary::worst_case(&row.fullest.rated);
         let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");
-        Finding::stated(what, (100.0 * load, "%"))
+        Finding::new_unrated(what, (100.0 * load, "%"))
     };
     let figure = Figure::new(
         "load",
@@ -36,9 +36,9 @@ pub fn section() -> Section {
         Axis::new("load", "%").with_ends(0.0, 200.0),
     );
     let marks = [
-        Mark::y(100.0, "full"),
-        Mark::x(f64::from(MAX_NODES - 1), "nodes electrically"),
-        Mark::x(count(cells), "the paper's arm"),
+        MarkLine::at_y(100.0, "full"),
+        MarkLine::at_x(f64::from(MAX_NODES - 1), "nodes electrically"),
+        MarkLine::at_x(count_to_f64(cells), "the paper's arm"),
     ];
     Section::new("load", "Bus load over the number of cells")
         .text(
@@ -65,9 +65,9 @@ fn table(rows: &[RatesRow], cells: usize) -> Table {
             format!("{:.1}", rated.case.packet_ns() as f64 / 1e3),
             format!("{:.1}", 100.0 * (load - rated.load.heartbeats)),
             format!("{:.1}", 100.0 * load),
-            row.fullest.most.in_time().to_string(),
-            row.need.in_time().map_or_else(|| "none".to_owned(), |buses| buses.to_string()),
-            row.need.in_short(),
+            row.fullest.most.max_cells_in_time().to_string(),
+            row.need.buses_for_timing().map_or_else(|| "none".to_owned(), |buses| buses.to_string()),
+            row.need.short_text(),
         ]
     };
     let head = [

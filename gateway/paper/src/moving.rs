@@ -2,16 +2,16 @@
 
 use serde_json::Value;
 
-use super::line::{LinearFit, WeightedPoint, count, quantile};
+use super::line::{LinearFit, WeightedPoint, count_to_f64, quantile};
 use super::recorded::TickRow;
 use analysis::paper;
 use analysis::report::figure::{
-    Axis, Figure, Finding, Mark, Quantity, Section, Series, Shape, Table, number,
+    Axis, Figure, Finding, MarkLine, Quantity, Section, Series, Shape, Table, number,
 };
 
 /// The recording of a bench: its ticks, and its summary (`bench::summary::Summary` as JSON).
 #[derive(Clone, Debug)]
-pub struct Run {
+pub struct BenchRun {
     /// The ticks of the run, in the order of time.
     pub rows: Vec<TickRow>,
     /// The summary of the run as JSON.
@@ -20,10 +20,10 @@ pub struct Run {
     pub joints: usize,
 }
 
-impl Run {
+impl BenchRun {
     /// Returns the number in the summary at this path of keys; NaN if there is none.
     #[must_use]
-    pub fn figure(&self, keys: &[&str]) -> f64 {
+    pub fn summary_number(&self, keys: &[&str]) -> f64 {
         let value = keys.iter().try_fold(&self.summary, |value, key| match key.parse::<usize>() {
             Ok(place) => value.get(place),
             Err(_) => value.get(key),
@@ -38,61 +38,65 @@ impl Run {
     }
 
     /// Returns the time at which the central computation was switched off, in s; `None` if it ran until the end.
-    fn switched_s(&self) -> Option<f64> {
+    fn switch_off_time_s(&self) -> Option<f64> {
         let last = self.rows.iter().rposition(|row| row.central.is_some())?;
         self.rows.get(last + 1).map(|row| row.time_s)
     }
 
-    fn over_time(&self, value: impl Fn(&TickRow) -> f64) -> Vec<(f64, f64)> {
+    fn points_over_time(&self, value: impl Fn(&TickRow) -> f64) -> Vec<(f64, f64)> {
         self.rows.iter().map(|row| (row.time_s, value(row))).collect()
     }
 
     /// Returns an empty figure whose x axis is the time of this run.
-    fn drawn(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
-        Figure::new(name, title, Axis::new("time", "s"), y).marks(self.switched())
+    fn time_figure(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
+        Figure::new(name, title, Axis::new("time", "s"), y).marks(self.switch_off_marks())
     }
 
-    fn switched(&self) -> Vec<Mark> {
-        self.switched_s().map(|at| Mark::x(at, "central computation off")).into_iter().collect()
+    fn switch_off_marks(&self) -> Vec<MarkLine> {
+        self.switch_off_time_s().map(|at| MarkLine::at_x(at, "central computation off")).into_iter().collect()
     }
 
     fn replies(&self) -> Finding {
-        let due = self.figure(&["buses", "0", "replies", "due"]);
-        let in_time = self.figure(&["buses", "0", "replies", "in_time"]);
-        Finding::stated(format!("replies in time, of {due}"), in_time)
+        let due = self.summary_number(&["buses", "0", "replies", "due"]);
+        let in_time = self.summary_number(&["buses", "0", "replies", "in_time"]);
+        Finding::new_unrated(format!("replies in time, of {due}"), in_time)
     }
 }
 
 /// Writes the section on Fig. 6: the central and the distributed torques of a run in which each cell sends its own
 /// torque, the errors of that run, and the errors of a run in which cells send sums.
 #[must_use]
-pub fn fig6(single: &Run, summed: &Run) -> Section {
+pub fn fig6(single: &BenchRun, summed: &BenchRun) -> Section {
     let joint = |joint: usize| {
         let central = |row: &TickRow| row.central.map_or(f64::NAN, |torque| joint_value(&torque, joint));
         let (name, title) = (format!("fig6-joint{}", joint + 1), format!("Joint {}", joint + 1));
         single
-            .drawn(name, title, Axis::new("torque", "Nm"))
-            .half()
-            .draw("central", Shape::Line, single.over_time(central))
-            .draw("distributed", Shape::Dashed, single.over_time(|row| joint_value(&row.distributed, joint)))
+            .time_figure(name, title, Axis::new("torque", "Nm"))
+            .half_width()
+            .draw("central", Shape::Line, single.points_over_time(central))
+            .draw(
+                "distributed",
+                Shape::Dashed,
+                single.points_over_time(|row| joint_value(&row.distributed, joint)),
+            )
     };
-    let error = |run: &Run, kind: &str, key: &str| run.figure(&["accuracy", kind, key]);
+    let error = |run: &BenchRun, kind: &str, key: &str| run.summary_number(&["accuracy", kind, key]);
     let (mean_single, mean_summed) = (error(single, "single", "mean_nm"), error(summed, "sums", "mean_nm"));
     let [summed_due, summed_in] =
-        ["due", "in_time"].map(|key| summed.figure(&["buses", "0", "sums", "contributions", key]));
-    let row = |name: &str, run: &Run, kind: &str| {
+        ["due", "in_time"].map(|key| summed.summary_number(&["buses", "0", "sums", "contributions", key]));
+    let row = |name: &str, run: &BenchRun, kind: &str| {
         let [mean, max, torques] = ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
         [name.to_owned(), mean, max, torques]
     };
     let title = "Fig. 6: torques of the moving arm, computed in the loop and on the cells";
     let cell = Finding::less_is_better(
         "mean error of a cell's torque, Q3.12",
-        paper::SINGLE_NM,
+        paper::SINGLE_CELL_ERROR_NM,
         (mean_single, "Nm"),
     );
     let sum = Finding::less_is_better(
         "mean error of the summed torque, Q7.8",
-        paper::SUMMED_NM,
+        paper::SUMMED_ERROR_NM,
         (mean_summed, "Nm"),
     );
     let rows = [
@@ -106,7 +110,7 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
             "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm yields to touches; up to {:.1} s \
              the loop computes the torques itself as well.",
             single.cells(),
-            single.switched_s().unwrap_or(f64::NAN)
+            single.switch_off_time_s().unwrap_or(f64::NAN)
         ))
         .text(
             "Errors compare each answer with the central computation on the same joints and touches, over the joints that \
@@ -114,13 +118,13 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
              The run with sums is a second one, with the same touches; only epochs whose sums were complete in time are \
              compared.",
         )
-        .text(bare(single))
+        .text(joints_without_torque(single))
         .figures((0..single.joints).map(joint))
         .findings([
             cell.with_requirement("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
             sum,
             single.replies(),
-            Finding::stated(format!("cells' torques that were in sums in time, of {summed_due}"), summed_in),
+            Finding::new_unrated(format!("cells' torques that were in sums in time, of {summed_due}"), summed_in),
         ])
         .tables([Table::new(
             "Errors against the central computation, Nm",
@@ -130,7 +134,7 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
 }
 
 /// Returns the names of the joints on which no torque acted.
-fn bare(run: &Run) -> String {
+fn joints_without_torque(run: &BenchRun) -> String {
     let bears = |joint: usize| run.rows.iter().any(|row| joint_value(&row.distributed, joint).abs() > 0.0);
     let bare: Vec<_> =
         (0..run.joints).filter(|&joint| !bears(joint)).map(|joint| (joint + 1).to_string()).collect();
@@ -147,16 +151,16 @@ fn joint_value(values: &[f64], joint: usize) -> f64 {
 
 /// Writes the section on Fig. 7: joint velocities and active cells of a run.
 #[must_use]
-pub fn fig7(run: &Run) -> Section {
+pub fn fig7(run: &BenchRun) -> Section {
     let velocity = |joint: usize| {
         let caption = format!("joint {}", joint + 1);
-        Series::new(caption, Shape::Line, run.over_time(|row| joint_value(&row.velocity, joint)))
+        Series::new(caption, Shape::Line, run.points_over_time(|row| joint_value(&row.velocity, joint)))
     };
     let active = run.rows.iter().map(|row| row.contributing).max().unwrap_or(0);
     let fastest = run.rows.iter().flat_map(|row| row.velocity).map(f64::abs).fold(0.0, f64::max);
-    let velocities = run.drawn("fig7-velocities", "Joint velocities", Axis::new("velocity", "rad/s"));
-    let cells = run.drawn("fig7-active", "Active cells", Axis::new("cells in the torque", ""));
-    let contributing = run.over_time(|row| f64::from(row.contributing));
+    let velocities = run.time_figure("fig7-velocities", "Joint velocities", Axis::new("velocity", "rad/s"));
+    let cells = run.time_figure("fig7-active", "Active cells", Axis::new("cells in the torque", ""));
+    let contributing = run.points_over_time(|row| f64::from(row.contributing));
     Section::new("fig7", "Fig. 7: joint velocities and active cells")
         .text("The same run. The cells' torques move the arm: the loop uses only theirs.")
         .figures([
@@ -164,8 +168,8 @@ pub fn fig7(run: &Run) -> Section {
             cells.draw("active cells", Shape::Steps, contributing),
         ])
         .findings([
-            Finding::stated("most cells active at once", (f64::from(active), "cells")),
-            Finding::stated("maximum joint velocity", (fastest, "rad/s")),
+            Finding::new_unrated("most cells active at once", (f64::from(active), "cells")),
+            Finding::new_unrated("maximum joint velocity", (fastest, "rad/s")),
         ])
 }
 
@@ -179,18 +183,18 @@ fn median<'a>(rows: impl Iterator<Item = &'a TickRow>, time: impl Fn(&TickRow) -
 
 /// Writes the section on Fig. 8: the times of cycles, and of the central computation until it is switched off.
 #[must_use]
-pub fn fig8(run: &Run) -> Section {
+pub fn fig8(run: &BenchRun) -> Section {
     let cells = run.cells();
     let before = || run.rows.iter().filter(|row| row.central.is_some());
     let after = || run.rows.iter().filter(|row| row.central.is_none());
     let none_active = {
         let times: Vec<f64> =
             before().filter(|row| row.contributing == 0).map(|row| row.central_us).collect();
-        times.iter().sum::<f64>() / count(times.len())
+        times.iter().sum::<f64>() / count_to_f64(times.len())
     };
     let total = [median(before(), |row| row.took_us), median(after(), |row| row.took_us)];
     let off = after().map(|row| row.central_us).fold(0.0, f64::max);
-    let slope = over_active(after());
+    let slope = fit_over_active(after());
     let top = {
         let mut times: Vec<f64> = run.rows.iter().map(|row| row.took_us).collect();
         2.0 * quantile(&mut times, 0.99)
@@ -199,15 +203,15 @@ pub fn fig8(run: &Run) -> Section {
     let over = run.rows.iter().filter(|row| row.took_us > paper::CYCLE_S * 1e6).count();
     let us = |value| (value, "µs");
     let figure = |name: &str, title: &str, top| {
-        run.drawn(name, title, Axis::new("time in a cycle", "µs").with_ends(0.0, top))
+        run.time_figure(name, title, Axis::new("time in a cycle", "µs").with_ends(0.0, top))
     };
     let medians = |time: &dyn Fn(&TickRow) -> f64| {
         let pieces = run.rows.chunks(CYCLES_PER_MEDIAN).filter_map(|rows| Some((rows.first()?.time_s, rows)));
         pieces.map(|(at, rows)| (at, median(rows.iter(), time))).collect::<Vec<_>>()
     };
     let per_frame = {
-        let frames = run.figure(&["buses", "0", "uplink", "delivered"]);
-        run.figure(&["processor", "gateway"]) * run.figure(&["duration_s"]) * 1e6 / frames
+        let frames = run.summary_number(&["buses", "0", "uplink", "delivered"]);
+        run.summary_number(&["processor", "gateway"]) * run.summary_number(&["duration_s"]) * 1e6 / frames
     };
     let none = Finding::less_is_better(
         format!("mean T_skin while none of {cells} cells is active"),
@@ -218,7 +222,7 @@ pub fn fig8(run: &Run) -> Section {
         Finding::less_is_better("T_total after the switch, median", paper::OTHER_WORK_S * 1e6, us(total[1]));
     let of_active = slope.map(|line| {
         let slope = Quantity::new(line.slope * 1e3, "ns").plus_minus(line.slope_half * 1e3);
-        Finding::stated("T_total after the switch for each active cell", slope)
+        Finding::new_unrated("T_total after the switch for each active cell", slope)
     });
     let took = |row: &TickRow| row.took_us;
     let central = |row: &TickRow| row.central_us;
@@ -234,22 +238,22 @@ pub fn fig8(run: &Run) -> Section {
         ))
         .figures([
             figure("fig8", "Cycle times", top)
-                .draw("T_total", Shape::Line, run.over_time(took))
-                .draw("T_skin", Shape::Line, run.over_time(central)),
+                .draw("T_total", Shape::Line, run.points_over_time(took))
+                .draw("T_skin", Shape::Line, run.points_over_time(central)),
             figure("fig8-medians", "The same, medians of 25 cycles", top / 2.0)
                 .draw("T_total", Shape::Steps, medians(&took))
                 .draw("T_skin", Shape::Steps, medians(&central)),
         ])
         .findings([
             none,
-            Finding::stated("T_skin after the switch, maximum", us(off)).with_paper_value(0.0).with_requirement("0", off <= 0.0),
-            Finding::stated("T_total before the switch, median", us(total[0])),
+            Finding::new_unrated("T_skin after the switch, maximum", us(off)).with_paper_value(0.0).with_requirement("0", off <= 0.0),
+            Finding::new_unrated("T_total before the switch, median", us(total[0])),
             after_switch.with_requirement("less than before", total[1] < total[0]),
         ])
         .findings(of_active)
         .findings([
-            Finding::stated("ticks above 2 ms", count(over)),
-            Finding::stated(
+            Finding::new_unrated("ticks above 2 ms", count_to_f64(over)),
+            Finding::new_unrated(
                 "all of the gateway's processor time by frames that came: socket, loop, recorder",
                 us(per_frame),
             ),
@@ -257,7 +261,7 @@ pub fn fig8(run: &Run) -> Section {
 }
 
 /// Fits a line to the median time of ticks over the number of active cells. Points are weighted by the number of ticks.
-fn over_active<'a>(rows: impl Iterator<Item = &'a TickRow>) -> Option<LinearFit> {
+fn fit_over_active<'a>(rows: impl Iterator<Item = &'a TickRow>) -> Option<LinearFit> {
     let mut by_active = std::collections::BTreeMap::<u32, Vec<f64>>::new();
     for row in rows {
         by_active.entry(row.contributing).or_default().push(row.took_us);
@@ -274,7 +278,7 @@ mod tests {
     use serde_json::json;
 
     /// Returns a run of one second in which the central computation takes 3 µs and is switched off at 0.5 s.
-    fn run() -> Run {
+    fn run() -> BenchRun {
         let row = |tick: u16| {
             let central = (tick < 250).then_some([1.0; 6]);
             let central_us = if central.is_some() { 3.0 } else { 0.0 };
@@ -296,13 +300,13 @@ mod tests {
             },
             "buses": [{ "replies": { "due": 100, "in_time": 99 }, "uplink": { "delivered": 4000 } }],
         });
-        Run { rows: (0..500).map(row).collect(), summary, joints: 6 }
+        BenchRun { rows: (0..500).map(row).collect(), summary, joints: 6 }
     }
 
     #[test]
     fn the_switch_is_found_and_what_came_before_it_and_after() {
         let run = run();
-        assert_eq!(run.switched_s(), Some(0.5));
+        assert_eq!(run.switch_off_time_s(), Some(0.5));
         let section = fig8(&run);
         let of = |what: &str| section.findings.iter().find(|finding| finding.what.starts_with(what)).unwrap();
         assert!((of("mean T_skin").ours.value - 3.0).abs() < 1e-9);

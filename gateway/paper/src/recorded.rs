@@ -6,7 +6,7 @@ use std::path::Path;
 use protocol::packet::padded;
 use protocol::skin::MAX_ROBOT_JOINTS;
 
-use trace::capture::{CaptureError, Item, Reader};
+use trace::capture::{CaptureError, Reader, RecordingItem};
 use trace::ros2::Message;
 use trace::ros2::cdr::CdrError;
 use trace::ros2::read;
@@ -40,7 +40,7 @@ pub fn read(path: &Path) -> Result<Vec<TickRow>, CaptureError> {
     let mut items = Reader::open_with_all_topics(&[path.to_path_buf()])?;
     let mut rows: BTreeMap<u64, TickRow> = BTreeMap::new();
     while let Some(item) = items.next_item()? {
-        if let Item::Other(other) = item {
+        if let RecordingItem::Other(other) = item {
             // Messages that cannot be decoded may come from another program, so they are ignored.
             let _ = store_message(&mut rows, other.topic, other.schema, other.nanos, other.message);
         }
@@ -65,12 +65,12 @@ fn store_message(
     let is_states = schema == JointState::TYPE && topic.ends_with("/joint_states");
     if is_states {
         let joints = read::joints(message)?;
-        rows.entry(nanos).or_default().velocity = by_joint(&joints.velocity);
+        rows.entry(nanos).or_default().velocity = padded_to_joints(&joints.velocity);
     } else if schema == Torques::TYPE {
         let torques = read::torques(message)?;
         let row = rows.entry(nanos).or_default();
-        row.distributed = by_joint(&torques.distributed);
-        row.central = (!torques.central.is_empty()).then(|| by_joint(&torques.central));
+        row.distributed = padded_to_joints(&torques.distributed);
+        row.central = (!torques.central.is_empty()).then(|| padded_to_joints(&torques.central));
     } else if schema == LoopTiming::TYPE {
         let timing = read::timing(message)?;
         let row = rows.entry(nanos).or_default();
@@ -81,7 +81,7 @@ fn store_message(
 }
 
 /// Returns an array with the number for each joint, filled with 0.
-fn by_joint(numbers: &[f64]) -> [f64; MAX_ROBOT_JOINTS] {
+fn padded_to_joints(numbers: &[f64]) -> [f64; MAX_ROBOT_JOINTS] {
     padded(numbers)
 }
 

@@ -11,7 +11,7 @@ use super::line::quantile;
 
 /// Measures each of `things` quantities once in each of `rounds` rounds. `once` measures the quantity with the given
 /// index. Returns the sorted measurements of each quantity.
-pub fn interleaved(
+pub fn measure_interleaved(
     things: usize,
     rounds: usize,
     seed: u64,
@@ -48,7 +48,7 @@ mod tests {
     #[test]
     fn every_thing_is_measured_in_every_round_and_a_stall_bends_nothing() {
         let mut calls = Vec::new();
-        let measured = interleaved(5, 9, 1, |thing| {
+        let measured = measure_interleaved(5, 9, 1, |thing| {
             calls.push(thing);
             let stalls = [0, 7, 22].contains(&calls.len());
             f64::from(u8::try_from(thing).unwrap()) + if stalls { 1e6 } else { 0.0 }

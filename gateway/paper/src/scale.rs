@@ -13,8 +13,8 @@ use protocol::id::CellId;
 use serde_json::Value;
 
 use super::distributed::{TickTimes, tick_times};
-use super::line::count;
-use super::ticks::{self, Ticks, spread};
+use super::line::count_to_f64;
+use super::ticks::{self, TickBench, skin_with_fewer_cells};
 use super::{Effort, Lab};
 use model::generate::{SkinRequest, generate};
 use model::scenario::TorqueSource;
@@ -150,7 +150,7 @@ impl BenchFigures {
     }
 
     /// Returns true if the bench holds its rate.
-    fn holds(&self) -> bool {
+    fn holds_rate(&self) -> bool {
         self.done && self.share() >= MIN_IN_TIME_SHARE && self.unknown <= 0.0
     }
 }
@@ -179,7 +179,7 @@ pub type ComparedTicks = [f64; 3];
 
 /// All measurements of the experiment.
 #[derive(Clone, Debug)]
-pub struct Scale {
+pub struct ScaleMeasurements {
     /// The measurements for each number of cells.
     pub sizes: Vec<SizeFigures>,
     /// The times of ticks without threads over the number of cells. All cells are active, on as many buses as the
@@ -222,41 +222,41 @@ const QUICK: ScaleExtent =
 ///
 /// # Panics
 /// Never panics in practice: generated skins are valid, and all lines are fitted to enough points.
-pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<Scale, L::Error> {
+pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<ScaleMeasurements, L::Error> {
     let extent = match effort {
         Effort::Quick => QUICK,
         Effort::Full => FULL,
     };
     let mut sizes = Vec::new();
     for &cells in extent.cells {
-        sizes.push(size(lab, cells, extent)?);
+        sizes.push(measure_size(lab, cells, extent)?);
     }
     lab.check_stopped()?;
     let (fewest, most) = (extent.cells.first().copied(), extent.cells.last().copied());
-    let (ticks, beside) = loops(fewest.unwrap_or(1), most.unwrap_or(1), extent, || lab.now());
-    Ok(Scale { sizes, ticks, beside })
+    let (ticks, beside) = measure_loops(fewest.unwrap_or(1), most.unwrap_or(1), extent, || lab.now());
+    Ok(ScaleMeasurements { sizes, ticks, beside })
 }
 
 /// Finds the highest rate that a bench with this many cells holds, and measures at this rate.
-fn size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Result<SizeFigures, L::Error> {
+fn measure_size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Result<SizeFigures, L::Error> {
     let buses = cells.div_ceil(CellId::COUNT);
     let of = |hz, active| ScaleBench { cells, buses, hz, active, seconds: extent.seconds };
     let (mut hz, mut active) = (f64::NAN, BenchFigures::default());
     for &rate in extent.rates {
         lab.check_stopped()?;
         hz = rate;
-        active = BenchFigures::from_summary(&lab.scaled(&of(hz, true))?);
-        if active.holds() {
+        active = BenchFigures::from_summary(&lab.run_scaled_bench(&of(hz, true))?);
+        if active.holds_rate() {
             break;
         }
     }
     lab.check_stopped()?;
-    let quiet = BenchFigures::from_summary(&lab.scaled(&of(hz, false))?);
-    Ok(SizeFigures { cells, buses, hz, holds: active.holds(), quiet, active })
+    let quiet = BenchFigures::from_summary(&lab.run_scaled_bench(&of(hz, false))?);
+    Ok(SizeFigures { cells, buses, hz, holds: active.holds_rate(), quiet, active })
 }
 
 /// Measures ticks without threads: for different numbers of cells, and three for comparison.
-fn loops(
+fn measure_loops(
     fewest: usize,
     most: usize,
     extent: ScaleExtent,
@@ -268,20 +268,20 @@ fn loops(
     // Each bus has at least one cell, because a bus without cells has no chain to be computed.
     let numbers: Vec<usize> =
         (0..=extent.steps).map(|step| (most * step / extent.steps).max(buses)).collect();
-    let parts: Vec<_> = numbers.iter().map(|&cells| spread(&large, cells)).collect();
+    let parts: Vec<_> = numbers.iter().map(|&cells| skin_with_fewer_cells(&large, cells)).collect();
     let all_active = |place: usize, mode| {
         let part = parts.get(place).unwrap_or(&large);
-        Ticks::new(part, part.cells.len(), mode)
+        TickBench::new(part, part.cells.len(), mode)
     };
     let over =
         tick_times(&numbers, extent.rounds, 14, all_active, now).expect("more than two numbers of cells");
     let few = skin(fewest, fewest.div_ceil(CellId::COUNT));
-    let skins = [&few, &spread(&large, fewest.max(buses)), &large];
-    let mut loops = skins.map(|skin| Ticks::new(skin, skin.cells.len(), TorqueSource::Distributed));
-    let measured = super::samples::interleaved(loops.len(), extent.rounds, 15, |thing| {
+    let skins = [&few, &skin_with_fewer_cells(&large, fewest.max(buses)), &large];
+    let mut loops = skins.map(|skin| TickBench::new(skin, skin.cells.len(), TorqueSource::Distributed));
+    let measured = super::samples::measure_interleaved(loops.len(), extent.rounds, 15, |thing| {
         let Some(ticks) = loops.get_mut(thing) else { return f64::NAN };
-        ticks.epoch(now);
-        ticks.epoch(now).tick
+        ticks.run_epoch(now);
+        ticks.run_epoch(now).tick
     });
     let medians = super::samples::medians(&measured);
     (over, std::array::from_fn(|place| medians.get(place).copied().unwrap_or(f64::NAN)))
@@ -289,7 +289,7 @@ fn loops(
 
 /// Returns the number of cells as the x of a figure.
 fn cells_of(size: &SizeFigures) -> f64 {
-    count(size.cells)
+    count_to_f64(size.cells)
 }
 
 #[cfg(test)]

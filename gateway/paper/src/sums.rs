@@ -10,13 +10,13 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::line::count;
+use super::line::count_to_f64;
 use super::tree::{EpochResult, SumTree};
 use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Section, Series, Shape, Table, number};
 
 /// The numbers of active cells that are measured. About twenty were active on the arm in the paper.
-const ACTIVE: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
+const ACTIVE_CELL_COUNTS: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
 /// The number of active cells at which the findings are stated.
 const FINDINGS_AT: usize = 20;
 /// The number of epochs over which the sum of a constant touch is averaged.
@@ -51,7 +51,7 @@ pub struct SumErrors {
 }
 
 /// Selects random cells of a skin, each with sensor values for a force of 0.6 to 6 N.
-fn touched(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, SkinSensors)> {
+fn random_touches(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, SkinSensors)> {
     let mut places: Vec<usize> = (0..cells).collect();
     places.shuffle(dice);
     let touched_cell = |place| {
@@ -85,9 +85,9 @@ impl Mean {
 }
 
 /// Returns those numbers of active cells that a skin has enough cells for.
-pub fn numbers(skin: &Skin) -> impl Iterator<Item = usize> + use<> {
+pub fn active_cell_counts(skin: &Skin) -> impl Iterator<Item = usize> + use<> {
     let cells = skin.cells.len();
-    ACTIVE.into_iter().filter(move |&active| active <= cells)
+    ACTIVE_CELL_COUNTS.into_iter().filter(move |&active| active <= cells)
 }
 
 /// Measures the errors for a number of active cells. Equal arguments give equal results.
@@ -98,7 +98,7 @@ pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
     let [mut truncated, mut rounded, mut carried] = [Mean::default(); 3];
     let [mut rounded_average, mut carried_average] = [Mean::default(); 2];
     for _ in 0..extent.touches {
-        let touch = touched(&mut dice, skin.cells.len(), active);
+        let touch = random_touches(&mut dice, skin.cells.len(), active);
         let phase: [f64; MAX_JOINTS] = core::array::from_fn(|_| dice.random_range(0.0..6.0));
         for epoch in 0..extent.epochs {
             let q = phase.map(|phase| (phase + f64::from(epoch) * 0.016).sin());
@@ -111,7 +111,7 @@ pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
         // Cells that carry begin each touch without a rounding error from the one before.
         let mut fresh = SumTree::new(skin, true);
         for (tree, average) in [(&mut rounding, &mut rounded_average), (&mut fresh, &mut carried_average)] {
-            let (mean, last) = averaged(tree, &q, &touch);
+            let (mean, last) = average_sum(tree, &q, &touch);
             average.add(last.loaded, &mean, &last.central);
         }
     }
@@ -126,7 +126,7 @@ pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
 }
 
 /// Returns the mean of the sums over the epochs of a constant touch, while the arm does not move.
-fn averaged(
+fn average_sum(
     tree: &mut SumTree,
     q: &[f64; MAX_JOINTS],
     touch: &[(usize, SkinSensors)],
@@ -145,7 +145,7 @@ fn averaged(
 type SumMethod = (&'static str, &'static str, fn(&SumErrors) -> f64);
 
 /// All kinds of sums that are compared.
-const WAYS: [SumMethod; 5] = [
+const SUM_METHODS: [SumMethod; 5] = [
     ("truncated", "each cut off, mean error", |at| at.truncated),
     ("rounded", "rounded, mean error", |at| at.rounded),
     ("carried", "carried, mean error of single epochs", |at| at.carried),
@@ -163,23 +163,23 @@ pub fn section(skin: &Skin, errors: &[SumErrors]) -> Section {
         Axis::new("active cells", "").log().with_ends(0.9, 300.0),
         Axis::new("mean absolute error", "Nm").log().with_ends(1e-5, 1.0),
     );
-    let series = WAYS.map(|(caption, _, error)| {
-        let points = errors.iter().map(|errors| (count(errors.active), error(errors))).collect();
+    let series = SUM_METHODS.map(|(caption, _, error)| {
+        let points = errors.iter().map(|errors| (count_to_f64(errors.active), error(errors))).collect();
         Series::new(caption, Shape::Line, points)
     });
     let at = errors.iter().filter(|errors| errors.active == FINDINGS_AT).take(1);
     let findings = at.flat_map(|at| {
-        WAYS.map(|(caption, what, error)| {
+        SUM_METHODS.map(|(caption, what, error)| {
             let what = format!("sum of {FINDINGS_AT} active cells of {of}, {what}");
-            let found = Finding::less_is_better(what, paper::SUMMED_NM, (error(at), "Nm"));
+            let found = Finding::less_is_better(what, paper::SUMMED_ERROR_NM, (error(at), "Nm"));
             if caption == "rounded" { found.at_most(0.005) } else { found }
         })
     });
     let rows = errors.iter().map(|at| {
-        let errors = WAYS.map(|(_, _, error)| number(error(at)));
+        let errors = SUM_METHODS.map(|(_, _, error)| number(error(at)));
         core::iter::once(at.active.to_string()).chain(errors).collect::<Vec<_>>()
     });
-    let [a, b, c, d, e] = WAYS.map(|(caption, ..)| caption);
+    let [a, b, c, d, e] = SUM_METHODS.map(|(caption, ..)| caption);
     Section::new("sums", "Sums along the tree: cutting off, rounding, carrying")
         .text(
             "Random cells measure 0.6 to 6 N while the arm moves; every cell computes and adds with the code of its \
@@ -189,7 +189,7 @@ pub fn section(skin: &Skin, errors: &[SumErrors]) -> Section {
         )
         .text(format!(
             "The paper's {} Nm is what cutting off gives for about twenty active cells.",
-            number(paper::SUMMED_NM)
+            number(paper::SUMMED_ERROR_NM)
         ))
         .figures([figure.series(series)])
         .findings(findings)
@@ -205,14 +205,16 @@ mod tests {
     fn truncated_sums_drift_with_the_cells_rounded_ones_do_not_and_carried_ones_are_right_on_average() {
         let skin = ticks::skin(64, 1).unwrap();
         let measure = || -> Vec<_> {
-            numbers(&skin).map(|active| errors(&skin, active, SumsExtent { touches: 6, epochs: 4 })).collect()
+            active_cell_counts(&skin)
+                .map(|active| errors(&skin, active, SumsExtent { touches: 6, epochs: 4 }))
+                .collect()
         };
         let errors = measure();
         assert_eq!(errors.iter().map(|at| at.active).collect::<Vec<_>>(), [1, 2, 5, 10, 20, 40]);
         let (one, forty) = (errors[0], errors[5]);
         // A cell that truncates is too low by half a step of 1/256 Nm on average. Cells near the base load fewer
         // joints.
-        let drift = |at: &SumErrors| at.truncated / (count(at.active) / 512.0);
+        let drift = |at: &SumErrors| at.truncated / (count_to_f64(at.active) / 512.0);
         assert!((0.6..1.1).contains(&drift(&one)) && (0.6..1.0).contains(&drift(&forty)), "{errors:?}");
         assert!((25.0..45.0).contains(&(forty.truncated / one.truncated)), "{errors:?}");
         // A cell that rounds is off by a quarter of a step on average, and the error of the sum grows with the square

@@ -17,11 +17,11 @@ impl Lab for Bare {
         u64::try_from(BEGAN.elapsed().as_nanos()).unwrap()
     }
 
-    fn bench(&mut self, _: Reply, _: Effort) -> Result<Run, &'static str> {
+    fn run_bench(&mut self, _: Reply, _: Effort) -> Result<BenchRun, &'static str> {
         Err("there is no bench here")
     }
 
-    fn scaled(&mut self, _: &scale::ScaleBench) -> Result<Value, &'static str> {
+    fn run_scaled_bench(&mut self, _: &scale::ScaleBench) -> Result<Value, &'static str> {
         Err("there is no bench here")
     }
 
@@ -36,7 +36,7 @@ fn is_drawable(figure: &Figure) {
         "{}",
         figure.name
     );
-    assert!(!figure.series.is_empty() && figure.series.len() <= Figure::COLOURS, "{}", figure.name);
+    assert!(!figure.series.is_empty() && figure.series.len() <= Figure::COLOUR_COUNT, "{}", figure.name);
     for series in &figure.series {
         let finite = series.points.iter().all(|(x, y)| x.is_finite() && y.is_finite());
         assert!(series.points.len() >= 2 && finite, "{}: {series:?}", figure.name);

@@ -10,13 +10,13 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 use protocol::time::{Micros, Span};
 
-use control::controller::{Controller, ControllerOutput, Input, Kinesthetic};
-use control::cycle::turn::{BusPort, Shared, TickDriver, TimedRecord};
+use control::controller::{Controller, ControllerInput, ControllerOutput, KinestheticController};
+use control::cycle::turn::{BusPort, SharedRunState, TickDriver, TimedRecord};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use model::generate::{GenerateError, SkinRequest, generate};
 use model::scenario::{ModeChange, Scenario, TorqueSource, contact_words};
-use model::table::{Snapshot, Table};
+use model::table::{BusTable, Snapshot};
 
 /// The maximum number of cells in Fig. 9 of the paper.
 pub const MAX_CELLS: usize = 3_000;
@@ -29,7 +29,7 @@ const TOUCH_N: f64 = 1.5;
 /// The number of ticks in an epoch, with 500 ticks and 62.5 epochs per second.
 const TICKS_PER_EPOCH: u64 = 8;
 /// The capacity of the queues for records and broadcasts between two epochs. It is much larger than needed.
-const QUEUE: usize = 64;
+const QUEUE_CAPACITY: usize = 64;
 
 /// Returns the skin of a UR5 with this many cells on this many buses.
 ///
@@ -43,7 +43,7 @@ pub fn skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
 /// Returns a skin that has only `cells` of the cells: the first ones of each bus. Their number differs by at most one
 /// between buses.
 #[must_use]
-pub fn spread(skin: &Skin, cells: usize) -> Skin {
+pub fn skin_with_fewer_cells(skin: &Skin, cells: usize) -> Skin {
     let buses = skin.buses.len().max(1);
     let share = |bus: usize| cells / buses + usize::from(bus < cells % buses);
     let of_bus = |bus: usize| skin.cells_on_bus(bus).take(share(bus)).cloned().collect::<Vec<_>>();
@@ -64,7 +64,7 @@ fn sensors(cells: usize, active: usize) -> Vec<SkinSensors> {
 /// Returns the snapshot that a bus receiver passes to the loop after the first `active` cells have replied. It is
 /// computed from frames by the same table as in a bench.
 fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
-    let mut table = Table::new(skin, bus);
+    let mut table = BusTable::new(skin, bus);
     let cells: Vec<&Cell> = skin.cells_on_bus(bus).collect();
     let epoch = Epoch(0);
     let mut hear = |own, message: Message| {
@@ -82,10 +82,10 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
 
 /// A controller that computes what the kinesthetic controller computes, but does not move the arm. Otherwise the robot
 /// would move to its limits, faster with many cells than with few, and their ticks would not be comparable.
-struct HoldingController(Kinesthetic);
+struct HoldingController(KinestheticController);
 
 impl Controller for HoldingController {
-    fn step(&mut self, input: &Input) -> ControllerOutput {
+    fn step(&mut self, input: &ControllerInput) -> ControllerOutput {
         match self.0.step(input) {
             ControllerOutput::Move(velocity) => {
                 ControllerOutput::Move(std::hint::black_box(velocity).map(|_| 0.0))
@@ -97,7 +97,7 @@ impl Controller for HoldingController {
 
 /// A control loop, and the receiving ends of its buses, which pass sums to the loop.
 #[derive(Debug)]
-pub struct Ticks {
+pub struct TickBench {
     turn: TickDriver,
     buses: Vec<ReceiverEnds>,
     records: rtrb::Consumer<TimedRecord>,
@@ -122,7 +122,7 @@ pub struct TickCost {
     pub central: f64,
 }
 
-impl Ticks {
+impl TickBench {
     /// Creates a loop over a skin. The first `active` cells are touched, distributed evenly over the buses.
     ///
     /// # Panics
@@ -131,13 +131,13 @@ impl Ticks {
     pub fn new(skin: &Skin, active: usize, mode: TorqueSource) -> Self {
         let buses = skin.buses.len();
         let share = |bus: usize| active / buses + usize::from(bus < active % buses);
-        let (records_in, records) = rtrb::RingBuffer::new(QUEUE);
+        let (records_in, records) = rtrb::RingBuffer::new(QUEUE_CAPACITY);
         let mut lines = Vec::with_capacity(buses);
         let mut inlets = Vec::with_capacity(buses);
         for bus in 0..buses {
             let snapshot = snapshot(skin, bus, share(bus));
             let (to_loop, from_receiver) = triple_buffer::triple_buffer(&snapshot);
-            let (positions_in, positions) = rtrb::RingBuffer::new(QUEUE);
+            let (positions_in, positions) = rtrb::RingBuffer::new(QUEUE_CAPACITY);
             lines.push(BusPort {
                 format: Format::Fd,
                 snapshot: from_receiver,
@@ -148,14 +148,21 @@ impl Ticks {
         }
         let modes = vec![ModeChange { at: Micros(0), mode }];
         let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
-        let controller = HoldingController(Kinesthetic::new(skin).expect("a generated skin moves by itself"));
+        let controller =
+            HoldingController(KinestheticController::new(skin).expect("a generated skin moves by itself"));
         let cycle = Cycle::new(skin, Box::new(controller), Box::new(SimulatedArm::new(skin, padded(&POSE))));
-        let turn = TickDriver::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), records_in);
+        let turn = TickDriver::new(
+            cycle,
+            lines,
+            Arc::new(scenario),
+            Arc::new(SharedRunState::default()),
+            records_in,
+        );
         Self { turn, buses: inlets, records, mode, number: 0 }
     }
 
     /// Runs the ticks of one epoch, each with a new snapshot. Returns their mean times.
-    pub fn epoch(&mut self, now: impl Fn() -> u64 + Copy) -> TickCost {
+    pub fn run_epoch(&mut self, now: impl Fn() -> u64 + Copy) -> TickCost {
         for _ in 0..TICKS_PER_EPOCH {
             for ReceiverEnds { snapshot, to_loop, positions } in &mut self.buses {
                 // The epoch that was read back is that of the previous broadcast, as on a bus that works.
@@ -182,7 +189,7 @@ impl Ticks {
     /// Runs one more epoch and returns the state after it: the number of cells in the torque, the number of active
     /// cells in the central computation (`None` if there is none), and true if the robot is halted.
     pub fn state_after_epoch(&mut self, now: impl Fn() -> u64 + Copy) -> (u32, Option<u32>, bool) {
-        self.epoch(now);
+        self.run_epoch(now);
         let tick = Tick { number: self.number, time: Micros(self.number * 2_000) };
         self.turn.run_tick(tick, 0, 0, now, |_, _| true);
         self.number += 1;
@@ -206,19 +213,19 @@ mod tests {
     fn a_skin_is_spread_evenly_and_its_ticks_know_who_is_touched() {
         let whole = skin(240, BUSES).unwrap();
         for (cells, active) in [(0, 0), (30, 0), (30, 7), (240, 240)] {
-            let part = spread(&whole, cells);
+            let part = skin_with_fewer_cells(&whole, cells);
             assert_eq!(part.cells.len(), cells);
             let counts: Vec<_> = (0..BUSES).map(|bus| part.cells_on_bus(bus).count()).collect();
             assert!(counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 1, "{counts:?}");
             let target = u32::try_from(active).unwrap();
-            let mut compared = Ticks::new(&part, active, TorqueSource::Compare);
+            let mut compared = TickBench::new(&part, active, TorqueSource::Compare);
             // The loop runs for more than a hundred ticks. If the broadcasts were not read back, the robot would be
             // halted.
             for _ in 0..20 {
-                compared.epoch(|| 0);
+                compared.run_epoch(|| 0);
             }
             assert_eq!(compared.state_after_epoch(|| 0), (target, Some(target), false));
-            let mut distributed = Ticks::new(&part, active, TorqueSource::Distributed);
+            let mut distributed = TickBench::new(&part, active, TorqueSource::Distributed);
             assert_eq!(distributed.state_after_epoch(|| 0), (target, None, false));
         }
     }
@@ -227,13 +234,13 @@ mod tests {
     /// and at its end.
     #[test]
     fn a_tick_is_told_without_its_central_computation() {
-        let part = spread(&skin(BUSES, BUSES).unwrap(), BUSES);
+        let part = skin_with_fewer_cells(&skin(BUSES, BUSES).unwrap(), BUSES);
         let clock = std::cell::Cell::new(0);
         let now = || {
             clock.set(clock.get() + 1);
             clock.get()
         };
-        let took = |mode| Ticks::new(&part, 0, mode).epoch(now);
+        let took = |mode| TickBench::new(&part, 0, mode).run_epoch(now);
         assert_eq!(took(TorqueSource::Compare), TickCost { tick: 2.0, central: 1.0 });
         assert_eq!(took(TorqueSource::Distributed), TickCost { tick: 1.0, central: 0.0 });
     }

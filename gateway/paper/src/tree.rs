@@ -6,21 +6,21 @@ use std::collections::VecDeque;
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
 use cell_node::sum::{EpochStart, Sum};
-use protocol::fixed::{Acc, Q1_14};
+use protocol::fixed::{Accumulator, Q1_14};
 use protocol::id::CellId;
 use protocol::message::SkinSensors;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
-use protocol::parameters::Slots;
+use protocol::parameters::SumSchedule;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
-use model::central::Central;
+use model::central::CentralComputation;
 
 /// The number of fraction bits of a cell's exact torque that Q7.8 does not have.
 const DROPPED_BITS: u32 = 30 - 8;
 /// The interval between joint broadcasts, in µs.
-const PERIOD: u64 = 16_000;
+const JOINTS_INTERVAL_US: u64 = 16_000;
 
 /// A cell, the number of wires from it to the root, and its children, each with the port to it.
 #[derive(Clone, Debug)]
@@ -34,7 +34,7 @@ struct Branch {
 #[derive(Clone, Debug)]
 pub struct SumTree {
     skin: Skin,
-    central: Central,
+    central: CentralComputation,
     sums: Vec<Sum>,
     /// The cells, sorted so that each comes after its children.
     order: Vec<Branch>,
@@ -88,10 +88,17 @@ impl SumTree {
         let deepest = order.first().map_or(0, |branch| branch.depth);
         let mut sums = vec![Sum::default(); skin.cells.len()];
         for sum in &mut sums {
-            sum.set_slots(Some(Slots { slot_us: 600, deepest, carry }));
+            sum.set_slots(Some(SumSchedule { slot_us: 600, deepest, carry }));
         }
         let kernels = skin.cells.iter().map(|cell| Wrench::new(&skin.parameters(cell))).collect();
-        Self { central: Central::new(skin), skin: skin.clone(), sums, order, kernels, epoch: Epoch(0) }
+        Self {
+            central: CentralComputation::new(skin),
+            skin: skin.clone(),
+            sums,
+            order,
+            kernels,
+            epoch: Epoch(0),
+        }
     }
 
     /// Returns the number of cells that have a path to a root.
@@ -114,7 +121,7 @@ impl SumTree {
             let force = self.central.force(*place, sensors);
             add(&mut came.central, self.central.torque(*place, &frames, force));
             let force = Force::fuse(sensors.contact, sensors.proximity, &self.skin.parameters(cell).contact);
-            let exact = Torque::new(&kernel.jacobian(&words), force).exact();
+            let exact = Torque::new(&kernel.jacobian(&words), force).exact_torques();
             add(&mut came.truncated, exact.map(truncated));
             came.loaded = came.loaded.max(cell.joint.into());
             if let Some(own) = own.get_mut(*place) {
@@ -128,7 +135,7 @@ impl SumTree {
             let begin = EpochStart {
                 epoch: self.epoch,
                 at: Micros(0),
-                period: Span(PERIOD),
+                period: Span(JOINTS_INTERVAL_US),
                 depth: Some(*depth),
                 may_send: true,
                 children: children.iter().map(|(port, _)| 1 << port).sum(),
@@ -142,7 +149,7 @@ impl SumTree {
                     sum.receive(Micros(0), *port, epoch, words);
                 }
             }
-            let says = sum.poll_sum(Micros(PERIOD));
+            let says = sum.poll_sum(Micros(JOINTS_INTERVAL_US));
             if let (0, Some((_, words, _))) = (depth, &says) {
                 add(&mut came.sum, words.torque.map(|word| word.to_f64()));
                 came.count += usize::from(words.count);
@@ -163,6 +170,6 @@ fn add(sum: &mut [f64; MAX_JOINTS], more: [f64; MAX_JOINTS]) {
 
 /// Returns the torque in Nm after the bits below those of Q7.8 were dropped.
 #[expect(clippy::cast_precision_loss, reason = "a torque has far fewer than 2^53 steps")]
-fn truncated(exact: Acc<30>) -> f64 {
+fn truncated(exact: Accumulator<30>) -> f64 {
     (exact.steps() >> DROPPED_BITS) as f64 / 256.0
 }

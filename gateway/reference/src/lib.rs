@@ -43,7 +43,7 @@ impl ReferenceCell {
     /// quarter turns or m.
     #[must_use]
     pub fn torque(&self, joints: &[Q1_14; MAX_JOINTS], sensors: &SkinSensors) -> [i16; MAX_JOINTS] {
-        self.under(joints, Force::fuse(sensors.contact, sensors.proximity, &self.contact))
+        self.torque_words(joints, Force::fuse(sensors.contact, sensors.proximity, &self.contact))
     }
 
     /// Returns the words of the torques of a force on the cell in N, whatever its sensors measure. The force is rounded
@@ -52,10 +52,10 @@ impl ReferenceCell {
     pub fn torque_for_force(&self, joints: &[Q1_14; MAX_JOINTS], newtons: f64) -> [i16; MAX_JOINTS] {
         #[expect(clippy::cast_possible_truncation, reason = "held within what a force can be")]
         let steps = (newtons * 65_536.0).round() as i64;
-        self.under(joints, Force::from_steps(steps))
+        self.torque_words(joints, Force::from_steps(steps))
     }
 
-    fn under(&self, joints: &[Q1_14; MAX_JOINTS], force: Force) -> [i16; MAX_JOINTS] {
+    fn torque_words(&self, joints: &[Q1_14; MAX_JOINTS], force: Force) -> [i16; MAX_JOINTS] {
         Torque::new(&self.jacobian(joints), force).words(self.format)
     }
 }

@@ -11,8 +11,8 @@ use protocol::bus::is_plain_name;
 use protocol::can::Format;
 use protocol::document::DocumentError;
 use protocol::parameters::RowKind;
-use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
-use protocol::skin::{JointKind, MAX_REACH, MAX_ROBOT_JOINTS, Skin, reach};
+use protocol::skin::file::{CellFacing, DraftBus, DraftCell, SkinDraft, Value};
+use protocol::skin::{JointKind, MAX_REACH, MAX_ROBOT_JOINTS, Skin, max_frame_distance};
 use thiserror::Error;
 
 use crate::chain::{ChainJoint, UrdfChain};
@@ -173,7 +173,7 @@ pub enum ImportError {
 impl ImportError {
     /// Returns true if the error is in the cells, false if it is in the robot.
     #[must_use]
-    pub const fn is_of_cells(&self) -> bool {
+    pub const fn is_in_cells(&self) -> bool {
         !matches!(self, Self::Joints { .. } | Self::Robot { .. })
     }
 
@@ -184,10 +184,11 @@ impl ImportError {
             return Self::Robot { what: error.to_string() };
         };
         let lines_of_buses = || buses.iter().map(|bus| bus.line);
-        let found =
-            numbered(&what, "cell").map(|(index, rest)| (cells.get(index).map(|cell| cell.line), rest));
-        let found =
-            found.or_else(|| numbered(&what, "bus").map(|(index, rest)| (lines_of_buses().nth(index), rest)));
+        let found = split_table_index(&what, "cell")
+            .map(|(index, rest)| (cells.get(index).map(|cell| cell.line), rest));
+        let found = found.or_else(|| {
+            split_table_index(&what, "bus").map(|(index, rest)| (lines_of_buses().nth(index), rest))
+        });
         match found {
             Some((line, rest)) => Self::Cells { line: line.unwrap_or_default(), what: rest.to_owned() },
             None if what.starts_with("bus = ") => Self::Cells { line: 0, what },
@@ -197,7 +198,7 @@ impl ImportError {
 }
 
 /// Splits an error text such as `cell[3].node = 7: ...`, for the given table, into the number and the rest.
-fn numbered<'a>(what: &'a str, table: &str) -> Option<(usize, &'a str)> {
+fn split_table_index<'a>(what: &'a str, table: &str) -> Option<(usize, &'a str)> {
     let (number, rest) = what.strip_prefix(table)?.strip_prefix('[')?.split_once(']')?;
     Some((number.parse().ok()?, rest.trim_start_matches('.')))
 }
@@ -242,7 +243,7 @@ impl SkinImport<'_> {
         if count > MAX_ROBOT_JOINTS {
             return Err(ImportError::Joints { count });
         }
-        let on_tips: Vec<_> = self.chains.iter().map(on_tip).collect();
+        let on_tips: Vec<_> = self.chains.iter().map(cell_on_tip).collect();
         let cells = if self.cells.is_empty() { &on_tips } else { self.cells };
         let mut buses: Vec<BusAssignment> = Vec::new();
         let placed = cells.iter().map(|cell| self.place(cell, &mut buses)).collect::<Result<Vec<_>, _>>()?;
@@ -284,12 +285,12 @@ impl SkinImport<'_> {
         };
         let position = frame.frame * Point3::from(cell.position);
         let rows = self.chains.get(owner).map(UrdfChain::chain_rows).unwrap_or_default();
-        let reach = reach(rows.get(..frame.row).unwrap_or_default(), position.into());
+        let reach = max_frame_distance(rows.get(..frame.row).unwrap_or_default(), position.into());
         if reach.is_nan() || reach >= MAX_REACH {
             let ([x, y, z], link) = (cell.position, cell.link.clone());
             return Err(ImportError::Reach { line, link, x, y, z, reach });
         }
-        let bus = self.bus(cell, owner, buses)?;
+        let bus = self.assign_bus(cell, owner, buses)?;
         let Some(there) = buses.get_mut(bus) else { unreachable!("just found") };
         let holder = |node: u8| there.taken.iter().find(|(taken, _)| *taken == node).map(|(_, line)| *line);
         let node = match cell.node.map(|node| (node, holder(node))) {
@@ -318,7 +319,7 @@ impl SkinImport<'_> {
 
     /// Returns the index of a cell's bus: the bus that the cell names, or the last bus of its chain with a free node
     /// id. Adds a bus if necessary.
-    fn bus(
+    fn assign_bus(
         &self,
         cell: &CellOnLink,
         chain: usize,
@@ -380,35 +381,40 @@ impl SkinImport<'_> {
         let by_kind = |turns: f64, slides: f64| {
             move |joint: &ChainJoint| if joint.kind == JointKind::Prismatic { slides } else { turns }
         };
-        let mut draft = Draft::default();
-        draft.comment(self.command);
+        let mut draft = SkinDraft::default();
+        draft.add_comment(self.command);
         for chain in self.chains {
             let (root, tip, count, rows) = (&chain.root, &chain.tip, chain.joints.len(), chain.rows.len());
             let far = chain.residual;
-            draft.comment(&format!(
+            draft.add_comment(&format!(
                 "{root} to {tip}: {count} joints in {rows} rows, which differ from the URDF by {far:.1e} m or rad at most."
             ));
         }
         draft.set("version", Value::Integer(1));
         draft.set("name", Value::Text(self.name));
-        draft.table("[robot]", None);
+        draft.add_table_header("[robot]", None);
         draft.set("name", Value::Text(self.name));
         if let Some(urdf) = self.urdf {
             draft.set("urdf", Value::Text(urdf));
         }
         for ChainJoint { name, kind, limits, .. } in &joints {
-            draft.table("[[robot.joint]]", None);
+            draft.add_table_header("[[robot.joint]]", None);
             draft.set("name", Value::Text(name));
             draft.set("kind", Value::Text(kind.name()));
             draft.set_with_comment("limits", Value::Numbers(limits), 3, kind.unit());
         }
         self.chains.iter().for_each(|chain| add_chain(&mut draft, chain));
-        draft.paper(62.5);
+        draft.add_paper_settings(62.5);
         for bus in buses {
             let chain = self.chains.get(bus.chain).map_or("", |chain| &chain.tip);
-            draft.bus(&DraftBus { name: &bus.name, chain: Some(chain), slot_us: None, format: Format::Fd });
+            draft.add_bus(&DraftBus {
+                name: &bus.name,
+                chain: Some(chain),
+                slot_us: None,
+                format: Format::Fd,
+            });
         }
-        draft.table("[controller]", Some("M q'' + D q' = tau, joint by joint"));
+        draft.add_table_header("[controller]", Some("M q'' + D q' = tau, joint by joint"));
         draft.set("kind", Value::Text("kinesthetic"));
         draft.set_with_comment("inertia", Value::Numbers(&each(&by_kind(1.0, 10.0))), 5, "kg m2, or kg");
         draft.set_with_comment(
@@ -423,15 +429,15 @@ impl SkinImport<'_> {
             let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
             let own = self.chains.get(cell.chain).and_then(|chain| row_of(chain, cell.joint));
             let CellOnLink { link, neighbors, root, .. } = cell.cell;
-            draft.cell(&DraftCell {
+            draft.add_cell(&DraftCell {
                 remark: Some(&format!("on {link}")),
                 bus,
                 node: cell.node.into(),
                 serial: None,
                 joint: cell.joint,
                 row: Some(cell.row).filter(|row| own != Some(*row)),
-                position: cell.position.map(tidy),
-                facing: Facing::Normal(cell.normal.map(tidy)),
+                position: cell.position.map(without_residue),
+                facing: CellFacing::Normal(cell.normal.map(without_residue)),
                 neighbors: neighbors
                     .iter()
                     .any(Option::is_some)
@@ -444,12 +450,12 @@ impl SkinImport<'_> {
 }
 
 /// Writes a chain of the robot: its base and its rows.
-fn add_chain(draft: &mut Draft, chain: &UrdfChain) {
-    draft.table("[[robot.chain]]", Some("standard Denavit-Hartenberg, base to tip; m, rad"));
+fn add_chain(draft: &mut SkinDraft, chain: &UrdfChain) {
+    draft.add_table_header("[[robot.chain]]", Some("standard Denavit-Hartenberg, base to tip; m, rad"));
     draft.set("name", Value::Text(&chain.tip));
     let base = chain.below * chain.base;
     let [position, turn] = [base.translation.vector.as_slice(), base.rotation.coords.as_slice()]
-        .map(|all| all.iter().copied().map(tidy).collect::<Vec<_>>());
+        .map(|all| all.iter().copied().map(without_residue).collect::<Vec<_>>());
     let base = [("position", Value::Numbers(&position)), ("orientation", Value::Numbers(&turn))];
     draft.set_table("base", &base);
     let mut names = chain.joints.iter();
@@ -469,11 +475,11 @@ fn row_of(chain: &UrdfChain, joint: usize) -> Option<usize> {
 }
 
 /// Returns a cell at the origin of a chain's tip link, with its normal along the z axis of that link.
-fn on_tip(chain: &UrdfChain) -> CellOnLink {
+fn cell_on_tip(chain: &UrdfChain) -> CellOnLink {
     CellOnLink { link: chain.tip.clone(), normal: [0.0, 0.0, 1.0], ..CellOnLink::default() }
 }
 
 /// Returns a value for output, without rounding residues and negative zeros.
-fn tidy(value: f64) -> f64 {
+fn without_residue(value: f64) -> f64 {
     if value.abs() < 1e-12 { 0.0 } else { value }
 }

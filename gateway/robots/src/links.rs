@@ -59,7 +59,7 @@ impl Urdf {
     /// Returns [`RobotError`] if one of the joints does not exist, or does not move by itself.
     pub fn link_poses(&self, joints: &[&str]) -> Result<Vec<LinkPose>, RobotError> {
         for name in joints {
-            self.moving(name)?;
+            self.moving_joint(name)?;
         }
         let place = |name: &str| joints.iter().position(|it| *it == name);
         let pose = |joint: &UrdfJoint| {
@@ -77,7 +77,7 @@ impl Urdf {
                 motion.map(|of| LinkMotion { joint: of, slides, axis: joint.axis, multiplier, offset });
             let origin = match motion {
                 Some(_) => joint.origin,
-                None => joint.transform(multiplier * self.rest(of) + offset),
+                None => joint.transform(multiplier * self.rest_position(of) + offset),
             };
             let name = |link| self.link_name(link).to_owned();
             LinkPose { parent: name(joint.parent), child: name(joint.child), origin, motion }
@@ -90,10 +90,10 @@ impl Urdf {
     /// # Errors
     /// Returns [`RobotError`] if the joint does not exist, or does not move by itself.
     pub fn link_of(&self, joint: &str) -> Result<&str, RobotError> {
-        Ok(self.link_name(self.moving(joint)?.child))
+        Ok(self.link_name(self.moving_joint(joint)?.child))
     }
 
-    fn moving(&self, name: &str) -> Result<&UrdfJoint, RobotError> {
+    fn moving_joint(&self, name: &str) -> Result<&UrdfJoint, RobotError> {
         let moves = |joint: &&UrdfJoint| {
             let kind = matches!(
                 joint.kind,

@@ -24,7 +24,7 @@ const LENGTH_TOLERANCE_M: f64 = 1e-12;
 const SAME_PLACE_M: f64 = 1e-9;
 
 /// Minimum sine of the angle between two axes. Below it, the common normal of the axes cannot be computed precisely.
-const WELL_KNOWN_SINE: f64 = 1e-3;
+const MIN_NORMAL_SINE: f64 = 1e-3;
 
 /// Maximum distance in m of frame 0 from the origin of the first joint, and of the last frame from the origin of the
 /// last joint, both along the joint's axis.
@@ -91,7 +91,7 @@ impl DhRow {
 
     /// Returns the row with lengths that are nearly zero set to zero, and angles that are nearly multiples of a quarter
     /// turn rounded.
-    fn tidy(self) -> Self {
+    fn rounded(self) -> Self {
         let length = |value: f64| if value.abs() < LENGTH_TOLERANCE_M { 0.0 } else { value };
         // Adding zero removes the sign of a negative zero.
         let angle = |value| round_to_quarter_turn(value) + 0.0;
@@ -153,11 +153,11 @@ impl RowPath {
 
 impl Axis {
     /// Returns the point of this axis that is nearest to the other axis; `None` if it cannot be computed precisely.
-    fn foot(&self, other: &Self) -> Option<Point3<f64>> {
+    fn nearest_point_to(&self, other: &Self) -> Option<Point3<f64>> {
         let across = self.direction.cross(&other.direction);
         let between = other.point - self.point;
         let along = between.cross(&other.direction).dot(&across) / across.norm_squared();
-        (across.norm() >= WELL_KNOWN_SINE).then(|| self.point + self.direction * along)
+        (across.norm() >= MIN_NORMAL_SINE).then(|| self.point + self.direction * along)
     }
 }
 
@@ -165,7 +165,7 @@ impl Axis {
 /// along the common normals of the axes or through the origins of the joints. The shortest path is chosen, so that rows
 /// do not fold back. The origin of the last row is the point of the last axis that is nearest to `tip`. `row_cost` is
 /// the length in m that a fixed row must save.
-pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometry3<f64>, Vec<DhRow>) {
+pub(crate) fn rows_for_axes(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometry3<f64>, Vec<DhRow>) {
     let Some(first) = axes.first() else { return (Isometry3::identity(), Vec::new()) };
     let base = base(first);
     let mut ways = vec![RowPath { rows: Vec::new(), frame: base, cost: 0.0 }];
@@ -177,18 +177,18 @@ pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometr
             let local = |point: &Point3<f64>| way.frame.inverse_transform_point(point).coords;
             let Some(next) = next else {
                 let d = local(tip).z.clamp(-MAX_SHIFT_M, MAX_SHIFT_M);
-                longer.push(
-                    way.extended(
-                        &[DhRow { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.tidy()],
-                        row_cost,
-                    ),
-                );
+                longer.push(way.extended(
+                    &[DhRow { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.rounded()],
+                    row_cost,
+                ));
                 continue;
             };
             let direction = way.frame.inverse_transform_vector(&next.direction);
             let mut places = vec![local(&next.point)];
-            places.extend(axes.get(index + 2).and_then(|beyond| next.foot(beyond)).map(|foot| local(&foot)));
-            for rows in between(kind, &places, &direction) {
+            places.extend(
+                axes.get(index + 2).and_then(|beyond| next.nearest_point_to(beyond)).map(|foot| local(&foot)),
+            );
+            for rows in candidate_rows(kind, &places, &direction) {
                 let way = way.extended(&rows, row_cost);
                 // Paths that end in the same frame have the same continuations.
                 let same = |other: &&mut RowPath| {
@@ -229,26 +229,29 @@ fn base(first: &Axis) -> Isometry3<f64> {
 
 /// Returns the possible sequences of rows from a frame whose z axis is a joint axis to the next axis, which has the
 /// direction `direction` and passes through the points `places`. Each sequence is one row, or one row and fixed rows.
-fn between(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> Vec<Vec<DhRow>> {
+fn candidate_rows(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> Vec<Vec<DhRow>> {
     let Some(point) = places.first() else { return Vec::new() };
     // The point of the axis that is nearest to the frame's origin.
     let nearest = point - direction * direction.dot(point);
     let places = places.iter().copied().chain([nearest]);
     let sine = direction.x.hypot(direction.y);
     if sine < ANGLE_TOLERANCE {
-        return places.map(|place| vec![parallel(kind, &place, direction)]).collect();
+        return places.map(|place| vec![row_to_parallel_axis(kind, &place, direction)]).collect();
     }
-    let normal = (sine >= WELL_KNOWN_SINE).then(|| vec![common_normal(kind, point, direction)]);
-    normal.into_iter().chain(places.map(|place| helper(kind, &place, direction).to_vec())).collect()
+    let normal = (sine >= MIN_NORMAL_SINE).then(|| vec![common_normal(kind, point, direction)]);
+    normal
+        .into_iter()
+        .chain(places.map(|place| rows_via_helper_axis(kind, &place, direction).to_vec()))
+        .collect()
 }
 
 /// Returns the row to an axis that is parallel or opposite to the z axis. Any d is possible; the one that leads to the
 /// next joint's origin is used.
-fn parallel(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
+fn row_to_parallel_axis(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let meets = point.xy().norm() < LENGTH_TOLERANCE_M;
     let theta_offset = if meets { 0.0 } else { within_quarter_turn(point.y.atan2(point.x)) };
     let alpha = if direction.z > 0.0 { 0.0 } else { PI };
-    DhRow { kind, a: along_x(point, theta_offset), alpha, d: point.z, theta_offset }.tidy()
+    DhRow { kind, a: along_x(point, theta_offset), alpha, d: point.z, theta_offset }.rounded()
 }
 
 /// Returns the row that leads along the common normal to an axis through `point`.
@@ -259,7 +262,7 @@ fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) 
     let (sine, cosine) = theta_offset.sin_cos();
     let alpha = (sine * direction.x - cosine * direction.y).atan2(direction.z);
     let d = point.z + along * direction.z;
-    DhRow { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.tidy()
+    DhRow { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.rounded()
 }
 
 /// Returns the x coordinate of a point after a rotation of the axes by `theta` about z. It is used as the length of the
@@ -273,7 +276,7 @@ fn along_x(point: &Vector3<f64>, theta: f64) -> f64 {
 /// Returns the two rows to the next axis that lead along a helper axis. The helper axis passes through the point `at`
 /// of the next axis and is perpendicular to both axes. The result is precise even if the angle between the axes is
 /// small.
-fn helper(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [DhRow; 2] {
+fn rows_via_helper_axis(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [DhRow; 2] {
     let normal = Vector3::new(-direction.y, direction.x, 0.0).normalize();
     let row = common_normal(kind, at, &normal);
     let frame = row.transform(0.0);

@@ -14,15 +14,15 @@ impl UniqueNames {
     pub fn assign_all(&mut self, requested: Vec<String>) -> Vec<String> {
         let is_free: Vec<_> = requested.iter().map(|name| self.0.insert(name.clone())).collect();
         let numbered = requested.into_iter().zip(is_free);
-        numbered.map(|(name, is_free)| if is_free { name } else { self.numbered(&name) }).collect()
+        numbered.map(|(name, is_free)| if is_free { name } else { self.add_numbered(&name) }).collect()
     }
 
     /// Returns a unique name for the requested name, and records it as used.
     pub fn assign(&mut self, name: String) -> String {
-        if self.0.insert(name.clone()) { name } else { self.numbered(&name) }
+        if self.0.insert(name.clone()) { name } else { self.add_numbered(&name) }
     }
 
-    fn numbered(&mut self, name: &str) -> String {
+    fn add_numbered(&mut self, name: &str) -> String {
         let mut number = 2_u64;
         loop {
             let other = format!("{name}_{number}");

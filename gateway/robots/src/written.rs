@@ -18,7 +18,7 @@ use crate::taken::chain_prefixes;
 /// Name of the link that is the base of all chains.
 const BASE_LINK: &str = "base";
 /// Radius of the cylinders that stand for segments, in m.
-const RADIUS_M: f64 = 0.04;
+const SEGMENT_RADIUS_M: f64 = 0.04;
 /// Minimum length of a segment that is drawn, in m.
 const MIN_DRAWN_M: f64 = 1e-3;
 /// The effort limit in Nm or N. URDF requires one, and a skin has none.
@@ -53,11 +53,11 @@ impl Origin {
     }
 
     fn xml(&self) -> String {
-        format!("<origin xyz=\"{}\" rpy=\"{}\"/>", three(self.xyz), three(self.rpy))
+        format!("<origin xyz=\"{}\" rpy=\"{}\"/>", format_three(self.xyz), format_three(self.rpy))
     }
 }
 
-fn three(numbers: [f64; 3]) -> String {
+fn format_three(numbers: [f64; 3]) -> String {
     // Adding zero removes the sign of a negative zero.
     numbers.map(|number| format!("{}", number + 0.0)).join(" ")
 }
@@ -154,9 +154,9 @@ fn xml(name: &str, joints: &[WrittenJoint]) -> String {
     );
     for link in core::iter::once(BASE_LINK).chain(joints.iter().map(|joint| joint.link.as_str())) {
         let _ = writeln!(out, "  <link name=\"{link}\">");
-        shape(&mut out, [0.0; 3], [0.0; 3], &format!("<sphere radius=\"{RADIUS_M}\"/>"));
+        write_shape(&mut out, [0.0; 3], [0.0; 3], &format!("<sphere radius=\"{SEGMENT_RADIUS_M}\"/>"));
         for joint in joints.iter().filter(|joint| joint.parent == link) {
-            segment(&mut out, joint.origin.xyz);
+            write_segment(&mut out, joint.origin.xyz);
         }
         out.push_str("  </link>\n");
     }
@@ -174,7 +174,7 @@ fn xml(name: &str, joints: &[WrittenJoint]) -> String {
 }
 
 /// Writes a shape for the segment between the origin of a link and the next joint.
-fn segment(out: &mut String, to: [f64; 3]) {
+fn write_segment(out: &mut String, to: [f64; 3]) {
     let way = Vector3::from(to);
     let length = way.norm();
     if length < MIN_DRAWN_M {
@@ -182,11 +182,11 @@ fn segment(out: &mut String, to: [f64; 3]) {
     }
     let turn = UnitQuaternion::rotation_between(&Vector3::z(), &way)
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), core::f64::consts::PI));
-    let cylinder = format!("<cylinder radius=\"{RADIUS_M}\" length=\"{length}\"/>");
-    shape(out, (way / 2.0).into(), turn.euler_angles().into(), &cylinder);
+    let cylinder = format!("<cylinder radius=\"{SEGMENT_RADIUS_M}\" length=\"{length}\"/>");
+    write_shape(out, (way / 2.0).into(), turn.euler_angles().into(), &cylinder);
 }
 
-fn shape(out: &mut String, xyz: [f64; 3], rpy: [f64; 3], geometry: &str) {
+fn write_shape(out: &mut String, xyz: [f64; 3], rpy: [f64; 3], geometry: &str) {
     let origin = Origin { xyz, rpy }.xml();
     let _ = writeln!(
         out,

@@ -14,16 +14,16 @@ pub(super) fn check_same_skin(name: &str, skin: &Skin, recorded: &Skin) -> Resul
 
 /// Returns the name of the first difference between two skins, with the two values.
 fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
-    type Pick = fn(&Skin) -> String;
-    let all: [(&str, Pick); 6] = [
-        ("buses", |skin| list(skin.buses.iter().map(|bus| bus.name.clone()))),
-        ("joints", |skin| list(skin.robot.joints.iter().map(|joint| joint.name.clone()))),
+    type SkinProperty = fn(&Skin) -> String;
+    let all: [(&str, SkinProperty); 6] = [
+        ("buses", |skin| comma_separated_list(skin.buses.iter().map(|bus| bus.name.clone()))),
+        ("joints", |skin| comma_separated_list(skin.robot.joints.iter().map(|joint| joint.name.clone()))),
         ("cells", |skin| skin.cells.len().to_string()),
-        ("nodes", |skin| sorted(skin, |skin, cell| format!("{} {}", bus(skin, cell.bus), cell.node))),
-        ("serial numbers", |skin| sorted(skin, |_, cell| cell.serial.to_string())),
+        ("nodes", |skin| sorted_cells(skin, |skin, cell| format!("{} {}", bus(skin, cell.bus), cell.node))),
+        ("serial numbers", |skin| sorted_cells(skin, |_, cell| cell.serial.to_string())),
         ("joint_broadcast_hz", |skin| skin.timing.broadcast_hz().to_string()),
     ];
-    let differing = |(what, pick): &(&'static str, Pick)| {
+    let differing = |(what, pick): &(&'static str, SkinProperty)| {
         let (is, was) = (pick(skin), pick(recorded));
         (is != was).then(|| first_item(what, &is, &was))
     };
@@ -67,13 +67,13 @@ fn bus(skin: &Skin, bus: usize) -> &str {
     skin.buses.get(bus).map_or("", |bus| &bus.name)
 }
 
-fn sorted(skin: &Skin, text: fn(&Skin, &protocol::skin::Cell) -> String) -> String {
+fn sorted_cells(skin: &Skin, text: fn(&Skin, &protocol::skin::Cell) -> String) -> String {
     let mut all: Vec<_> = skin.cells.iter().map(|cell| text(skin, cell)).collect();
     all.sort_unstable();
     all.join(", ")
 }
 
-fn list(all: impl Iterator<Item = String>) -> String {
+fn comma_separated_list(all: impl Iterator<Item = String>) -> String {
     all.collect::<Vec<_>>().join(", ")
 }
 

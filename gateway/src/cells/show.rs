@@ -8,7 +8,7 @@ use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use model::listing::ListedCell;
 use protocol::can::Format;
 use protocol::id::CellId;
-use protocol::message::{Heartbeat, PortState, ReceivedCounts, RejectedCounts, State, Tree};
+use protocol::message::{Heartbeat, PortState, ReceivedCounts, RejectedCounts, State, TreePage};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use rustix::termios::tcgetwinsize;
@@ -25,17 +25,17 @@ pub(super) struct DescribedBus {
 }
 
 /// A column: its header, and the text of a cell if it has reported the value.
-type Column = (&'static str, fn(&CellShown) -> Option<String>);
+type Column = (&'static str, fn(&DisplayedCell) -> Option<String>);
 
 const COLUMNS: [Column; 10] = [
     ("cell", |it| text(Some(it.node))),
     ("serial", |it| text(it.serial)),
-    ("state", CellShown::state),
+    ("state", DisplayedCell::state),
     ("joint", |it| text(it.joint)),
-    ("up", |it| it.tree.as_ref().map(TreeShown::up)),
+    ("up", |it| it.tree.as_ref().map(DisplayedTree::parent_text)),
     ("depth", |it| text(it.tree.as_ref()?.depth)),
     ("ports", |it| {
-        it.ports.as_ref().map(|ports| space_separated(ports.iter().map(PortShown::neighbour_text)))
+        it.ports.as_ref().map(|ports| space_separated(ports.iter().map(DisplayedPort::neighbour_text)))
     }),
     ("hash", |it| it.hash.clone()),
     ("skin", |it| it.skin.clone()),
@@ -68,7 +68,7 @@ pub(super) struct CellList<'a> {
     bus: &'a str,
     kind: String,
     gateway_heard: bool,
-    cells: Vec<CellShown>,
+    cells: Vec<DisplayedCell>,
     /// Node ids of the skin's cells that are missing on the bus.
     #[serde(skip_serializing_if = "Option::is_none")]
     missing: Option<Vec<u8>>,
@@ -78,7 +78,7 @@ pub(super) struct CellList<'a> {
 
 impl<'a> CellList<'a> {
     /// Collects the cells of the bus, and compares them with those of a skin, if given.
-    pub(super) fn of(watch: &'a CellWatch, known: Option<&'a DescribedBus>) -> Self {
+    pub(super) fn from_watch(watch: &'a CellWatch, known: Option<&'a DescribedBus>) -> Self {
         let (bus, listing, now) = (watch.bus(), watch.listing(), watch.now());
         let missing = |known: &DescribedBus| {
             let silent = known.cells.iter().filter(|(serial, _)| listing.node_id(**serial).is_none());
@@ -88,7 +88,10 @@ impl<'a> CellList<'a> {
             bus: bus.name(),
             kind: bus.kind().to_string(),
             gateway_heard: listing.has_gateway(),
-            cells: listing.cells().map(|(node, cell)| CellShown::of(node, cell, known, now)).collect(),
+            cells: listing
+                .cells()
+                .map(|(node, cell)| DisplayedCell::from_listed(node, cell, known, now))
+                .collect(),
             missing: known.map(missing),
             file: known.map_or("", |known| &known.file),
         }
@@ -123,7 +126,7 @@ impl<'a> CellList<'a> {
     /// Formats the counts and anomalies below the table.
     fn totals(&self) -> String {
         let mut text = format!("{} cells on {} ({})", self.cells.len(), self.bus, self.kind);
-        let active = self.cells.iter().filter(|cell| cell.is("active")).count();
+        let active = self.cells.iter().filter(|cell| cell.has_state("active")).count();
         let bare = self.cells.iter().filter(|cell| cell.configured == Some(false)).count();
         for (count, what) in [(active, "in contact"), (bare, "without parameters")] {
             if count > 0 {
@@ -188,7 +191,7 @@ pub(super) fn redraw(text: &str) -> String {
 
 /// Values of one cell; unreported values are null.
 #[derive(Serialize)]
-struct CellShown {
+struct DisplayedCell {
     node: u8,
     age_s: f64,
     serial: Option<u32>,
@@ -203,15 +206,15 @@ struct CellShown {
     refused: Option<u16>,
     heard: Option<ReceivedCounts>,
     refused_by: Option<RejectedCounts>,
-    tree: Option<TreeShown>,
-    ports: Option<Vec<PortShown>>,
+    tree: Option<DisplayedTree>,
+    ports: Option<Vec<DisplayedPort>>,
     parent_changes: Option<u16>,
     #[serde(skip_serializing_if = "Option::is_none")]
     other_serial: Option<u32>,
 }
 
-impl CellShown {
-    fn of(node: u8, cell: &ListedCell, known: Option<&DescribedBus>, now: Micros) -> Self {
+impl DisplayedCell {
+    fn from_listed(node: u8, cell: &ListedCell, known: Option<&DescribedBus>, now: Micros) -> Self {
         let beat = cell.heartbeat.as_ref();
         let configured = beat.filter(|it| it.state.has(State::CONFIGURED));
         #[expect(clippy::cast_precision_loss, reason = "seconds, to the ms, which is what it is known to")]
@@ -230,15 +233,15 @@ impl CellShown {
             refused: beat.map(|it| it.rejected),
             heard: cell.pages.received,
             refused_by: cell.pages.rejected,
-            tree: cell.pages.tree.as_ref().map(TreeShown::of),
-            ports: cell.pages.ports.map(|it| it.ports.iter().map(PortShown::of).collect()),
+            tree: cell.pages.tree.as_ref().map(DisplayedTree::from_tree),
+            ports: cell.pages.ports.map(|it| it.ports.iter().map(DisplayedPort::from_port).collect()),
             parent_changes: cell.pages.ports.map(|it| it.changes),
             other_serial: cell.other_serial,
         }
     }
 
     /// Returns true if the cell has reported this state.
-    fn is(&self, state: &str) -> bool {
+    fn has_state(&self, state: &str) -> bool {
         self.state.iter().flatten().any(|name| *name == state)
     }
 
@@ -252,7 +255,7 @@ impl CellShown {
 }
 
 #[derive(Serialize)]
-struct TreeShown {
+struct DisplayedTree {
     /// Node id of the parent; 0 is the gateway's side.
     parent: Option<u8>,
     depth: Option<u8>,
@@ -261,15 +264,15 @@ struct TreeShown {
     sums_dropped: u16,
 }
 
-impl TreeShown {
-    fn of(it: &Tree) -> Self {
-        let Tree { parent, depth, sent, accepted: taken, dropped, .. } = *it;
+impl DisplayedTree {
+    fn from_tree(it: &TreePage) -> Self {
+        let TreePage { parent, depth, sent, accepted: taken, dropped, .. } = *it;
         let depth = parent.map(|_| depth);
         Self { parent, depth, sums_sent: sent, sums_taken: taken, sums_dropped: dropped }
     }
 
     /// Formats the parent of the cell.
-    fn up(&self) -> String {
+    fn parent_text(&self) -> String {
         match self.parent {
             None => "none".to_owned(),
             Some(0) => "gateway".to_owned(),
@@ -279,7 +282,7 @@ impl TreeShown {
 }
 
 #[derive(Serialize)]
-struct PortShown {
+struct DisplayedPort {
     /// Node id of the neighbour: null if the port receives nothing, 0 for a neighbour without a node id.
     node: Option<u8>,
     port: Option<u8>,
@@ -287,8 +290,8 @@ struct PortShown {
     other_version: bool,
 }
 
-impl PortShown {
-    fn of(it: &PortState) -> Self {
+impl DisplayedPort {
+    fn from_port(it: &PortState) -> Self {
         let PortState { number, port, receives: hears, works, other_version } = *it;
         Self { node: hears.then_some(number), port: hears.then_some(port), works, other_version }
     }
@@ -310,12 +313,15 @@ mod tests {
 
     #[test]
     fn places_in_the_tree_are_words() {
-        let up = |parent| TreeShown::of(&Tree { parent, ..Tree::default() }).up();
+        let up = |parent| DisplayedTree::from_tree(&TreePage { parent, ..TreePage::default() }).parent_text();
         assert_eq!([up(None), up(Some(0)), up(Some(12))], ["none", "gateway", "12"]);
         let heard = PortState { number: 12, receives: true, ..PortState::default() };
         let works = PortState { works: true, ..heard };
         let other = PortState { other_version: true, ..works };
         let all = [PortState::default(), heard, works, other];
-        assert_eq!(space_separated(all.map(|port| PortShown::of(&port).neighbour_text())), ". 12? 12 12!");
+        assert_eq!(
+            space_separated(all.map(|port| DisplayedPort::from_port(&port).neighbour_text())),
+            ". 12? 12 12!"
+        );
     }
 }

@@ -13,7 +13,9 @@ use protocol::usage::{Failure, printable};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use crate::print::{comma_separated, count, decimals, json as pretty, or_else_text, space_separated, table};
+use crate::print::{
+    comma_separated, count_with_noun, decimals, json as pretty, or_else_text, space_separated, table,
+};
 
 /// Maximum number of values listed one by one.
 const MAX_LISTED: usize = 8;
@@ -21,7 +23,7 @@ const MAX_LISTED: usize = 8;
 /// Checks the text of a scenario file against a skin, and describes the scenario.
 ///
 /// Also returns the reason if a run would refuse the scenario; a bench in virtual time may accept it.
-pub(super) fn plan(
+pub(super) fn describe_scenario(
     file: &Path,
     text: &str,
     skin: &Skin,
@@ -29,7 +31,7 @@ pub(super) fn plan(
 ) -> Result<(String, Option<Failure>), Failure> {
     let scenario = Description::parse(&file.display().to_string(), text, skin).map_err(Failure::usage)?;
     let refused = RunError::bus_fault(&scenario, skin).map(Failure::usage);
-    let plan = ScenarioPlan::of(&scenario, skin);
+    let plan = ScenarioPlan::from_scenario(&scenario, skin);
     let text = if as_json { pretty(&plan)? } else { plan.text(&file.display().to_string()) };
     Ok((text, refused))
 }
@@ -77,7 +79,7 @@ struct PlannedEvent {
 }
 
 impl ScenarioPlan {
-    fn of(scenario: &Description, skin: &Skin) -> Self {
+    fn from_scenario(scenario: &Description, skin: &Skin) -> Self {
         let joints = skin.robot.joints.len();
         let each = |values: &[f64]| values.iter().take(joints).copied().collect::<Vec<_>>();
         let how = match scenario.motion.kind {
@@ -107,8 +109,8 @@ impl ScenarioPlan {
                 }
             };
             let mut how = to_map([("force_n", json!(touch.force_n)), ("profile", profile)]);
-            how.extend(touch.values.listed().map(|(key, value)| (key.to_owned(), value)));
-            events.extend(on_cells(
+            how.extend(touch.values.key_values().map(|(key, value)| (key.to_owned(), value)));
+            events.extend(cell_events(
                 skin,
                 touch.at,
                 finite_seconds(touch.length),
@@ -167,7 +169,7 @@ impl ScenarioPlan {
         let (file, skin) = (printable(file), printable(skin));
         let head = format!(
             "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n{}{}",
-            count(events.len(), "event"),
+            count_with_noun(events.len(), "event"),
             or_else_text(touches_repeat_s.map(|period| format!("the touches repeat every {period} s\n")), ""),
             if sensors.is_empty() {
                 String::new()
@@ -208,7 +210,7 @@ impl PlannedEvent {
 }
 
 /// Creates the events of some cells: one event for each bus that has any of them.
-fn on_cells(
+fn cell_events(
     skin: &Skin,
     at: Micros,
     for_s: Option<f64>,
@@ -251,16 +253,16 @@ const fn errors(errors: &ForceErrors) -> [(&'static str, f64); 9] {
 fn fault_events(skin: &Skin, at: Micros, kind: &FaultKind) -> Vec<PlannedEvent> {
     let what = kind.name();
     match kind {
-        FaultKind::Process { cells, .. } => on_cells(skin, at, None, what, cells, &Map::new()),
+        FaultKind::Process { cells, .. } => cell_events(skin, at, None, what, cells, &Map::new()),
         FaultKind::Sensor { fault, length: span, cells } => {
             let how = match fault {
                 SensorFault::Stuck => Map::new(),
                 SensorFault::Drift { n_per_s } => to_map([("n_per_s", json!(n_per_s))]),
             };
-            on_cells(skin, at, finite_seconds(*span), what, cells, &how)
+            cell_events(skin, at, finite_seconds(*span), what, cells, &how)
         }
         FaultKind::Wire { from, to, both_ways, .. } => {
-            on_cells(skin, at, None, what, &[*from, *to], &to_map([("one_way", json!(!both_ways))]))
+            cell_events(skin, at, None, what, &[*from, *to], &to_map([("one_way", json!(!both_ways))]))
         }
         FaultKind::Bus { fault, length: span, bus, cells } => {
             let nodes = cells.iter().filter_map(|&cell| skin.cells.get(cell));

@@ -11,12 +11,12 @@ use protocol::usage::{Failure, printable};
 use serde_json::{Value, json};
 
 use crate::arguments::bus_names;
-use crate::print::{comma_separated, count, or_else_text, space_separated};
+use crate::print::{comma_separated, count_with_noun, or_else_text, space_separated};
 use crate::robot_file::{SkinRobot, urdf_path};
 
 /// Selection of the cells that are listed with or without the summary.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Listed<'a> {
+pub(super) enum ListedCells<'a> {
     None,
     All,
     /// List this cell only, without the summary.
@@ -27,19 +27,19 @@ pub(super) enum Listed<'a> {
 pub(super) fn summary(
     file: &Path,
     skin: &Skin,
-    listed: Listed<'_>,
+    listed: ListedCells<'_>,
     as_json: bool,
 ) -> Result<String, Failure> {
     if let Some(urdf) = &skin.robot.urdf {
         SkinRobot::read(skin, Some(&urdf_path(file, urdf)))?;
     }
     let is_listed = |cell: &&Cell| match listed {
-        Listed::None => false,
-        Listed::All => true,
-        Listed::Only(named) => named.fits(bus_name(skin, cell), cell.node),
+        ListedCells::None => false,
+        ListedCells::All => true,
+        ListedCells::Only(named) => named.fits(bus_name(skin, cell), cell.node),
     };
     let cells: Vec<_> = skin.cells.iter().filter(is_listed).collect();
-    if let Listed::Only(named) = listed
+    if let ListedCells::Only(named) = listed
         && cells.is_empty()
     {
         let (file, buses) = (file.display(), comma_separated(bus_names(skin)));
@@ -51,7 +51,7 @@ pub(super) fn summary(
         return crate::print::json(&skin_json(file, skin, &cells));
     }
     let lines: String = cells.iter().map(|cell| cell_line(skin, cell)).collect();
-    Ok(if let Listed::Only(_) = listed { lines } else { describe(skin) + &lines })
+    Ok(if let ListedCells::Only(_) = listed { lines } else { describe(skin) + &lines })
 }
 
 fn describe(skin: &Skin) -> String {
@@ -64,10 +64,10 @@ fn describe(skin: &Skin) -> String {
     let (name, robot_name) = (printable(name), printable(&robot.name));
     let mut text = format!(
         "{name}: {}, {}\nrobot: {}, {}\ntiming: control loop {} Hz, joints {} Hz{}, {controller}\n",
-        count(cells.len(), "cell"),
-        count(buses.len(), "bus"),
+        count_with_noun(cells.len(), "cell"),
+        count_with_noun(buses.len(), "bus"),
         robot_name,
-        count(robot.joints.len(), "joint"),
+        count_with_noun(robot.joints.len(), "joint"),
         timing.control_hz,
         timing.broadcast_hz(),
         or_else_text(every, ""),
@@ -78,7 +78,8 @@ fn describe(skin: &Skin) -> String {
         let names = space_separated(
             chain.joints.iter().filter_map(|joint| robot.joints.get(*joint)).map(|joint| &joint.name),
         );
-        let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
+        let (joints, rows) =
+            (count_with_noun(chain.joints.len(), "joint"), count_with_noun(chain.rows.len(), "row"));
         text += &format!("chain {}: {joints} in {rows}: {}\n", printable(&chain.name), printable(&names));
     }
     for (index, bus) in buses.iter().enumerate() {
@@ -92,7 +93,7 @@ fn describe(skin: &Skin) -> String {
         for cell in skin.cells_on_bus(index) {
             *by_joint.entry(cell.joint).or_default() += 1;
         }
-        let cells = count(by_joint.values().sum::<usize>(), "cell");
+        let cells = count_with_noun(by_joint.values().sum::<usize>(), "cell");
         let parts =
             comma_separated(by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")));
         let roots: Vec<_> = skin.cells_on_bus(index).filter(|cell| cell.root).map(|cell| cell.node).collect();

@@ -8,7 +8,7 @@ use protocol::id::CellId;
 use protocol::usage::Failure;
 use serde::Serialize;
 
-use crate::print::{KeyValueTable, abbreviated, count};
+use crate::print::{KeyValueTable, abbreviated, count_with_noun};
 
 /// Maximum number of cells with other node ids that get a line each.
 const MAX_CELL_LINES: usize = 8;
@@ -23,12 +23,12 @@ pub(super) struct CommissionResult<'a> {
     pub(super) seconds: f64,
     pub(super) dry_run: bool,
     pub(super) interrupted: bool,
-    pub(super) buses: Vec<BusShown<'a>>,
+    pub(super) buses: Vec<DisplayedBus<'a>>,
 }
 
 /// Result of commissioning the cells of one bus, as printed.
 #[derive(Debug, Serialize)]
-pub(super) struct BusShown<'a> {
+pub(super) struct DisplayedBus<'a> {
     name: &'a str,
     kind: &'a str,
     written: usize,
@@ -44,8 +44,10 @@ pub(super) struct BusShown<'a> {
     unknown_nodes: &'a [UnknownNode],
 }
 
-impl<'a> BusShown<'a> {
-    pub(super) fn of(CommissionedBus { name, kind, report, failure, dropped }: &'a CommissionedBus) -> Self {
+impl<'a> DisplayedBus<'a> {
+    pub(super) fn from_bus(
+        CommissionedBus { name, kind, report, failure, dropped }: &'a CommissionedBus,
+    ) -> Self {
         let Report { cells, unknown_nodes, requests, repeated, trouble: _ } = report;
         let count = |is: fn(&Outcome) -> bool| cells.iter().filter(|cell| is(&cell.outcome)).count();
         Self {
@@ -70,14 +72,14 @@ impl<'a> BusShown<'a> {
         self.cells.iter().filter_map(|it| Some((it.number.filter(|&node| node != it.described)?, it)))
     }
 
-    fn rows(&self, rows: &mut KeyValueTable) {
-        let cells = format!("{} described", count(self.cells.len(), "cell"));
+    fn add_rows(&self, rows: &mut KeyValueTable) {
+        let cells = format!("{} described", count_with_noun(self.cells.len(), "cell"));
         let others = match self.unknown_nodes.len() {
             0 => String::new(),
             1 => "1 other, left alone".to_owned(),
             count => format!("{count} others, left alone"),
         };
-        rows.section(format!("{} ({})", self.name, self.kind), cells, others);
+        rows.add_section(format!("{} ({})", self.name, self.kind), cells, others);
         let compared = "read back, and compared word by word";
         rows.row_unless_zero("written", self.written, compared);
         rows.row_unless_zero("already so", self.already_so, "by their hash; --verify reads them back");
@@ -92,10 +94,10 @@ impl<'a> BusShown<'a> {
             }
         }
         for (why, cells) in reasons {
-            rows.row(format!("  {}", abbreviated(&cells)), why, "");
+            rows.add_row(format!("  {}", abbreviated(&cells)), why, "");
         }
         if let Some(failure) = &self.failure {
-            rows.row("ended", failure, "");
+            rows.add_row("ended", failure, "");
         }
         let moved = self.renumbered_cells().count();
         rows.row_unless_zero(
@@ -152,13 +154,13 @@ impl CommissionResult<'_> {
         };
         let mut rows =
             KeyValueTable::new(self.skin, format!("{cells} cells, {:.1} s, {ended}", self.seconds), "");
-        self.buses.iter().for_each(|bus| bus.rows(&mut rows));
-        rows.text()
+        self.buses.iter().for_each(|bus| bus.add_rows(&mut rows));
+        rows.to_text()
     }
 
     /// Returns the failure with which the program ends if a cell is not commissioned. Call it after all output.
     pub(super) fn outcome(&self) -> Result<(), Failure> {
-        let sum = |part: fn(&BusShown<'_>) -> usize| self.buses.iter().map(part).sum::<usize>();
+        let sum = |part: fn(&DisplayedBus<'_>) -> usize| self.buses.iter().map(part).sum::<usize>();
         let (cells, failed) = (sum(|bus| bus.cells.len()), sum(|bus| bus.failed));
         let are = if failed == 1 { "is" } else { "are" };
         let what = format!("{failed} of {cells} cells {are} not commissioned");

@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use analysis::compare::{self, Both, JointTrace};
+use analysis::compare::{self, JointTrace, PerCapture};
 use model::decode::Decoder;
 use protocol::input::can_be_read_again;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use protocol::usage::Failure;
-use trace::capture::{Entry, Reader};
+use trace::capture::{CaptureEntry, Reader};
 
 /// Finds the parts of a recording after the first file: `run-1.mcap`, `run-2.mcap` after `run.mcap`.
 pub(super) fn recording_parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
@@ -22,14 +22,14 @@ pub(super) fn recording_parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
     if !can_be_read_again(first) {
         return Ok(files);
     }
-    let Some((began, 0)) = part(first) else { return Ok(files) };
+    let Some((began, 0)) = recording_part(first) else { return Ok(files) };
     let (Some(stem), Some(end)) = (first.file_stem(), first.extension()) else { return Ok(files) };
     for number in 1_u32.. {
         let mut name = stem.to_owned();
         name.push(format!("-{number}."));
         name.push(end);
         let next = first.with_file_name(name);
-        if part(&next).is_none_or(|part| part != (began.clone(), number)) {
+        if recording_part(&next).is_none_or(|part| part != (began.clone(), number)) {
             break;
         }
         files.push(next);
@@ -38,7 +38,7 @@ pub(super) fn recording_parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
 }
 
 /// Returns the start of a recording, by its metadata, and the number of the part that a file holds.
-fn part(file: &Path) -> Option<(String, u32)> {
+fn recording_part(file: &Path) -> Option<(String, u32)> {
     let reader = can_be_read_again(file).then(|| Reader::open(file).ok()).flatten()?;
     let fact = |record, key| reader.extras().metadata_value(record, key).map(str::to_owned);
     Some((fact("program", "began_ns")?, fact("part", "number")?.parse().ok()?))
@@ -46,13 +46,17 @@ fn part(file: &Path) -> Option<(String, u32)> {
 
 /// Returns for each capture the number of its first joints within the run. Reads a capture that starts in the middle of
 /// a run once more for that, if it can be read twice.
-pub(super) fn first_numbers(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<Both<Option<u64>>, Failure> {
-    let unknown = Both { a: None, b: None };
+pub(super) fn first_numbers(
+    files: &PerCapture<Vec<PathBuf>>,
+    skin: &Skin,
+) -> Result<PerCapture<Option<u64>>, Failure> {
+    let unknown = PerCapture { a: None, b: None };
     if ![&files.a, &files.b].iter().all(|files| files.iter().all(|file| can_be_read_again(file))) {
         return Ok(unknown);
     }
     let begins = |files: &[PathBuf]| {
-        let is_later = files.first().and_then(|first| part(first)).is_some_and(|(_, number)| number > 0);
+        let is_later =
+            files.first().and_then(|first| recording_part(first)).is_some_and(|(_, number)| number > 0);
         !is_later && read_joints(files, skin, true).is_none_or(|trace| trace.first() == Some(0))
     };
     if begins(&files.a) && begins(&files.b) {
@@ -64,15 +68,15 @@ pub(super) fn first_numbers(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<B
 
 /// Reads the joints of a capture, or only the first. Errors are reported later, when it is compared.
 fn read_joints(files: &[PathBuf], skin: &Skin, is_first_enough: bool) -> Option<JointTrace> {
-    let mut reader = super::captures(files, |file| Box::new(file)).ok()?;
+    let mut reader = super::open_capture(files, |file| Box::new(file)).ok()?;
     let mut decoder = Decoder::new(None);
     let mut trace = JointTrace::new(skin);
     while let Ok(Some(entry)) = reader.next() {
-        let Entry::Frame(record) = entry else { continue };
+        let CaptureEntry::Frame(record) = entry else { continue };
         let nanos = record.time.nanos;
         let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
         if let Some(message) = decoded.message() {
-            trace.take(nanos, record.interface, message);
+            trace.record(nanos, record.interface, message);
         }
         if is_first_enough && trace.first().is_some() {
             break;

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use analysis::compare::{
-    ASPECTS, Both, CaptureFigures, CaptureSide, CellRow, CompareReport, FirstDifference, ReplyCounts,
+    ASPECTS, CaptureFigures, CaptureSide, CellRow, CompareReport, FirstDifference, PerCapture, ReplyCounts,
 };
 use model::quantiles::Quantiles;
 use protocol::usage::printable;
 
-use crate::junit::{Case, Outcome, Suite};
-use crate::print::{abbreviated, comma_separated, count, decimals, or_else_text, table};
+use crate::junit::{Outcome, TestCase, TestSuite};
+use crate::print::{abbreviated, comma_separated, count_with_noun, decimals, or_else_text, table};
 
 /// Width of the tables in columns.
 const TABLE_WIDTH: u16 = 80;
@@ -29,7 +29,7 @@ pub(super) struct CaptureNames<'a> {
 /// Result of a comparison with its inputs, to be printed.
 #[derive(Debug)]
 pub(super) struct ComparisonText<'a> {
-    pub(super) inputs: Both<CaptureNames<'a>>,
+    pub(super) inputs: PerCapture<CaptureNames<'a>>,
     /// Path given by the option `--skin`.
     pub(super) skin: Option<&'a Path>,
     pub(super) report: &'a CompareReport,
@@ -45,7 +45,7 @@ impl ComparisonText<'_> {
         text += &self.table();
         text += &self.cells();
         if let Some(first) = &self.report.first {
-            text += &self.first(first);
+            text += &self.first_difference_text(first);
         }
         text
     }
@@ -55,14 +55,14 @@ impl ComparisonText<'_> {
         if self.report.equal {
             let tolerated = torques.tolerated + sums.tolerated + self.report.joints.tolerated;
             let within = if tolerated > 0 { " within the tolerance" } else { "" };
-            let mut all = vec![count(epochs.compared, "epoch")];
+            let mut all = vec![count_with_noun(epochs.compared, "epoch")];
             let replies = [(torques, "torque"), (sums, "sum")];
             all.extend(
                 replies
                     .iter()
                     .map(|(it, name)| (it.equal + it.tolerated, name))
                     .filter(|(count, _)| *count > 0)
-                    .map(|(number, name)| count(number, name)),
+                    .map(|(number, name)| count_with_noun(number, name)),
             );
             return format!("equal{within}: {}", comma_separated(all));
         }
@@ -78,8 +78,16 @@ impl ComparisonText<'_> {
     }
 
     fn table(&self) -> String {
-        let CompareReport { captures: Both { a, b }, epochs, joints, halts, contacts, torques, sums, .. } =
-            self.report;
+        let CompareReport {
+            captures: PerCapture { a, b },
+            epochs,
+            joints,
+            halts,
+            contacts,
+            torques,
+            sums,
+            ..
+        } = self.report;
         let mut rows = Vec::new();
         let mut row = |name: &str, a: String, b: String, both: String| {
             rows.push(vec![name.to_owned(), a, b, both]);
@@ -166,7 +174,11 @@ impl ComparisonText<'_> {
             }
             let _ = writeln!(text, "{table}");
             if total > MAX_CELLS {
-                let _ = writeln!(text, "and {}; --json has all", count(total - MAX_CELLS, "further cell"));
+                let _ = writeln!(
+                    text,
+                    "and {}; --json has all",
+                    count_with_noun(total - MAX_CELLS, "further cell")
+                );
             }
         }
         for (letter, only_in) in [("A", "a"), ("B", "b")] {
@@ -180,7 +192,7 @@ impl ComparisonText<'_> {
     }
 
     /// Describes the first difference, and names commands that show more.
-    fn first(&self, first: &FirstDifference) -> String {
+    fn first_difference_text(&self, first: &FirstDifference) -> String {
         let FirstDifference { what, bus, epoch, number, time_s, words, values, .. } = first;
         let cell = first.cell.map_or_else(String::new, |cell| format!(" of cell {cell}"));
         let joint = first.joint.map_or_else(String::new, |joint| format!(", joint {joint}"));
@@ -205,7 +217,7 @@ impl ComparisonText<'_> {
             let _ = writeln!(text, "  {letter}  {time}{has}");
         }
         if let Some(steps) = first.steps {
-            let _ = writeln!(text, "  {} apart", count(steps, "step"));
+            let _ = writeln!(text, "  {} apart", count_with_noun(steps, "step"));
         }
         if first.cell.is_some() && *what != "contact" {
             let inputs = match (first.inputs.as_slice(), first.unknown_inputs.as_slice()) {
@@ -270,16 +282,17 @@ impl ComparisonText<'_> {
     }
 
     /// Returns a JUnit report with a test case for each aspect of the comparison.
-    pub(super) fn junit(&self, took: Duration) -> Suite {
-        let first = self.report.first.as_ref().map(|first| self.first(first)).unwrap_or_default();
+    pub(super) fn junit(&self, took: Duration) -> TestSuite {
+        let first =
+            self.report.first.as_ref().map(|first| self.first_difference_text(first)).unwrap_or_default();
         let cases = ASPECTS.into_iter().map(|aspect| {
             let outcome = match self.report.differs.contains(&aspect) {
                 false => Outcome::Passed,
-                true => Outcome::Failed { message: self.failed(aspect), text: first.clone() },
+                true => Outcome::Failed { message: self.failure_text(aspect), text: first.clone() },
             };
-            Case { class: "skinbus.compare".to_owned(), name: aspect.to_owned(), outcome }
+            TestCase { class: "skinbus.compare".to_owned(), name: aspect.to_owned(), outcome }
         });
-        Suite {
+        TestSuite {
             name: format!("{} and {}", self.inputs.a.name, self.inputs.b.name),
             seconds: took.as_secs_f64(),
             cases: cases.collect(),
@@ -287,7 +300,7 @@ impl ComparisonText<'_> {
     }
 
     /// Describes the differences of one aspect in one line.
-    fn failed(&self, aspect: &str) -> String {
+    fn failure_text(&self, aspect: &str) -> String {
         let CompareReport { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = self.report;
         let missing = |a, b| format!("{a} missing in A, {b} in B");
         match aspect {
@@ -296,7 +309,7 @@ impl ComparisonText<'_> {
             "joints" => format!("{} different, at most {} steps", joints.different, joints.max_steps),
             "halts" => format!("{} only in A, {} only in B", halts.only_a, halts.only_b),
             "contacts" => format!("{} only in A, {} only in B", contacts.only.only_a, contacts.only.only_b),
-            "cells" => count(extra_cells.len(), "extra cell"),
+            "cells" => count_with_noun(extra_cells.len(), "extra cell"),
             _ => {
                 let replies = if aspect == "sums" { sums } else { torques };
                 format!("{}, {}", replies_text(replies), missing(replies.missing_in_a, replies.missing_in_b))

@@ -9,8 +9,8 @@ use conformance::findings::{Finding, Verdict};
 use protocol::can::Format;
 use serde::Serialize;
 
-use crate::junit::{Case, Outcome, Suite};
-use crate::print::{comma_separated, count, readable, table};
+use crate::junit::{Outcome, TestCase, TestSuite};
+use crate::print::{comma_separated, count_with_noun, limit_width, table};
 
 /// Result of a conformance test, as JSON.
 #[derive(Debug, Serialize)]
@@ -66,7 +66,7 @@ impl ConformanceResult {
             let about = if more.is_empty() { title.to_owned() } else { format!("{title}: {more}") };
             vec![it.requirement.id.to_owned(), verdict.to_owned(), about]
         });
-        let table = readable(table(["requirement", "", ""], rows, |_| false));
+        let table = limit_width(table(["requirement", "", ""], rows, |_| false));
         let mut text = format!("{table}\n");
         for it in &self.requirements {
             let Verdict::Failed { what, failures, frames } = &it.verdict else { continue };
@@ -109,18 +109,18 @@ impl ConformanceResult {
                 }
                 Verdict::Open => Outcome::Skipped { why: None },
             };
-            Case {
+            TestCase {
                 class: document.as_str().unwrap_or_default().to_owned(),
                 name: format!("{} {}", requirement.id, requirement.title),
                 outcome,
             }
         };
-        let suite = Suite {
+        let suite = TestSuite {
             name: format!("cell {} on {}", self.node, self.bus),
             seconds: self.seconds,
             cases: self.requirements.iter().map(case).collect(),
         };
-        suite.text()
+        suite.to_xml()
     }
 }
 
@@ -129,7 +129,7 @@ fn verdict_text(verdict: &Verdict) -> (&'static str, String) {
     match verdict {
         Verdict::Passed { checks, but } => {
             let but = but.as_ref().map_or_else(String::new, |but| format!("; not tested: {but}"));
-            ("passed", format!("{}{but}", count(*checks, "check")))
+            ("passed", format!("{}{but}", count_with_noun(*checks, "check")))
         }
         Verdict::Failed { .. } => ("FAILED", "see below".to_owned()),
         Verdict::NotApplicable { why } => ("not applicable", why.clone()),

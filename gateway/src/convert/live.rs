@@ -15,14 +15,14 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use trace::capture::convert::{CaptureWriter, EntrySink, Origin};
-use trace::capture::log::{Style, WriteOutcome};
-use trace::capture::{CaptureFormat, Entry};
+use trace::capture::convert::{CaptureWriter, EntrySink, RecordingOrigin};
+use trace::capture::log::{LogStyle, WriteOutcome};
+use trace::capture::{CaptureEntry, CaptureFormat};
 use trace::files::LogFile;
 use trace::recording::names::{self, PartFile};
 
 /// Maximum time after which written entries are in the file.
-const KEEP_INTERVAL: Duration = Duration::from_millis(50);
+const FLUSH_INTERVAL: Duration = Duration::from_millis(50);
 /// Number of bytes written to a recording at once.
 const WRITE_BYTES: usize = 64 << 10;
 /// Stack size in bytes of the writing thread, which calls no deep functions.
@@ -52,7 +52,7 @@ impl Write for GrowingFile {
 }
 
 /// An output, and what has happened since its last flush.
-struct State {
+struct OutputState {
     output: CaptureWriter<GrowingFile>,
     /// Set by each write, cleared when everything is in the file.
     is_dirty: bool,
@@ -63,13 +63,13 @@ struct State {
 
 #[derive(Default)]
 struct SharedOutput {
-    state: Mutex<Option<State>>,
+    state: Mutex<Option<OutputState>>,
     /// Condition that wakes the writing thread at the end.
     over: Condvar,
 }
 
 impl SharedOutput {
-    fn with<T>(&self, act: impl FnOnce(&mut State) -> io::Result<T>) -> io::Result<T> {
+    fn with_state<T>(&self, act: impl FnOnce(&mut OutputState) -> io::Result<T>) -> io::Result<T> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let state = state.as_mut().ok_or_else(|| io::Error::other("it has ended"))?;
         match state.failed.take() {
@@ -81,11 +81,11 @@ impl SharedOutput {
     /// Flushes written entries at intervals, until the output is finished or closed.
     fn flush_periodically(&self) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        while let Some(State { output, is_dirty, failed, is_over: false }) = state.as_mut() {
+        while let Some(OutputState { output, is_dirty, failed, is_over: false }) = state.as_mut() {
             if std::mem::take(is_dirty) && failed.is_none() {
                 *failed = output.flush_all().err();
             }
-            let waited = self.over.wait_timeout(state, KEEP_INTERVAL);
+            let waited = self.over.wait_timeout(state, FLUSH_INTERVAL);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
     }
@@ -106,7 +106,7 @@ impl GrowingCapture {
     pub(super) fn create(
         path: &Path,
         force: bool,
-        (format, style, of_log): (CaptureFormat, Style, bool),
+        (format, style, of_log): (CaptureFormat, LogStyle, bool),
         stopped: &AtomicBool,
     ) -> io::Result<Self> {
         let (output, part) = match format {
@@ -118,12 +118,12 @@ impl GrowingCapture {
                 let (part, mut file) = PartFile::create(path.to_owned())?;
                 let begun = file.rewind().and_then(|()| {
                     let out = GrowingFile::Part(BufWriter::with_capacity(WRITE_BYTES, file.try_clone()?));
-                    CaptureWriter::new_mcap(out, Origin { of_log, file: Some(&file.metadata()?) })
+                    CaptureWriter::new_mcap(out, RecordingOrigin { of_log, file: Some(&file.metadata()?) })
                 });
                 (begun.inspect_err(|_| part.remove())?, Some((part, file)))
             }
         };
-        let state = State { output, is_dirty: false, failed: None, is_over: false };
+        let state = OutputState { output, is_dirty: false, failed: None, is_over: false };
         let meeting = Arc::new(SharedOutput { state: Mutex::new(Some(state)), ..SharedOutput::default() });
         let keeping = Arc::clone(&meeting);
         let keeper =
@@ -144,7 +144,7 @@ impl GrowingCapture {
 
     /// Finishes the file, and gives a recording its name.
     pub(super) fn finish(mut self) -> io::Result<()> {
-        let ended = self.end(|state| {
+        let ended = self.end_output(|state| {
             state.output.finish()?;
             Ok(())
         });
@@ -160,13 +160,13 @@ impl GrowingCapture {
     /// Closes the unfinished file, which keeps the entries written so far.
     pub(super) fn close(mut self) {
         // The reason why the conversion ended has been reported already.
-        let _ = self.end(|state| state.output.flush_all());
+        let _ = self.end_output(|state| state.output.flush_all());
     }
 
     /// Closes the output, and removes its file unless it is a former file that was to be overwritten.
     pub(super) fn discard(mut self) {
-        let is_there = self.part.is_some() || self.meeting.with(|_| Ok(())).is_ok();
-        let _ = self.end(|_| Ok(()));
+        let is_there = self.part.is_some() || self.meeting.with_state(|_| Ok(())).is_ok();
+        let _ = self.end_output(|_| Ok(()));
         match &self.part {
             Some((part, _)) => part.remove(),
             // The former file is replaced only when the first line is written, so before that it must stay.
@@ -176,8 +176,8 @@ impl GrowingCapture {
     }
 
     /// Ends the writing thread, then the output by calling `end`.
-    fn end(&mut self, end: impl FnOnce(&mut State) -> io::Result<()>) -> io::Result<()> {
-        let ended = self.meeting.with(|state| {
+    fn end_output(&mut self, end: impl FnOnce(&mut OutputState) -> io::Result<()>) -> io::Result<()> {
+        let ended = self.meeting.with_state(|state| {
             state.is_over = true;
             end(state)
         });
@@ -192,15 +192,15 @@ impl GrowingCapture {
 }
 
 impl EntrySink for GrowingCapture {
-    fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
-        self.meeting.with(|state| {
+    fn write(&mut self, entry: &CaptureEntry<'_>) -> io::Result<WriteOutcome> {
+        self.meeting.with_state(|state| {
             state.is_dirty = true;
             state.output.write(entry)
         })
     }
 
     fn flush_lines(&mut self) -> io::Result<()> {
-        self.meeting.with(|state| state.output.flush_lines())
+        self.meeting.with_state(|state| state.output.flush_lines())
     }
 }
 

@@ -56,7 +56,7 @@ fn header(skin: &Skin) -> Vec<String> {
 }
 
 /// Formats a number with all its digits, and with an exponent if it is small.
-fn digits(value: f64) -> String {
+fn format_number(value: f64) -> String {
     format!("{value:?}")
 }
 
@@ -74,11 +74,11 @@ impl<W: Write> TorqueRows<W> {
         let mut row = vec![format!("{seconds:.9}"), epoch.to_string()];
         let joints = positions.iter().zip(&explanation.total).zip(&self.summed);
         for ((position, total), summed) in joints {
-            let of_words = |value: f64| if *summed { String::new() } else { digits(value) };
+            let of_words = |value: f64| if *summed { String::new() } else { format_number(value) };
             row.extend([
-                position.map_or_else(String::new, digits),
+                position.map_or_else(String::new, format_number),
                 of_words(total.words_nm),
-                digits(total.central_nm),
+                format_number(total.central_nm),
                 of_words(total.difference_nm),
             ]);
         }

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use analysis::explain::other_robot_text;
 use analysis::stats::{Stats, StatsReport};
 use model::decode::pick::FrameFilter;
-use model::decode::settle::Settler;
+use model::decode::settle::OrderedDecoder;
 use model::decode::{Decoded, json};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
@@ -19,7 +19,7 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use protocol::usage::printable;
 
-use crate::output::note;
+use crate::output::print_note;
 use crate::print::{GREEN, PLAIN, RED, YELLOW, comma_separated, escape_controls};
 
 /// Colours of a terminal.
@@ -41,7 +41,7 @@ pub(super) enum OutputStyle {
 }
 
 /// A frame that waits for the rest of its packet before it can be decoded.
-struct Waiting {
+struct PendingFrame {
     time: Timestamp,
     bus: Arc<str>,
     units: Units,
@@ -52,7 +52,7 @@ struct Waiting {
 /// Decodes, filters and shows frames.
 pub(super) struct FrameOutput<W> {
     out: W,
-    settler: Settler<Waiting>,
+    settler: OrderedDecoder<PendingFrame>,
     /// Bus of the last frame, with its units.
     bus: Arc<str>,
     units: Units,
@@ -83,7 +83,7 @@ impl<W: Write> FrameOutput<W> {
         let absent = pick.bus_names().map(str::to_owned).collect();
         Self {
             out,
-            settler: Settler::new(format),
+            settler: OrderedDecoder::new(format),
             absent,
             bus: Arc::from(""),
             units: Units::default(),
@@ -98,7 +98,7 @@ impl<W: Write> FrameOutput<W> {
     }
 
     /// Sets the time in ns since 1970 from which seconds count. Call it before the first frame.
-    pub(super) const fn count_from(&mut self, zero: u64) {
+    pub(super) const fn set_zero_time(&mut self, zero: u64) {
         self.zero = Some(zero);
     }
 
@@ -113,7 +113,7 @@ impl<W: Write> FrameOutput<W> {
 
     /// Adds the next frame. It is shown as soon as its packet is complete or known to be incomplete, if the filters
     /// select it.
-    pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<()> {
+    pub(super) fn add_frame(&mut self, record: &Record<'_>) -> io::Result<()> {
         let Record { time, interface, frame, direction } = *record;
         if *self.bus != *interface {
             self.bus = Arc::from(interface);
@@ -121,7 +121,7 @@ impl<W: Write> FrameOutput<W> {
             let described = self.described.iter().find(|(name, ..)| name == interface);
             self.units = described.map_or_else(Units::default, |(_, units, _)| *units);
         }
-        let waiting = Waiting { time, bus: Arc::clone(&self.bus), units: self.units, frame, direction };
+        let waiting = PendingFrame { time, bus: Arc::clone(&self.bus), units: self.units, frame, direction };
         self.settler.push(Micros(time.nanos / 1_000), interface, &frame, waiting);
         self.show_settled()
     }
@@ -147,7 +147,7 @@ impl<W: Write> FrameOutput<W> {
     /// Shows the frames whose meaning is settled.
     fn show_settled(&mut self) -> io::Result<()> {
         while self.remaining > 0
-            && let Some((Waiting { time, bus, units, frame, direction }, decoded)) = self.settler.pop()
+            && let Some((PendingFrame { time, bus, units, frame, direction }, decoded)) = self.settler.pop()
         {
             self.check_robot(&bus, &decoded);
             let is_described = self.described.iter().any(|(name, ..)| **name == *bus);
@@ -163,7 +163,7 @@ impl<W: Write> FrameOutput<W> {
     }
 
     /// Returns true if no further frames are to be shown.
-    pub(super) const fn has_enough(&self) -> bool {
+    pub(super) const fn is_limit_reached(&self) -> bool {
         self.remaining == 0
     }
 
@@ -176,7 +176,7 @@ impl<W: Write> FrameOutput<W> {
         if let Some(at) = self.described.iter().position(is_other) {
             let (name, _, chain) = self.described.remove(at);
             let another = other_robot_text(&name, came, chain);
-            note(format_args!(
+            print_note(format_args!(
                 "{another}; its torques are read as Q3.12 and joints as revolute from here on"
             ));
             self.bus = Arc::from("");
@@ -237,16 +237,16 @@ impl<W: Write> FrameOutput<W> {
     }
 
     /// Counts frames that were lost before this point.
-    pub(super) fn dropped(&mut self, bus: &str, frames: u64) {
+    pub(super) fn count_dropped(&mut self, bus: &str, frames: u64) {
         if let OutputStyle::Stats(stats) = &mut self.how {
             stats.record_dropped(bus, frames);
         }
     }
 
     /// Notes that the frames have no valid times, so that statistics give no rates.
-    pub(super) const fn without_times(&mut self) {
+    pub(super) const fn disable_rates(&mut self) {
         if let OutputStyle::Stats(stats) = &mut self.how {
-            stats.without_times();
+            stats.mark_untimed();
         }
     }
 
@@ -289,8 +289,8 @@ mod tests {
         let pick = FrameFilter::default();
         let mut show = FrameOutput::new(Vec::new(), None, pick, false, how, 1);
         let frame = candump::parse_frame("123#00").unwrap();
-        let time = Timestamp::six_digits(1_000_000_000);
-        show.frame(&Record { time, interface: bus, frame, direction: None }).unwrap();
+        let time = Timestamp::with_six_digits(1_000_000_000);
+        show.add_frame(&Record { time, interface: bus, frame, direction: None }).unwrap();
         show.finish().unwrap();
         String::from_utf8(show.out).unwrap()
     }

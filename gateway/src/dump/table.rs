@@ -15,7 +15,7 @@ use crate::print::{
 /// Formats the whole report: the capture, each bus, and each bus's cells.
 pub(super) fn text(name: &str, what: &str, report: &StatsReport, extras: Option<&RecordingExtras>) -> String {
     let head = format!("{what}, {:.3} s", report.duration_s);
-    let mut rows = KeyValueTable::new(name, head, print::count(report.frames, "frame"));
+    let mut rows = KeyValueTable::new(name, head, print::count_with_noun(report.frames, "frame"));
     rows.row_unless_zero("frames before the one before them", report.times_backwards, "times run backwards");
     rows.row_unless_zero("frames missing", report.dropped, "lost by the recorder");
     rows.row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
@@ -25,7 +25,7 @@ pub(super) fn text(name: &str, what: &str, report: &StatsReport, extras: Option<
     if let Some(extras) = extras {
         extra_rows(&mut rows, extras);
     }
-    let mut text = rows.text();
+    let mut text = rows.to_text();
     for bus in &report.buses {
         if !bus.cells.is_empty() {
             text += &format!("\n{}\n", cells(bus));
@@ -48,15 +48,19 @@ fn seconds_text(span_s: f64) -> String {
 }
 
 fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
-    rows.section(&bus.bus, print::count(bus.frames, "frame"), per_s(bus.frames_per_s, duration_s));
+    rows.add_section(
+        &bus.bus,
+        print::count_with_noun(bus.frames, "frame"),
+        per_s(bus.frames_per_s, duration_s),
+    );
     for kind in &bus.kinds {
-        rows.row(kind.kind, kind.packets, per_s(kind.packets_per_s, kind.span_s));
+        rows.add_row(kind.kind, kind.packets, per_s(kind.packets_per_s, kind.span_s));
     }
     let Epochs { first, last, missing, repeated, jumps } = bus.epochs;
     if let (Some(first), Some(last)) = (first, last) {
         let odd = [(missing, "missing"), (repeated, "repeated"), (jumps, "restarts")];
         let odd = comma_separated(odd.map(|(count, what)| format!("{count} {what}")));
-        rows.row("epochs", format!("{first} to {last}"), odd);
+        rows.add_row("epochs", format!("{first} to {last}"), odd);
     }
     rows.row_unless_zero(
         "wires",
@@ -65,34 +69,34 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
     );
     let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
     let reasons = comma_separated(refused.iter().map(|(reason, count)| format!("{count} {reason}")));
-    rows.row("damaged or refused", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
+    rows.add_row("damaged or refused", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
     let ForeignFrames { standard, extended, remote, error, packets_by_chance, .. } = bus.foreign;
-    rows.row("foreign", bus.foreign.frames, "");
+    rows.add_row("foreign", bus.foreign.frames, "");
     rows.row_unless_zero("  11-bit identifiers", standard, "");
     rows.row_unless_zero("  29-bit identifiers", extended, "");
     rows.row_unless_zero("  remote frames", remote, "");
     rows.row_unless_zero("  error frames", error, comma_separated(error_counts(&bus.foreign)));
     if packets_by_chance >= 0.05 {
         let chance = format!("{packets_by_chance:.1}");
-        rows.row("  packets by chance", chance, "expected");
+        rows.add_row("  packets by chance", chance, "expected");
     }
     let why = if bus.dropped > 0 { "lost by the recorder" } else { "" };
-    rows.row("frames missing", bus.dropped, why);
+    rows.add_row("frames missing", bus.dropped, why);
 }
 
 /// Adds rows on the contents of an MCAP recording other than frames.
 fn extra_rows(rows: &mut KeyValueTable, extras: &RecordingExtras) {
     if !extras.topics.is_empty() {
-        rows.section("other topics", "messages", "");
+        rows.add_section("other topics", "messages", "");
     }
     for Topic { name, schema, messages } in &extras.topics {
-        rows.row(name, messages, schema);
+        rows.add_row(name, messages, schema);
     }
     if !extras.attachments.is_empty() {
-        rows.section("attachments", "bytes", "");
+        rows.add_section("attachments", "bytes", "");
     }
     for (name, bytes) in &extras.attachments {
-        rows.row(name, bytes.len(), "");
+        rows.add_row(name, bytes.len(), "");
     }
 }
 
@@ -154,7 +158,7 @@ type Column<'a> = (&'a str, fn(&CellReport) -> Option<String>);
 /// Formats a table with one line per cell, without empty columns (unanswered, lost, ...).
 fn cells(bus: &BusReport) -> Table {
     // A zero is left blank.
-    fn some(count: u64) -> Option<String> {
+    fn blank_if_zero(count: u64) -> Option<String> {
         (count > 0).then(|| count.to_string())
     }
     const STATE: &str = "last state";
@@ -165,20 +169,20 @@ fn cells(bus: &BusReport) -> Table {
         ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
         ("in s", |cell| cell.torques_per_s.map(|_| seconds_text(cell.torques_span_s))),
         ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),
-        ("unanswered", |cell| some(cell.unanswered)),
-        ("twice", |cell| some(cell.repeated)),
-        ("sums", |cell| some(cell.sums)),
-        ("again", |cell| some(cell.resent)),
+        ("unanswered", |cell| blank_if_zero(cell.unanswered)),
+        ("twice", |cell| blank_if_zero(cell.repeated)),
+        ("sums", |cell| blank_if_zero(cell.sums)),
+        ("again", |cell| blank_if_zero(cell.resent)),
         ("parent", |cell| match cell.parent? {
             0 => Some("gateway".to_owned()),
             parent => Some(parent.to_string()),
         }),
         ("depth", |cell| cell.depth.map(|depth| depth.to_string())),
-        ("satur.", |cell| some(cell.saturated)),
+        ("satur.", |cell| blank_if_zero(cell.saturated)),
         ("beats", |cell| Some(cell.heartbeats.to_string())),
-        ("refused", |cell| some(cell.refused?.into())),
-        ("lost", |cell| some(cell.lost)),
-        ("starts", |cell| some(cell.restarts)),
+        ("refused", |cell| blank_if_zero(cell.refused?.into())),
+        ("lost", |cell| blank_if_zero(cell.lost)),
+        ("starts", |cell| blank_if_zero(cell.restarts)),
         (STATE, |cell| Some(space_separated(&cell.state)).filter(|state| !state.is_empty())),
     ];
     let (heads, lines) = drop_empty_columns(columns, &bus.cells, "");

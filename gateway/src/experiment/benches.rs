@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use bench::summary::Outcome;
 use paper::arm::{self, Reply};
-use paper::moving::Run;
+use paper::moving::BenchRun;
 use paper::scale::ScaleBench;
 use paper::{Effort, recorded};
 use protocol::id::CellId;
@@ -18,13 +18,13 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
-use trace::files::write_whole;
+use trace::files::write_atomically;
 
 use crate::buses;
 
 /// Settings that all benches share.
 #[derive(Debug)]
-pub(super) struct Benches {
+pub(super) struct BenchRunner {
     /// Directory for the skins, scenarios, recordings and summaries of the benches.
     pub(super) folder: PathBuf,
     /// Flag that ends the bench.
@@ -42,9 +42,9 @@ struct RunFiles {
     recording: Option<PathBuf>,
 }
 
-impl Benches {
+impl BenchRunner {
     /// Runs `skinbus run` on the arm and reads the recording.
-    pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
+    pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<BenchRun, Failure> {
         let name = arm::run_name(reply);
         let what = format!("the bench of the moving arm ({name})");
         let file = |end: &str| self.folder.join(format!("arm-{name}{end}"));
@@ -55,12 +55,12 @@ impl Benches {
             summary: file(".json"),
             recording: Some(recording.clone()),
         };
-        let text = arm::skin(reply, effort);
-        let texts = [text.as_str(), arm::scenario(effort)];
+        let text = arm::skin_toml(reply, effort);
+        let texts = [text.as_str(), arm::scenario_toml(effort)];
         let buses = buses::private_directory("experiment")?;
         let ended = self.perform(&what, &files, texts, 1, buses.path())?;
         if !ended.status.success() {
-            return Err(failed(&what, &last_message(&ended)));
+            return Err(bench_failure(&what, &last_message(&ended)));
         }
         let rows = recorded::read(&recording).map_err(|error| file_error(&what, &recording, &error))?;
         let summary = read_summary(&what, &files.summary)?;
@@ -68,13 +68,13 @@ impl Benches {
         if rows.is_empty() {
             return Err(file_error(&what, &recording, &"it has no ticks"));
         }
-        Ok(Run { rows, summary, joints })
+        Ok(BenchRun { rows, summary, joints })
     }
 
     /// Runs `skinbus run` on a bench, with each bus's cells in one process, and returns its summary. Accepts the
     /// summary of a run that failed or was halted because the machine is too slow for it, but returns an error if cells
     /// failed.
-    pub(super) fn scaled(&self, bench: &ScaleBench) -> Result<Value, Failure> {
+    pub(super) fn run_scaled(&self, bench: &ScaleBench) -> Result<Value, Failure> {
         let what = format!("the bench of {} cells ({})", bench.cells, bench.name());
         let buses = buses::private_directory("experiment")?;
         // Files that can be generated again go into a temporary directory.
@@ -92,7 +92,7 @@ impl Benches {
         if files.summary.exists() && !is_invalid {
             read_summary(&what, &files.summary)
         } else {
-            Err(failed(&what, &last_message(&ended)))
+            Err(bench_failure(&what, &last_message(&ended)))
         }
     }
 
@@ -106,7 +106,7 @@ impl Benches {
         buses: &Path,
     ) -> Result<Output, Failure> {
         for (path, text) in [&files.skin, &files.scenario].into_iter().zip(texts) {
-            write_whole(path, text, true).map_err(|error| file_error(what, path, &error))?;
+            write_atomically(path, text, true).map_err(|error| file_error(what, path, &error))?;
         }
         let own = std::env::current_exe().map_err(|error| file_error(what, Path::new("skinbus"), &error))?;
         let mut command = Command::new(&own);
@@ -136,12 +136,12 @@ impl Benches {
     }
 }
 
-fn failed(what: &str, error: &dyn std::fmt::Display) -> Failure {
+fn bench_failure(what: &str, error: &dyn std::fmt::Display) -> Failure {
     Failure::run(format!("{what}: {error}"))
 }
 
 fn file_error(what: &str, path: &Path, error: &dyn std::fmt::Display) -> Failure {
-    failed(what, &format_args!("{}: {error}", path.display()))
+    bench_failure(what, &format_args!("{}: {error}", path.display()))
 }
 
 /// Returns the last line that a run printed.

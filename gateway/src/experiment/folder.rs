@@ -5,9 +5,9 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use protocol::usage::Failure;
-use trace::files::{rename, sync_folder, write_whole};
+use trace::files::{rename, sync_folder, write_atomically};
 
-use crate::output::Overwrite;
+use crate::output::OverwriteOption;
 
 /// A directory for results of experiments. Files are written to a hidden directory in it until [`Folder::finish`];
 /// without that call they are removed.
@@ -17,13 +17,13 @@ pub(super) struct ResultFolder {
     inside: PathBuf,
     /// True if this program created the directory.
     made: bool,
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
 impl ResultFolder {
     /// Creates the directory if it does not exist, and checks that it can be written. A directory that is not empty is
     /// accepted only with `overwrite`.
-    pub(super) fn create(path: &Path, overwrite: Overwrite) -> Result<Self, Failure> {
+    pub(super) fn create(path: &Path, overwrite: OverwriteOption) -> Result<Self, Failure> {
         let wrong = |error: &dyn std::fmt::Display| {
             Failure::run(format!("-o {}: {error}; name a folder that can be written", path.display()))
         };
@@ -52,16 +52,16 @@ impl ResultFolder {
 
     /// Writes a file.
     pub(super) fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
-        write_whole(&self.inside.join(name), text, false).map_err(|error| self.failed(name, &error))
+        write_atomically(&self.inside.join(name), text, false).map_err(|error| self.failed(name, &error))
     }
 
     /// Gives all files their names, in alphabetical order. Existing files are replaced only with `overwrite`.
     pub(super) fn finish(self) -> Result<(), Failure> {
-        self.publish()
+        self.publish_files()
     }
 
     /// Gives the files written so far their names.
-    pub(super) fn publish(&self) -> Result<(), Failure> {
+    pub(super) fn publish_files(&self) -> Result<(), Failure> {
         let listed = fs::read_dir(&self.inside).and_then(Iterator::collect::<io::Result<Vec<_>>>);
         let mut names: Vec<_> =
             listed.map_err(|error| self.failed("", &error))?.iter().map(fs::DirEntry::file_name).collect();
@@ -108,7 +108,7 @@ mod tests {
     fn what_is_not_finished_leaves_nothing_and_what_is_replaces_what_was_there() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("deep/er");
-        let [kept, forced] = [false, true].map(|overwrite| Overwrite { overwrite });
+        let [kept, forced] = [false, true].map(|overwrite| OverwriteOption { overwrite });
         let folder = ResultFolder::create(&path, kept).unwrap();
         folder.write("report.html", "half").unwrap();
         drop(folder);
@@ -133,9 +133,9 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("out");
         fs::create_dir_all(path.join("report.html")).unwrap();
-        let folder = ResultFolder::create(&path, Overwrite { overwrite: true }).unwrap();
+        let folder = ResultFolder::create(&path, OverwriteOption { overwrite: true }).unwrap();
         folder.write("results.json", "{}").unwrap();
-        folder.publish().unwrap();
+        folder.publish_files().unwrap();
         folder.write("report.html", "page").unwrap();
         let failed = folder.finish().unwrap_err();
         assert!(failed.to_string().contains("out/report.html: "), "{failed}");
@@ -148,7 +148,7 @@ mod tests {
         let path = place.path().join("file");
         fs::write(&path, "mine").unwrap();
         for path in [path.clone(), path.join("below")] {
-            let error = ResultFolder::create(&path, Overwrite { overwrite: true }).unwrap_err();
+            let error = ResultFolder::create(&path, OverwriteOption { overwrite: true }).unwrap_err();
             assert!(format!("{error:?}").contains("name a folder"), "{error:?}");
         }
         assert_eq!(fs::read_to_string(&path).unwrap(), "mine");

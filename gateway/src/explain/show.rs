@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use analysis::explain::{
-    BusExplained, CellExplained, Explanation, ForceSteps, JointTotal, MAX_JACOBIAN_ERROR_STEPS, Origin,
-    TorqueRow, WordVerdict,
+    BusExplained, CellExplained, ContactOrigin, Explanation, ForceSteps, JointTotal,
+    MAX_JACOBIAN_ERROR_STEPS, TorqueRow, WordVerdict,
 };
 use protocol::fixed::TorqueFormat;
 use protocol::usage::printable;
@@ -24,7 +24,7 @@ pub(super) enum ExplainDetail {
 }
 
 /// Formats the explanation. Seconds count from `zero`, in ns since 1970: the start of the run or the first frame.
-pub(super) fn text(
+pub(super) fn format_explanation(
     name: &str,
     epoch: u8,
     (zero, is_of_run): (u64, bool),
@@ -47,13 +47,13 @@ pub(super) fn text(
         (ExplainDetail::All | ExplainDetail::Cells, []) => {
             text += "\nno cell was in contact, and none answered\n"
         }
-        (ExplainDetail::Joint, _) => text += &joint(cells),
+        (ExplainDetail::Joint, _) => text += &format_joint(cells),
         (ExplainDetail::Cells, _) | (ExplainDetail::All, [_]) => {
             for cell in cells {
-                text += &every_step(cell, zero);
+                text += &format_cell_steps(cell, zero);
             }
         }
-        (ExplainDetail::All, _) => text += &one_line_each(cells, is_finest),
+        (ExplainDetail::All, _) => text += &format_one_line_per_cell(cells, is_finest),
     }
     if what != ExplainDetail::Cells && !cells.is_empty() {
         text += &totals(&explanation.total, is_finest);
@@ -117,7 +117,7 @@ fn millis(nanos: u64) -> String {
 }
 
 /// Formats tables with one line per cell, chain by chain. A chain with many joints gets several tables.
-fn one_line_each(cells: &[CellExplained], is_finest: bool) -> String {
+fn format_one_line_per_cell(cells: &[CellExplained], is_finest: bool) -> String {
     let turns = cells.iter().flat_map(|cell| &cell.rows).all(|row| row.unit == "Nm");
     let (unit, steps) =
         (if turns { " in Nm" } else { "" }, if is_finest { "2^-12" } else { "their bus's format" });
@@ -142,10 +142,10 @@ fn torques(cells: &[CellExplained]) -> String {
     };
     let used = cells.iter().map(says).max().unwrap_or_default();
     let joints = cells.first().map_or(&[][..], |cell| cell.rows.get(..used).unwrap_or_default());
-    let names = CellNames::of(cells);
+    let names = CellNames::for_cells(cells);
     let tables = joints.chunks(JOINTS_PER_TABLE).enumerate().map(|(part, joints)| {
         let is_last = (part + 1) * JOINTS_PER_TABLE >= used;
-        let mut head = vec![names.head()];
+        let mut head = vec![names.column_heading()];
         head.extend((part == 0).then(|| "F_z N".to_owned()));
         head.extend(joints.iter().map(|row| format!("{} {}", row.unit, row.joint)));
         head.extend(["off", "which is"].iter().filter(|_| is_last).map(|&name| name.to_owned()));
@@ -155,7 +155,10 @@ fn torques(cells: &[CellExplained]) -> String {
             let rows = cell.rows.iter().skip(part * JOINTS_PER_TABLE).take(joints.len());
             line.extend(rows.map(|row| decimals(row.word_nm, 4, "-")));
             line.extend(
-                is_last.then(|| [steps_off(&cell.rows), worst_verdict(&cell.rows)]).into_iter().flatten(),
+                is_last
+                    .then(|| [format_largest_difference(&cell.rows), worst_verdict(&cell.rows)])
+                    .into_iter()
+                    .flatten(),
             );
             line
         });
@@ -172,12 +175,12 @@ fn force_of(cell: &CellExplained) -> Option<f64> {
 struct CellNames(Option<String>);
 
 impl CellNames {
-    fn of(cells: &[CellExplained]) -> Self {
+    fn for_cells(cells: &[CellExplained]) -> Self {
         let bus = cells.first().map(|cell| &cell.bus);
         Self(bus.filter(|bus| cells.iter().all(|cell| cell.bus == **bus)).cloned())
     }
 
-    fn head(&self) -> String {
+    fn column_heading(&self) -> String {
         self.0.clone().unwrap_or_else(|| "cell".to_owned())
     }
 
@@ -191,13 +194,13 @@ fn name(cell: &CellExplained) -> String {
 }
 
 /// Formats the largest difference between the words of a cell and the nearest steps.
-fn steps_off(rows: &[TorqueRow]) -> String {
+fn format_largest_difference(rows: &[TorqueRow]) -> String {
     // Take the last one of equally large differences.
     let most = rows.iter().filter_map(|row| row.difference_steps).max_by_key(|steps| steps.abs());
-    or_else_text(most.map(sign), "?")
+    or_else_text(most.map(format_signed_steps), "?")
 }
 
-fn sign(steps: i32) -> String {
+fn format_signed_steps(steps: i32) -> String {
     if steps == 0 { "0".to_owned() } else { format!("{steps:+}") }
 }
 
@@ -246,7 +249,7 @@ fn legend(cells: &[CellExplained]) -> String {
     said.iter().filter_map(|(_, short, means)| Some(format!("  {short}: {}\n", means.as_ref()?))).collect()
 }
 
-fn every_step(cell: &CellExplained, zero: u64) -> String {
+fn format_cell_steps(cell: &CellExplained, zero: u64) -> String {
     let mut text = format!("\n{}, on the link that joint {} moves\n", name(cell), cell.joint);
     match &cell.force {
         Some(force) => text += &force_steps(force, zero),
@@ -256,7 +259,7 @@ fn every_step(cell: &CellExplained, zero: u64) -> String {
         Some(nanos) => text += &format!("  answered   {} after the joints\n", millis(nanos)),
         None => text += "  answered   nothing\n",
     }
-    text + &rows(std::slice::from_ref(cell), false)
+    text + &format_joint_rows(std::slice::from_ref(cell), false)
 }
 
 fn force_steps(force: &ForceSteps, zero: u64) -> String {
@@ -269,7 +272,7 @@ fn force_steps(force: &ForceSteps, zero: u64) -> String {
     let touch = against(touch_n, contact_threshold_n);
     let near = against(proximity, proximity_threshold);
     let fused = against(fused_n, force_threshold_n);
-    let origin = origin(&force.origin, zero);
+    let origin = format_force_origin(&force.origin, zero);
     let [touch_counts, near_counts] =
         [touch_n >= contact_threshold_n, proximity >= proximity_threshold].map(counts);
     format!(
@@ -282,33 +285,33 @@ fn force_steps(force: &ForceSteps, zero: u64) -> String {
     )
 }
 
-fn origin(origin: &Origin, zero: u64) -> String {
+fn format_force_origin(origin: &ContactOrigin, zero: u64) -> String {
     let at = |nanos: u64| format!("{:.6}", seconds_since(zero, nanos));
     match *origin {
-        Origin::Start { at_ns } => format!("it started at {} s", at(at_ns)),
-        Origin::Mode { at_ns } => format!("its mode was written at {} s", at(at_ns)),
-        Origin::Said { at_ns } => format!("it reported so itself at {} s", at(at_ns)),
-        Origin::Stimulus { at_ns, from_epoch: None, .. } => {
+        ContactOrigin::Start { at_ns } => format!("it started at {} s", at(at_ns)),
+        ContactOrigin::Mode { at_ns } => format!("its mode was written at {} s", at(at_ns)),
+        ContactOrigin::Said { at_ns } => format!("it reported so itself at {} s", at(at_ns)),
+        ContactOrigin::Stimulus { at_ns, from_epoch: None, .. } => {
             format!("stimulus of {} s, from the next joints on", at(at_ns))
         }
-        Origin::Stimulus { at_ns, from_epoch: Some(epoch), late } => {
+        ContactOrigin::Stimulus { at_ns, from_epoch: Some(epoch), late } => {
             let late = if late { ", late" } else { "" };
             format!("stimulus of {} s, from epoch {epoch} on{late}", at(at_ns))
         }
     }
 }
 
-fn joint(cells: &[CellExplained]) -> String {
+fn format_joint(cells: &[CellExplained]) -> String {
     if cells.is_empty() {
         return "\nno cell was in contact, and none answered\n".to_owned();
     }
-    format!("\n{}", rows(cells, true))
+    format!("\n{}", format_joint_rows(cells, true))
 }
 
 /// Formats a table with one line per joint of each cell.
-fn rows(cells: &[CellExplained], by_cell: bool) -> String {
-    let names = CellNames::of(cells);
-    let first = if by_cell { names.head() } else { "joint".to_owned() };
+fn format_joint_rows(cells: &[CellExplained], by_cell: bool) -> String {
+    let names = CellNames::for_cells(cells);
+    let first = if by_cell { names.column_heading() } else { "joint".to_owned() };
     let mut head = vec![first];
     head.extend(by_cell.then(|| "F_z N".to_owned()));
     head.extend(["J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"].map(str::to_owned));
@@ -321,7 +324,7 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
             or_else_text(row.nearest_word, "-"),
             or_else_text(row.word, "-"),
             decimals(row.word_nm, 6, "-"),
-            or_else_text(row.difference_steps.map(sign), "?"),
+            or_else_text(row.difference_steps.map(format_signed_steps), "?"),
             verdict_with_jacobian(&row.verdict),
         ]);
         line

@@ -5,7 +5,7 @@ use core::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use model::central::Central;
+use model::central::CentralComputation;
 use model::scenario::MAX_FORCE_N;
 use protocol::document;
 use protocol::fixed::{Q1_14, is_saturated};
@@ -16,9 +16,9 @@ use reference::ReferenceCell;
 use serde::Serialize;
 
 use crate::arguments::find_cell;
-use crate::columns::{Columns, Table};
+use crate::columns::{Columns, CsvTable};
 use crate::input::skin_in;
-use crate::print::{count, json_line, table};
+use crate::print::{count_with_noun, json_line, table};
 
 /// Maximum size in bytes of a file of rows.
 const MAX_BATCH_BYTES: u64 = 256 << 20;
@@ -28,7 +28,7 @@ const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: 
 
 /// Options for a force on a cell, or rows of them.
 #[derive(Args, Debug)]
-pub(super) struct Given {
+pub(super) struct TorqueOptions {
     /// Compute the torques of a force against the cell's outward normal in N, 0 to 95.997: the range of three contact
     /// words
     #[arg(long, value_name = "N", requires_all = ["cell", "joints"], conflicts_with_all = ["epoch", "skin"], allow_negative_numbers = true)]
@@ -43,7 +43,7 @@ pub(super) struct Given {
 
 /// Torques of a row, computed both ways, in Nm (prismatic joints: N).
 #[derive(Serialize)]
-struct Row {
+struct ComputedRow {
     cell: String,
     force_n: f64,
     joints: Vec<String>,
@@ -54,9 +54,9 @@ struct Row {
     saturated: bool,
 }
 
-impl Given {
+impl TorqueOptions {
     /// Computes the torques for a skin, or the skin in a recording, and prints them.
-    pub(super) fn compute(
+    pub(super) fn print_torques(
         &self,
         files: &[PathBuf],
         cell: Option<&CellName>,
@@ -68,18 +68,22 @@ impl Given {
         let skin = skin_in(file)?;
         let calculator = Calculator::new(&skin);
         let rows = match (cell, &self.batch) {
-            (_, Some(path)) => calculator.batch(path)?,
+            (_, Some(path)) => calculator.compute_batch_file(path)?,
             (Some(cell), None) => {
                 let (force, joints) =
                     (self.force.unwrap_or_default(), self.joints.as_deref().unwrap_or_default());
-                vec![calculator.row(cell, "--cell", force, joints).map_err(Failure::usage)?]
+                vec![
+                    calculator
+                        .compute_for_named_cell(cell, "--cell", force, joints)
+                        .map_err(Failure::usage)?,
+                ]
             }
             (None, None) => Vec::new(),
         };
         if as_json {
             return rows.iter().try_for_each(|row| print_text(&json_line(row)?));
         }
-        rows.iter().try_for_each(|row| print_text(&row.text()))
+        rows.iter().try_for_each(|row| print_text(&row.to_text()))
     }
 }
 
@@ -87,19 +91,20 @@ impl Given {
 struct Calculator<'a> {
     skin: &'a Skin,
     /// Central computation of each bus.
-    central: Vec<Central>,
+    central: Vec<CentralComputation>,
 }
 
 impl<'a> Calculator<'a> {
     fn new(skin: &'a Skin) -> Self {
-        let central = (0..skin.buses.len()).map(|bus| Central::unquantised(&skin.with_cells_of_bus(bus)));
+        let central =
+            (0..skin.buses.len()).map(|bus| CentralComputation::unquantised(&skin.with_cells_of_bus(bus)));
         Self { skin, central: central.collect() }
     }
 
-    fn batch(&self, path: &Path) -> Result<Vec<Row>, Failure> {
+    fn compute_batch_file(&self, path: &Path) -> Result<Vec<ComputedRow>, Failure> {
         let file = path.display().to_string();
         let text = document::read_text_within(path, MAX_BATCH_BYTES).map_err(Failure::usage)?;
-        let mut table = Table::new(&file, &text, COLUMNS)?;
+        let mut table = CsvTable::new(&file, &text, COLUMNS)?;
         let mut rows = Vec::new();
         while let Some(line) = table.next_row()? {
             let at = format!("{file}, row {}: cell", rows.len() + 1);
@@ -108,7 +113,9 @@ impl<'a> Calculator<'a> {
                 .parse::<CellName>()
                 .map_err(|error| Failure::usage(format!("{at} {error}")))?;
             let force = line.number("force_n")?;
-            rows.push(self.row(&named, &at, force, line.text("q")).map_err(Failure::usage)?);
+            rows.push(
+                self.compute_for_named_cell(&named, &at, force, line.text("q")).map_err(Failure::usage)?,
+            );
         }
         if rows.is_empty() {
             return Err(Failure::usage(format!("{file}: there is no row in it: write a line for each")));
@@ -118,13 +125,19 @@ impl<'a> Calculator<'a> {
 
     /// Computes the torques of one row both ways. Returns the reason if this is not possible; `option` names the option
     /// that gave the cell.
-    fn row(&self, named: &CellName, option: &str, force: f64, positions: &str) -> Result<Row, String> {
+    fn compute_for_named_cell(
+        &self,
+        named: &CellName,
+        option: &str,
+        force: f64,
+        positions: &str,
+    ) -> Result<ComputedRow, String> {
         let index = find_cell(self.skin, named, option).map_err(|failure| failure.to_string())?;
         self.compute_row(index, force, positions).map_err(|why| format!("{option} {named}: {why}"))
     }
 
     /// Computes the torques of one row for the cell with this index.
-    fn compute_row(&self, index: usize, force: f64, positions: &str) -> Result<Row, String> {
+    fn compute_row(&self, index: usize, force: f64, positions: &str) -> Result<ComputedRow, String> {
         let skin = self.skin;
         let Some(cell) = skin.cells.get(index) else { return Err("no such cell".to_owned()) };
         let joints: Vec<_> = skin.joints_on_bus(cell.bus).map(|(_, joint)| joint).collect();
@@ -137,7 +150,8 @@ impl<'a> Calculator<'a> {
         let given: Vec<&str> = positions.split([' ', ',']).filter(|text| !text.is_empty()).collect();
         if given.len() != joints.len() {
             let names = joints.iter().map(|joint| joint.name.as_str()).collect::<Vec<_>>().join(", ");
-            let (got, needed) = (count(given.len(), "position"), count(joints.len(), "joint"));
+            let (got, needed) =
+                (count_with_noun(given.len(), "position"), count_with_noun(joints.len(), "joint"));
             return Err(format!("{got} given: one is needed for each of the chain's {needed}, {names}"));
         }
         let mut q = Vec::with_capacity(given.len());
@@ -183,7 +197,7 @@ impl<'a> Calculator<'a> {
         let words = words.get(..joints.len()).unwrap_or_default();
         let fixed: Vec<f64> = words.iter().map(|&word| reference.format().to_real(word)).collect();
         let bus = skin.buses.get(cell.bus).map_or("", |bus| &bus.name);
-        Ok(Row {
+        Ok(ComputedRow {
             cell: format!("{bus}:{}", cell.node),
             force_n: force,
             joints: joints.iter().map(|joint| joint.name.clone()).collect(),
@@ -196,8 +210,8 @@ impl<'a> Calculator<'a> {
     }
 }
 
-impl Row {
-    fn text(&self) -> String {
+impl ComputedRow {
+    fn to_text(&self) -> String {
         let numbers = self.central.iter().zip(&self.fixed).zip(&self.difference);
         let rows = self.joints.iter().zip(&self.units).zip(numbers).map(
             |((name, unit), ((central, fixed), difference))| {

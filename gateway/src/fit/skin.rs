@@ -6,13 +6,13 @@ use protocol::skin::{Skin, SkinBus};
 use protocol::usage::{Failure, print_text};
 use protocol::wire_time::BitRates;
 
-use super::{Fit, skin_text};
-use crate::output::note;
+use super::{FitCommand, skin_text};
+use crate::output::print_note;
 use crate::print::{comma_separated, json};
 
-impl Fit {
+impl FitCommand {
     /// Computes and prints the fit of a skin.
-    pub(super) fn of_skin(&self, skin: &Skin) -> Result<(), Failure> {
+    pub(super) fn print_skin_fit(&self, skin: &Skin) -> Result<(), Failure> {
         let computation_ns = self.computation.unwrap_or(COMPUTATION_NS);
         let chosen = if self.table { None } else { self.rates(skin)? };
         let (buses, whole, rows) = match chosen {
@@ -30,11 +30,15 @@ impl Fit {
         if is_partly_described && !self.table && !self.json {
             let without = skin.buses.iter().filter(|bus| bus.bitrate.is_none()).map(|bus| &bus.name);
             let (without, skin) = (comma_separated(without), &skin.name);
-            note(format_args!("no bitrate of {without}: these are common bit rates, not those of {skin}"));
+            print_note(format_args!(
+                "no bitrate of {without}: these are common bit rates, not those of {skin}"
+            ));
         }
         print_text(&match self.json {
             true => json(&fit::json(skin, &buses, whole.as_ref(), &rows))?,
-            false => skin_text::table(skin, &rows) + &skin_text::buses(skin, &buses, whole.as_ref()),
+            false => {
+                skin_text::table(skin, &rows) + &skin_text::format_bus_fits(skin, &buses, whole.as_ref())
+            }
         })
     }
 
@@ -43,7 +47,8 @@ impl Fit {
     fn rates(&self, skin: &Skin) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
         let formats: Vec<_> = skin.buses.iter().map(|bus| self.format.unwrap_or(bus.format)).collect();
         let Some(nominal) = self.nominal else {
-            let described = skin.buses.iter().zip(&formats).map(|(bus, &format)| described(bus, format));
+            let described =
+                skin.buses.iter().zip(&formats).map(|(bus, &format)| bit_rates_from_skin(bus, format));
             return described.collect();
         };
         if self.data.is_some() && !formats.contains(&Format::Fd) {
@@ -58,7 +63,7 @@ impl Fit {
                 BitRates::classic(nominal).map_err(Failure::usage)?;
                 Err(Failure::usage(format!(
                     "CAN FD needs a data bit rate: add --data, {nominal} to {}, or --format classic",
-                    BitRates::MAX_DATA
+                    BitRates::MAX_DATA_BIT_RATE
                 )))
             }
         };
@@ -67,7 +72,7 @@ impl Fit {
 }
 
 /// Returns the bit rates that the skin gives for a bus, with the format.
-fn described(bus: &SkinBus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
+fn bit_rates_from_skin(bus: &SkinBus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
     let rates = rates::described_rates(bus, format).transpose();
     let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;
     Ok(rates.map(|rates| (format, rates)))

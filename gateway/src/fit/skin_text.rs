@@ -3,12 +3,12 @@
 use analysis::fit::case::{AnswerPlan, BusCase};
 use analysis::fit::limits::{Limit, MAX_NODES, NeededBuses};
 use analysis::fit::verdict::{FitSummary, percent};
-use analysis::fit::{AssessedBus, BusFit, RatesRow, SkinFit, Spread, rates_name};
+use analysis::fit::{AssessedBus, BusFit, RatesRow, SkinFit, SpreadFit, rates_name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
 use protocol::usage::printable;
 
-use crate::print::{self, KeyValueTable, comma_separated, count, decimals, or_else_text};
+use crate::print::{self, KeyValueTable, comma_separated, count_with_noun, decimals, or_else_text};
 
 /// Columns of the table over bit rates.
 const HEADER: [&str; 8] = [
@@ -27,15 +27,15 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
     let Some(first) = rows.first() else { return String::new() };
     let lines = rows.iter().map(|row| {
         let BusFit { rated, most, answers, .. } = &row.fullest;
-        let roots = answers.iter().map(|it| &it.after).find(|it| is_of_roots(&it.case));
+        let roots = answers.iter().map(|it| &it.after).find(|it| is_roots_only(&it.case));
         vec![
             rates_name(rated.case.format, rated.case.rates),
             micros(rated.case.packet_ns()),
-            tenths(rated.load.total()),
+            format_percent_number(rated.load.total()),
             last_ms(rated),
-            most.in_time().to_string(),
-            row.need.in_short(),
-            or_else_text(roots.map(|it| tenths(it.load.total())), ""),
+            most.max_cells_in_time().to_string(),
+            row.need.short_text(),
+            or_else_text(roots.map(|it| format_percent_number(it.load.total())), ""),
             or_else_text(roots.map(last_ms), ""),
         ]
     });
@@ -57,77 +57,87 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
         millis(case.period_ns),
         micros(case.computation_ns),
         reply_name(case),
-        sensors(case),
+        sensor_traffic_suffix(case),
         MAX_NODES - 1,
     )
 }
 
 /// Formats the results of the buses at their bit rates: a section for each bus, and one for all cells of the skin.
-pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>) -> String {
+pub(super) fn format_bus_fits(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>) -> String {
     let Some(first) = buses.first() else { return String::new() };
     let case = &first.rated.case;
     let period = format!("joints every {} ms", millis(case.period_ns));
     let computation = format!("a cell computes {} µs", micros(case.computation_ns));
     let mut rows = KeyValueTable::new(&skin.name, period, computation).names_in_one_line();
     for bus in buses {
-        section(&mut rows, bus);
+        add_bus_section(&mut rows, bus);
     }
     // With one bus, its own section has the same values.
     if let Some(whole) = whole.filter(|_| buses.len() > 1) {
-        rows.section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
-        rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
-        for Spread { buses, fullest } in &whole.spread {
-            let on = format!("{} of {} cells", count(*buses, "bus"), fullest.case.answers.cells());
-            rows.row(on, figures(fullest), fullest.verdict());
+        rows.add_section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
+        rows.add_row("buses needed", format_needed_buses(&whole.need), each_need(&whole.need));
+        for SpreadFit { buses, fullest } in &whole.spread {
+            let on = format!("{} of {} cells", count_with_noun(*buses, "bus"), fullest.case.answers.cells());
+            rows.add_row(on, format_load_and_last_answer(fullest), fullest.verdict());
         }
     }
-    rows.text()
+    rows.to_text()
 }
 
-fn section(rows: &mut KeyValueTable, bus: &BusFit) {
+fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
     let BusFit { name: bus_name, rated, most, need, answers, hints } = bus;
     let AssessedBus { case, load, times, .. } = rated;
     let cells = case.answers.cells();
     let worst = FitSummary::worst_case(rated);
-    rows.section(
+    rows.add_section(
         format!("{bus_name} at {}", worst.rates),
         format!("{cells} cells, {}", reply_name(case)),
         "",
     );
-    rows.row(worst.case_name(), worst.table_value(), worst.cells);
+    rows.add_row(worst.case_name(), worst.table_value(), worst.cells);
     let parts = [
         (format!("joints and {}", reply_name(case)), load.joints + load.answers),
         ("sensors".to_owned(), load.sensors),
         ("heartbeats".to_owned(), load.heartbeats),
     ];
-    let parts =
-        parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", tenths(*share)));
-    rows.row("  load", percent(load.total()), comma_separated(parts));
+    let parts = parts
+        .iter()
+        .filter(|it| it.1 > 0.0)
+        .map(|(what, share)| format!("{what} {}", format_percent_number(*share)));
+    rows.add_row("  load", percent(load.total()), comma_separated(parts));
     let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
     let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
     let due = format!("due after {} ms", millis(case.deadline_ns()));
-    rows.row("last answer", last(rated), comma_separated([due].into_iter().chain(bounds)));
+    rows.add_row("last answer", format_last_answer(rated), comma_separated([due].into_iter().chain(bounds)));
     let heartbeat = or_else_text(times.heartbeat_ns.map(|ns| format!("{} ms", millis(ns))), "no bound");
-    rows.row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
+    rows.add_row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
     let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
-    rows.row("cells that fit", most.in_time().min(most.nodes), others);
-    rows.row("buses needed", needed(need), each_need(need));
+    rows.add_row("cells that fit", most.max_cells_in_time().min(most.nodes), others);
+    rows.add_row("buses needed", format_needed_buses(need), each_need(need));
     if !hints.is_empty() {
-        rows.section("  what to change", "", "");
+        rows.add_section("  what to change", "", "");
         for hint in hints {
-            rows.row(format!("  {}", hint.change), figures(&hint.after), hint.after.verdict());
+            rows.add_row(
+                format!("  {}", hint.change),
+                format_load_and_last_answer(&hint.after),
+                hint.after.verdict(),
+            );
         }
     }
-    rows.section("  instead of these answers", "", "");
+    rows.add_section("  instead of these answers", "", "");
     for hint in answers {
-        rows.row(format!("  {}", hint.change), figures(&hint.after), hint.after.verdict());
+        rows.add_row(
+            format!("  {}", hint.change),
+            format_load_and_last_answer(&hint.after),
+            hint.after.verdict(),
+        );
     }
-    if !answers.iter().any(|it| is_of_roots(&it.after.case)) {
-        rows.row("  sums", "not possible", "a cell is unreachable");
+    if !answers.iter().any(|it| is_roots_only(&it.after.case)) {
+        rows.add_row("  sums", "not possible", "a cell is unreachable");
     }
 }
 
-fn is_of_roots(case: &BusCase) -> bool {
+fn is_roots_only(case: &BusCase) -> bool {
     matches!(case.answers, AnswerPlan::Sums { shared: false, .. })
 }
 
@@ -138,7 +148,7 @@ const fn reply_name(case: &BusCase) -> &'static str {
     }
 }
 
-const fn sensors(case: &BusCase) -> &'static str {
+const fn sensor_traffic_suffix(case: &BusCase) -> &'static str {
     match case.sensing {
         Sensing::Off => "",
         Sensing::Continuous { .. } => ", sensors",
@@ -147,13 +157,13 @@ const fn sensors(case: &BusCase) -> &'static str {
 }
 
 /// Formats the load of a bus and the time of the last answer.
-fn figures(rated: &AssessedBus) -> String {
-    format!("{}, {}", percent(rated.load.total()), last(rated))
+fn format_load_and_last_answer(rated: &AssessedBus) -> String {
+    format!("{}, {}", percent(rated.load.total()), format_last_answer(rated))
 }
 
-fn last(rated: &AssessedBus) -> String {
+fn format_last_answer(rated: &AssessedBus) -> String {
     let AssessedBus { case, load, times, .. } = rated;
-    match times.last_ns() {
+    match times.last_answer_ns() {
         Some(last_ns) => format!("{} ms", millis(last_ns)),
         None if load.total() > 1.0 => "no bound".to_owned(),
         None => format!("above {} ms", millis(case.period_ns)),
@@ -163,11 +173,11 @@ fn last(rated: &AssessedBus) -> String {
 /// Formats the time of the last answer in ms for a column of numbers.
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn last_ms(rated: &AssessedBus) -> String {
-    decimals(rated.times.last_ns().map(|ns| ns as f64 / 1e6), 2, "-")
+    decimals(rated.times.last_answer_ns().map(|ns| ns as f64 / 1e6), 2, "-")
 }
 
-fn needed(need: &NeededBuses) -> String {
-    let why = comma_separated(need.binding().into_iter().map(Limit::name));
+fn format_needed_buses(need: &NeededBuses) -> String {
+    let why = comma_separated(need.binding_limits().into_iter().map(Limit::name));
     match need.buses() {
         None => format!("none: {why}"),
         Some(1) => "1".to_owned(),
@@ -192,6 +202,6 @@ fn micros(ns: u64) -> String {
 }
 
 /// Formats a share in %, for a column or a list.
-fn tenths(share: f64) -> String {
+fn format_percent_number(share: f64) -> String {
     format!("{:.1}", 100.0 * share)
 }

@@ -12,19 +12,19 @@ use protocol::bus::{BusError, BusOptions};
 use protocol::skin::Skin;
 use protocol::stop::{self, InterruptibleWriter};
 use protocol::usage::{Failure, ignore_broken_pipe, print_text};
-use trace::capture::{Entry, NoteKind, Reader};
+use trace::capture::{CaptureEntry, NoteKind, Reader};
 
 use self::show::write_frames;
-use super::Fit;
+use super::FitCommand;
 use crate::input::{
-    self, LossCounts, POLL_TIMEOUT, ReceiveEnd, captures, is_file, location, no_frame, note_other_skin,
+    self, BusReceiver, LossCounts, POLL_TIMEOUT, is_file, location, no_frame, note_other_skin, open_capture,
     skin_so_far, stop_flag,
 };
 use crate::output;
 use crate::print::comma_separated;
 
 /// Size of the receive buffer in bytes, for frames that wait while others are processed.
-const RECEIVE_BUFFER: usize = 8 << 20;
+const RECEIVE_BUFFER_BYTES: usize = 8 << 20;
 
 /// Result of reading the traffic from a capture or from buses.
 struct TrafficInput {
@@ -36,9 +36,9 @@ struct TrafficInput {
     ended: Result<(), Failure>,
 }
 
-impl Fit {
+impl FitCommand {
     /// Computes and prints for each frame when it would be sent on a bus with bit rates.
-    pub(super) fn of_traffic(&self) -> Result<(), Failure> {
+    pub(super) fn print_traffic_fit(&self) -> Result<(), Failure> {
         let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         if let (Some(path), Some(skin)) = (&self.skin, &skin) {
             note_other_skin(&self.sources, path, skin);
@@ -48,7 +48,7 @@ impl Fit {
         let mut title = name.clone();
         let mut run_began = None;
         let (mut shadow, taken) = if self.are_captures(&name)? {
-            let reader = captures(&self.sources, |file| Box::new(file))?;
+            let reader = open_capture(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
             let mut shadow = self.shadow(skin.or_else(|| skin_so_far(&reader, "name one with --skin")))?;
             for before in &reader.extras().latched {
@@ -60,7 +60,7 @@ impl Fit {
         } else {
             let stopped = stop_flag()?;
             let mut shadow = self.shadow(skin)?;
-            let taken = self.live(&mut shadow, &mut out, &stopped)?;
+            let taken = self.receive_live_traffic(&mut shadow, &mut out, &stopped)?;
             (shadow, taken)
         };
         shadow.finish();
@@ -72,11 +72,11 @@ impl Fit {
         }
         for (bus, _) in &self.rates {
             if report.buses.iter().all(|it| it.bus != *bus) {
-                output::note(format_args!("--rates {bus}=…: {name} has no frame of {bus}"));
+                output::print_note(format_args!("--rates {bus}=…: {name} has no frame of {bus}"));
             }
         }
         if !self.json && report.frames > 0 {
-            print_text(&show::text(&title, taken.what, taken.missing, &report))?;
+            print_text(&show::format_report(&title, taken.what, taken.missing, &report))?;
         }
         taken.ended
     }
@@ -126,15 +126,15 @@ impl Fit {
     }
 
     /// Receives from buses until a signal, and passes the frames to the model.
-    fn live(
+    fn receive_live_traffic(
         &self,
         shadow: &mut Shadow,
         out: &mut impl Write,
         stopped: &AtomicBool,
     ) -> Result<TrafficInput, Failure> {
         let kinds = self.kinds.any_kinds()?;
-        let options = BusOptions { receive_buffer: RECEIVE_BUFFER, ..BusOptions::default() };
-        let mut receive_ends = input::receive_ends(&self.sources, &kinds, None, &options, None)?;
+        let options = BusOptions { receive_buffer: RECEIVE_BUFFER_BYTES, ..BusOptions::default() };
+        let mut receive_ends = input::open_bus_receivers(&self.sources, &kinds, None, &options, None)?;
         let length = self.duration.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
         let end = length.map(|length| Instant::now() + length);
         let mut ended = Ok(());
@@ -153,7 +153,7 @@ impl Fit {
         }
         let mut missing = 0;
         for receive_end in &receive_ends {
-            let lost = receive_end.missing("read");
+            let lost = receive_end.report_missing_frames("read");
             shadow.record_missing(receive_end.bus().name(), lost);
             missing += lost;
         }
@@ -162,7 +162,7 @@ impl Fit {
 }
 
 /// Passes waiting frames to the model.
-fn pass_frames(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusError> {
+fn pass_frames(receive_end: &mut BusReceiver, shadow: &mut Shadow) -> Result<(), BusError> {
     while receive_end.receive(Duration::ZERO)? {
         for received in receive_end.frames() {
             shadow.receive(receive_end.bus().name(), received.at_nanos, &received.frame);
@@ -178,13 +178,13 @@ fn pass_capture(
     out: &mut impl Write,
 ) -> Result<TrafficInput, Failure> {
     let name = reader.name().to_owned();
-    let what = input::format(&reader);
+    let what = input::format_name(&reader);
     let (mut frames, mut missing) = (0_u64, LossCounts::default());
     let mut ended = loop {
         match reader.next() {
             Ok(None) => break Ok(()),
             Err(error) => break Err(Failure::run(error)),
-            Ok(Some(Entry::Frame(record))) => {
+            Ok(Some(CaptureEntry::Frame(record))) => {
                 frames += 1;
                 shadow.receive(record.interface, record.time.nanos, &record.frame);
                 if let Err(error) = write_frames(shadow, out) {
@@ -192,14 +192,14 @@ fn pass_capture(
                     return Ok(TrafficInput { what, missing: missing.frames, ended: Ok(()) });
                 }
             }
-            Ok(Some(Entry::Note(note))) => {
+            Ok(Some(CaptureEntry::Note(note))) => {
                 missing.count(&note);
                 match note.kind {
                     NoteKind::Dropped(lost) if !note.interface.is_empty() => {
                         shadow.record_missing(note.interface, lost);
                     }
                     NoteKind::Unreadable(why) if missing.unreadable() == 1 => {
-                        output::note(format_args!("{}: {why}", location(&name, note.line)));
+                        output::print_note(format_args!("{}: {why}", location(&name, note.line)));
                     }
                     NoteKind::Text | NoteKind::CanXl | NoteKind::Dropped(_) | NoteKind::Unreadable(_) => {}
                 }
@@ -211,7 +211,7 @@ fn pass_capture(
     }
     missing.report(&reader, "left out");
     if stop::stop_flag().load(Ordering::Relaxed) {
-        output::note(format_args!("{name}: stopped after {frames} frames"));
+        output::print_note(format_args!("{name}: stopped after {frames} frames"));
     } else if frames == 0 && ended.is_ok() {
         ended = Err(no_frame(&reader));
     }

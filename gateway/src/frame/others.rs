@@ -7,11 +7,11 @@ use protocol::packet::WORDS;
 use protocol::schema::{Field, Layout, packets};
 
 /// Options of the page of the skin, which exclude all others.
-const OF_SKIN: [&str; 3] = ["force", "proximity", "temperature"];
+const SKIN_PAGE_OPTIONS: [&str; 3] = ["force", "proximity", "temperature"];
 
 /// The values of one page.
 #[derive(Clone, Debug, Default)]
-pub(super) struct OtherPages {
+pub(super) struct OtherPageOptions {
     /// Each given field, with its texts.
     given: Vec<(&'static Layout, &'static Field, Vec<String>)>,
 }
@@ -27,7 +27,7 @@ fn fields() -> impl Iterator<Item = (&'static Layout, &'static Field)> {
     others.flat_map(|layout| layout.fields.iter().map(move |field| (layout, field)))
 }
 
-impl OtherPages {
+impl OtherPageOptions {
     /// Returns the number and the words of the page, if one is given.
     pub(super) fn page(&self) -> Result<Option<(u8, [i16; WORDS])>, String> {
         let Some((layout, ..)) = self.given.first() else { return Ok(None) };
@@ -42,7 +42,7 @@ impl OtherPages {
     }
 }
 
-impl FromArgMatches for OtherPages {
+impl FromArgMatches for OtherPageOptions {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, Error> {
         let texts = |field: &Field| {
             let texts = matches.get_many::<String>(field.bare_name())?;
@@ -58,7 +58,7 @@ impl FromArgMatches for OtherPages {
     }
 }
 
-impl Args for OtherPages {
+impl Args for OtherPageOptions {
     fn augment_args(command: Command) -> Command {
         fields().fold(command, |command, (layout, field)| {
             let name = field.bare_name();
@@ -76,7 +76,9 @@ impl Args for OtherPages {
                     .num_args(field.elements())
                     .value_names(labels)
                     .allow_negative_numbers(true)
-                    .conflicts_with_all(OF_SKIN.into_iter().chain(pages.map(|(_, field)| field.bare_name())))
+                    .conflicts_with_all(
+                        SKIN_PAGE_OPTIONS.into_iter().chain(pages.map(|(_, field)| field.bare_name())),
+                    )
                     .help(format!("{}{rest}{unit}, instead of a touch", first.to_uppercase())),
             )
         })

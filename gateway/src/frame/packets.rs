@@ -2,15 +2,15 @@
 
 use clap::{Args, Subcommand};
 use model::decode::parameter;
-use model::decode::pick::Party;
+use model::decode::pick::NodeSelector;
 use model::scenario::contact_words;
 use protocol::fixed::{Q, Q1_14, Q5_10};
-use protocol::message::{AppliesFrom, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{Joints, Message, Request, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 
 use super::addressee::addressee;
-use super::others::{OtherPages, layouts};
+use super::others::{OtherPageOptions, layouts};
 use super::sensing;
 
 #[derive(Debug, Subcommand)]
@@ -27,9 +27,9 @@ pub(super) enum PacketCommand {
     /// Answer with the pages of counters and sensors
     #[command(after_help = "Example:\n  skinbus frame report")]
     Report,
-    Joints(Positions),
-    Stimulus(Stimulus),
-    Configure(Configure),
+    Joints(JointsCommand),
+    Stimulus(StimulusCommand),
+    Configure(ConfigureCommand),
     Sensing(sensing::SensingCommand),
 }
 
@@ -38,7 +38,7 @@ pub(super) enum PacketCommand {
 #[command(after_help = "Examples:
   skinbus frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
   skinbus frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
-pub(super) struct Positions {
+pub(super) struct JointsCommand {
     /// Number of this broadcast, 0 to 255; cells drop a repetition of the last one
     #[arg(long, value_name = "E")]
     epoch: u8,
@@ -66,10 +66,10 @@ struct Angles {
   skinbus frame stimulus --cell 12 --force 3.0
   skinbus frame stimulus --cell everyone --epoch 7 --force 0.5 --proximity 0.9
   skinbus frame stimulus --cell 12 --acceleration 0 0 1")]
-pub(super) struct Stimulus {
+pub(super) struct StimulusCommand {
     /// The cell, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
-    cell: Party,
+    cell: NodeSelector,
     /// Force of the touch in N, divided among the three contact words
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<String>,
@@ -80,7 +80,7 @@ pub(super) struct Stimulus {
     #[arg(long, num_args = 2, value_names = ["T1", "T2"], allow_negative_numbers = true)]
     temperature: Option<Vec<String>>,
     #[command(flatten)]
-    others: OtherPages,
+    others: OtherPageOptions,
     /// Take effect with the joints of this epoch [default: with the next joints]
     #[arg(long, value_name = "E")]
     epoch: Option<u8>,
@@ -114,12 +114,12 @@ pub(super) struct Stimulus {
   skinbus frame configure --cell everyone --write row2 -0.425 0 0 0
   skinbus frame configure --cell 12 --write 99 1 -1 0x7FFF"
 )]
-pub(super) struct Configure {
+pub(super) struct ConfigureCommand {
     /// The cell, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
-    cell: Party,
+    cell: NodeSelector,
     #[command(flatten)]
-    request: Requested,
+    request: ParameterRequest,
     /// Tag, copied into the answer
     #[arg(long, value_name = "T", default_value_t = 0)]
     tag: u8,
@@ -127,7 +127,7 @@ pub(super) struct Configure {
 
 #[derive(Args, Debug)]
 #[group(required = true, multiple = false)]
-struct Requested {
+struct ParameterRequest {
     /// Read a parameter, by name or number
     #[arg(long, value_name = "PARAMETER")]
     read: Option<String>,
@@ -151,16 +151,18 @@ impl PacketCommand {
     }
 
     /// Returns the addressee of the packet, or `None` if the packet is for all receivers.
-    pub(super) const fn addressee(&self) -> Option<&Party> {
+    pub(super) const fn addressee(&self) -> Option<&NodeSelector> {
         match self {
             Self::Halt | Self::Resume | Self::Sync | Self::Report | Self::Joints(_) => None,
-            Self::Stimulus(Stimulus { cell, .. }) | Self::Configure(Configure { cell, .. }) => Some(cell),
+            Self::Stimulus(StimulusCommand { cell, .. }) | Self::Configure(ConfigureCommand { cell, .. }) => {
+                Some(cell)
+            }
             Self::Sensing(switch) => Some(&switch.cell),
         }
     }
 }
 
-impl Positions {
+impl JointsCommand {
     fn message(&self) -> Result<Message, String> {
         let Angles { rad, words } = &self.positions;
         let (name, texts, read): (_, _, fn(&str) -> _) = match (rad, words) {
@@ -175,19 +177,21 @@ impl Positions {
         }
         let mut positions = [Q1_14::ZERO; MAX_JOINTS];
         for (position, text) in positions.iter_mut().zip(texts) {
-            *position = Q1_14::from_bits(value(name, text, read)?);
+            *position = Q1_14::from_bits(parse_option_value(name, text, read)?);
         }
         let in_use = u8::try_from(texts.len()).map_err(|error| error.to_string())?;
         Ok(Message::Joints { epoch: Epoch(self.epoch), joints: Joints { positions, in_use } })
     }
 }
 
-impl Stimulus {
+impl StimulusCommand {
     fn message(&self) -> Result<Message, String> {
-        let (to, from) =
-            (self.cell.node, self.epoch.map_or(AppliesFrom::Next, |epoch| AppliesFrom::Epoch(Epoch(epoch))));
+        let (to, from) = (
+            self.cell.node,
+            self.epoch.map_or(StimulusStart::Next, |epoch| StimulusStart::Epoch(Epoch(epoch))),
+        );
         if let Some((number, words)) = self.others.page()? {
-            let page = SensorPage::of_stimulus(number, words).map_err(|error| error.to_string())?;
+            let page = SensorPage::from_stimulus(number, words).map_err(|error| error.to_string())?;
             return Ok(Message::Stimulus { to, from, page });
         }
         let page = SensorPage::Skin(SkinSensors {
@@ -206,7 +210,7 @@ impl Stimulus {
     }
 }
 
-impl Configure {
+impl ConfigureCommand {
     fn message(&self) -> Result<Message, String> {
         let wrong = |error: parameter::ParameterTextError| error.to_string();
         let request = match (&self.request.read, self.request.write.as_deref()) {
@@ -222,7 +226,11 @@ impl Configure {
 }
 
 /// Parses the value of an option. An error names the option, the value and the allowed values.
-fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, String> {
+fn parse_option_value<T>(
+    option: &str,
+    text: &str,
+    read: impl Fn(&str) -> Result<T, String>,
+) -> Result<T, String> {
     read(text).map_err(|allowed| format!("{option} {text}: {allowed}"))
 }
 
@@ -230,7 +238,7 @@ fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) 
 fn sensor_value<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
     let field = layouts().flat_map(|layout| &layout.fields).find(|field| field.name == name);
     let field = field.ok_or_else(|| format!("{option}: cells measure no {name}"))?;
-    let word = value(option, text, |text| {
+    let word = parse_option_value(option, text, |text| {
         parameter::parse_finite(text).and_then(|_| parameter::parse_value(field, text))
     })?;
     Ok(Q::from_bits(word))
@@ -251,7 +259,7 @@ fn sensor_values<const F: u32, const N: usize>(
 
 /// Parses a force in N, and divides it among the three contact words.
 fn force_words(text: &str) -> Result<[Q5_10; 3], String> {
-    let force = value("--force", text, parameter::parse_finite)?;
+    let force = parse_option_value("--force", text, parameter::parse_finite)?;
     let words = contact_words(force);
     let sum: f64 = words.into_iter().map(Q::to_f64).sum();
     if (sum - force).abs() > 1.0 / 1_024.0 {
@@ -315,7 +323,7 @@ mod tests {
         {
             let Ok(Message::Stimulus {
                 page: SensorPage::Skin(skin),
-                from: AppliesFrom::Next,
+                from: StimulusStart::Next,
                 to: Node::Everyone,
             }) = message(&format!("stimulus --cell everyone --force {force}"))
             else {

@@ -1,6 +1,6 @@
 //! `skinbus frame sensing`.
 
-use bench::sensing::switch;
+use bench::sensing::switch_sensing;
 use clap::Args;
 use model::decode::parameter::ParameterWords;
 use protocol::bus::Bus;
@@ -12,7 +12,7 @@ use protocol::usage::{Failure, print_text};
 
 use super::addressee::{addressee, only_cell};
 use crate::arguments::{OptionValue, one_of_values};
-use model::decode::pick::Party;
+use model::decode::pick::NodeSelector;
 
 /// Set when cells send their sensor values: never, at a rate, or on changes
 ///
@@ -33,7 +33,7 @@ pub(super) struct SensingCommand {
     hz: Option<f64>,
     /// The cell, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee, default_value = "everyone")]
-    pub(super) cell: Party,
+    pub(super) cell: NodeSelector,
 }
 
 /// Mode of the sensor frames.
@@ -60,7 +60,7 @@ impl SensingCommand {
     pub(super) fn send(&self, bus: Bus, format: Format) -> Result<(), Failure> {
         let mode = self.sensing().map_err(Failure::usage)?;
         let on = format!("{} ({})", bus.name(), bus.kind());
-        let confirmed = switch(bus, format, only_cell(&self.cell), mode).map_err(Failure::run)?;
+        let confirmed = switch_sensing(bus, format, only_cell(&self.cell), mode).map_err(Failure::run)?;
         print_text(&format!(
             "{confirmed} on {on}: {}\n",
             ParameterWords(Parameter::Sensing.number(), mode.words())

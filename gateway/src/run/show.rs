@@ -7,11 +7,11 @@ use analysis::paper;
 use bench::summary::{BusSummary, CELL_ERROR_NM, CellSummary, HaltSummary, Outcome, ProcessorUse, Summary};
 use comfy_table::Color;
 use model::listing::ranges;
-use model::table::Errors;
+use model::table::TorqueErrors;
 use protocol::usage::printable;
 
 use crate::print::{
-    GREEN, KeyValueTable, PLAIN, RED, YELLOW, comma_separated, count, hanging_indent, or_else_text,
+    GREEN, KeyValueTable, PLAIN, RED, YELLOW, comma_separated, count_with_noun, hanging_indent, or_else_text,
     quantiles, space_separated,
 };
 
@@ -36,9 +36,9 @@ pub(super) struct TableStyle {
 }
 
 /// Returns the verdict and the table of a run.
-pub(super) fn text(summary: &Summary, look: TableStyle) -> String {
+pub(super) fn format_summary(summary: &Summary, look: TableStyle) -> String {
     let rows = rows(summary, look);
-    verdict(summary, look, rows.columns()) + &rows.text()
+    verdict(summary, look, rows.columns()) + &rows.to_text()
 }
 
 fn verdict(summary: &Summary, look: TableStyle, columns: usize) -> String {
@@ -67,75 +67,101 @@ fn verdict(summary: &Summary, look: TableStyle, columns: usize) -> String {
 }
 
 fn rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
-    let cells = format!("{}, {:.1} s", count(summary.cells.len(), "cell"), summary.duration_s);
+    let cells = format!("{}, {:.1} s", count_with_noun(summary.cells.len(), "cell"), summary.duration_s);
     let (cells, ended) = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
         Some(halted) => (cells, format!("halted at {:.3} s", halted.at_s)),
         None => (format!("{cells}, {}", summary.outcome), String::new()),
     };
     let is_verbose = look.is_verbose;
     let mut rows = if is_verbose {
-        KeyValueTable::in_columns(look.columns, &summary.skin, cells, ended)
+        KeyValueTable::with_terminal_width(look.columns, &summary.skin, cells, ended)
     } else {
-        KeyValueTable::in_columns(look.columns, &summary.skin, cells, ended).names_in(MAX_NAME_WIDTH)
+        KeyValueTable::with_terminal_width(look.columns, &summary.skin, cells, ended)
+            .with_name_width(MAX_NAME_WIDTH)
     };
     rows = rows.coloured(look.is_coloured);
-    halts(&mut rows, summary);
+    add_halt_sections(&mut rows, summary);
     for error in &summary.cell_errors {
-        rows.section("ended by errors of their own", count(error.count(), "cell"), &error.reason);
-        rows.row("cells", error.names(), "");
+        rows.add_section(
+            "ended by errors of their own",
+            count_with_noun(error.count(), "cell"),
+            &error.reason,
+        );
+        rows.add_row("cells", error.names(), "");
     }
-    accuracy(&mut rows, summary, is_verbose);
-    control(&mut rows, summary, is_verbose);
+    add_accuracy_rows(&mut rows, summary, is_verbose);
+    add_control_rows(&mut rows, summary, is_verbose);
     for bus in &summary.buses {
-        replies(&mut rows, bus, is_verbose);
-        frames(&mut rows, bus, is_verbose);
-        noteworthy(&mut rows, bus, &summary.cells);
+        add_reply_rows(&mut rows, bus, is_verbose);
+        add_frame_rows(&mut rows, bus, is_verbose);
+        add_noteworthy_cell_rows(&mut rows, bus, &summary.cells);
     }
-    costs(&mut rows, summary, is_verbose);
+    add_cost_rows(&mut rows, summary, is_verbose);
     rows
 }
 
-fn halts(rows: &mut KeyValueTable, summary: &Summary) {
+fn add_halt_sections(rows: &mut KeyValueTable, summary: &Summary) {
     for HaltSummary { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(MAX_HALTS) {
         let until = until_s.map_or_else(|| "to the end".to_owned(), |until| format!("to {until:.3} s"));
-        rows.section("halted", format!("{at_s:.3} s {until}, epoch {epoch}"), reason);
+        rows.add_section("halted", format!("{at_s:.3} s {until}, epoch {epoch}"), reason);
     }
     let more = summary.halts.len().saturating_sub(MAX_HALTS) as u64 + summary.further_halts;
     if more > 0 {
-        rows.section("halted", format!("{} more", count(more, "time")), "--summary has when and why");
+        rows.add_section(
+            "halted",
+            format!("{} more", count_with_noun(more, "time")),
+            "--summary has when and why",
+        );
     }
 }
 
-fn accuracy(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
+fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
     let accuracy = &summary.accuracy;
     let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean().is_some());
     if single || sums {
-        rows.section("accuracy", "mean (max) error, Nm", "against central torques");
+        rows.add_section("accuracy", "mean (max) error, Nm", "against central torques");
     }
     let name = |short: &'static str, long: &'static str| if is_verbose { long } else { short };
-    let of_paper = |errors: &Errors, paper: f64| format!("{}, paper {paper}", compared(errors));
+    let of_paper =
+        |errors: &TorqueErrors, paper: f64| format!("{}, paper {paper}", format_torque_count(errors));
     if single {
         let errors = &accuracy.single;
-        rows.row(
+        rows.add_row(
             name("single cells", "single cells, loaded joints"),
-            error(errors),
-            of_paper(errors, paper::SINGLE_NM),
+            format_mean_and_max(errors),
+            of_paper(errors, paper::SINGLE_CELL_ERROR_NM),
         );
         if is_verbose {
             let errors = &accuracy.unquantised;
-            rows.row("  against unrounded parameters", error(errors), compared(errors));
+            rows.add_row(
+                "  against unrounded parameters",
+                format_mean_and_max(errors),
+                format_torque_count(errors),
+            );
         }
         let errors = &accuracy.whole;
         if is_verbose || errors.count() > 0 {
-            rows.row(name("the whole skin", "the whole skin, all joints"), error(errors), compared(errors));
+            rows.add_row(
+                name("the whole skin", "the whole skin, all joints"),
+                format_mean_and_max(errors),
+                format_torque_count(errors),
+            );
         }
     }
     if sums {
         let errors = &accuracy.sums;
-        rows.row(name("sums", "sums, loaded joints"), error(errors), of_paper(errors, paper::SUMMED_NM));
+        rows.add_row(
+            name("sums", "sums, loaded joints"),
+            format_mean_and_max(errors),
+            of_paper(errors, paper::SUMMED_ERROR_NM),
+        );
         let errors = &accuracy.sums_averaged;
         if is_verbose || errors.count() > 0 {
-            rows.row("  averaged over 32 epochs", error(errors), compared(errors));
+            rows.add_row(
+                "  averaged over 32 epochs",
+                format_mean_and_max(errors),
+                format_torque_count(errors),
+            );
         }
     }
     rows.row_unless_zero(
@@ -145,75 +171,81 @@ fn accuracy(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
     );
 }
 
-fn error(errors: &Errors) -> String {
+fn format_mean_and_max(errors: &TorqueErrors) -> String {
     or_else_text(errors.mean().map(|mean| format!("{mean:.2e} ({:.1e})", errors.max())), "nothing compared")
 }
 
-fn compared(errors: &Errors) -> String {
-    count(errors.count(), "torque")
+fn format_torque_count(errors: &TorqueErrors) -> String {
+    count_with_noun(errors.count(), "torque")
 }
 
-fn control(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
+fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
     let control = &summary.control;
-    rows.section("control loop", "median / 90 % / 99 % / max", "µs");
-    rows.row("began late", quantiles(&control.late_us), format!("idle {}", quantiles(&control.idle_late_us)));
+    rows.add_section("control loop", "median / 90 % / 99 % / max", "µs");
+    rows.add_row(
+        "began late",
+        quantiles(&control.late_us),
+        format!("idle {}", quantiles(&control.idle_late_us)),
+    );
     if is_verbose && control.central_us.count > 0 {
-        rows.row("tick", quantiles(&control.took_us), "");
-        rows.row("  central computation in it", quantiles(&control.central_us), "distributed: 0");
+        rows.add_row("tick", quantiles(&control.took_us), "");
+        rows.add_row("  central computation in it", quantiles(&control.central_us), "distributed: 0");
     }
     if is_verbose && control.took_distributed_us.count > 0 {
-        rows.row("tick, distributed", quantiles(&control.took_distributed_us), "");
+        rows.add_row("tick, distributed", quantiles(&control.took_distributed_us), "");
     }
     let counts = [
         ("ticks", control.ticks, control.ticks_skipped),
         ("broadcasts", control.broadcasts, control.broadcasts_skipped),
     ];
     for (name, count, skipped) in counts.into_iter().filter(|(_, _, skipped)| is_verbose || *skipped > 0) {
-        rows.row(name, count, format!("{skipped} skipped"));
+        rows.add_row(name, count, format!("{skipped} skipped"));
     }
     let why = "the bus refused them, or this machine was busy";
     rows.row_unless_zero("frames not sent", control.unsent, why);
     rows.row_unless_zero("records of ticks lost", control.records_lost, why);
     for (name, count) in &control.controller {
-        rows.row("external controller", count, name);
+        rows.add_row("external controller", count, name);
     }
     for (reason, count) in &control.bad_cycles {
-        rows.row("bad cycles", count, reason);
+        rows.add_row("bad cycles", count, reason);
     }
     if is_verbose {
         let granted = |granted| if granted { "granted" } else { "refused" };
         let locked = granted(control.memory_locked);
-        rows.row("SCHED_FIFO", granted(control.fifo), format!("memory lock {locked}"));
+        rows.add_row("SCHED_FIFO", granted(control.fifo), format!("memory lock {locked}"));
     }
 }
 
-fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
+fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let replies = &bus.replies;
-    rows.section(&bus.name, counts_by_kind(&bus.cells), &bus.kind);
+    rows.add_section(&bus.name, counts_by_kind(&bus.cells), &bus.kind);
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
-        let ticks = format!("{} without it", count(bus.outages.ticks, "tick"));
-        let times = count(bus.outages.times, "time");
-        rows.row("lost", format!("{times}, {:.1} s{end}", bus.outages.lost_s), ticks);
+        let ticks = format!("{} without it", count_with_noun(bus.outages.ticks, "tick"));
+        let times = count_with_noun(bus.outages.times, "time");
+        rows.add_row("lost", format!("{times}, {:.1} s{end}", bus.outages.lost_s), ticks);
     }
     for it in &bus.hosts {
-        let gone = (it.gone > 0).then(|| format!("gone {}, {:.1} s", count(it.gone, "time"), it.gone_s));
+        let gone =
+            (it.gone > 0).then(|| format!("gone {}, {:.1} s", count_with_noun(it.gone, "time"), it.gone_s));
         let end = (!it.at_end).then(|| "not reached at the end".to_owned());
         let lost = comma_separated(
             [(it.lost_from, "from there"), (it.lost_to, "to there")]
-                .map(|(n, way)| format!("{} lost {way}", count(n, "frame"))),
+                .map(|(n, way)| format!("{} lost {way}", count_with_noun(n, "frame"))),
         );
-        let cells = count(it.cells, "cell");
-        rows.row(
+        let cells = count_with_noun(it.cells, "cell");
+        rows.add_row(
             format!("host {}", it.name),
             comma_separated([cells].into_iter().chain(gone).chain(end)),
             lost,
         );
     }
     if !bus.silent_cells.is_empty() {
-        rows.row("silent cells", comma_separated(ranges(&bus.silent_cells)), "");
+        rows.add_row("silent cells", comma_separated(ranges(&bus.silent_cells)), "");
     }
-    let complete = format!("{} of {} complete", bus.epochs_complete, count(bus.epochs_due, "epoch"));
+    let complete =
+        format!("{} of {} complete", bus.epochs_complete, count_with_noun(bus.epochs_due, "epoch"));
     if let Some(sums) = &bus.sums {
         let parts = sums.contributions;
         let unexpected = parts.unasked - parts.contact_unknown;
@@ -227,9 +259,13 @@ fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
             [parts.contact_unknown, unexpected],
         );
         if !is_brief {
-            rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
+            rows.add_row(
+                "  in time",
+                parts.in_time,
+                format!("{} late, {} missing", parts.late, parts.missing),
+            );
         }
-        sums_on_the_bus(rows, bus, is_verbose);
+        add_sum_rows(rows, bus, is_verbose);
     } else {
         let is_brief = !is_verbose && replies.in_time == replies.due;
         due_rows(
@@ -241,11 +277,11 @@ fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
             [replies.contact_unknown, replies.unexpected],
         );
         if !is_brief {
-            rows.row("  in time", replies.in_time, format!("{} late", replies.late));
+            rows.add_row("  in time", replies.in_time, format!("{} late", replies.late));
             let missing = replies.due - replies.in_time - replies.late;
             if is_verbose || missing > 0 {
                 let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, key_words(why)));
-                unexplained(
+                add_unexplained_row(
                     rows,
                     "  missing",
                     missing,
@@ -258,52 +294,58 @@ fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     if is_verbose {
         let last = if bus.sums.is_some() { "last sum" } else { "last reply" };
         let name = format!("{last} after broadcast, µs");
-        rows.row(name, quantiles(&bus.last_reply_us), "by kernel time stamps");
+        rows.add_row(name, quantiles(&bus.last_reply_us), "by kernel time stamps");
         if bus.sums.is_none() {
-            rows.row("  each reply, µs", quantiles(&bus.reply_us), "late ones included");
+            rows.add_row("  each reply, µs", quantiles(&bus.reply_us), "late ones included");
         }
-        joint_age_row(rows, bus);
+        add_joint_age_row(rows, bus);
     } else if bus.last_reply_us.count > 0 {
         let name = if bus.sums.is_some() { "last sum, µs" } else { "last reply, µs" };
-        rows.row(name, quantiles(&bus.last_reply_us), "after the joints");
+        rows.add_row(name, quantiles(&bus.last_reply_us), "after the joints");
     }
 }
 
 /// Adds rows on sums, and on the tree that carries them.
-fn sums_on_the_bus(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
+fn add_sum_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let Some(sums) = &bus.sums else { return };
     let counts = sums.counts;
     if is_verbose || counts.resent + counts.overheard + counts.stale > 0 {
         let more =
             format!("{} resent, {} overheard, {} stale", counts.resent, counts.overheard, counts.stale);
-        rows.row(format!("sums from {}", count(sums.roots, "root")), counts.first, more);
+        rows.add_row(format!("sums from {}", count_with_noun(sums.roots, "root")), counts.first, more);
     }
     if is_verbose {
         let on_the_bus = counts.received + bus.uplink.unheard;
         let taken =
             format!("the gateway took {}: the tree saves it frames, but not a shared bus", counts.received);
-        rows.row("sums on the bus, of all cells", on_the_bus, taken);
+        rows.add_row("sums on the bus, of all cells", on_the_bus, taken);
     }
     let Some(network) = &bus.network else { return };
     if is_verbose || network.tree_ready_s.is_none() {
         let tree_ready = or_else_text(network.tree_ready_s.map(|s| format!("in {s:.2} s")), "never complete");
-        let changes = count(network.parent_changes, "change");
-        rows.row("tree, wires deep", network.deepest, format!("{tree_ready}, {changes} of parents"));
+        let changes = count_with_noun(network.parent_changes, "change");
+        rows.add_row("tree, wires deep", network.deepest, format!("{tree_ready}, {changes} of parents"));
     }
     if !network.unreachable.is_empty() {
-        rows.row("unreachable cells", space_separated(&network.unreachable), "no sum contains them");
+        rows.add_row("unreachable cells", space_separated(&network.unreachable), "no sum contains them");
     }
     for difference in &network.differences {
-        rows.row("not as described", difference, "");
+        rows.add_row("not as described", difference, "");
     }
 }
 
 /// Adds a row whose last text is red if something is missing for an unknown reason.
-fn unexplained(rows: &mut KeyValueTable, name: &str, value: impl Display, reasons: String, unknown: u64) {
+fn add_unexplained_row(
+    rows: &mut KeyValueTable,
+    name: &str,
+    value: impl Display,
+    reasons: String,
+    unknown: u64,
+) {
     if unknown > 0 {
-        rows.row_in_colour(name, value, reasons, Color::Red);
+        rows.add_coloured_row(name, value, reasons, Color::Red);
     } else {
-        rows.row(name, value, reasons);
+        rows.add_row(name, value, reasons);
     }
 }
 
@@ -321,20 +363,20 @@ fn due_rows(
     let mut reasons = reasons.into_iter().filter(|(count, _)| *count > 0);
     let beside = if due == 0 { reasons.next() } else { None };
     match beside {
-        Some((count, why)) => rows.row_in_one_line(name, due, &format!("{count} not due: {why}")),
-        None if due == 0 => rows.row(name, due, "no cell was in contact"),
-        None if is_brief => rows.row(name, format!("{due}, all in time"), complete),
-        None => rows.row(name, due, complete),
+        Some((count, why)) => rows.add_row_in_one_line(name, due, &format!("{count} not due: {why}")),
+        None if due == 0 => rows.add_row(name, due, "no cell was in contact"),
+        None if is_brief => rows.add_row(name, format!("{due}, all in time"), complete),
+        None => rows.add_row(name, due, complete),
     }
     for (count, why) in reasons {
-        rows.row("  not due", count, why);
+        rows.add_row("  not due", count, why);
     }
 }
 
 /// Adds a row on the age of joints that cells have not received.
-fn joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
+fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
     let why = "large: busy machine; losses: see the bus";
-    rows.row("joint age at heartbeat, µs", quantiles(&bus.joints_not_taken_us), why);
+    rows.add_row("joint age at heartbeat, µs", quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Converts a key of the summary to words.
@@ -355,16 +397,20 @@ fn reasons_text(reasons: &[(u64, impl Display)], unknown: u64) -> String {
 }
 
 /// Adds rows on the measuring cells of a bus, and on its most conspicuous cells.
-fn noteworthy(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
+fn add_noteworthy_cell_rows(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
     let all = || all.iter().filter(|cell| cell.bus == bus.name);
-    let measuring: Vec<_> = all().filter(|cell| cell.measures()).map(|cell| cell.node).collect();
+    let measuring: Vec<_> = all().filter(|cell| cell.is_measuring()).map(|cell| cell.node).collect();
     if !measuring.is_empty() {
-        rows.row("cells that measure", space_separated(measuring), "not pressed, their torques not compared");
+        rows.add_row(
+            "cells that measure",
+            space_separated(measuring),
+            "not pressed, their torques not compared",
+        );
     }
     let unclear: Vec<_> =
-        all().filter(|cell| cell.contact_unknown > 0 && !cell.measures()).map(|cell| cell.node).collect();
+        all().filter(|cell| cell.contact_unknown > 0 && !cell.is_measuring()).map(|cell| cell.node).collect();
     if !unclear.is_empty() {
-        rows.row(
+        rows.add_row(
             "cells of unknown contact",
             space_separated(unclear),
             "stimuli from before this run, or a baseline",
@@ -372,7 +418,7 @@ fn noteworthy(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
     }
     for cell in all().filter(|cell| !cell.stuck.is_empty()) {
         let kinds = cell.stuck.iter().map(|(kind, count)| format!("{count} times one {kind}"));
-        rows.row(
+        rows.add_row(
             format!("stuck: cell {}", cell.node),
             comma_separated(kinds),
             "while it should have sent others",
@@ -387,47 +433,50 @@ fn noteworthy(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
         let CellSummary { due, in_time, late, restarts, .. } = **cell;
         let late = (late > 0).then(|| format!("{late} late"));
         let missing = cell.missing.iter().map(|(why, count)| format!("{count} {}", key_words(why)));
-        let restarts = (restarts > 0).then(|| count(restarts, "restart"));
+        let restarts = (restarts > 0).then(|| count_with_noun(restarts, "restart"));
         let error =
             cell.error.mean().filter(|_| is_off(cell)).map(|mean| format!("mean error {mean:.1e} Nm"));
         let why = late.into_iter().chain(missing).chain(restarts).chain(error);
         let in_time = (due > 0).then(|| format!("{in_time} of {due} replies in time"));
-        rows.row(format!("cell {}", cell.node), or_else_text(in_time, ""), comma_separated(why));
+        rows.add_row(format!("cell {}", cell.node), or_else_text(in_time, ""), comma_separated(why));
     }
     let more = worst.len().saturating_sub(MAX_CELLS);
     rows.row_unless_zero("further cells that stand out", more as u64, "--summary has each cell");
 }
 
-fn frames(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
+fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let up = &bus.uplink;
     let lost = up.dropped + up.backlog + up.outage + up.hosts + up.unknown;
     let odd = up.rejected + up.surplus + up.outsiders + up.in_doubt + u64::from(up.restarts);
     if is_verbose || lost + odd > 0 {
-        packets(rows, bus, lost);
+        add_packet_rows(rows, bus, lost);
     } else {
-        rows.row("packets of cells", up.sent, "none lost");
+        rows.add_row("packets of cells", up.sent, "none lost");
     }
     if is_verbose {
-        rows.row("received", counts_by_kind(&bus.received), "");
+        rows.add_row("received", counts_by_kind(&bus.received), "");
     }
     let sensors = &bus.sensors;
     if let (Some(min), Some(mean), Some(max)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
-        let touches = comma_separated([count(sensors.touches, "touch"), count(sensors.releases, "release")]);
-        rows.row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
+        let touches = comma_separated([
+            count_with_noun(sensors.touches, "touch"),
+            count_with_noun(sensors.releases, "release"),
+        ]);
+        rows.add_row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
     }
     if is_verbose {
-        rows.row("sent", counts_by_kind(&bus.sent), "");
+        rows.add_row("sent", counts_by_kind(&bus.sent), "");
     }
     if !bus.events.is_empty() {
-        rows.row("anomalies", counts_by_kind(&bus.events), "");
+        rows.add_row("anomalies", counts_by_kind(&bus.events), "");
     }
 }
 
 /// Adds rows on the packets from the cells, by what became of them.
-fn packets(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
+fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
-    rows.row("packets sent by cells", up.sent, "by their own count");
-    rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
+    rows.add_row("packets sent by cells", up.sent, "by their own count");
+    rows.add_row("  delivered", up.delivered, format!("{} rejected", up.rejected));
     rows.row_unless_zero("  for other cells", up.unheard, "sums that the gateway does not take");
     let reasons = [
         (up.dropped, "dropped by the bus"),
@@ -435,7 +484,7 @@ fn packets(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
         (up.outage, "with the bus"),
         (up.hosts, "between hosts"),
     ];
-    unexplained(rows, "  lost", lost, reasons_text(&reasons, up.unknown), up.unknown);
+    add_unexplained_row(rows, "  lost", lost, reasons_text(&reasons, up.unknown), up.unknown);
     rows.row_unless_zero("  surplus", up.surplus, "");
     rows.row_unless_zero("  of other senders", up.outsiders, "");
     rows.row_unless_zero("  in doubt", up.in_doubt, "");
@@ -443,34 +492,34 @@ fn packets(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     rows.row_unless_zero("  restarts of cells", up.restarts, "what they sent last is in doubt");
 }
 
-fn costs(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
+fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
     let ProcessorUse { gateway, cells, buses } = summary.processor;
     // Adding 0.0 turns -0.0 into 0.0.
     let [gateway, cells, buses] = [gateway, cells, buses].map(|cores| cores.max(0.0) + 0.0);
     let cores = format!("{:.3}", gateway + cells + buses);
     if is_verbose {
-        rows.section("cost", "", "");
+        rows.add_section("cost", "", "");
         let parts = format!("gateway {gateway:.3}, cells {cells:.3}, buses {buses:.3}");
-        rows.row("processor, cores", cores, parts);
+        rows.add_row("processor, cores", cores, parts);
         if let Some(kib) = summary.memory.cell_private_kib {
-            rows.row("private memory of a cell process", format!("{kib} KiB"), "the largest");
+            rows.add_row("private memory of a cell process", format!("{kib} KiB"), "the largest");
         }
         if let Some(kib) = summary.memory.gateway_private_kib {
             let buses = summary.memory.buses_private_kib.map(|kib| format!("its servers of buses {kib} KiB"));
-            rows.row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
+            rows.add_row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
         }
-        rows.row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
+        rows.add_row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
     } else {
-        rows.section("processor", format!("{cores} cores"), format!("of them {cells:.3} for cells"));
+        rows.add_section("processor", format!("{cores} cores"), format!("of them {cells:.3} for cells"));
     }
     let Some(recording) = &summary.recording else { return };
     for file in &recording.files {
-        let frames = count(file.frames, "frame");
+        let frames = count_with_noun(file.frames, "frame");
         let size = size(file.bytes);
-        rows.section("recording", &file.path, format!("{frames}, {size}"));
+        rows.add_section("recording", &file.path, format!("{frames}, {size}"));
     }
     if is_verbose || recording.lost > 0 || recording.files.is_empty() {
-        rows.row("frames in every format", recording.frames, format!("{} lost", recording.lost));
+        rows.add_row("frames in every format", recording.frames, format!("{} lost", recording.lost));
     }
 }
 

@@ -8,20 +8,20 @@ use cover::{CoverOptions, KeepOut, LinkFigures, MAX_NODES, MAX_PITCH, MIN_PITCH,
 use protocol::usage::Failure;
 use robots::{CellOnLink, Isometry3, Urdf, UrdfChain};
 
-use super::super::print::{comma_separated, count};
-use super::super::visuals::{Packages, Visuals};
+use super::super::print::{comma_separated, count_with_noun};
+use super::super::visuals::{PackageOptions, Visuals};
 
 /// Options for the covered links.
 #[derive(Args, Debug)]
-pub(super) struct Covering {
+pub(super) struct CoverArguments {
     /// Cover these links with cells, on the meshes and shapes of their visuals; the other links are obstacles
-    #[arg(long, value_name = "LINK,..", value_delimiter = ',', value_parser = link, conflicts_with = "places")]
+    #[arg(long, value_name = "LINK,..", value_delimiter = ',', value_parser = parse_link_name, conflicts_with = "places")]
     pub(super) cover: Vec<String>,
     /// Distance between the centers of neighbouring cells in m, 0.001 to 1
-    #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = pitch, allow_negative_numbers = true)]
+    #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = parse_pitch, allow_negative_numbers = true)]
     pitch: f64,
     /// Treat these links as absent: their visuals are not read, and cells may lie where they are
-    #[arg(long, value_name = "LINK,..", requires = "cover", value_delimiter = ',', value_parser = link)]
+    #[arg(long, value_name = "LINK,..", requires = "cover", value_delimiter = ',', value_parser = parse_link_name)]
     leave_out: Vec<String>,
     /// A box in the frame of a covered link that holds no cell, in m; may be given several times
     #[arg(long, value_name = "LINK:MINX,MINY,MINZ,MAXX,MAXY,MAXZ", requires = "cover", value_parser = keep_out)]
@@ -33,7 +33,7 @@ pub(super) struct Covering {
     #[arg(long, value_name = "N", requires = "cover", default_value_t = 250, value_parser = clap::value_parser!(u8).range(1..=250))]
     nodes_per_bus: u8,
     #[command(flatten)]
-    packages: Packages,
+    packages: PackageOptions,
 }
 
 /// A box in the frame of a link.
@@ -48,14 +48,14 @@ struct ExcludedBox {
 
 const PITCH: RangeInclusive<f64> = MIN_PITCH..=MAX_PITCH;
 
-fn pitch(text: &str) -> Result<f64, String> {
+fn parse_pitch(text: &str) -> Result<f64, String> {
     let pitch = text.parse().ok().filter(|pitch| PITCH.contains(pitch));
     pitch.ok_or_else(|| format!("a length from {MIN_PITCH} to {MAX_PITCH} m"))
 }
 
 /// Parses the name of a link, and removes surrounding blanks.
 #[expect(clippy::unnecessary_wraps, reason = "a parser of clap's")]
-fn link(text: &str) -> Result<String, String> {
+fn parse_link_name(text: &str) -> Result<String, String> {
     Ok(text.trim().to_owned())
 }
 
@@ -76,19 +76,25 @@ fn keep_out(text: &str) -> Result<ExcludedBox, String> {
 }
 
 /// Cells that cover the links, and figures about them.
-pub(super) struct Covered {
+pub(super) struct CoverResult {
     pub(super) cells: Vec<CellOnLink>,
     pub(super) figures: Vec<LinkFigures>,
 }
 
-impl Covering {
+impl CoverArguments {
     /// Covers the links with cells. A link belongs to the first chain that moves it, and each bus to one chain.
-    pub(super) fn cells(&self, urdf: &Urdf, file: &Path, chains: &[UrdfChain]) -> Result<Covered, Failure> {
-        let owners = self.owners(urdf, chains)?;
+    pub(super) fn cells(
+        &self,
+        urdf: &Urdf,
+        file: &Path,
+        chains: &[UrdfChain],
+    ) -> Result<CoverResult, Failure> {
+        let owners = self.chain_of_each_link(urdf, chains)?;
         let visuals = Visuals::new(urdf, file, &self.packages);
         let there = urdf.links().filter(|name| !self.leave_out.iter().any(|out| out == name));
         let links = there.map(|name| {
-            let pose = urdf.pose(name, &|joint| urdf.rest(joint)).map_err(|error| error.to_string())?;
+            let pose =
+                urdf.pose(name, &|joint| urdf.rest_position(joint)).map_err(|error| error.to_string())?;
             let parts = visuals.link_parts(name).map_err(|error| {
                 let is_covered = self.cover.iter().any(|covered| covered == name);
                 let hint = if is_covered {
@@ -111,7 +117,7 @@ impl Covering {
                 "--cover {bare}: {file} has no visual of this link: add one, or take the link out of --cover"
             )));
         }
-        let mut covered = Covered { cells: Vec::new(), figures: Vec::new() };
+        let mut covered = CoverResult { cells: Vec::new(), figures: Vec::new() };
         let mut buses = 0;
         for chain in 0..chains.len() {
             let names: Vec<_> = self
@@ -138,7 +144,7 @@ impl Covering {
                 .map_err(|error| Failure::usage(format!("--cover: {error}")))?;
             if let Some(bare) = skin.links.iter().find(|figures| figures.cells == 0) {
                 let is_flat = own.iter().any(|link| link.name == bare.name && !has_area(link));
-                return Err(Failure::usage(without_cells(bare, is_flat)));
+                return Err(Failure::usage(no_cells_reason(bare, is_flat)));
             }
             covered.cells.extend(skin.cells.iter().map(|cell| CellOnLink {
                 link: own.get(cell.link).map_or_else(String::new, |link| link.name.clone()),
@@ -157,7 +163,7 @@ impl Covering {
     }
 
     /// Returns for each covered link the index of its chain.
-    fn owners(&self, urdf: &Urdf, chains: &[UrdfChain]) -> Result<Vec<usize>, Failure> {
+    fn chain_of_each_link(&self, urdf: &Urdf, chains: &[UrdfChain]) -> Result<Vec<usize>, Failure> {
         let moved = || {
             let on_path = urdf.links().filter(|link| chains.iter().any(|chain| chain.link(link).is_ok()));
             comma_separated(on_path)
@@ -229,7 +235,7 @@ fn has_area(link: &RobotLink) -> bool {
 }
 
 /// Returns the reason why a link has no cell, in one line.
-fn without_cells(LinkFigures { name, outer_area, kept_out, .. }: &LinkFigures, is_flat: bool) -> String {
+fn no_cells_reason(LinkFigures { name, outer_area, kept_out, .. }: &LinkFigures, is_flat: bool) -> String {
     let why = if is_flat {
         "its triangles have no area: correct its meshes, or take it out of --cover".to_owned()
     } else if *outer_area <= 0.0 {
@@ -252,7 +258,7 @@ pub(super) fn figures_text(figures: &LinkFigures) -> String {
         spacing.map_or_else(String::new, |metres| format!("; {:.1} mm from cell to cell", metres * 1e3));
     format!(
         "{name}: {}, {:.1} % of {outer_area:.4} m2 covered{spacing}; tilted by {:.1} degrees at most",
-        count(*cells, "cell"),
+        count_with_noun(*cells, "cell"),
         covered * 100.0,
         tilt.to_degrees()
     )

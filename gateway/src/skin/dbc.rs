@@ -9,7 +9,7 @@ use protocol::usage::{Failure, print_text};
 
 use crate::arguments::bus_names;
 use crate::input::skin_in;
-use crate::output::{Overwrite, check_distinct};
+use crate::output::{OverwriteOption, check_distinct};
 use crate::print::comma_separated;
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
@@ -23,7 +23,7 @@ use crate::print::comma_separated;
   skinbus skin dbc skin.toml --bus can1 > can1.dbc
   skinbus skin dbc run.mcap -o run.dbc
   candump -L vcan0 | python3 -m cantools decode -s skin.dbc")]
-pub(super) struct Dbc {
+pub(super) struct DbcCommand {
     /// A skin, or a recording of a run, which contains its skin
     #[arg(value_name = "SKIN|MCAP")]
     file: PathBuf,
@@ -37,10 +37,10 @@ pub(super) struct Dbc {
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Dbc {
+impl DbcCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let file = self.file.display();
         check_distinct([("-o", self.output.as_deref())], [self.file.as_path()])?;

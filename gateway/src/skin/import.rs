@@ -8,11 +8,11 @@ use protocol::id::CellId;
 use protocol::usage::{Failure, print_text};
 use robots::{CellOnLink, ImportError, JointKind, SkinImport as Described, UrdfChain};
 
-use super::super::columns::{Columns, Table};
-use super::super::output::{Overwrite, check_distinct, is_standard_output, note};
-use super::super::print::{comma_separated, count};
+use super::super::columns::{Columns, CsvTable};
+use super::super::output::{OverwriteOption, check_distinct, is_standard_output, print_note};
+use super::super::print::{comma_separated, count_with_noun};
 use super::super::robot_file::{read_urdf, relative_path};
-use super::covering::{self, Covered, Covering};
+use super::covering::{self, CoverArguments, CoverResult};
 
 /// Describe a skin on your own robot, from its URDF
 ///
@@ -33,7 +33,7 @@ Examples:
   skinbus skin import two-arms.urdf --tip left_hand --tip right_hand -o both.toml
   skinbus run panda.toml --duration 10"
 )]
-pub(super) struct Import {
+pub(super) struct ImportCommand {
     /// The robot's URDF; for a xacro file, the output of `xacrodoc FILE -o ROBOT.urdf`
     #[arg(value_name = "ROBOT.urdf")]
     urdf: PathBuf,
@@ -47,19 +47,19 @@ pub(super) struct Import {
     #[arg(long, value_name = "CELLS.csv")]
     places: Option<PathBuf>,
     #[command(flatten)]
-    covering: Covering,
+    covering: CoverArguments,
     /// The file to write, completely or not at all [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
 /// Columns of the file of cells.
 const COLUMNS: Columns =
     Columns { needed: &["link", "px", "py", "pz", "nx", "ny", "nz"], optional: &["bus", "node"] };
 
-impl Import {
+impl ImportCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let read = [Some(self.urdf.as_path()), self.places.as_deref()].into_iter().flatten();
         check_distinct([("-o", self.output.as_deref())], read)?;
@@ -72,9 +72,9 @@ impl Import {
         {
             return Err(Failure::usage(format!("--tip {}: this tip is named twice: name it once", twice.1)));
         }
-        let Covered { cells, figures } = match &self.places {
-            Some(path) => Covered { cells: cells(path)?, figures: Vec::new() },
-            None if self.covering.cover.is_empty() => Covered { cells: Vec::new(), figures: Vec::new() },
+        let CoverResult { cells, figures } = match &self.places {
+            Some(path) => CoverResult { cells: cells(path)?, figures: Vec::new() },
+            None if self.covering.cover.is_empty() => CoverResult { cells: Vec::new(), figures: Vec::new() },
             None => self.covering.cells(&urdf, &self.urdf, &chains)?,
         };
         let command = self.command();
@@ -90,7 +90,7 @@ impl Import {
             cells: &cells,
         };
         let wrong = |error: ImportError| match &self.places {
-            Some(path) if error.is_of_cells() => Failure::usage(format!("{}: {error}", path.display())),
+            Some(path) if error.is_in_cells() => Failure::usage(format!("{}: {error}", path.display())),
             Some(_) | None => Failure::usage(format!("{file}: {error}")),
         };
         let skin = import.toml().map_err(wrong)?;
@@ -99,13 +99,13 @@ impl Import {
             None => print_text(&skin)?,
         }
         for chain in &chains {
-            note(chain_text(chain));
+            print_note(chain_text(chain));
             for joint in suspicious_limits(chain) {
-                note(joint);
+                print_note(joint);
             }
         }
         for figures in &figures {
-            note(covering::figures_text(figures));
+            print_note(covering::figures_text(figures));
         }
         Ok(())
     }
@@ -130,7 +130,8 @@ impl Import {
 
 /// Describes a chain in one line.
 fn chain_text(chain: &UrdfChain) -> String {
-    let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
+    let (joints, rows) =
+        (count_with_noun(chain.joints.len(), "joint"), count_with_noun(chain.rows.len(), "row"));
     let names = comma_separated(chain.joints.iter().map(|joint| &joint.name));
     format!(
         "{} to {}: {joints} ({names}) in {rows}; rows and URDF differ by {:.1e} m or rad at most",
@@ -154,15 +155,15 @@ fn suspicious_limits(chain: &UrdfChain) -> impl Iterator<Item = String> {
     })
 }
 
-fn text(path: &Path) -> Result<String, Failure> {
+fn read_text(path: &Path) -> Result<String, Failure> {
     document::read_text(path).map_err(Failure::usage)
 }
 
 /// Reads the cells from a CSV file.
 fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
     let file = path.display().to_string();
-    let text = text(path)?;
-    let mut table = Table::new(&file, &text, COLUMNS)?;
+    let text = read_text(path)?;
+    let mut table = CsvTable::new(&file, &text, COLUMNS)?;
     let mut cells = Vec::new();
     while let Some(row) = table.next_row()? {
         let vector =

@@ -6,13 +6,13 @@ use clap::Args;
 use protocol::parameters::RowKind;
 use protocol::skin::{Cell, Skin};
 use protocol::usage::{Failure, print_text};
-use view::{Scene, Still};
+use view::{Scene, StillPage};
 
-use super::super::output::{Overwrite, check_distinct};
+use super::super::output::{OverwriteOption, check_distinct};
 use super::super::print::space_separated;
 use super::super::robot_file::urdf_path;
 use super::super::surface::shells;
-use super::super::visuals::Packages;
+use super::super::visuals::PackageOptions;
 
 /// Maximum number of triangles of the robot in a page; larger meshes are simplified.
 const MAX_TRIANGLES: usize = 12_000;
@@ -24,20 +24,20 @@ const MAX_TRIANGLES: usize = 12_000;
 /// vcan1.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus skin show skin.toml -o skin.html")]
-pub(super) struct Show {
+pub(super) struct ShowCommand {
     /// The skin
     #[arg(value_name = "SKIN")]
     file: PathBuf,
     #[command(flatten)]
-    packages: Packages,
+    packages: PackageOptions,
     /// The file to write, completely or not at all [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Show {
+impl ShowCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let skin = Skin::read(&self.file).map_err(Failure::usage)?;
         let urdf = skin.robot.urdf.as_deref().map(|urdf| urdf_path(&self.file, urdf));
@@ -46,7 +46,7 @@ impl Show {
         if let Some(path) = &self.output {
             self.overwrite.check("-o", path)?;
         }
-        let page = still_view(&self.file, &skin, &self.packages).page();
+        let page = still_view(&self.file, &skin, &self.packages).to_html();
         match &self.output {
             Some(path) => self.overwrite.write("-o", path, &page),
             None => print_text(&page),
@@ -55,9 +55,9 @@ impl Show {
 }
 
 /// Reads the meshes of a skin's robot, and returns the skin as a page shows it.
-pub(crate) fn still_view(file: &Path, skin: &Skin, packages: &Packages) -> Still {
+pub(crate) fn still_view(file: &Path, skin: &Skin, packages: &PackageOptions) -> StillPage {
     let position = |[min, max]: [f64; 2]| 0.0_f64.clamp(min, max);
-    Still {
+    StillPage {
         scene: Scene::from_skin(skin, false),
         surface: shells(file, skin, packages, MAX_TRIANGLES),
         positions: skin.robot.joints.iter().map(|joint| position(joint.limits)).collect(),

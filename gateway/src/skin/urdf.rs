@@ -7,7 +7,7 @@ use protocol::skin::Skin;
 use protocol::usage::{Failure, print_text};
 use robots::write_urdf;
 
-use super::super::output::{Overwrite, check_distinct};
+use super::super::output::{OverwriteOption, check_distinct};
 
 /// Describe a skin's robot as a URDF: its chains, row by row
 ///
@@ -17,7 +17,7 @@ use super::super::output::{Overwrite, check_distinct};
 /// the joints' velocity.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus skin urdf skin.toml -o robot.urdf")]
-pub(super) struct Urdf {
+pub(super) struct UrdfCommand {
     /// The skin
     #[arg(value_name = "SKIN")]
     file: PathBuf,
@@ -25,10 +25,10 @@ pub(super) struct Urdf {
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    overwrite: Overwrite,
+    overwrite: OverwriteOption,
 }
 
-impl Urdf {
+impl UrdfCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let skin = Skin::read(&self.file).map_err(Failure::usage)?;
         check_distinct([("-o", self.output.as_deref())], [self.file.as_path()])?;

@@ -6,7 +6,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use protocol::usage::{Failure, print_text};
-use trace::files::WholeFile;
+use trace::files::AtomicFile;
 
 /// Maximum size in bytes of a file that may be an address.
 const MAX_FILE_BYTES: u64 = 4096;
@@ -30,13 +30,13 @@ impl AddressFile {
         let refused =
             |error: io::Error| Failure::usage(format!("--address-file {}: {error}", path.display()));
         let is_file = fs::symlink_metadata(path).is_ok_and(|about| about.is_file());
-        if is_file && !is_address(path) {
+        if is_file && !is_address_file(path) {
             let why = "it exists and does not contain the address of a page: name another file";
             return Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, why)));
         }
         // Without this check, the error for a symlink would name an option that does not exist.
         let is_there = is_file || path.is_symlink();
-        let (whole, mut file) = WholeFile::create(path, is_there).map_err(refused)?;
+        let (whole, mut file) = AtomicFile::create(path, is_there).map_err(refused)?;
         let is_stream = whole.is_stream();
         let written = || -> io::Result<()> {
             if !is_stream {
@@ -63,7 +63,7 @@ impl Drop for AddressFile {
 }
 
 /// Returns true if an earlier page left the file.
-fn is_address(path: &Path) -> bool {
+fn is_address_file(path: &Path) -> bool {
     start_of(path).is_ok_and(|text| text.starts_with("http://") && text.lines().count() == 1)
 }
 

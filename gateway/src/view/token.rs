@@ -9,11 +9,11 @@ use std::path::Path;
 use protocol::usage::Failure;
 use view::Token;
 
-use crate::output::note;
+use crate::output::print_note;
 
 /// Environment variable that holds the token. A run passes the token to its page in it, because only the same user can
 /// read it there.
-pub(super) const VARIABLE: &str = "SKINBUS_TOKEN";
+pub(super) const TOKEN_VARIABLE: &str = "SKINBUS_TOKEN";
 /// Maximum number of bytes read from a token file.
 const MAX_FILE_BYTES: u64 = 4096;
 
@@ -21,7 +21,7 @@ const MAX_FILE_BYTES: u64 = 4096;
 pub(super) fn chosen_token(file: Option<&Path>) -> Result<Option<Token>, Failure> {
     match file {
         Some(path) => read(path).map(Some),
-        None => of_environment(),
+        None => token_from_environment(),
     }
 }
 
@@ -42,10 +42,12 @@ pub(super) fn required_token(
     }
 }
 
-fn of_environment() -> Result<Option<Token>, Failure> {
-    let Some(text) = std::env::var_os(VARIABLE).filter(|text| !text.is_empty()) else { return Ok(None) };
+fn token_from_environment() -> Result<Option<Token>, Failure> {
+    let Some(text) = std::env::var_os(TOKEN_VARIABLE).filter(|text| !text.is_empty()) else {
+        return Ok(None);
+    };
     let token = Token::parse(&text.to_string_lossy());
-    token.map(Some).map_err(|error| Failure::usage(format!("{VARIABLE}: {error}")))
+    token.map(Some).map_err(|error| Failure::usage(format!("{TOKEN_VARIABLE}: {error}")))
 }
 
 fn read(path: &Path) -> Result<Token, Failure> {
@@ -62,7 +64,7 @@ fn read(path: &Path) -> Result<Token, Failure> {
     let others =
         file.metadata().ok().filter(|about| about.is_file() && about.permissions().mode() & 0o077 != 0);
     if others.is_some() {
-        note(format_args!("--token-file {name}: other users may read it; `chmod 600` keeps it to you"));
+        print_note(format_args!("--token-file {name}: other users may read it; `chmod 600` keeps it to you"));
     }
     Ok(token)
 }

@@ -10,16 +10,16 @@ use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use bench::bus::follow::Source;
+use bench::bus::follow::BusSource;
 use bench::bus::link::SharedBus;
 use bench::bus::realtime;
-use control::controller::Kinesthetic;
-use control::cycle::turn::{BusPort, BusState, Shared, TickDriver};
+use control::controller::KinestheticController;
+use control::cycle::turn::{BusPort, BusState, SharedRunState, TickDriver};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use model::generate::{SkinRequest, generate};
 use model::scenario::{ModeChange, Scenario, TorqueSource};
-use model::table::Table;
+use model::table::BusTable;
 use protocol::bus::{Bus, BusKind, BusOptions, KindChoice};
 use protocol::can::Frame;
 use protocol::packet::padded;
@@ -62,7 +62,7 @@ fn skin(cells: usize) -> Skin {
 fn turn(
     skin: &Skin,
     mode: TorqueSource,
-) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, Table) {
+) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, BusTable) {
     let (turn, input, table, _) = turn_of(skin, mode);
     (turn, input, table)
 }
@@ -71,8 +71,8 @@ fn turn(
 fn turn_of(
     skin: &Skin,
     mode: TorqueSource,
-) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, Table, Arc<BusState>) {
-    let table = Table::new(skin, 0);
+) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, BusTable, Arc<BusState>) {
+    let table = BusTable::new(skin, 0);
     let (input, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, _) = rtrb::RingBuffer::new(4_096);
     let (records, _) = rtrb::RingBuffer::new(4_096);
@@ -80,9 +80,10 @@ fn turn_of(
     let line = BusPort { format: protocol::can::Format::Fd, snapshot, positions, state: Arc::clone(&state) };
     let modes = vec![ModeChange { at: Micros(0), mode }];
     let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
-    let controller = Box::new(Kinesthetic::new(skin).unwrap());
+    let controller = Box::new(KinestheticController::new(skin).unwrap());
     let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, padded(&[0.1; WORDS]))));
-    let turn = TickDriver::new(cycle, vec![line], Arc::new(scenario), Arc::new(Shared::default()), records);
+    let turn =
+        TickDriver::new(cycle, vec![line], Arc::new(scenario), Arc::new(SharedRunState::default()), records);
     (turn, input, table, state)
 }
 
@@ -179,16 +180,16 @@ fn a_bus_that_was_opened_again_is_found_by_the_tick_which_allocates_nothing_for_
     assert_eq!(offer(), (true, 0));
     first.stop().unwrap();
     assert!(monitor.mark_lost(true) && !monitor.mark_lost(true), "reported once");
-    assert_eq!((offer(), link.is_gone(), link.state.is_there()), ((false, 0), true, false));
+    assert_eq!((offer(), link.is_gone(), link.state.is_working()), ((false, 0), true, false));
     assert!(monitor.reopen().is_err() && link.is_gone());
     let second = serve();
     monitor.reopen().unwrap();
     assert_eq!(
-        (link.is_gone(), link.state.is_there()),
+        (link.is_gone(), link.state.is_working()),
         (false, false),
         "open, and nothing was received on it yet"
     );
-    assert!(monitor.mark_working() && !monitor.mark_working() && link.state.is_there());
+    assert!(monitor.mark_working() && !monitor.mark_working() && link.state.is_working());
     assert_eq!(offer(), (true, 0));
     link.send(&frames).unwrap();
     assert_eq!(second.stop().unwrap().frames, 2);

@@ -11,7 +11,7 @@ use protocol::candump::{Direction, Record, Timestamp, write_record};
 use protocol::fixed::Q1_14;
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State,
+    Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State, StimulusStart,
 };
 use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
@@ -41,7 +41,7 @@ impl Files {
         let mut log = String::new();
         for (nanos, message) in run() {
             for frame in message.encode().frames(Format::Fd) {
-                let time = Timestamp::nine_digits(nanos);
+                let time = Timestamp::with_nine_digits(nanos);
                 let direction = Some(Direction::Received);
                 let record = Record { time, interface: "vcan0", frame, direction };
                 mcap.write(&mut topic, nanos, &record).unwrap();
@@ -111,7 +111,10 @@ fn run() -> Vec<(u64, Message)> {
         let epoch = Epoch(epoch);
         for node in 1..=ANSWERING {
             let page = SensorPage::Skin(SkinSensors::default());
-            said.push((now, Message::Stimulus { to: Node::Cell(cell(node)), from: AppliesFrom::Next, page }));
+            said.push((
+                now,
+                Message::Stimulus { to: Node::Cell(cell(node)), from: StimulusStart::Next, page },
+            ));
         }
         let joints = Joints { positions: padded(&[Q1_14::from_bits(0x2345); WORDS]), in_use: 6 };
         said.push((now, Message::Joints { epoch, joints }));

@@ -9,8 +9,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use analysis::stats::{Stats, StatsReport};
-use model::decode::settle::Settler;
-use model::decode::{Decoded, Foreign};
+use model::decode::settle::OrderedDecoder;
+use model::decode::{Decoded, ForeignReason};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::CellId;
@@ -23,7 +23,7 @@ use traffic::{Random, car, others};
 
 /// Decoded meaning of each frame, in order.
 fn settled(frames: &[(u64, Frame)]) -> Vec<((u64, Frame), Decoded)> {
-    let mut settler = Settler::new(None);
+    let mut settler = OrderedDecoder::new(None);
     let mut all = Vec::new();
     for (nanos, frame) in frames {
         settler.push(Micros(nanos / 1_000), "can0", frame, (*nanos, *frame));
@@ -37,7 +37,7 @@ fn settled(frames: &[(u64, Frame)]) -> Vec<((u64, Frame), Decoded)> {
 }
 
 fn record(nanos: u64, frame: Frame) -> Record<'static> {
-    let time = Timestamp::nine_digits(nanos);
+    let time = Timestamp::with_nine_digits(nanos);
     Record { time, interface: "can0", frame, direction: None }
 }
 
@@ -180,7 +180,7 @@ fn single_segments_on_a_lossy_bus_are_damaged_and_not_foreign() {
 
 #[test]
 fn a_frame_waits_no_longer_than_the_reassembly_timeout() {
-    let mut settler = Settler::new(None);
+    let mut settler = OrderedDecoder::new(None);
     let [first, second] = [0, 1].map(|at| ours(Format::Classic, 1)[at].1);
     settler.push(Micros(1_000_000), "can0", &first, 1);
     assert_eq!(settler.pop(), None, "the second segment may come");
@@ -203,7 +203,7 @@ fn a_frame_waits_no_longer_than_the_reassembly_timeout() {
 #[test]
 fn frames_that_wait_are_bounded_where_times_do_not_move_or_run_backwards() {
     for step in [0_i64, -1] {
-        let mut settler = Settler::new(None);
+        let mut settler = OrderedDecoder::new(None);
         let (mut out, mut most) = (0_u64, 0_u64);
         let frames = 200_000_u32;
         // Each frame has an identifier of its own as far as there are enough: no later frame settles an earlier one.
@@ -231,7 +231,7 @@ fn identifiers_are_bounded_and_what_is_beyond_them_is_counted() {
     let foreign = &statistics(&frames).buses[0].foreign;
     let told_apart = u64::try_from(foreign.identifiers.len()).unwrap();
     assert_eq!((foreign.frames, told_apart + foreign.frames_of_other_identifiers), (10_000, 10_000));
-    assert!(told_apart <= 4096 && matches!(settled(&frames)[0].1, Decoded::Foreign(Foreign::Extended)));
+    assert!(told_apart <= 4096 && matches!(settled(&frames)[0].1, Decoded::Foreign(ForeignReason::Extended)));
 }
 
 fn gateway(folder: &Path, arguments: &str) -> String {

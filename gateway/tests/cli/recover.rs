@@ -19,7 +19,7 @@ use trace::ros2::standard::JointState;
 /// A recording with messages of two topics in five chunks, a file and metadata.
 fn recording() -> Vec<u8> {
     let mut writer = FileWriter::new(Vec::new()).unwrap();
-    writer.metadata("program", &BTreeMap::from([("a".to_owned(), "b".to_owned())])).unwrap();
+    writer.write_metadata("program", &BTreeMap::from([("a".to_owned(), "b".to_owned())])).unwrap();
     writer.attach("skin.toml", "application/toml", 7, b"version = 1\n").unwrap();
     let mut can = writer.channel::<Record<'_>>("/can/vcan0", &[("time_digits", "9")]).unwrap();
     let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
@@ -27,7 +27,7 @@ fn recording() -> Vec<u8> {
     for number in 0..50_u8 {
         let nanos = u64::from(number) * 1_000;
         let frame = Frame::classic(0x123, &[number; 8]).unwrap();
-        let time = Timestamp::nine_digits(nanos);
+        let time = Timestamp::with_nine_digits(nanos);
         let record = Record { time, interface: "vcan0", frame, direction: None };
         writer.write(&mut can, nanos, &record).unwrap();
         let q = [f64::from(number)];

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use protocol::candump::{self, CandumpLine};
-use protocol::wire_time::Bits;
+use protocol::wire_time::FrameBits;
 use serde_json::Value;
 
 const CORPUS: &[u8] = include_bytes!("../../../protocol/tests/golden/candump_corpus.log");
@@ -47,7 +47,7 @@ fn each_frame_is_an_object_with_the_bits_and_times_of_a_bus() {
         let CandumpLine::Frame(record) = candump::parse(line).unwrap() else { panic!("{line}") };
         let keys: Vec<_> = object.as_object().unwrap().keys().map(String::as_str).collect();
         assert_eq!(keys.len(), 7, "{keys:?}");
-        let bits = Bits::from_frame(&record.frame).unwrap();
+        let bits = FrameBits::from_frame(&record.frame).unwrap();
         assert_eq!(object["nominal_bits"], bits.nominal);
         assert_eq!(object["data_bits"], bits.data);
         assert_eq!(

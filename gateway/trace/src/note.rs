@@ -2,7 +2,7 @@
 
 /// An entry of a capture that is not a frame but has a position between frames.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Note<'a> {
+pub struct CaptureNote<'a> {
     /// The kind of the note.
     pub kind: NoteKind,
     /// The time, in ns since 1970. In a log this is the time of the preceding frame, or 0 before the first frame.
@@ -41,7 +41,7 @@ pub enum BusNote {
 impl BusNote {
     const ALL: [Self; 2] = [Self::Lost, Self::Back];
 
-    const fn end(self) -> &'static str {
+    const fn text_suffix(self) -> &'static str {
         match self {
             Self::Lost => "' was lost",
             Self::Back => "' works again",
@@ -51,16 +51,16 @@ impl BusNote {
     /// Returns the text of the note.
     #[must_use]
     pub fn text(self, bus: &str) -> String {
-        format!("{START}{bus}{}", self.end())
+        format!("{START}{bus}{}", self.text_suffix())
     }
 
     /// Parses a note. Returns the bus and its new state, or `None` if the note is not about the state of a bus.
     #[must_use]
-    pub fn parse<'a>(note: &Note<'a>) -> Option<(&'a str, Self)> {
+    pub fn parse<'a>(note: &CaptureNote<'a>) -> Option<(&'a str, Self)> {
         let text = core::str::from_utf8(note.text).ok().filter(|_| note.kind == NoteKind::Text)?;
         // In a log the note is a comment.
         let text = text.strip_prefix("# ").unwrap_or(text);
-        let of = |it: Self| Some((text.strip_prefix(START)?.strip_suffix(it.end())?, it));
+        let of = |it: Self| Some((text.strip_prefix(START)?.strip_suffix(it.text_suffix())?, it));
         Self::ALL.into_iter().find_map(of)
     }
 }
@@ -74,7 +74,8 @@ mod tests {
     #[test]
     fn what_is_noted_of_a_bus_is_read_back() {
         let said = |text: &str| {
-            let note = Note { kind: NoteKind::Text, nanos: 0, interface: "", line: 0, text: text.as_bytes() };
+            let note =
+                CaptureNote { kind: NoteKind::Text, nanos: 0, interface: "", line: 0, text: text.as_bytes() };
             BusNote::parse(&note).map(|(bus, it)| (bus.to_owned(), it))
         };
         for it in BusNote::ALL {

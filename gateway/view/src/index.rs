@@ -11,28 +11,28 @@ use protocol::skin::Skin;
 use trace::capture::{CaptureError, Reader, SeekPoint};
 
 use crate::locked;
-use crate::tape::{Event, EventDetector, EventKind, Tape, TapeStep};
+use crate::tape::{Event, EventDetector, EventKind, PlaybackState, PlaybackStep};
 
 /// The approximate maximum memory for all stored states, in bytes.
-const MEMORY_LIMIT: usize = 256 << 20;
+const MEMORY_LIMIT_BYTES: usize = 256 << 20;
 /// The approximate size of a stored state in bytes: this much for each bus, and `CELL_BYTES` for each cell.
-const BUS_BYTES: usize = 1 << 20;
-const CELL_BYTES: usize = 4 << 10;
+const STATE_BYTES_PER_BUS: usize = 1 << 20;
+const STATE_BYTES_PER_CELL: usize = 4 << 10;
 /// The interval between stored states at first, in ns. It doubles whenever the memory limit is reached.
-const SPACING_NS: u64 = 2_000_000_000;
+const CHECKPOINT_SPACING_NS: u64 = 2_000_000_000;
 
 /// The state of the skin at a position of a recording, and the place in the file where reading continues.
 #[derive(Debug)]
 pub struct Checkpoint {
     /// The tape with the state at this position.
-    pub tape: Tape,
+    pub tape: PlaybackState,
     /// The place in the file of the next entry.
     pub place: SeekPoint,
 }
 
 /// The index of a recording. One thread builds it while another one reads it.
 #[derive(Debug, Default)]
-pub struct Index(Mutex<Inner>);
+pub struct RecordingIndex(Mutex<Inner>);
 
 #[derive(Debug, Default)]
 struct Inner {
@@ -62,24 +62,25 @@ pub struct Progress {
     pub events: usize,
 }
 
-impl Index {
+impl RecordingIndex {
     /// Indexes a recording from its first frame to its end, or until `stop` is set. `first` is the time of the first
     /// frame and `zero` the one from which seconds count, both in ns since 1970.
     pub fn build(&self, mut reader: Reader, skin: Skin, (first, zero): (u64, u64), stop: &AtomicBool) {
-        let count = MEMORY_LIMIT / (skin.buses.len() * BUS_BYTES + skin.cells.len() * CELL_BYTES).max(1);
-        let mut spacing = SPACING_NS;
+        let count = MEMORY_LIMIT_BYTES
+            / (skin.buses.len() * STATE_BYTES_PER_BUS + skin.cells.len() * STATE_BYTES_PER_CELL).max(1);
+        let mut spacing = CHECKPOINT_SPACING_NS;
         let mut next = first.saturating_add(spacing);
-        let mut tape = Tape::new(skin, zero);
-        tape.begin(reader.extras());
+        let mut tape = PlaybackState::new(skin, zero);
+        tape.set_latched_frames(reader.extras());
         let mut watcher = EventDetector::default();
         while !tape.is_over() && !stop.load(Ordering::Relaxed) {
             match tape.step(u64::MAX) {
-                TapeStep::NeedsEntries => {
-                    if let Err(error) = tape.feed(&mut reader) {
+                PlaybackStep::NeedsEntries => {
+                    if let Err(error) = tape.read_entry(&mut reader) {
                         self.fail(&error);
                     }
                 }
-                TapeStep::Updated => {
+                PlaybackStep::Updated => {
                     let events = watcher.detect(tape.position(), tape.live());
                     let kept = (tape.position() >= next).then(|| {
                         let mut kept = Checkpoint { tape: tape.clone(), place: reader.place() };
@@ -102,7 +103,7 @@ impl Index {
                         next = tape.position().saturating_add(spacing);
                     }
                 }
-                TapeStep::Applied { .. } | TapeStep::Reached | TapeStep::Over => {}
+                PlaybackStep::Applied { .. } | PlaybackStep::Reached | PlaybackStep::Over => {}
             }
         }
         let mut inner = locked(&self.0);
@@ -144,7 +145,7 @@ impl Index {
     /// Divides the time from `from` to `to` into `parts` equal parts. Returns the numbers of the parts in which events
     /// of a kind occur.
     #[must_use]
-    pub fn marks(&self, kind: EventKind, (from, to): (u64, u64), parts: u16) -> Vec<u16> {
+    pub fn parts_with_events(&self, kind: EventKind, (from, to): (u64, u64), parts: u16) -> Vec<u16> {
         let inner = locked(&self.0);
         let length = u128::from(to.saturating_sub(from).max(1));
         let part = |event: &Event| {

@@ -9,10 +9,10 @@
 //! The view only receives on the buses, like any other node. It therefore does not disturb a control loop, and shows
 //! what the buses actually carry. A touch on the page becomes a stimulus on the bus, which cells in test mode obey.
 //!
-//! A recording is shown in the same way: [`tape`] applies its frames to [`Live`] up to a position in time, [`index`]
+//! A recording is shown in the same way: [`tape`] applies its frames to [`LiveState`] up to a position in time, [`index`]
 //! stores the state at intervals, and [`player`] continues from a stored state to any position.
 //!
-//! A skin without buses is shown as a [`Still`]: one HTML file with the same scene, drawn by the same scripts.
+//! A skin without buses is shown as a [`StillPage`]: one HTML file with the same scene, drawn by the same scripts.
 //!
 //! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] use neither sockets nor clocks.
 //! [`server`], [`serve`] and [`play`] do the input and output for them.
@@ -34,9 +34,9 @@ mod web;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-pub use live::Live;
+pub use live::LiveState;
 pub use scene::Scene;
-pub use still::{MovedCell, Still};
+pub use still::{MovedCell, StillPage};
 pub use surface::RowMesh;
 pub use token::Token;
 

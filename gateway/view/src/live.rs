@@ -13,14 +13,14 @@ use protocol::time::Micros;
 use self::bus::LiveBus;
 pub use self::recent::{DecodedFrame, RecentFrames, TorqueExplanation};
 pub use self::said::{
-    BusStatus, CellDetail, DeadCell, Gains, Reading, StatusMessage, TorqueReply, TreePlace,
+    BusStatus, CellDetail, DeadCell, Gains, SensorReading, StatusMessage, TorqueReply, TreePlace,
 };
 use crate::pressed::{CellKey, TouchRegistry};
 use protocol::message::SkinSensors;
 
 /// The state of a skin and its cells, as the frames on the buses show it.
 #[derive(Clone, Debug)]
-pub struct Live {
+pub struct LiveState {
     skin: Skin,
     buses: Vec<LiveBus>,
     /// For each cell of the skin: the index of its bus, and the index of the cell on that bus.
@@ -37,13 +37,13 @@ pub struct Live {
 mod flag {
     pub(super) const UNCONFIGURED: u8 = 1;
     pub(super) const OTHER_CONFIGURATION: u8 = 2;
-    pub(super) const MEASURES: u8 = 4;
+    pub(super) const MEASURING: u8 = 4;
     pub(super) const HALTED: u8 = 8;
     pub(super) const PRESSED: u8 = 16;
     pub(super) const STUCK: u8 = 32;
 }
 
-impl Live {
+impl LiveState {
     /// Creates the state of a skin of which no frame has been received yet.
     #[must_use]
     pub fn new(skin: Skin) -> Self {
@@ -77,7 +77,7 @@ impl Live {
                 self.recent.push(at, index, frame);
             }
         }
-        self.buses.iter_mut().for_each(LiveBus::begin_accounts);
+        self.buses.iter_mut().for_each(LiveBus::restart_counters);
     }
 
     /// Applies a frame of the bus with this index. Returns true if the frame begins an epoch.
@@ -104,7 +104,7 @@ impl Live {
 
     /// Returns each cell by bus and node id, with two flags: touched and dead. A cell is touched if its sensors show
     /// it, or if its torque does while the sensor values are unknown.
-    pub fn touched(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
+    pub fn touched_and_dead(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
         self.buses.iter().enumerate().flat_map(move |(index, bus)| {
             let cells = bus.table.cells().iter().zip(bus.table.presumed_sensors(now)).enumerate();
             cells.map(move |(place, (cell, (sensors, status)))| {
@@ -141,7 +141,7 @@ impl Live {
     /// receive.
     pub fn set_bus(&mut self, bus: usize, is_up: bool, dropped: u64) {
         if let Some(bus) = self.buses.get_mut(bus) {
-            bus.set_up(is_up, dropped);
+            bus.set_state(is_up, dropped);
         }
     }
 
@@ -156,12 +156,12 @@ impl Live {
     pub fn pressable_cell(&self, bus: usize, node: u8) -> Option<CellKey> {
         let node = CellId::new(node.into()).ok()?;
         let cell = self.buses.get(bus)?.cell(node)?;
-        (cell.measures() == Some(false)).then_some((bus, node))
+        (cell.is_measuring() == Some(false)).then_some((bus, node))
     }
 
     /// Returns the sensor values of the stimulus that a cell has latched, as far as the frames on the bus show it.
     #[must_use]
-    pub fn latched(&self, (bus, node): CellKey, now: Micros) -> Option<SkinSensors> {
+    pub fn latched_sensors(&self, (bus, node): CellKey, now: Micros) -> Option<SkinSensors> {
         self.buses.get(bus)?.sensors(node, now)
     }
 

@@ -17,7 +17,7 @@ use crate::player::{PlayError, Player};
 use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
 use crate::serve::ServeError;
-use crate::server::{Access, Server, ServerCounts};
+use crate::server::{PageAccess, Server, ServerCounts};
 use crate::surface::{RowMesh, pack};
 use crate::tape::EventKind;
 
@@ -30,7 +30,7 @@ const TIMELINE_PARTS: u16 = 600;
 
 /// The recording to be played, and the settings of the server.
 #[derive(Debug)]
-pub struct Options {
+pub struct PlayOptions {
     /// A candump log, or all parts of an MCAP recording.
     pub paths: Vec<PathBuf>,
     /// The skin whose buses were recorded.
@@ -40,7 +40,7 @@ pub struct Options {
     /// The socket that pages connect to.
     pub listener: TcpListener,
     /// The rights of the pages, and the token that they need.
-    pub access: Access,
+    pub access: PageAccess,
     /// The position at which playback is paused at first, in s of the run or in s since the first frame. If it is
     /// `None`, playback starts at the beginning.
     pub at_s: Option<f64>,
@@ -53,12 +53,12 @@ pub struct Options {
 /// Returns an error if a thread cannot be started, or if the recording cannot be read or is damaged. The pages show the
 /// part before the damage.
 pub fn play(
-    options: Options,
+    options: PlayOptions,
     stop: &AtomicBool,
     is_served: impl FnOnce(),
     warns: impl Fn(&str) + Sync,
 ) -> Result<ServerCounts, ServeError> {
-    let Options { paths, skin, surface, listener, access, at_s } = options;
+    let PlayOptions { paths, skin, surface, listener, access, at_s } = options;
     let mut player = Player::open(&paths, skin.clone())?;
     let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
     let (shells, corners) = pack(&surface);
@@ -66,7 +66,7 @@ pub fn play(
         serde_json::to_string(&Scene { shells, ..Scene::from_skin(&skin, false) }).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
     is_served();
-    let (index, times) = (player.index(), (player.first(), player.zero()));
+    let (index, times) = (player.index(), (player.first_frame_ns(), player.time_origin_ns()));
     let name = reader.name().to_owned();
     thread::scope(|scope| {
         let (index, name, warns) = (&index, &name, &warns);
@@ -81,14 +81,14 @@ pub fn play(
             Some(at_s) => player.seek(at_s).map_err(PlayError::from)?,
             None => player.play(1.0),
         }
-        publish(&mut player, &server, stop);
+        publish_and_execute(&mut player, &server, stop);
         Ok::<_, ServeError>(())
     })?;
     index.progress().failed.map_or_else(|| Ok(server.counts()), |what| Err(PlayError::Damaged(what).into()))
 }
 
 /// Sends the state of the player to the pages, and executes their commands.
-fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
+fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) {
     let nobody = TouchRegistry::default();
     let (mut next, mut before) = (Instant::now(), Instant::now());
     let (mut number, mut jumps) = (0_u64, u64::MAX);
@@ -120,12 +120,12 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
                 server.publish_history(player.history());
             }
             let said = number.is_multiple_of(SNAPSHOTS_PER_STATUS).then(|| {
-                let playback = player.playback();
+                let playback = player.status();
                 if marks.0 != playback.events {
                     let kinds = [EventKind::Touch, EventKind::Loss, EventKind::Silence, EventKind::Halt];
                     marks = (
                         playback.events,
-                        kinds.map(|kind| (kind, player.marks(kind, TIMELINE_PARTS))).into(),
+                        kinds.map(|kind| (kind, player.parts_with_events(kind, TIMELINE_PARTS))).into(),
                     );
                 }
                 let live = player.live();

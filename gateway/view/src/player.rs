@@ -8,11 +8,11 @@ use std::time::Duration;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
-use trace::capture::{CaptureError, Entry, Reader, SeekIndex, SeekPoint, seconds_since};
+use trace::capture::{CaptureEntry, CaptureError, Reader, SeekIndex, SeekPoint, seconds_since};
 
-use crate::index::{Checkpoint, Index};
-use crate::live::Live;
-use crate::tape::{EventKind, Tape, TapeStep};
+use crate::index::{Checkpoint, RecordingIndex};
+use crate::live::LiveState;
+use crate::tape::{EventKind, PlaybackState, PlaybackStep};
 
 /// The time before a position for which the plots get values, in ns.
 const HISTORY_NS: u64 = 10_000_000_000;
@@ -31,9 +31,9 @@ type Sample = (u64, Vec<[f64; 2]>);
 pub struct Player {
     skin: Skin,
     places: SeekIndex,
-    index: Arc<Index>,
+    index: Arc<RecordingIndex>,
     reader: Reader,
-    tape: Tape,
+    tape: PlaybackState,
     /// The time of the first frame, in ns since 1970.
     first: u64,
     /// The time from which seconds count, in ns since 1970.
@@ -53,7 +53,7 @@ pub struct Player {
 
 /// The state of the player that pages show.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Playback {
+pub struct PlayerStatus {
     /// The position in s of the run, or in s since the first frame if there is no run.
     pub at_s: f64,
     /// The position in ns since 1970.
@@ -82,7 +82,7 @@ pub struct Playback {
     pub marks: BTreeMap<EventKind, Vec<u16>>,
 }
 
-impl Playback {
+impl PlayerStatus {
     /// Returns the same playback state with these marks.
     #[must_use]
     pub fn with_marks(self, marks: BTreeMap<EventKind, Vec<u16>>) -> Self {
@@ -113,16 +113,16 @@ impl Player {
         let mut beginning = Reader::open_all(paths)?;
         let first = loop {
             match beginning.next()? {
-                Some(Entry::Frame(record)) => break record.time.nanos,
-                Some(Entry::Note(_)) => {}
+                Some(CaptureEntry::Frame(record)) => break record.time.nanos,
+                Some(CaptureEntry::Note(_)) => {}
                 None => return Err(PlayError::Empty(beginning.name().to_owned())),
             }
         };
         let zero = beginning.extras().run_began().unwrap_or(first);
         let places = SeekIndex::open(paths)?;
         let reader = Reader::open_all(paths)?;
-        let mut tape = Tape::new(skin.clone(), zero);
-        tape.begin(reader.extras());
+        let mut tape = PlaybackState::new(skin.clone(), zero);
+        tape.set_latched_frames(reader.extras());
         Ok(Self {
             skin,
             places,
@@ -143,24 +143,24 @@ impl Player {
 
     /// Returns the index of the recording, which the caller builds in another thread.
     #[must_use]
-    pub fn index(&self) -> Arc<Index> {
+    pub fn index(&self) -> Arc<RecordingIndex> {
         Arc::clone(&self.index)
     }
 
     /// Returns the time of the first frame, in ns since 1970.
     #[must_use]
-    pub const fn first(&self) -> u64 {
+    pub const fn first_frame_ns(&self) -> u64 {
         self.first
     }
 
     /// Returns the time from which seconds count, in ns since 1970.
     #[must_use]
-    pub const fn zero(&self) -> u64 {
+    pub const fn time_origin_ns(&self) -> u64 {
         self.zero
     }
 
     /// Returns the state of the skin at the present position.
-    pub const fn live(&mut self) -> &mut Live {
+    pub const fn live(&mut self) -> &mut LiveState {
         self.tape.live_mut()
     }
 
@@ -177,9 +177,9 @@ impl Player {
     }
 
     /// Returns the time of the recording's end in ns since 1970, as far as it is known.
-    fn last(&self) -> u64 {
+    fn end_ns(&self) -> u64 {
         let progress = self.index.progress();
-        let last = if progress.is_over { progress.at } else { self.places.latest().max(progress.at) };
+        let last = if progress.is_over { progress.at } else { self.places.latest_ns().max(progress.at) };
         last.max(self.first)
     }
 
@@ -217,7 +217,7 @@ impl Player {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few seconds")]
         let passed = (elapsed.as_secs_f64() * self.speed * 1e9) as u64;
         let until = self.at.saturating_add(passed);
-        let last = self.last();
+        let last = self.end_ns();
         self.advance(until.min(last), false)?;
         self.playing &= until < last;
         Ok(true)
@@ -241,7 +241,7 @@ impl Player {
     pub fn step(&mut self, forward: bool) -> Result<(), CaptureError> {
         self.playing = false;
         if forward {
-            return self.advance(self.last(), true);
+            return self.advance(self.end_ns(), true);
         }
         if self.tape.epoch_before(self.at).is_none() {
             // The time before the position is read again, because only its epochs are known that were read.
@@ -268,7 +268,7 @@ impl Player {
     }
 
     fn go_to(&mut self, at: u64) -> Result<(), CaptureError> {
-        let at = at.clamp(self.first, self.last());
+        let at = at.clamp(self.first, self.end_ns());
         let near = self.tape.position() <= at && at - self.tape.position() <= HISTORY_NS;
         if near && self.is_exact {
             return self.advance(at, false);
@@ -286,7 +286,7 @@ impl Player {
                 *place
             }
             None => {
-                self.tape = Tape::new(self.skin.clone(), self.zero);
+                self.tape = PlaybackState::new(self.skin.clone(), self.zero);
                 match self.is_exact {
                     true => SeekPoint::default(),
                     false => self.places.point_before(at.saturating_sub(PREVIEW_NS)),
@@ -295,7 +295,7 @@ impl Player {
         };
         self.reader.seek(&self.places, place)?;
         if place == SeekPoint::default() {
-            self.tape.begin(self.reader.extras());
+            self.tape.set_latched_frames(self.reader.extras());
         }
         self.history.clear();
         self.failed = None;
@@ -307,9 +307,9 @@ impl Player {
     fn advance(&mut self, until: u64, to_epoch: bool) -> Result<(), CaptureError> {
         loop {
             match self.tape.step(until) {
-                TapeStep::NeedsEntries => self.tape.feed(&mut self.reader)?,
-                TapeStep::Updated => {}
-                TapeStep::Applied { epoch } => {
+                PlaybackStep::NeedsEntries => self.tape.read_entry(&mut self.reader)?,
+                PlaybackStep::Updated => {}
+                PlaybackStep::Applied { epoch } => {
                     let at = self.tape.position();
                     let is_due = |(last, _): &(u64, _)| at.saturating_sub(*last) >= SAMPLE_NS;
                     if epoch && self.history.back().is_none_or(is_due) {
@@ -319,7 +319,7 @@ impl Player {
                         break;
                     }
                 }
-                TapeStep::Reached | TapeStep::Over => break,
+                PlaybackStep::Reached | PlaybackStep::Over => break,
             }
         }
         self.at = if to_epoch { self.tape.position().min(until) } else { until };
@@ -365,14 +365,14 @@ impl Player {
 
     /// Returns the state of the player for the pages.
     #[must_use]
-    pub fn playback(&self) -> Playback {
+    pub fn status(&self) -> PlayerStatus {
         let progress = self.index.progress();
-        let (of, read) = (self.last() - self.first, progress.at.saturating_sub(self.first));
-        Playback {
+        let (of, read) = (self.end_ns() - self.first, progress.at.saturating_sub(self.first));
+        PlayerStatus {
             at_s: self.seconds(self.at),
             at_ns: self.at.to_string(),
             from_s: self.seconds(self.first),
-            of_s: self.seconds(self.last()),
+            of_s: self.seconds(self.end_ns()),
             playing: self.playing,
             speed: self.speed,
             exact: self.is_exact,
@@ -388,8 +388,8 @@ impl Player {
     /// Divides the recording into `parts` equal parts. Returns the numbers of the parts in which events of a kind
     /// occur.
     #[must_use]
-    pub fn marks(&self, kind: EventKind, parts: u16) -> Vec<u16> {
-        self.index.marks(kind, (self.first, self.last()), parts)
+    pub fn parts_with_events(&self, kind: EventKind, parts: u16) -> Vec<u16> {
+        self.index.parts_with_events(kind, (self.first, self.end_ns()), parts)
     }
 }
 

@@ -9,24 +9,24 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use bench::bus::follow::{FollowStep, FollowedItem, Follower, Source};
+use bench::bus::follow::{BusSource, FollowStep, FollowedItem, Follower};
 use bench::bus::listen::{now, open, send};
 use bench::remote::{BenchState, JsonPipe};
-use protocol::bus::batch::BATCH;
+use protocol::bus::batch::MAX_BATCH_DATAGRAMS;
 use protocol::bus::{self, Bus, BusError, KindChoices};
 use protocol::can::Format;
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, SensorPage};
+use protocol::message::{Message, SensorPage, StimulusStart};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
 use crate::command::Command;
-use crate::live::{Live, StatusMessage};
+use crate::live::{LiveState, StatusMessage};
 use crate::locked;
 use crate::player::PlayError;
 use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
-use crate::server::{Access, Server, ServerCounts};
+use crate::server::{PageAccess, Server, ServerCounts};
 use crate::surface::{RowMesh, pack};
 
 /// The interval between snapshots.
@@ -39,11 +39,11 @@ const RECEIVE_TIMEOUT: Duration = Duration::from_millis(50);
 const GATHER_TIME: Duration = Duration::from_millis(8);
 
 /// The value of `read_to` while no frames wait to be read.
-const UP_TO_DATE: u64 = u64::MAX;
+const ALL_FRAMES_READ: u64 = u64::MAX;
 
 /// The skin to be shown, and the settings of the server.
 #[derive(Debug)]
-pub struct Options {
+pub struct ServeOptions {
     /// The skin to be shown.
     pub skin: Skin,
     /// The surface of the robot's links; empty if it is unknown.
@@ -55,7 +55,7 @@ pub struct Options {
     /// The socket that pages connect to.
     pub listener: TcpListener,
     /// The rights of the pages, and the token that they need.
-    pub access: Access,
+    pub access: PageAccess,
     /// True to wait for buses that do not exist yet.
     pub waits_for_buses: bool,
     /// The connection to the bench that the pages control. The view ends with the bench.
@@ -95,11 +95,11 @@ struct SharedBus {
 /// Returns [`ServeError`] if a bus cannot be opened at the start and `patient` is false, or if a thread cannot be
 /// started.
 pub fn serve(
-    options: Options,
+    options: ServeOptions,
     stop: &AtomicBool,
     is_served: impl FnOnce(),
 ) -> Result<ServerCounts, ServeError> {
-    let Options { skin, surface, kinds, directory, listener, access, waits_for_buses: patient, bench } =
+    let ServeOptions { skin, surface, kinds, directory, listener, access, waits_for_buses: patient, bench } =
         options;
     let may_act = access.may_act;
     let opened = |name: &str, format: Format| {
@@ -117,7 +117,7 @@ pub fn serve(
             Err(_) if patient => None,
             Err(error) => return Err(ServeError::Bus(error)),
         };
-        let read_to = AtomicU64::new(UP_TO_DATE);
+        let read_to = AtomicU64::new(ALL_FRAMES_READ);
         Ok(SharedBus { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first), read_to })
     });
     let buses: Vec<_> = buses.collect::<Result<_, _>>()?;
@@ -126,7 +126,7 @@ pub fn serve(
     let scene = serde_json::to_string(&scene).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
     is_served();
-    let live = Mutex::new(Live::new(skin));
+    let live = Mutex::new(LiveState::new(skin));
     thread::scope(|scope| {
         for (index, shared) in buses.iter().enumerate() {
             let (live, opened) = (&live, &opened);
@@ -136,7 +136,7 @@ pub fn serve(
                 return Err(ServeError::Thread(error));
             }
         }
-        publish(&live, &buses, &server, bench, stop);
+        publish_and_execute(&live, &buses, &server, bench, stop);
         Ok(())
     })?;
     Ok(server.counts())
@@ -149,7 +149,7 @@ struct ReopeningBus<'a, O> {
     bus: Option<Arc<Bus>>,
 }
 
-impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> Source for ReopeningBus<'_, O> {
+impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> BusSource for ReopeningBus<'_, O> {
     fn bus(&self) -> Option<&Bus> {
         self.bus.as_deref()
     }
@@ -166,7 +166,7 @@ impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> Source for ReopeningBus<
 fn receive(
     index: usize,
     shared: &SharedBus,
-    live: &Mutex<Live>,
+    live: &Mutex<LiveState>,
     stop: &AtomicBool,
     opened: &impl Fn(&str, Format) -> Result<Arc<Bus>, BusError>,
 ) {
@@ -177,8 +177,8 @@ fn receive(
             *locked(&shared.bus) = None;
         }
         // If the batch was full, more frames may be waiting to be read.
-        let last = follower.frames().last().filter(|_| follower.frames().len() == BATCH);
-        let read_to = last.map_or(UP_TO_DATE, |last| last.at_nanos / 1_000);
+        let last = follower.frames().last().filter(|_| follower.frames().len() == MAX_BATCH_DATAGRAMS);
+        let read_to = last.map_or(ALL_FRAMES_READ, |last| last.at_nanos / 1_000);
         shared.read_to.store(read_to, Ordering::Relaxed);
         let mut live = locked(live);
         follower.for_each_item(|part| {
@@ -191,8 +191,8 @@ fn receive(
 }
 
 /// Sends snapshots to the pages, and passes their commands to the buses and to the bench.
-fn publish(
-    live: &Mutex<Live>,
+fn publish_and_execute(
+    live: &Mutex<LiveState>,
     buses: &[SharedBus],
     server: &Server,
     mut bench: Option<JsonPipe>,
@@ -225,7 +225,7 @@ fn publish(
         let due = {
             let mut live = locked(live);
             live.handle_time(now);
-            let due = pressed.due_stimuli(now, |cell| live.latched(cell, now));
+            let due = pressed.due_stimuli(now, |cell| live.latched_sensors(cell, now));
             if server.page_count() > 0 {
                 let snapshot = live.snapshot(now, &pressed);
                 let said = number.is_multiple_of(SNAPSHOTS_PER_STATUS).then(|| {
@@ -249,7 +249,7 @@ fn publish(
             let page = SensorPage::Skin(sensors);
             send_message(
                 buses.get(bus),
-                &Message::Stimulus { to: Node::Cell(node), from: AppliesFrom::Next, page },
+                &Message::Stimulus { to: Node::Cell(node), from: StimulusStart::Next, page },
             );
         }
         next = (next + SNAPSHOT_INTERVAL).max(Instant::now());
@@ -261,7 +261,7 @@ fn to_json(said: &StatusMessage) -> String {
     serde_json::to_string(said).unwrap_or_default()
 }
 
-fn execute(page: u64, command: &Command, live: &Live, pressed: &mut TouchRegistry, buses: &[SharedBus]) {
+fn execute(page: u64, command: &Command, live: &LiveState, pressed: &mut TouchRegistry, buses: &[SharedBus]) {
     let everywhere = |message: &Message| buses.iter().for_each(|bus| send_message(Some(bus), message));
     match *command {
         Command::Press { bus, node, force_n } => match live.pressable_cell(bus, node) {

@@ -30,7 +30,7 @@ const COMMAND_QUEUE_SIZE: usize = 256;
 
 /// The rights of the pages, and the token that they need.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Access {
+pub struct PageAccess {
     /// True if pages may press cells, halt and resume the robot, and control the bench.
     pub may_act: bool,
     /// True if pages may control the playback of a recording.
@@ -67,8 +67,8 @@ struct LatestMessages {
 
 /// The state that all threads of the server share.
 #[derive(Debug)]
-struct Shared {
-    access: Access,
+struct ServerState {
+    access: PageAccess,
     /// The address on which the server listens.
     address: SocketAddr,
     scene: String,
@@ -88,7 +88,7 @@ struct Shared {
 /// A running server. Dropping it stops its threads.
 #[derive(Debug)]
 pub struct Server {
-    shared: Arc<Shared>,
+    shared: Arc<ServerState>,
     commands: Receiver<(u64, Command)>,
 }
 
@@ -98,11 +98,16 @@ impl Server {
     ///
     /// # Errors
     /// Returns an error if the listener cannot be set up, or if the system refuses a thread.
-    pub fn start(listener: TcpListener, access: Access, scene: String, surface: Vec<u8>) -> io::Result<Self> {
+    pub fn start(
+        listener: TcpListener,
+        access: PageAccess,
+        scene: String,
+        surface: Vec<u8>,
+    ) -> io::Result<Self> {
         listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
         let (sender, commands) = sync_channel(COMMAND_QUEUE_SIZE);
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ServerState {
             access,
             address,
             scene,
@@ -121,7 +126,7 @@ impl Server {
         let (pages, begun) = channel();
         let of_pages = Arc::clone(&shared);
         let named = |name: &str| thread::Builder::new().name(name.to_owned());
-        named("view pages").spawn(move || door::open(begun, &of_pages))?;
+        named("view pages").spawn(move || door::start_page_threads(begun, &of_pages))?;
         named("view door").spawn(move || door::serve(&listener, &shared, &pages))?;
         Ok(server)
     }
@@ -184,7 +189,7 @@ impl Server {
     #[must_use]
     pub fn counts(&self) -> ServerCounts {
         let count = |count: &AtomicU64| count.load(Ordering::Relaxed);
-        let Shared { clients, refused, ignored, .. } = &*self.shared;
+        let ServerState { clients, refused, ignored, .. } = &*self.shared;
         ServerCounts { clients: count(clients), refused: count(refused), ignored: count(ignored) }
     }
 }

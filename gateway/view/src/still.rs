@@ -14,7 +14,7 @@ use crate::web;
 
 /// The contents of a page that shows a skin without buses.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Still {
+pub struct StillPage {
     /// The scene to draw.
     pub scene: Scene,
     /// The surface of the robot's links; empty if it is unknown.
@@ -53,10 +53,10 @@ struct PageData<'a> {
     surface: String,
 }
 
-impl Still {
+impl StillPage {
     /// Returns the HTML text of the page.
     #[must_use]
-    pub fn page(&self) -> String {
+    pub fn to_html(&self) -> String {
         let (shells, corners) = pack(&self.surface);
         let data = PageData {
             scene: &Scene { shells, may_press: false, ..self.scene.clone() },
@@ -69,10 +69,10 @@ impl Still {
         let data = serde_json::to_string(&data).unwrap_or_default().replace('<', "\\u003c");
         let mut text = String::new();
         // The template is split at its marks first, so that marks in inserted text are not replaced.
-        for (at, piece) in web::text("still.html").unwrap_or_default().split('@').enumerate() {
+        for (at, piece) in web::file_text("still.html").unwrap_or_default().split('@').enumerate() {
             match piece {
                 "NAME" => text.push_str(&escaped(&self.scene.name)),
-                "CSS" => text.push_str(web::text("style.css").unwrap_or_default()),
+                "CSS" => text.push_str(web::file_text("style.css").unwrap_or_default()),
                 "DATA" => text.push_str(&data),
                 "SCRIPT" => text.push_str(&web::bundle("still.js")),
                 _ => {
@@ -90,14 +90,14 @@ mod tests {
     use super::*;
     use protocol::skin::Skin;
 
-    fn still() -> Still {
+    fn still() -> StillPage {
         let skin = Skin::parse("ur5", include_str!("../../examples/ur5-253.toml")).unwrap();
         let mut scene = Scene::from_skin(&skin, true);
         scene.name = "<arm> & @DATA@ 'x'".to_owned();
         let details = vec![vec![("a<b".to_owned(), "</script><b>".to_owned())]; scene.cells.len()];
         let triangles = vec![[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]];
         let [position, normal] = [[0.0, 0.1, 0.2], [0.0, 0.0, 1.0]];
-        Still {
+        StillPage {
             positions: vec![0.0; scene.joints.len()],
             moved: vec![MovedCell { cell: 7, chain: 0, row: 2, position, normal }],
             surface: vec![RowMesh { chain: 0, row: 1, triangles }],
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn text_is_escaped_and_data_can_be_read() {
-        let page = still().page();
+        let page = still().to_html();
         assert_eq!(page.matches("&lt;arm&gt; &amp; @DATA@ &#39;x&#39;").count(), 2, "title and heading");
         assert_eq!(page.matches("</script>").count(), 2, "of the page's own two");
         let (_, data) = page.split_once(r#"id="skin">"#).unwrap();
@@ -126,7 +126,7 @@ mod tests {
 
     #[test]
     fn the_page_asks_for_nothing_outside() {
-        let page = still().page();
+        let page = still().to_html();
         assert!(!page.contains("http:") && !page.contains("https:") && !page.contains("import "));
         assert!(!page.contains("src=") && !page.contains("href=") && !page.contains("@import"));
         assert!(page.contains("default-src 'none'"));

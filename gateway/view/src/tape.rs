@@ -5,7 +5,7 @@
 //! ```
 //!
 //! The state depends only on the position and on the entries of the recording, not on the way in which the player got
-//! there: the same entries up to the same position give the same [`Live`].
+//! there: the same entries up to the same position give the same [`LiveState`].
 
 mod events;
 
@@ -14,11 +14,11 @@ use std::collections::VecDeque;
 use protocol::can::Frame;
 use protocol::skin::Skin;
 use protocol::time::Micros;
-use trace::capture::{CaptureError, Entry, NoteKind, Reader, RecordingExtras};
+use trace::capture::{CaptureEntry, CaptureError, NoteKind, Reader, RecordingExtras};
 use trace::order::{BusMerger, ReleasedFrame};
 
 pub use self::events::{Event, EventDetector, EventKind};
-use crate::live::Live;
+use crate::live::LiveState;
 
 /// The interval in ns at which the passing of time is applied to the state: cells become silent, and loads are
 /// measured.
@@ -30,7 +30,7 @@ const MAX_EPOCHS: usize = 256;
 
 /// The result of a step on the tape.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum TapeStep {
+pub enum PlaybackStep {
     /// A frame was applied.
     Applied {
         /// True if the frame begins an epoch.
@@ -48,15 +48,15 @@ pub enum TapeStep {
 
 /// The state of a recording up to a position, and the entries after it that were already read.
 #[derive(Clone, Debug)]
-pub struct Tape {
-    live: Live,
+pub struct PlaybackState {
+    live: LiveState,
     names: Vec<String>,
-    order: BusMerger<TapeFrame>,
-    next: Option<ReleasedFrame<TapeFrame>>,
+    order: BusMerger<QueuedFrame>,
+    next: Option<ReleasedFrame<QueuedFrame>>,
     /// True if the reader has reached the end of the recording.
     ended: bool,
     /// The frames that were latched when the recording began. They are applied before the first frame and then removed.
-    latched: Vec<TapeFrame>,
+    latched: Vec<QueuedFrame>,
     /// The time of the first frame, in ns since 1970.
     first: Option<u64>,
     /// The position in ns since 1970: all frames up to it were applied.
@@ -71,17 +71,17 @@ pub struct Tape {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct TapeFrame {
+struct QueuedFrame {
     bus: usize,
     frame: Frame,
 }
 
-impl Tape {
+impl PlaybackState {
     /// Creates a tape at the beginning of a recording. Seconds count from `zero`, in ns since 1970.
     #[must_use]
     pub fn new(skin: Skin, zero: u64) -> Self {
         let names: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
-        let mut live = Live::with_start(skin, Micros(zero / 1_000));
+        let mut live = LiveState::with_start(skin, Micros(zero / 1_000));
         (0..names.len()).for_each(|bus| live.set_bus(bus, true, 0));
         Self {
             live,
@@ -103,7 +103,7 @@ impl Tape {
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the capture cannot be read or is damaged. The tape then ends there.
-    pub fn feed(&mut self, reader: &mut Reader) -> Result<(), CaptureError> {
+    pub fn read_entry(&mut self, reader: &mut Reader) -> Result<(), CaptureError> {
         match reader.next() {
             Ok(Some(entry)) => self.push(&entry),
             Ok(None) => self.ended = true,
@@ -116,23 +116,24 @@ impl Tape {
     }
 
     /// Stores the frames that were latched when the recording began. Must be called before the first entry is added.
-    pub fn begin(&mut self, extras: &RecordingExtras) {
+    pub fn set_latched_frames(&mut self, extras: &RecordingExtras) {
         let latched = extras.latched.iter();
-        self.latched =
-            latched.filter_map(|it| Some(TapeFrame { bus: self.bus(&it.bus)?, frame: it.frame })).collect();
+        self.latched = latched
+            .filter_map(|it| Some(QueuedFrame { bus: self.bus_index(&it.bus)?, frame: it.frame }))
+            .collect();
     }
 
     /// Adds the next entry of the recording.
-    pub fn push(&mut self, entry: &Entry<'_>) {
+    pub fn push(&mut self, entry: &CaptureEntry<'_>) {
         match entry {
-            Entry::Frame(record) => {
+            CaptureEntry::Frame(record) => {
                 let nanos = record.time.nanos;
-                match self.bus(record.interface) {
-                    Some(bus) => self.order.push(bus, nanos, TapeFrame { bus, frame: record.frame }),
+                match self.bus_index(record.interface) {
+                    Some(bus) => self.order.push(bus, nanos, QueuedFrame { bus, frame: record.frame }),
                     None => self.foreign_frames += 1,
                 }
             }
-            Entry::Note(note) => {
+            CaptureEntry::Note(note) => {
                 if let NoteKind::Dropped(frames) = note.kind {
                     for (bus, dropped) in self.dropped.iter_mut().enumerate() {
                         let of_it = self.names.get(bus).is_some_and(|name| name == note.interface);
@@ -147,15 +148,15 @@ impl Tape {
     }
 
     /// Advances by one frame, or by one interval of time without a frame, but not beyond `until`, in ns since 1970.
-    pub fn step(&mut self, until: u64) -> TapeStep {
+    pub fn step(&mut self, until: u64) -> PlaybackStep {
         if self.next.is_none() {
             self.next = if self.ended { self.order.pop_last() } else { self.order.pop() };
         }
         let Some(next) = self.next else {
             return match self.ended {
-                false => TapeStep::NeedsEntries,
-                true if self.first.is_none() => TapeStep::Over,
-                true => self.update_until(until).unwrap_or(TapeStep::Over),
+                false => PlaybackStep::NeedsEntries,
+                true if self.first.is_none() => PlaybackStep::Over,
+                true => self.update_until(until).unwrap_or(PlaybackStep::Over),
             };
         };
         if self.first.is_none() {
@@ -171,11 +172,11 @@ impl Tape {
         }
         if next.send_nanos > until {
             self.at = self.at.max(until);
-            return TapeStep::Reached;
+            return PlaybackStep::Reached;
         }
         self.next = None;
         self.at = next.send_nanos;
-        let TapeFrame { bus, frame } = next.item;
+        let QueuedFrame { bus, frame } = next.item;
         let epoch = self.live.apply_frame(bus, Micros(next.send_nanos / 1_000), &frame);
         if epoch {
             if self.epochs.len() == MAX_EPOCHS {
@@ -183,11 +184,11 @@ impl Tape {
             }
             self.epochs.push_back(next.send_nanos);
         }
-        TapeStep::Applied { epoch }
+        PlaybackStep::Applied { epoch }
     }
 
     /// Applies the passing of time to the state, if the next time to do so is not after `until`.
-    fn update_until(&mut self, until: u64) -> Option<TapeStep> {
+    fn update_until(&mut self, until: u64) -> Option<PlaybackStep> {
         // Times in 64 bits of ns end in the year 2554, so there is no later time.
         if self.next_update > until || self.next_update == u64::MAX {
             return None;
@@ -199,17 +200,17 @@ impl Tape {
         if until.saturating_sub(self.next_update) > MAX_PAUSE_NS {
             self.next_update = until - MAX_PAUSE_NS;
         }
-        Some(TapeStep::Updated)
+        Some(PlaybackStep::Updated)
     }
 
     /// Returns the state at the position.
     #[must_use]
-    pub const fn live(&self) -> &Live {
+    pub const fn live(&self) -> &LiveState {
         &self.live
     }
 
     /// Returns the state at the position for changes, which snapshots need to count themselves.
-    pub const fn live_mut(&mut self) -> &mut Live {
+    pub const fn live_mut(&mut self) -> &mut LiveState {
         &mut self.live
     }
 
@@ -243,7 +244,7 @@ impl Tape {
         self.foreign_frames
     }
 
-    fn bus(&self, name: &str) -> Option<usize> {
+    fn bus_index(&self, name: &str) -> Option<usize> {
         self.names.iter().position(|bus| bus == name)
     }
 }

@@ -30,12 +30,12 @@ const FILES: [(&str, &str); 25] = [
 ];
 
 /// Returns the text of the file with this name.
-pub(crate) fn text(name: &str) -> Option<&'static str> {
+pub(crate) fn file_text(name: &str) -> Option<&'static str> {
     FILES.iter().find(|(known, _)| *known == name).map(|(_, text)| *text)
 }
 
 /// Returns the media type and the contents of the file at a path of the server.
-pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
+pub(crate) fn media_type_and_contents(path: &str) -> Option<(&'static str, &'static [u8])> {
     let name = if path == "/" { "index.html" } else { path.strip_prefix('/')? };
     let kind = match name.rsplit_once('.')? {
         (_, "js") => "text/javascript; charset=utf-8",
@@ -43,13 +43,13 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
         _ if path == "/" => "text/html; charset=utf-8",
         _ => return None,
     };
-    text(name).map(|text| (kind, text.as_bytes()))
+    file_text(name).map(|text| (kind, text.as_bytes()))
 }
 
 /// Returns true if the path is that of a script or a style. These are the same for every client and reveal nothing
 /// about the bench.
-pub(crate) fn is_code(path: &str) -> bool {
-    path != "/" && file(path).is_some()
+pub(crate) fn is_script_or_style(path: &str) -> bool {
+    path != "/" && media_type_and_contents(path).is_some()
 }
 
 /// Bundles a module and all modules that it imports into one script. Each module becomes a function, defined after
@@ -58,20 +58,20 @@ pub(crate) fn is_code(path: &str) -> bool {
 /// Supports only the syntax of the files here: an import is on one line, and a declaration follows `export`.
 pub(crate) fn bundle(entry: &'static str) -> String {
     let mut script = String::from("\"use strict\";\nconst modules = {};\n");
-    add(entry, &mut Vec::new(), &mut script);
+    add_module(entry, &mut Vec::new(), &mut script);
     script
 }
 
-fn add(name: &'static str, added: &mut Vec<&'static str>, script: &mut String) {
+fn add_module(name: &'static str, added: &mut Vec<&'static str>, script: &mut String) {
     if added.contains(&name) {
         return;
     }
     added.push(name);
-    let Some(text) = text(name) else { return };
+    let Some(text) = file_text(name) else { return };
     let (mut body, mut exported) = (String::new(), Vec::new());
     for line in text.lines() {
         if let Some((names, from)) = import(line) {
-            add(from, added, script);
+            add_module(from, added, script);
             let names =
                 names.strip_prefix("* as ").map_or_else(|| names.replace(" as ", ": "), str::to_owned);
             body.push_str(&format!("const {names} = modules[\"{from}\"];"));
@@ -117,7 +117,7 @@ mod tests {
             bytes += text.len();
             for line in text.lines().filter(|line| line.starts_with("import ")) {
                 let (_, from) = import(line).unwrap_or_else(|| panic!("{name}: {line}"));
-                assert!(super::text(from).is_some(), "{name} imports {from}");
+                assert!(file_text(from).is_some(), "{name} imports {from}");
             }
         }
         assert!(bytes <= 200_000, "{bytes}");
@@ -131,7 +131,7 @@ mod tests {
             ("app.js", false),
             ("//", false),
         ] {
-            assert_eq!(file(path).is_some(), is_served, "{path}");
+            assert_eq!(media_type_and_contents(path).is_some(), is_served, "{path}");
         }
     }
 

@@ -27,9 +27,9 @@ mod tests;
 use std::cmp::Ordering;
 use std::collections::{BinaryHeap, VecDeque};
 
-use protocol::wire_time::{BitRates, Bits};
+use protocol::wire_time::{BitRates, FrameBits};
 
-pub use noise::{BitErrors, BitErrorsError, ERROR_FRAME};
+pub use noise::{BitErrors, BitErrorsError, ERROR_FRAME_BITS};
 pub use priority::Priority;
 
 /// A request to send a frame.
@@ -40,7 +40,7 @@ pub struct Request<T = u64> {
     /// Priority of the frame in arbitration.
     pub priority: Priority,
     /// Number of bits of the frame, by bit rate.
-    pub bits: Bits,
+    pub bits: FrameBits,
     /// Number of the transmit queue in which the frame waits, a small number that the caller chooses. The frames of a
     /// queue are sent in the order of their requests, as SocketCAN does. `None` if the frame takes part in every
     /// arbitration, as from a controller with a buffer for each identifier.
@@ -261,7 +261,7 @@ impl<T: Copy> BusModel<T> {
 
     fn attempt(&mut self, request: &Request<T>, start: u64) -> Attempt<T> {
         let Request { tag, at, bits, .. } = *request;
-        let spoilt = self.errors.as_mut().and_then(|errors| errors.damage(bits));
+        let spoilt = self.errors.as_mut().and_then(|errors| errors.damage_frame(bits));
         let took = spoilt.unwrap_or(bits).nanoseconds(self.rates);
         Attempt { tag, at, start, end: start + took, is_damaged: spoilt.is_some() }
     }

@@ -1,21 +1,21 @@
 //! Random bit errors.
 
-use protocol::wire_time::Bits;
+use protocol::wire_time::FrameBits;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use thiserror::Error;
 
 /// Number of nominal bits of an error frame and the following intermission: two consecutive flags of 6 bits, a
 /// delimiter of 8 and an intermission of 3.
-pub const ERROR_FRAME: u32 = 12 + 8 + 3;
+pub const ERROR_FRAME_BITS: u32 = 12 + 8 + 3;
 /// Number of bits of the intermission. Errors in these bits do not damage a frame.
-const INTERMISSION: u32 = 3;
+const INTERMISSION_BITS: u32 = 3;
 /// Number of bits at the end of an FD frame that are sent at the nominal bit rate, including the intermission.
-const FD_TAIL: u32 = 12;
+const FD_TAIL_BITS: u32 = 12;
 
-/// The error for a bit-error rate that is not a number, negative, or above [`BitErrors::MAX`].
+/// The error for a bit-error rate that is not a number, negative, or above [`BitErrors::MAX_RATE`].
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
-#[error("bit-error rate {got}: 0 to {} are possible", BitErrors::MAX)]
+#[error("bit-error rate {got}: 0 to {} are possible", BitErrors::MAX_RATE)]
 pub struct BitErrorsError {
     /// The rejected rate.
     pub got: f64,
@@ -33,14 +33,14 @@ pub struct BitErrors {
 
 impl BitErrors {
     /// Maximum bit-error rate. At this rate, one of seven attempts to send a frame of 200 bits succeeds.
-    pub const MAX: f64 = 0.01;
+    pub const MAX_RATE: f64 = 0.01;
 
-    /// Creates bit errors with a rate (probability per bit) in the range 0 to [`BitErrors::MAX`].
+    /// Creates bit errors with a rate (probability per bit) in the range 0 to [`BitErrors::MAX_RATE`].
     ///
     /// # Errors
     /// Returns an error if the rate is outside that range.
     pub fn new(rate: f64, seed: u64) -> Result<Self, BitErrorsError> {
-        if !(0.0..=Self::MAX).contains(&rate) {
+        if !(0.0..=Self::MAX_RATE).contains(&rate) {
             return Err(BitErrorsError { got: rate });
         }
         let mut errors =
@@ -67,17 +67,17 @@ impl BitErrors {
 
     /// Counts the bits of one attempt to send a frame. Returns the bits sent up to the first damaged one, plus the
     /// error frame; `None` if no bit is damaged.
-    pub(super) fn damage(&mut self, bits: Bits) -> Option<Bits> {
-        let exposed = bits.total().saturating_sub(INTERMISSION);
+    pub(super) fn damage_frame(&mut self, bits: FrameBits) -> Option<FrameBits> {
+        let exposed = bits.total().saturating_sub(INTERMISSION_BITS);
         if self.undamaged_bits >= u64::from(exposed) {
             self.undamaged_bits = self.undamaged_bits.saturating_sub(u64::from(exposed));
             return None;
         }
         let sent = u32::try_from(self.undamaged_bits).unwrap_or(exposed) + 1;
         self.draw_next();
-        let head = if bits.data > 0 { bits.nominal.saturating_sub(FD_TAIL) } else { bits.nominal };
+        let head = if bits.data > 0 { bits.nominal.saturating_sub(FD_TAIL_BITS) } else { bits.nominal };
         let data = sent.saturating_sub(head).min(bits.data);
-        Some(Bits { nominal: sent - data + ERROR_FRAME, data })
+        Some(FrameBits { nominal: sent - data + ERROR_FRAME_BITS, data })
     }
 }
 
@@ -85,14 +85,14 @@ impl BitErrors {
 mod tests {
     use super::*;
 
-    const FRAME: Bits = Bits { nominal: 30, data: 170 };
+    const FRAME: FrameBits = FrameBits { nominal: 30, data: 170 };
 
     #[test]
     fn frames_are_damaged_as_often_as_the_rate_says() {
         const FRAMES: u32 = 200_000;
         let rate = 1e-3;
         let mut errors = BitErrors::new(rate, 7).unwrap();
-        let damaged = (0..FRAMES).filter(|_| errors.damage(FRAME).is_some()).count();
+        let damaged = (0..FRAMES).filter(|_| errors.damage_frame(FRAME).is_some()).count();
         // A frame is damaged if one of its first 197 bits is. Six standard deviations: one failure in 500
         // million seeds.
         let (frames, one) = (f64::from(FRAMES), 1.0 - (1.0 - rate).powi(197));
@@ -105,8 +105,8 @@ mod tests {
         let mut errors = BitErrors::new(0.01, 1).unwrap();
         let mut seen = [false; 3];
         for _ in 0..10_000 {
-            let Some(Bits { nominal, data }) = errors.damage(FRAME) else { continue };
-            let sent = nominal - ERROR_FRAME;
+            let Some(FrameBits { nominal, data }) = errors.damage_frame(FRAME) else { continue };
+            let sent = nominal - ERROR_FRAME_BITS;
             // Head: 18 nominal bits. Tail: 9 bits before the intermission.
             match (sent, data) {
                 (1..=18, 0) => seen[0] = true,
@@ -121,7 +121,7 @@ mod tests {
     #[test]
     fn without_a_rate_nothing_is_damaged_and_no_other_rate_is_taken() {
         let mut errors = BitErrors::new(0.0, 3).unwrap();
-        assert!((0..1_000).all(|_| errors.damage(FRAME).is_none()));
+        assert!((0..1_000).all(|_| errors.damage_frame(FRAME).is_none()));
         for got in [-1e-9, 0.011, f64::NAN, f64::INFINITY] {
             assert!(BitErrors::new(got, 0).is_err(), "{got}");
         }

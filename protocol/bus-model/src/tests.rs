@@ -11,7 +11,7 @@ fn rates() -> BitRates {
 
 fn request(at: u64, id: u32, nominal: u32, tag: u64) -> Request {
     let priority = Priority::from_frame(&Frame::classic(id, &[]).unwrap());
-    Request { at, priority, bits: Bits { nominal, data: 0 }, queue: None, tag }
+    Request { at, priority, bits: FrameBits { nominal, data: 0 }, queue: None, tag }
 }
 
 /// Returns all attempts that a bus makes for these requests.
@@ -72,7 +72,7 @@ fn the_frames_of_a_queue_keep_their_order_whatever_their_identifiers() {
 #[test]
 fn data_bits_take_the_data_bit_rate() {
     let frame = Frame::fd(0x201, BIT_RATE_SWITCH, &[0x55; 16]).unwrap();
-    let bits = Bits::from_frame(&frame).unwrap();
+    let bits = FrameBits::from_frame(&frame).unwrap();
     let request = Request { at: 7, priority: Priority::from_frame(&frame), bits, queue: None, tag: 0 };
     let [attempt] = all(BusModel::new(rates()), &[request]).try_into().unwrap();
     assert_eq!(attempt.end - attempt.start, u64::from(bits.nominal) * 1_000 + u64::from(bits.data) * 200);
@@ -109,7 +109,7 @@ fn damaged_frames_come_again_until_they_are_whole() {
     for attempt in damaged {
         // At least one bit and the error frame; at most all bits but the intermission, and the error frame.
         let bits = (attempt.end - attempt.start) / 1_000;
-        let error_frame = u64::from(ERROR_FRAME);
+        let error_frame = u64::from(ERROR_FRAME_BITS);
         assert!((1 + error_frame..=97 + error_frame).contains(&bits), "{bits}");
         let next = attempts.iter().find(|it| it.start == attempt.end).unwrap();
         assert_eq!(next.tag, attempt.tag, "no other frame waits");

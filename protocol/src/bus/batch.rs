@@ -1,7 +1,7 @@
 //! Batches of datagrams, received and sent with one system call. Clients and servers of embedded buses use them, and
 //! SocketCAN.
 //!
-//! Only functions whose documentation says so wait. Nothing allocates after [`Batch::new`].
+//! Only functions whose documentation says so wait. Nothing allocates after [`ReceiveBatch::new`].
 
 use std::io;
 use std::os::fd::AsFd;
@@ -10,33 +10,34 @@ use rustix::io::Errno;
 use rustix::net::SendFlags;
 
 use super::calls;
-use super::slot::Slot;
+use super::slot::DatagramBuffer;
 use crate::can::FD_BYTES;
 
 pub use super::slot::DatagramInfo;
 
 /// Maximum number of datagrams per system call.
-pub const BATCH: usize = 64;
+pub const MAX_BATCH_DATAGRAMS: usize = 64;
 /// Number of datagrams of the first receive call. Most calls return one or two, and preparing 64 slots costs
 /// more than receiving a datagram.
-const FIRST_BATCH: usize = 4;
+const FIRST_BATCH_SIZE: usize = 4;
 /// Capacity of the smaller of the two send calls, which suffices for most sends. Preparing fewer slots is faster; see
 /// [`FEW`].
-pub(super) const SMALL_BATCH: usize = 8;
+pub(super) const SMALL_BATCH_SIZE: usize = 8;
 
-/// A receive buffer for up to [`BATCH`] datagrams of at most 72 bytes.
-pub struct Batch {
-    slots: Box<[Slot; BATCH]>,
+/// A receive buffer for up to [`MAX_BATCH_DATAGRAMS`] datagrams of at most 72 bytes.
+pub struct ReceiveBatch {
+    slots: Box<[DatagramBuffer; MAX_BATCH_DATAGRAMS]>,
     count: usize,
     /// The error that followed the datagrams of the last receive. It is stored because the kernel reports it only once.
     failure: Option<io::Error>,
 }
 
-impl Batch {
+impl ReceiveBatch {
     /// Creates an empty buffer.
     #[must_use]
     pub fn new() -> Self {
-        let slot = || Slot { bytes: [0; FD_BYTES], control: [0; 8], len: 0, control_len: 0, flags: 0 };
+        let slot =
+            || DatagramBuffer { bytes: [0; FD_BYTES], control: [0; 8], len: 0, control_len: 0, flags: 0 };
         Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0, failure: None }
     }
 
@@ -48,9 +49,11 @@ impl Batch {
     pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
         (self.count, self.failure) = (0, None);
         let (fd, slots) = (fd.as_fd(), self.slots.as_mut_slice());
-        let Some((few, rest)) = slots.split_first_chunk_mut::<FIRST_BATCH>() else { return Ok(0) };
+        let Some((few, rest)) = slots.split_first_chunk_mut::<FIRST_BATCH_SIZE>() else { return Ok(0) };
         self.count = retry_on_interrupt(|| calls::receive(fd, few, false))?;
-        if let (FIRST_BATCH, Some(many)) = (self.count, rest.first_chunk_mut::<{ BATCH - FIRST_BATCH }>()) {
+        if let (FIRST_BATCH_SIZE, Some(many)) =
+            (self.count, rest.first_chunk_mut::<{ MAX_BATCH_DATAGRAMS - FIRST_BATCH_SIZE }>())
+        {
             match retry_on_interrupt(|| calls::receive(fd, many, false)) {
                 Ok(count) => self.count += count,
                 Err(error) => self.failure = Some(error).filter(|it| it.kind() != io::ErrorKind::WouldBlock),
@@ -84,21 +87,21 @@ impl Batch {
     }
 }
 
-impl Default for Batch {
+impl Default for ReceiveBatch {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl std::fmt::Debug for Batch {
+impl std::fmt::Debug for ReceiveBatch {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Batch").field("count", &self.count).finish_non_exhaustive()
     }
 }
 
-/// One datagram in a [`Batch`].
+/// One datagram in a [`ReceiveBatch`].
 #[derive(Clone, Copy)]
-pub struct Datagram<'a>(&'a Slot);
+pub struct Datagram<'a>(&'a DatagramBuffer);
 
 impl<'a> Datagram<'a> {
     /// Returns the bytes of the datagram; `None` if it was truncated because it is longer than 72 bytes.
@@ -118,7 +121,7 @@ impl<'a> Datagram<'a> {
     #[must_use]
     pub fn info(self) -> DatagramInfo {
         let words = self.0.control.map(u64::to_ne_bytes);
-        DatagramInfo::read(words.as_flattened().get(..self.0.control_len).unwrap_or_default())
+        DatagramInfo::decode(words.as_flattened().get(..self.0.control_len).unwrap_or_default())
     }
 }
 
@@ -129,7 +132,7 @@ impl std::fmt::Debug for Datagram<'_> {
 }
 
 /// A send buffer for up to N datagrams of at most 72 bytes.
-pub struct Outgoing<const N: usize = BATCH> {
+pub struct Outgoing<const N: usize = MAX_BATCH_DATAGRAMS> {
     bytes: [[u8; FD_BYTES]; N],
     lens: [usize; N],
     count: usize,
@@ -168,8 +171,8 @@ impl<const N: usize> Outgoing<N> {
         match self.count {
             0 => Ok(0),
             1 => send_one(fd, datagrams.next().unwrap_or_default()),
-            2..=SMALL_BATCH => {
-                retry_on_interrupt(|| calls::send::<SMALL_BATCH>(fd.as_fd(), datagrams.clone()))
+            2..=SMALL_BATCH_SIZE => {
+                retry_on_interrupt(|| calls::send::<SMALL_BATCH_SIZE>(fd.as_fd(), datagrams.clone()))
             }
             _ => retry_on_interrupt(|| calls::send::<N>(fd.as_fd(), datagrams.clone())),
         }
@@ -225,23 +228,23 @@ mod tests {
         let (a, b) =
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
         let mut outgoing = <Outgoing>::new();
-        for len in 1..=BATCH {
+        for len in 1..=MAX_BATCH_DATAGRAMS {
             assert!(outgoing.push(&[u8::try_from(len).unwrap(); FD_BYTES], len));
         }
         assert!(!outgoing.push(&[0; FD_BYTES], 1), "64 fit, a 65th does not");
-        assert_eq!(outgoing.send(&a).unwrap(), BATCH);
+        assert_eq!(outgoing.send(&a).unwrap(), MAX_BATCH_DATAGRAMS);
 
-        let mut batch = Batch::new();
-        assert_eq!(batch.receive(&b).unwrap(), BATCH);
+        let mut batch = ReceiveBatch::new();
+        assert_eq!(batch.receive(&b).unwrap(), MAX_BATCH_DATAGRAMS);
         let lens: Vec<_> = batch.datagrams().map(|datagram| datagram.bytes().unwrap().len()).collect();
-        assert_eq!(lens, (1..=BATCH).collect::<Vec<_>>());
+        assert_eq!(lens, (1..=MAX_BATCH_DATAGRAMS).collect::<Vec<_>>());
         assert_eq!(batch.receive(&b).unwrap_err().kind(), io::ErrorKind::WouldBlock);
     }
 
     fn sent_whole_and_in_order<const N: usize>() {
         let (a, b) =
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
-        let (mut outgoing, mut batch) = (Outgoing::<N>::new(), Batch::new());
+        let (mut outgoing, mut batch) = (Outgoing::<N>::new(), ReceiveBatch::new());
         assert_eq!(outgoing.send(&a).unwrap(), 0);
         for count in 1..=N {
             outgoing.clear();
@@ -257,8 +260,8 @@ mod tests {
 
     #[test]
     fn each_number_of_datagrams_is_sent_whole_and_in_order() {
-        sent_whole_and_in_order::<SMALL_BATCH>();
-        sent_whole_and_in_order::<BATCH>();
+        sent_whole_and_in_order::<SMALL_BATCH_SIZE>();
+        sent_whole_and_in_order::<MAX_BATCH_DATAGRAMS>();
     }
 
     #[test]
@@ -267,7 +270,7 @@ mod tests {
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
         rustix::net::send(&a, &[1; 73], SendFlags::empty()).unwrap();
         rustix::net::send(&a, &[2; 72], SendFlags::empty()).unwrap();
-        let mut batch = Batch::new();
+        let mut batch = ReceiveBatch::new();
         assert_eq!(batch.receive(&b).unwrap(), 2);
         let bytes: Vec<_> = batch.datagrams().map(Datagram::bytes).collect();
         assert_eq!(bytes, [None, Some(&[2; 72][..])]);
@@ -283,7 +286,7 @@ mod tests {
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
         let b = socketcan::CanFdSocket::from(b);
         b.set_recv_timestamp(true).unwrap();
-        let mut batch = Batch::new();
+        let mut batch = ReceiveBatch::new();
         for count in 1..=5 {
             let (read, write) = io::pipe().unwrap();
             rustix::io::ioctl_fionbio(&read, true).unwrap();

@@ -5,10 +5,10 @@ use std::io;
 use std::mem;
 use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 
-use super::slot::{Slot, for_each_descriptor};
+use super::slot::{DatagramBuffer, for_each_descriptor};
 
 /// Sets the scheduling policy `SCHED_BATCH` for this thread. Returns true if the system granted it.
-pub(super) fn set_batch() -> bool {
+pub(super) fn set_sched_batch() -> bool {
     let parameters = libc::sched_param { sched_priority: 0 };
     // SAFETY: the pointer is to a live, initialised struct, which the call only reads.
     unsafe { libc::sched_setscheduler(0, libc::SCHED_BATCH, &raw const parameters) == 0 }
@@ -33,7 +33,7 @@ pub(super) fn peer_process(fd: BorrowedFd<'_>) -> Option<u32> {
 #[inline(never)]
 pub(super) fn receive<const N: usize>(
     fd: BorrowedFd<'_>,
-    slots: &mut [Slot; N],
+    slots: &mut [DatagramBuffer; N],
     wait: bool,
 ) -> io::Result<usize> {
     let mut vectors = [libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 }; N];

@@ -9,13 +9,13 @@ use super::batch::Datagram;
 use super::{Bus, BusError, BusOptions, Filter};
 
 /// The operations in which the kinds of buses differ; the rest of [`Bus`] is common to all.
-pub(super) trait Carrier {
+pub(super) trait BusBackend {
     /// Opens a bus, with filters and time stamps enabled. Returns the socket, and the size of its receive
     /// buffer as the kernel counts it.
     fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError>;
 
     /// Returns the name under which a process serves the bus.
-    fn served_as(&self, name: &str) -> String {
+    fn served_name(&self, name: &str) -> String {
         name.to_owned()
     }
 
@@ -29,7 +29,7 @@ pub(super) trait Carrier {
     fn is_own(&self, frame: Datagram<'_>) -> bool;
 
     /// Decodes a drop notice and returns the number of frames dropped so far; `None` for other datagrams.
-    fn dropped(&self, notice: &[u8]) -> Option<u32>;
+    fn decode_drop_notice(&self, notice: &[u8]) -> Option<u32>;
 
     /// Converts a system error of an open socket to the bus error that it means on this kind of bus; `None` if the
     /// error has no special meaning.

@@ -9,7 +9,7 @@ use std::os::fd::AsFd;
 use super::{Filter, calls};
 
 pub use client::seqpacket;
-pub(super) use client::{Embedded, closed_error};
+pub(super) use client::{EmbeddedBackend, closed_error};
 pub use directory::{
     DirectoryError, MARKER_FILE, address, default_directory, make_directory, open_directory,
     remove_directory, socket_name, write_marker,
@@ -21,12 +21,12 @@ mod directory;
 /// The version of the protocol between client and server, which every hello contains.
 pub const VERSION: u8 = 2;
 /// Index of the byte in a frame that is 1 if the receiving client sent the frame itself.
-pub const OWN_BYTE: usize = 6;
+pub const OWN_FRAME_BYTE: usize = 6;
 /// Maximum length of a client's hello in bytes.
-pub const MAX_HELLO_BYTES: usize = HELLO_HEAD + 8 * Filter::MAX;
+pub const MAX_HELLO_BYTES: usize = HELLO_HEADER_BYTES + 8 * Filter::MAX_COUNT;
 
 const MAGIC: &[u8; 7] = b"skinbus";
-const HELLO_HEAD: usize = 23;
+const HELLO_HEADER_BYTES: usize = 23;
 const ANSWER_LEN: usize = 17;
 
 /// Returns the id of the process that connected a socket; `None` if the process is in another pid namespace.
@@ -54,7 +54,7 @@ impl ClientHello {
     /// Encodes the hello as a datagram.
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = Vec::with_capacity(HELLO_HEAD + 8 * self.filters.len());
+        let mut bytes = Vec::with_capacity(HELLO_HEADER_BYTES + 8 * self.filters.len());
         bytes.extend_from_slice(MAGIC);
         bytes.extend_from_slice(&[VERSION, self.own_frames.into(), self.fd.into()]);
         bytes.extend_from_slice(&self.error_mask.to_le_bytes());
@@ -67,12 +67,12 @@ impl ClientHello {
     /// Decodes a datagram. Returns `None` if it is not a hello of this version. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
-        let (head, filters) = bytes.split_first_chunk::<HELLO_HEAD>()?;
+        let (head, filters) = bytes.split_first_chunk::<HELLO_HEADER_BYTES>()?;
         let rest = head.strip_prefix(MAGIC)?;
         let &[VERSION, own @ 0..=1, fd @ 0..=1, m0, m1, m2, m3, ref rest @ ..] = rest else { return None };
         let (buffer, [0]) = rest.split_first_chunk()? else { return None };
         Some(Self {
-            filters: decode_filters(filters).filter(|filters| filters.len() <= Filter::MAX)?,
+            filters: decode_filters(filters).filter(|filters| filters.len() <= Filter::MAX_COUNT)?,
             own_frames: own == 1,
             fd: fd == 1,
             error_mask: u32::from_le_bytes([m0, m1, m2, m3]),
@@ -238,9 +238,9 @@ mod tests {
 
     #[test]
     fn no_control_datagram_is_as_long_as_a_frame() {
-        let lens = (0..=Filter::MAX)
-            .map(|count| HELLO_HEAD + 8 * count)
-            .chain((0..=Filter::MAX).flat_map(|count| {
+        let lens = (0..=Filter::MAX_COUNT)
+            .map(|count| HELLO_HEADER_BYTES + 8 * count)
+            .chain((0..=Filter::MAX_COUNT).flat_map(|count| {
                 let filters = vec![Filter::ALL; count];
                 FilterPart::split(&filters).map(|part| part.encode().len()).collect::<Vec<_>>()
             }))

@@ -20,7 +20,7 @@ pub enum BusError {
     )]
     Name(String),
     /// There are more filters than the kernel accepts.
-    #[error("{got} filters are too many for one socket on {name}: at most {max}", max = Filter::MAX)]
+    #[error("{got} filters are too many for one socket on {name}: at most {max}", max = Filter::MAX_COUNT)]
     Filters {
         /// The bus.
         name: String,

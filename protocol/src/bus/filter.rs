@@ -27,7 +27,7 @@ impl Filter {
     /// number costs no time.
     pub const EXACT_MASK: u32 = STANDARD_MASK | EXTENDED | REMOTE;
     /// Maximum number of filters of a socket (the kernel's `CAN_RAW_FILTER_MAX`).
-    pub const MAX: usize = 512;
+    pub const MAX_COUNT: usize = 512;
 
     /// Creates a filter for the data frames with this identifier.
     #[must_use]

@@ -2,13 +2,13 @@
 
 use std::io;
 
-use super::batch::{BATCH, Batch};
-use super::carrier::Carrier;
+use super::batch::{MAX_BATCH_DATAGRAMS, ReceiveBatch};
+use super::carrier::BusBackend;
 use crate::can::Frame;
 
 /// A received frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Received {
+pub struct ReceivedFrame {
     /// The frame.
     pub frame: Frame,
     /// Time of arrival at this socket, in nanoseconds of the wall clock (`SO_TIMESTAMPNS`); 0 if the kernel
@@ -21,10 +21,10 @@ pub struct Received {
 /// A reusable buffer for [`super::Bus::receive`]. It does not allocate after [`Inbox::new`].
 #[derive(Debug)]
 pub struct Inbox {
-    pub(super) batch: Batch,
+    pub(super) batch: ReceiveBatch,
     /// The error that followed the frames of the last receive. The next receive returns it.
     pub(super) failure: Option<io::Error>,
-    frames: Vec<Received>,
+    frames: Vec<ReceivedFrame>,
     dropped: u32,
     unreadable: u64,
 }
@@ -34,16 +34,16 @@ impl Inbox {
     #[must_use]
     pub fn new() -> Self {
         Self {
-            batch: Batch::new(),
+            batch: ReceiveBatch::new(),
             failure: None,
-            frames: Vec::with_capacity(BATCH),
+            frames: Vec::with_capacity(MAX_BATCH_DATAGRAMS),
             dropped: 0,
             unreadable: 0,
         }
     }
 
     /// Returns the frames of the last [`super::Bus::receive`], in order of arrival.
-    pub fn frames(&self) -> impl ExactSizeIterator<Item = Received> + '_ {
+    pub fn frames(&self) -> impl ExactSizeIterator<Item = ReceivedFrame> + '_ {
         self.frames.iter().copied()
     }
 
@@ -68,7 +68,7 @@ impl Inbox {
     }
 
     /// Decodes the datagrams of the batch into frames. Returns true if the other end closed the connection after them.
-    pub(super) fn decode(&mut self, carrier: &dyn Carrier) -> bool {
+    pub(super) fn decode(&mut self, carrier: &dyn BusBackend) -> bool {
         let Self { batch, frames, dropped, unreadable, failure: _ } = self;
         frames.clear();
         for datagram in batch.datagrams() {
@@ -80,8 +80,8 @@ impl Inbox {
                 let notes = datagram.info();
                 *dropped = notes.dropped.unwrap_or(*dropped);
                 let at_nanos = notes.at_nanos.unwrap_or(0);
-                frames.push(Received { frame, at_nanos, own: carrier.is_own(datagram) });
-            } else if let Some(total) = bytes.and_then(|bytes| carrier.dropped(bytes)) {
+                frames.push(ReceivedFrame { frame, at_nanos, own: carrier.is_own(datagram) });
+            } else if let Some(total) = bytes.and_then(|bytes| carrier.decode_drop_notice(bytes)) {
                 *dropped = total;
             } else {
                 *unreadable += 1;

@@ -7,8 +7,8 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, Protocol, SocketFlags, SocketType, sockopt};
 use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
 
-use super::batch::{Batch, Datagram};
-use super::carrier::Carrier;
+use super::batch::{Datagram, ReceiveBatch};
+use super::carrier::BusBackend;
 use super::link::NetworkInterface;
 use super::{Bus, BusError, BusOptions, Filter};
 
@@ -17,13 +17,13 @@ const FD_MTU: u32 = 72;
 
 /// Default size in bytes of a gateway's receive buffer for each bus: room for the answers of all cells to a report at
 /// once.
-pub const GATEWAY_RECEIVE_BUFFER: u32 = 8 << 20;
+pub const GATEWAY_RECEIVE_BUFFER_BYTES: u32 = 8 << 20;
 
 /// Returns true if the kernel has `CAN_RAW` sockets. Any error except "protocol not supported" counts as
 /// true.
 #[must_use]
 pub fn has_socketcan() -> bool {
-    !matches!(probe(), Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT))
+    !matches!(probe_can_raw(), Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT))
 }
 
 /// Returns true if there is an interface of this name, CAN or not. Any error except "no such device" counts
@@ -33,23 +33,23 @@ pub(super) fn has_interface(name: &str) -> bool {
         .is_err_and(|error| matches!(error.raw_os_error(), Some(libc::ENODEV | libc::ENXIO)))
 }
 
-fn probe() -> Result<OwnedFd, Errno> {
+fn probe_can_raw() -> Result<OwnedFd, Errno> {
     let protocol = u32::try_from(libc::CAN_RAW).ok().and_then(std::num::NonZeroU32::new);
     let protocol = protocol.map(Protocol::from_raw);
     rustix::net::socket_with(AddressFamily::CAN, SocketType::RAW, SocketFlags::CLOEXEC, protocol)
 }
 
 /// SocketCAN interfaces.
-pub(super) struct SocketCan;
+pub(super) struct SocketCanBackend;
 
-impl Carrier for SocketCan {
+impl BusBackend for SocketCanBackend {
     fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError> {
         let own = || name.to_owned();
         let failed = |source: io::Error| match source.raw_os_error() {
             Some(libc::ENETDOWN) => BusError::Down(own()),
             _ => BusError::open_error(name, "open", source),
         };
-        match probe() {
+        match probe_can_raw() {
             Ok(_) => {}
             Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT) => return Err(BusError::NoSocketCan(own())),
             Err(errno) => return Err(failed(errno.into())),
@@ -69,7 +69,7 @@ impl Carrier for SocketCan {
         if options.fd && link.mtu < FD_MTU {
             return Err(BusError::ClassicOnly { name: own(), mtu: link.mtu });
         }
-        let granted = set_up(&socket, options).map_err(failed)?;
+        let granted = configure_socket(&socket, options).map_err(failed)?;
         Ok((socket, granted))
     }
 
@@ -85,7 +85,7 @@ impl Carrier for SocketCan {
         frame.is_own()
     }
 
-    fn dropped(&self, _notice: &[u8]) -> Option<u32> {
+    fn decode_drop_notice(&self, _notice: &[u8]) -> Option<u32> {
         None
     }
 
@@ -99,7 +99,7 @@ impl Carrier for SocketCan {
 }
 
 /// Sets the options of a new socket. Returns the size of its receive buffer.
-fn set_up(socket: &CanFdSocket, options: &BusOptions) -> io::Result<usize> {
+fn configure_socket(socket: &CanFdSocket, options: &BusOptions) -> io::Result<usize> {
     set_filters(socket, &options.filters)?;
     socket.set_error_filter(options.error_mask)?;
     let fd = libc::c_int::from(options.fd);
@@ -131,7 +131,7 @@ pub fn set_receive_buffer(socket: impl AsFd, bytes: usize) -> io::Result<usize> 
 
 /// Discards frames that arrived between the creation of the socket and the setting of its filters.
 fn discard(socket: &CanFdSocket) {
-    let mut batch = Batch::new();
+    let mut batch = ReceiveBatch::new();
     for _ in 0..16 {
         if batch.receive(socket).is_err() {
             break;
@@ -148,7 +148,7 @@ mod tests {
         let flags = SocketFlags::CLOEXEC;
         let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, flags, None).unwrap();
         assert_eq!(set_receive_buffer(&socket, 64 << 10).unwrap(), 128 << 10);
-        let much = GATEWAY_RECEIVE_BUFFER as usize;
+        let much = GATEWAY_RECEIVE_BUFFER_BYTES as usize;
         let granted = set_receive_buffer(&socket, much).unwrap();
         assert!(granted > 128 << 10 && granted <= 2 * much, "{granted}");
     }

@@ -8,10 +8,10 @@ use std::str::FromStr;
 
 use thiserror::Error;
 
-use super::carrier::Carrier;
+use super::carrier::BusBackend;
 use super::check_name;
-use super::embedded::Embedded;
-use super::kernel::SocketCan;
+use super::embedded::EmbeddedBackend;
+use super::kernel::SocketCanBackend;
 
 /// A kind of bus, by the transport of its frames.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
@@ -27,10 +27,10 @@ impl BusKind {
     pub const ALL: [Self; 2] = [Self::SocketCan, Self::Embedded];
 
     /// Returns the implementation of the kind.
-    pub(super) const fn carrier(self) -> &'static dyn Carrier {
+    pub(super) const fn backend(self) -> &'static dyn BusBackend {
         match self {
-            Self::SocketCan => &SocketCan,
-            Self::Embedded => &Embedded,
+            Self::SocketCan => &SocketCanBackend,
+            Self::Embedded => &EmbeddedBackend,
         }
     }
 
@@ -57,8 +57,8 @@ impl BusKind {
 
     /// Returns the name under which a process serves a bus of this kind.
     #[must_use]
-    pub fn served_as(self, name: &str) -> String {
-        self.carrier().served_as(name)
+    pub fn served_name(self, name: &str) -> String {
+        self.backend().served_name(name)
     }
 
     /// Returns the name of the kind in sentences.
@@ -99,7 +99,7 @@ pub enum KindChoice {
 impl KindChoice {
     /// Returns the kind of a bus that a process serves for this choice.
     #[must_use]
-    pub const fn served(self) -> BusKind {
+    pub const fn served_kind(self) -> BusKind {
         match self {
             Self::Only(kind) if !kind.is_interface() => kind,
             Self::Only(_) | Self::Auto => BusKind::Embedded,

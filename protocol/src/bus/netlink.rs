@@ -15,11 +15,11 @@ use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
 
 /// Maximum time to wait for the kernel, which normally answers at once.
-const TIMEOUT: Duration = Duration::from_secs(5);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of attempts to read a list that the kernel changes while it is read.
 const RETRIES: usize = 8;
 /// Size of `struct ifinfomsg` in bytes; the attributes follow it.
-const HEADER: usize = 16;
+const INTERFACE_HEADER_BYTES: usize = 16;
 
 /// A netlink socket in the network namespace in which it was opened.
 #[derive(Debug)]
@@ -41,7 +41,7 @@ impl RtnetlinkSocket {
             // NETLINK_ROUTE is protocol 0.
             None,
         )?;
-        set_socket_timeout(&socket, Timeout::Recv, Some(TIMEOUT))?;
+        set_socket_timeout(&socket, Timeout::Recv, Some(ANSWER_TIMEOUT))?;
         rustix::net::connect(&socket, &SocketAddrNetlink::new(0, 0))?;
         Ok(Self { socket, sequence: 0 })
     }
@@ -104,7 +104,7 @@ impl RtnetlinkSocket {
 /// Decodes the attributes of an interface in an answer. Unknown attributes are skipped, so that an unusual
 /// interface does not hide the others.
 pub fn attributes(answer: &[u8]) -> impl Iterator<Item = LinkAttribute> {
-    NlasIterator::new(answer.get(HEADER..).unwrap_or_default())
+    NlasIterator::new(answer.get(INTERFACE_HEADER_BYTES..).unwrap_or_default())
         .flatten()
         .filter_map(|attribute| LinkAttribute::parse_with_param(&attribute, AddressFamily::Unspec).ok())
 }

@@ -3,7 +3,7 @@
 use crate::can::FD_BYTES;
 
 /// The buffer of one datagram and its control messages.
-pub(super) struct Slot {
+pub(super) struct DatagramBuffer {
     pub(super) bytes: [u8; FD_BYTES],
     /// Control messages: a time stamp (32 bytes) and a drop count (24 bytes).
     pub(super) control: [u64; 8],
@@ -23,7 +23,7 @@ pub struct DatagramInfo {
 
 impl DatagramInfo {
     /// Decodes control messages.
-    pub(super) fn read(control: &[u8]) -> Self {
+    pub(super) fn decode(control: &[u8]) -> Self {
         let mut notes = Self::default();
         for ControlMessage { kind, data } in ControlMessages(control) {
             if kind == libc::SCM_TIMESTAMPNS {
@@ -68,7 +68,7 @@ impl<'a> Iterator for ControlMessages<'a> {
 }
 
 /// Calls `take` with each file descriptor that came with a datagram (`SCM_RIGHTS`).
-pub(super) fn for_each_descriptor(slot: &Slot, mut take: impl FnMut(i32)) {
+pub(super) fn for_each_descriptor(slot: &DatagramBuffer, mut take: impl FnMut(i32)) {
     let words = slot.control.map(u64::to_ne_bytes);
     let messages = ControlMessages(words.as_flattened().get(..slot.control_len).unwrap_or_default());
     for message in messages.filter(|message| message.kind == libc::SCM_RIGHTS) {
@@ -94,7 +94,7 @@ mod tests {
     proptest! {
         #[test]
         fn no_control_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..80)) {
-            let _ = DatagramInfo::read(&bytes);
+            let _ = DatagramInfo::decode(&bytes);
         }
     }
 }

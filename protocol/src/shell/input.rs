@@ -14,11 +14,11 @@ use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 pub const STANDARD_INPUT: &str = "-";
 
 /// The descriptors that [`open`] has already returned. Their data can be read only once.
-static OPENED: Mutex<Vec<u32>> = Mutex::new(Vec::new());
+static OPENED_DESCRIPTORS: Mutex<Vec<u32>> = Mutex::new(Vec::new());
 
 /// Records that a descriptor is in use. Returns an error if it already is.
 fn claim_descriptor(descriptor: u32) -> io::Result<()> {
-    let mut taken = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut taken = OPENED_DESCRIPTORS.lock().unwrap_or_else(PoisonError::into_inner);
     if taken.contains(&descriptor) {
         return Err(io::Error::other(
             "it can be read only once and was already read: use a file for one of the two",
@@ -60,7 +60,7 @@ pub fn open(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
     let kind = file.metadata()?.file_type();
     if !kind.is_file() {
-        claim_descriptor(own_descriptor(path).ok_or_else(|| not_readable_error(kind))?)?;
+        claim_descriptor(descriptor_of_path(path).ok_or_else(|| not_readable_error(kind))?)?;
         fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
     }
     Ok(file)
@@ -93,7 +93,7 @@ pub fn read_bytes(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
 /// Returns the number of the file descriptor of this process that a path such as `/dev/stdout` names; `None` for other
 /// paths.
 #[must_use]
-pub fn own_descriptor(path: &Path) -> Option<u32> {
+pub fn descriptor_of_path(path: &Path) -> Option<u32> {
     let own = fs::canonicalize("/proc/self/fd").ok()?;
     let mut path = path.to_owned();
     // The kernel follows at most 40 links as well.

@@ -15,7 +15,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Number of intervals for which a writer still waits after a stop request.
 const MAX_STOP_POLLS: u32 = 10;
 /// Number of bytes that a writable pipe accepts without blocking (`PIPE_BUF`).
-const MAX_WRITE: usize = 4_096;
+const MAX_WRITE_BYTES: usize = 4_096;
 
 /// Returns the stop flag, which the signal handler sets.
 #[must_use]
@@ -68,7 +68,7 @@ impl<F: AsFd> Write for InterruptibleWriter<F> {
         if !self.waits {
             return Ok(rustix::io::write(&self.file, bytes)?);
         }
-        let piece = bytes.get(..MAX_WRITE).unwrap_or(bytes);
+        let piece = bytes.get(..MAX_WRITE_BYTES).unwrap_or(bytes);
         loop {
             self.wait()?;
             match rustix::io::write(&self.file, piece) {

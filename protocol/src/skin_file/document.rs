@@ -81,7 +81,7 @@ impl KeyPath {
     ///
     /// # Errors
     /// Returns an error if the word is not one of them.
-    pub fn choose<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, DocumentFault> {
+    pub fn parse_choice<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, DocumentFault> {
         let found = words.iter().find(|(word, _)| *word == got);
         found.map(|&(_, meaning)| meaning).ok_or_else(|| {
             let mut words = words.iter().map(|(word, _)| format!("{word:?}")).collect::<Vec<_>>();
@@ -137,7 +137,7 @@ impl KeyPath {
     ///
     /// # Errors
     /// Returns an error if the number is negative, or outside the range of the word.
-    pub fn set_word<const F: u32>(
+    pub fn set_fixed_if_given<const F: u32>(
         &self,
         given: Option<f64>,
         word: &mut Q<F>,
@@ -210,7 +210,7 @@ impl DocumentError {
     /// Returns [`DocumentError::WrongKind`] with `what` if the text is a file of another kind: it has one of the keys
     /// `has` and none of the keys `lacks`. Otherwise returns the error unchanged.
     #[must_use]
-    pub fn or_wrong_kind(self, text: &str, has: &[&str], lacks: &[&str], what: &'static str) -> Self {
+    pub fn detect_wrong_kind(self, text: &str, has: &[&str], lacks: &[&str], what: &'static str) -> Self {
         let Self::InvalidValue { path, .. } = &self else { return self };
         let Ok(root) = DeTable::parse(text) else { return self };
         let any = |keys: &[&str]| keys.iter().any(|key| root.get_ref().contains_key(*key));

@@ -13,7 +13,9 @@ use std::path::Path;
 use crate::id::{Command, Kind};
 use crate::message::State;
 use crate::parameters::Parameter;
-use crate::schema::{Field, FieldFormat, FieldRange, Layout, PacketSchema, packets, reasons, wires};
+use crate::schema::{
+    Field, FieldFormat, FieldRange, Layout, PacketSchema, packets, refusal_reasons, wire_layouts,
+};
 
 /// The documents with the requirements.
 const REQUIREMENTS: [&str; 3] = [
@@ -199,10 +201,10 @@ fn the_documents_tables_list_the_fields_of_the_schema() {
 #[test]
 fn the_document_names_every_reason_and_every_message_over_a_wire() {
     let document = std::fs::read_to_string(PATH).unwrap();
-    for (number, why) in reasons() {
+    for (number, why) in refusal_reasons() {
         assert!(document.contains(&format!("\n| {number} | ")), "{number}: {why}");
     }
-    for Layout { number, name, .. } in wires() {
+    for Layout { number, name, .. } in wire_layouts() {
         assert!(document.contains(&format!("\n| {number} | {name} | ")), "{name}");
     }
 }

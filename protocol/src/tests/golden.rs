@@ -14,11 +14,13 @@ use meaning::{Error, Meaning};
 
 use crate::can::{FD_FORMAT, Format, Frame};
 use crate::candump::{self, CandumpLine};
-use crate::fixed::{Acc, TorqueFormat};
+use crate::fixed::{Accumulator, TorqueFormat};
 use crate::id::{CellId, Id, Kind};
 use crate::message::{Answer, Message, Request};
 use crate::packet::{Epoch, Length, Lengths, Packet, Reassembler, Reassembly, crc16, data_id};
-use crate::parameters::{Baseline, Events, Parameter, ParameterError, Parameters, Reply, Sensing, Tare};
+use crate::parameters::{
+    Baseline, Events, Parameter, ParameterError, Parameters, Reply, Sensing, TareCommand,
+};
 use crate::port::LinkId;
 use crate::time::Micros;
 
@@ -267,9 +269,9 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
             Some(Parameter::Sensing) => (*number, cannot_be(Sensing::from_words(*words))),
             Some(Parameter::Events) => (*number, cannot_be(Events::from_words(*words))),
             Some(Parameter::Baseline) => (*number, cannot_be(Baseline::from_words(*words))),
-            Some(Parameter::Tare) => (*number, cannot_be(Tare::from_words(*words))),
+            Some(Parameter::Tare) => (*number, cannot_be(TareCommand::from_words(*words))),
             // The cell of the session is not in test mode.
-            Some(Parameter::LinksDown) => (*number, Answer::INVALID),
+            Some(Parameter::LinksDown) => (*number, Answer::INVALID_WORDS),
             Some(parameter) => match spoilt.set(parameter, *words) {
                 Err(error) => (*number, error.code()),
                 Ok(()) => (127, spoilt.check().map_err(ParameterError::code).unwrap_err()),
@@ -283,7 +285,7 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
 
 fn cannot_be<T: core::fmt::Debug>(read: Option<T>) -> i16 {
     assert!(read.is_none(), "{read:?} can be");
-    Answer::INVALID
+    Answer::INVALID_WORDS
 }
 
 #[test]
@@ -319,12 +321,12 @@ fn the_documents_torque_comes_out() {
     let (parameters, _) = staged(SESSION);
     let force: i64 = 3 * 1_024;
     assert!(force >= i64::from(parameters.contact.contact_threshold.to_bits()));
-    let fused = Acc::<22>::from_steps(i64::from(parameters.contact.alpha_c.to_bits()) * force)
+    let fused = Accumulator::<22>::from_steps(i64::from(parameters.contact.alpha_c.to_bits()) * force)
         .with_fraction_bits::<24>();
     assert!(fused >= parameters.contact.force_threshold.widen().with_fraction_bits());
     let rounded = (fused.steps() + (1 << 7)) >> 8;
-    let torque =
-        [-1_433, 4_260, 0, 0, 0, 0].map(|j| TorqueFormat::Q3_12.round(Acc::<30>::from_steps(j * rounded)));
+    let torque = [-1_433, 4_260, 0, 0, 0, 0]
+        .map(|j| TorqueFormat::Q3_12.round(Accumulator::<30>::from_steps(j * rounded)));
     let torque = torque.into();
     let from = CellId::new(12).unwrap();
     let expected = only_frame(&Message::Torque { from, epoch: Epoch(7), torque });

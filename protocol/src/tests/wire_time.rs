@@ -6,7 +6,7 @@ mod every_frame;
 mod oracle;
 
 use crate::can::{BIT_RATE_SWITCH, ERROR, ERROR_STATE, EXTENDED, Format, Frame, REMOTE};
-use crate::wire_time::{BitRates, Bits, Coding, Shape};
+use crate::wire_time::{BitRates, FrameBits, FrameCoding, FrameShape};
 use proptest::prelude::*;
 
 /// Frames and their numbers of bits, counted by another program.
@@ -30,8 +30,8 @@ fn every_counted_frame_has_its_bits() {
             (0..data.len()).step_by(2).map(|at| u8::from_str_radix(&data[at..at + 2], 16).unwrap()).collect();
         let flag = if extended == "1" { EXTENDED } else { 0 };
         let frame = frame(format, u32::from_str_radix(id, 16).unwrap() | flag, &data);
-        let expected = Bits { nominal: nominal.parse().unwrap(), data: switched.parse().unwrap() };
-        assert_eq!(Bits::from_frame(&frame), Some(expected), "{line}");
+        let expected = FrameBits { nominal: nominal.parse().unwrap(), data: switched.parse().unwrap() };
+        assert_eq!(FrameBits::from_frame(&frame), Some(expected), "{line}");
         assert_eq!(oracle::bits(&frame), expected, "{line}");
         count += 1;
     }
@@ -40,21 +40,21 @@ fn every_counted_frame_has_its_bits() {
 
 #[test]
 fn the_worst_packet_takes_what_the_documents_say() {
-    let fd = Shape { coding: Coding::FdSwitched, extended: false, len: 16 }.max_bits();
-    assert_eq!(fd, Bits { nominal: 32, data: 192 });
+    let fd = FrameShape { coding: FrameCoding::FdSwitched, extended: false, len: 16 }.max_bits();
+    assert_eq!(fd, FrameBits { nominal: 32, data: 192 });
     let micros = |text: &str| fd.seconds(text.parse().unwrap()) * 1e6;
     for (rates, expected) in
         [("500k/2M", 160.0), ("500k/5M", 102.4), ("1M/2M", 128.0), ("1M/5M", 70.4), ("1M/8M", 56.0)]
     {
         assert!((micros(rates) - expected).abs() < 1e-9, "{rates}: {}", micros(rates));
     }
-    let segment = Shape { coding: Coding::Classic, extended: false, len: 8 }.max_bits();
+    let segment = FrameShape { coding: FrameCoding::Classic, extended: false, len: 8 }.max_bits();
     assert_eq!(2 * segment.nanoseconds(BitRates::classic(1_000_000).unwrap()), 266_000);
 }
 
 #[test]
 fn a_drivers_error_frame_has_no_bits() {
-    assert_eq!(Bits::from_frame(&Frame::classic(ERROR | 4, &[0; 8]).unwrap()), None);
+    assert_eq!(FrameBits::from_frame(&Frame::classic(ERROR | 4, &[0; 8]).unwrap()), None);
 }
 
 #[test]
@@ -67,8 +67,8 @@ fn an_fd_length_that_does_not_exist_is_filled_up_with_zeros() {
         full.resize(wire.unwrap(), 0);
         for id in [0x123, EXTENDED | 0x123] {
             assert_eq!(
-                Bits::from_frame(&frame("fd-brs", id, &data)),
-                Bits::from_frame(&frame("fd-brs", id, &full)),
+                FrameBits::from_frame(&frame("fd-brs", id, &data)),
+                FrameBits::from_frame(&frame("fd-brs", id, &full)),
                 "{len}"
             );
         }
@@ -78,7 +78,7 @@ fn an_fd_length_that_does_not_exist_is_filled_up_with_zeros() {
 #[test]
 fn times_are_rounded_up_where_they_are_no_whole_nanoseconds() {
     let rates = BitRates::new(300_000, 7_000_000).unwrap();
-    let bits = Bits { nominal: 2, data: 3 };
+    let bits = FrameBits { nominal: 2, data: 3 };
     // 6666.67 and 428.57 ns.
     assert_eq!(bits.nanoseconds(rates), 6_667 + 429);
     assert!((bits.seconds(rates) - 7.095_238_095e-6).abs() < 1e-15);
@@ -111,12 +111,12 @@ proptest! {
 
     #[test]
     fn bits_are_those_of_a_second_implementation(frame in any_frame()) {
-        prop_assert_eq!(Bits::from_frame(&frame), Some(oracle::bits(&frame)));
+        prop_assert_eq!(FrameBits::from_frame(&frame), Some(oracle::bits(&frame)));
     }
 
     #[test]
     fn no_frame_is_shorter_than_the_best_or_longer_than_the_worst(frame in any_frame()) {
-        let (bits, shape) = (Bits::from_frame(&frame).unwrap(), Shape::from_frame(&frame));
+        let (bits, shape) = (FrameBits::from_frame(&frame).unwrap(), FrameShape::from_frame(&frame));
         let (best, worst) = (shape.min_bits(), shape.max_bits());
         prop_assert!(best.nominal <= bits.nominal && bits.nominal <= worst.nominal, "{best:?} {bits:?} {worst:?}");
         prop_assert!(best.data <= bits.data && bits.data <= worst.data, "{best:?} {bits:?} {worst:?}");
@@ -124,7 +124,7 @@ proptest! {
 
     #[test]
     fn no_remote_flag_changes_an_fd_frame(id in 0..0x800_u32, data in proptest::collection::vec(any::<u8>(), 0..=64)) {
-        let with = |id| Bits::from_frame(&Frame::with_data(id, Format::Fd, BIT_RATE_SWITCH, &data).unwrap());
+        let with = |id| FrameBits::from_frame(&Frame::with_data(id, Format::Fd, BIT_RATE_SWITCH, &data).unwrap());
         prop_assert_eq!(with(id | REMOTE), with(id));
     }
 }

@@ -118,7 +118,7 @@ impl Format {
 
     /// Returns the other format.
     #[must_use]
-    pub const fn other(self) -> Self {
+    pub const fn other_format(self) -> Self {
         match self {
             Self::Classic => Self::Fd,
             Self::Fd => Self::Classic,
@@ -312,7 +312,7 @@ impl Frame {
 
     /// Returns the data bytes that are on the wire between control field and checksum. Data of a length that CAN FD
     /// does not allow is padded with zeros. The remote flag of an FD frame is ignored.
-    pub(crate) fn on_wire(&self) -> &[u8] {
+    pub(crate) fn wire_bytes(&self) -> &[u8] {
         let len = match self.format {
             Format::Classic => self.data().len(),
             Format::Fd => fd_len(usize::from(self.len)),

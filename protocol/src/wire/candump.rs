@@ -31,7 +31,7 @@ use thiserror::Error;
 
 use crate::can::Frame;
 use read::{Cursor, is_blank};
-pub use read::{eight_digit_identifier, fraction};
+pub use read::{eight_digit_identifier, fraction_to_nanos};
 pub use write::{write_frame, write_record};
 
 /// The time of a frame, and the number of digits with which it is written.
@@ -48,14 +48,14 @@ pub struct Timestamp {
 impl Timestamp {
     /// Creates a time that is written with 6 fractional digits.
     #[must_use]
-    pub const fn six_digits(nanos: u64) -> Self {
+    pub const fn with_six_digits(nanos: u64) -> Self {
         Self { nanos, nine_digits: false, min_digits: 1 }
     }
 
     /// Creates a time that is written with 9 fractional digits.
     #[must_use]
-    pub const fn nine_digits(nanos: u64) -> Self {
-        Self { nine_digits: true, ..Self::six_digits(nanos) }
+    pub const fn with_nine_digits(nanos: u64) -> Self {
+        Self { nine_digits: true, ..Self::with_six_digits(nanos) }
     }
 }
 
@@ -142,15 +142,15 @@ fn parse_general(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
 /// Parses a line whose opening parenthesis is at index `at`.
 fn parse_at(text: &[u8], at: usize) -> Result<CandumpLine<'_>, LineError> {
     let mut cursor = Cursor::new(text, at + 1);
-    let time = cursor.time()?;
+    let time = cursor.parse_time()?;
     cursor.expect(b')', "`)` after the time")?;
     cursor.skip_blanks()?;
-    let interface = cursor.interface()?;
+    let interface = cursor.parse_interface()?;
     cursor.skip_blanks()?;
-    let Some(frame) = cursor.frame()? else {
+    let Some(frame) = cursor.parse_frame()? else {
         return Ok(CandumpLine::CanXl);
     };
-    let direction = cursor.direction()?;
+    let direction = cursor.parse_direction()?;
     Ok(CandumpLine::Frame(Record { time, interface, frame, direction }))
 }
 
@@ -168,8 +168,9 @@ fn parse_after_prefix(text: &[u8]) -> Option<CandumpLine<'_>> {
 /// Returns an error if the text is not a frame, is a CAN XL frame, or contains anything after the frame.
 pub fn parse_frame(text: &str) -> Result<Frame, LineError> {
     let mut cursor = Cursor::new(text.as_bytes(), 0);
-    let frame =
-        cursor.frame()?.ok_or(LineError { column: 1, expected: "a classic or FD frame, not CAN XL" })?;
+    let frame = cursor
+        .parse_frame()?
+        .ok_or(LineError { column: 1, expected: "a classic or FD frame, not CAN XL" })?;
     if cursor.is_at_end() { Ok(frame) } else { Err(cursor.error("the end of the frame")) }
 }
 
@@ -221,7 +222,7 @@ mod tests {
     fn a_line_is_read_in_every_dress() {
         let plain = parse("(1700000000.123456) vcan0 22C##1AABBCC").unwrap();
         let CandumpLine::Frame(record) = plain else { panic!("{plain:?}") };
-        assert_eq!(record.time, Timestamp::six_digits(1_700_000_000_123_456_000));
+        assert_eq!(record.time, Timestamp::with_six_digits(1_700_000_000_123_456_000));
         assert_eq!((record.interface, record.direction), ("vcan0", None));
         assert_eq!(record.frame.data(), [0xAA, 0xBB, 0xCC]);
         assert_eq!(record.frame.flags(), BIT_RATE_SWITCH);
@@ -229,7 +230,7 @@ mod tests {
         let dressed = parse("(1700000000.123456789)   vcan0  22C##1AA.BB.cc   T\r\n").unwrap();
         let CandumpLine::Frame(other) = dressed else { panic!("{dressed:?}") };
         assert_eq!(other.frame, record.frame);
-        assert_eq!(other.time, Timestamp::nine_digits(1_700_000_000_123_456_789));
+        assert_eq!(other.time, Timestamp::with_nine_digits(1_700_000_000_123_456_789));
         assert_eq!(other.direction, Some(Direction::Sent));
     }
 
@@ -369,7 +370,7 @@ mod tests {
             // Only padded seconds begin with a zero.
             let is_padded = |&digits: &u8| nanos / 1_000_000_000 < 10_u64.pow(u32::from(digits) - 1);
             let min_digits = [1, 3, 10].into_iter().nth(pad).filter(is_padded).unwrap_or(1);
-            let record = Record { time: Timestamp { nine_digits: nine, min_digits, ..Timestamp::six_digits(nanos) }, interface: "vcan0", frame, direction: None };
+            let record = Record { time: Timestamp { nine_digits: nine, min_digits, ..Timestamp::with_six_digits(nanos) }, interface: "vcan0", frame, direction: None };
             let line = record.to_string();
             prop_assert_eq!(parse(&line), Ok(CandumpLine::Frame(record)));
             prop_assert_eq!(parse_frame(&frame.to_string()), Ok(frame));

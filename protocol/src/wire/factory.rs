@@ -19,20 +19,20 @@ use crate::packet::crc16;
 use crate::port::{LinkId, PORTS};
 
 /// Size of a record in bytes.
-pub const BYTES: usize = 32;
+pub const RECORD_BYTES: usize = 32;
 /// The linker section that holds the record.
 pub const SECTION: &str = ".factory";
 /// The bytes of a record that was not written: erased flash.
-pub const ERASED: [u8; BYTES] = [0xFF; BYTES];
+pub const ERASED: [u8; RECORD_BYTES] = [0xFF; RECORD_BYTES];
 
 const MAGIC: &[u8; 4] = b"CELL";
 const VERSION: u8 = 1;
-const CLASSIC: u8 = 1;
-const HOSTED: u8 = 2;
+const CLASSIC_FLAG: u8 = 1;
+const HOSTED_FLAG: u8 = 2;
 
 /// The settings of a cell that its manufacturer chooses.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Factory {
+pub struct FactoryRecord {
     /// The node id, if assigned at the factory.
     pub node: Option<CellId>,
     /// The serial number.
@@ -45,12 +45,12 @@ pub struct Factory {
     pub link_ids: [Option<LinkId>; PORTS + 1],
 }
 
-impl Factory {
+impl FactoryRecord {
     /// Encodes the record.
     #[must_use]
-    pub fn encode(&self) -> [u8; BYTES] {
+    pub fn encode(&self) -> [u8; RECORD_BYTES] {
         let flag = |set, flag| if set { flag } else { 0 };
-        let flags = flag(self.format == Format::Classic, CLASSIC) | flag(self.hosted, HOSTED);
+        let flags = flag(self.format == Format::Classic, CLASSIC_FLAG) | flag(self.hosted, HOSTED_FLAG);
         let [s0, s1, s2, s3] = self.serial.to_le_bytes();
         let (mut wired, mut back, mut wires) = (0, 0, [0; 2 * (PORTS + 1)]);
         for ((port, link_id), wire) in self.link_ids.iter().enumerate().zip(wires.as_chunks_mut().0) {
@@ -61,7 +61,7 @@ impl Factory {
         }
         let head = [VERSION, self.node.map_or(0, CellId::get), flags, 0, s0, s1, s2, s3, wired, back];
         let body: [&[u8]; 3] = [MAGIC, &head, &wires];
-        let mut bytes = [0; BYTES];
+        let mut bytes = [0; RECORD_BYTES];
         for (byte, value) in bytes.iter_mut().zip(body.into_iter().flatten()) {
             *byte = *value;
         }
@@ -73,7 +73,7 @@ impl Factory {
 
     /// Decodes a record. Returns `None` if it was not written or is damaged. Never panics.
     #[must_use]
-    pub fn decode(bytes: &[u8; BYTES]) -> Option<Self> {
+    pub fn decode(bytes: &[u8; RECORD_BYTES]) -> Option<Self> {
         let (body, crc) = bytes.split_last_chunk()?;
         let (magic, rest) = body.split_first_chunk::<4>()?;
         let (&[version, node, flags, _, s0, s1, s2, s3, wired, back], rest) = rest.split_first_chunk()?;
@@ -89,8 +89,8 @@ impl Factory {
         Some(Self {
             node: CellId::new(node.into()).ok(),
             serial: u32::from_le_bytes([s0, s1, s2, s3]),
-            format: if flags & CLASSIC == 0 { Format::Fd } else { Format::Classic },
-            hosted: flags & HOSTED != 0,
+            format: if flags & CLASSIC_FLAG == 0 { Format::Fd } else { Format::Classic },
+            hosted: flags & HOSTED_FLAG != 0,
             link_ids: core::array::from_fn(link_id),
         })
     }
@@ -111,7 +111,8 @@ mod tests {
         link_ids[1] = Some(LinkId { wire: 0x0203, back: false });
         link_ids[4] = Some(LinkId { wire: 7, back: true });
         let node = CellId::new(12).ok();
-        let factory = Factory { node, serial: 100_012, format: Format::Classic, hosted: true, link_ids };
+        let factory =
+            FactoryRecord { node, serial: 100_012, format: Format::Classic, hosted: true, link_ids };
         let bytes = factory.encode();
         assert_eq!(bytes[..14], *b"CELL\x01\x0c\x03\0\xac\x86\x01\0\x12\x10");
         assert_eq!(bytes[14..30], [0, 0, 3, 2, 0, 0, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0]);
@@ -119,22 +120,22 @@ mod tests {
 
     #[test]
     fn erased_flash_is_no_record() {
-        assert_eq!(Factory::decode(&ERASED), None);
-        assert_eq!(Factory::decode(&[0; BYTES]), None);
+        assert_eq!(FactoryRecord::decode(&ERASED), None);
+        assert_eq!(FactoryRecord::decode(&[0; RECORD_BYTES]), None);
     }
 
     proptest! {
         #[test]
         fn every_record_comes_back_and_no_wrong_bit_passes(
             node in 0_i64..=254, serial: u32, classic: bool, hosted: bool,
-            link_ids in proptest::array::uniform5(link_id()), bit in 0..BYTES * 8,
+            link_ids in proptest::array::uniform5(link_id()), bit in 0..RECORD_BYTES * 8,
         ) {
             let format = if classic { Format::Classic } else { Format::Fd };
-            let factory = Factory { node: CellId::new(node).ok(), serial, format, hosted, link_ids };
+            let factory = FactoryRecord { node: CellId::new(node).ok(), serial, format, hosted, link_ids };
             let mut bytes = factory.encode();
-            prop_assert_eq!(Factory::decode(&bytes), Some(factory));
+            prop_assert_eq!(FactoryRecord::decode(&bytes), Some(factory));
             bytes[bit / 8] ^= 1 << (bit % 8);
-            prop_assert_eq!(Factory::decode(&bytes), None);
+            prop_assert_eq!(FactoryRecord::decode(&bytes), None);
         }
     }
 }

@@ -5,7 +5,7 @@
 //!
 //! A format defines the resolution of a number and not the quantity: [`crate::message`] defines which word is a force
 //! and which a torque. Operators are not overloaded, so that every operation that can lose bits is visible as a call of
-//! [`Acc::round`] or of a saturating function.
+//! [`Accumulator::round`] or of a saturating function.
 
 use thiserror::Error;
 
@@ -72,7 +72,7 @@ impl TorqueFormat {
 
     /// Returns the number of fraction bits of a word.
     #[must_use]
-    pub const fn fraction(self) -> u32 {
+    pub const fn fraction_bits(self) -> u32 {
         match self {
             Self::Q3_12 => 12,
             Self::Q5_10 => 10,
@@ -82,20 +82,20 @@ impl TorqueFormat {
 
     /// Returns the value of one step, in Nm or N.
     #[must_use]
-    pub fn step(self) -> f64 {
-        1.0 / f64::from(1_u32 << self.fraction())
+    pub fn step_size(self) -> f64 {
+        1.0 / f64::from(1_u32 << self.fraction_bits())
     }
 
     /// Converts a word to Nm or N.
     #[must_use]
     pub fn to_real(self, word: i16) -> f64 {
-        f64::from(word) * self.step()
+        f64::from(word) * self.step_size()
     }
 
     /// Rounds a value in Nm or N to the nearest word, ties away from zero. Values out of range saturate; NaN becomes
     /// zero.
     #[must_use]
-    pub fn nearest(self, value: f64) -> i16 {
+    pub fn nearest_word(self, value: f64) -> i16 {
         match self {
             Self::Q3_12 => Q::<12>::nearest(value).0,
             Self::Q5_10 => Q::<10>::nearest(value).0,
@@ -106,18 +106,18 @@ impl TorqueFormat {
     /// Converts a word to steps of 2^-12 Nm or N, the finest of all formats. The result is exact.
     #[must_use]
     pub fn finest_steps(self, word: i16) -> i32 {
-        i32::from(word) << (Self::Q3_12.fraction() - self.fraction())
+        i32::from(word) << (Self::Q3_12.fraction_bits() - self.fraction_bits())
     }
 
     /// Returns the upper bound of the range in Nm or N, exclusive.
     #[must_use]
-    pub fn bound(self) -> f64 {
+    pub fn upper_bound(self) -> f64 {
         -self.to_real(i16::MIN)
     }
 
     /// Rounds an exact torque to the nearest word, ties up. Torques out of range saturate.
     #[must_use]
-    pub fn round<const F: u32>(self, exact: Acc<F>) -> i16 {
+    pub fn round<const F: u32>(self, exact: Accumulator<F>) -> i16 {
         match self {
             Self::Q3_12 => exact.round::<12>().to_bits(),
             Self::Q5_10 => exact.round::<10>().to_bits(),
@@ -189,7 +189,7 @@ impl<const F: u32> Q<F> {
     ///
     /// # Errors
     /// Returns an error if that number is outside the range, or `value` is NaN.
-    pub fn try_at_least(value: f64) -> Result<Self, OutOfRange> {
+    pub fn try_round_up(value: f64) -> Result<Self, OutOfRange> {
         let nearest = Self::try_nearest(value)?;
         if nearest.to_f64() >= value {
             return Ok(nearest);
@@ -227,8 +227,8 @@ impl<const F: u32> Q<F> {
 
     /// Converts the number to an exact sum with one term.
     #[must_use]
-    pub fn widen(self) -> Acc<F> {
-        Acc(i64::from(self.0))
+    pub fn widen(self) -> Accumulator<F> {
+        Accumulator(i64::from(self.0))
     }
 
     /// Multiplies two numbers exactly. `P` must be `F + G`, which is checked at compile time.
@@ -238,9 +238,9 @@ impl<const F: u32> Q<F> {
     /// let _: Acc<21> = Q1_14::ZERO.mul_wide(Q7_8::ZERO); // 14 + 8 is not 21
     /// ```
     #[must_use]
-    pub fn mul_wide<const G: u32, const P: u32>(self, rhs: Q<G>) -> Acc<P> {
+    pub fn mul_wide<const G: u32, const P: u32>(self, rhs: Q<G>) -> Accumulator<P> {
         const { assert!(P == F + G, "a product has the sum of the fractional bits") }
-        Acc(i64::from(self.0) * i64::from(rhs.0))
+        Accumulator(i64::from(self.0) * i64::from(rhs.0))
     }
 }
 
@@ -271,9 +271,9 @@ impl Q1_14 {
 /// An exact sum of products of fixed-point numbers, with `F` fraction bits. It holds at least 2^33 products of two
 /// words without overflow.
 #[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
-pub struct Acc<const F: u32>(i64);
+pub struct Accumulator<const F: u32>(i64);
 
-impl<const F: u32> Acc<F> {
+impl<const F: u32> Accumulator<F> {
     /// Zero.
     pub const ZERO: Self = Self(0);
 
@@ -297,9 +297,9 @@ impl<const F: u32> Acc<F> {
 
     /// Converts to finer steps. `G` must be at least `F`, which is checked at compile time.
     #[must_use]
-    pub const fn with_fraction_bits<const G: u32>(self) -> Acc<G> {
+    pub const fn with_fraction_bits<const G: u32>(self) -> Accumulator<G> {
         const { assert!(G >= F, "finer means more fractional bits") }
-        Acc(self.0.saturating_mul(1_i64 << (G - F)))
+        Accumulator(self.0.saturating_mul(1_i64 << (G - F)))
     }
 
     /// Rounds to `G` fraction bits, ties up, and saturates at 16 bits, so that bits may be lost.
@@ -390,7 +390,7 @@ mod tests {
     proptest! {
         #[test]
         fn a_threshold_is_the_smallest_step_not_below_it(value in -31.9_f64..31.9) {
-            let word = Q5_10::try_at_least(value).unwrap();
+            let word = Q5_10::try_round_up(value).unwrap();
             prop_assert!(word.to_f64() >= value && word.to_f64() - value < 1.0 / 1_024.0);
         }
 
@@ -404,7 +404,7 @@ mod tests {
 
         #[test]
         fn ties_round_up(whole in -32_768_i64..32_767) {
-            let half = Acc::<13>::from_steps(2 * whole + 1);
+            let half = Accumulator::<13>::from_steps(2 * whole + 1);
             prop_assert_eq!(i64::from(half.round::<12>().to_bits()), whole + 1);
         }
     }
@@ -412,7 +412,10 @@ mod tests {
     #[test]
     fn a_torque_format_has_its_range() {
         let format = TorqueFormat::Q3_12;
-        assert_eq!((format.to_real(i16::MIN), format.to_real(1), format.bound()), (-8.0, 1.0 / 4_096.0, 8.0));
+        assert_eq!(
+            (format.to_real(i16::MIN), format.to_real(1), format.upper_bound()),
+            (-8.0, 1.0 / 4_096.0, 8.0)
+        );
         assert_eq!([Q3_12::MIN, Q3_12::ZERO, Q3_12::MAX].map(Q::is_saturated), [true, false, true]);
     }
 }

@@ -42,7 +42,7 @@ pub const WORDS: usize = 6;
 /// Number of words in the longest packet.
 pub const MAX_WORDS: usize = 14;
 /// Size of a packet with [`WORDS`] words, in bytes.
-pub const BYTES: usize = Length::Six.bytes();
+pub const PACKET_BYTES: usize = Length::Six.bytes();
 /// Size of the longest packet in bytes.
 const MAX_BYTES: usize = Length::Fourteen.bytes();
 /// Size of each classic frame of a packet except the last, in bytes.
@@ -195,7 +195,7 @@ impl Packet {
     /// Returns the bytes to which the fields of [`crate::schema`] refer: the first six words, epoch and count as in a
     /// packet of six words, then the other words.
     #[must_use]
-    pub fn fields(&self) -> Bytes {
+    pub fn field_bytes(&self) -> Bytes {
         let (first, rest) = self.words.as_slice().split_at(WORDS);
         let bytes = |words: &'_ [i16]| words.iter().flat_map(|word| word.to_le_bytes()).collect::<Bytes>();
         let end = [self.epoch.0, self.count];
@@ -258,7 +258,7 @@ impl Packet {
     pub fn from_fd(frame: &Frame) -> Result<Self, PacketError> {
         let id = data_id(frame)?;
         if frame.format() != Format::Fd {
-            return Err(PacketError::Length { expected: BYTES, got: frame.data().len() });
+            return Err(PacketError::Length { expected: PACKET_BYTES, got: frame.data().len() });
         }
         Self::decode(id, frame.data())
     }

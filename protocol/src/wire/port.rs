@@ -38,7 +38,7 @@ pub const PORTS: usize = 4;
 /// Index of the uplink, the wire of a root to the gateway's side. It follows the ports.
 pub const UPLINK: usize = PORTS;
 /// Size of a message with its CRC, in bytes.
-pub const BYTES: usize = 8;
+pub const MESSAGE_BYTES: usize = 8;
 
 /// The identifier of one direction of a simulated wire: the frames that one end sends.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
@@ -54,14 +54,14 @@ pub struct LinkId {
 /// A cell's rank only ever improves: to a later round, or to a smaller depth in the same round. A cell accepts a parent
 /// only if the parent's rank is better than its own, so that parents never form a loop.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
-pub struct Rank {
+pub struct TreeRank {
     /// Round of the exploration in which the depth was determined (the version of the tree), modulo 2^8.
     pub round: u8,
     /// Number of wires between the sender and the gateway: 0 for the gateway, 1 for a root.
     pub depth: u8,
 }
 
-impl Rank {
+impl TreeRank {
     /// Returns true if this rank is better than `other`: of a later round, or with a smaller depth in the same round.
     #[must_use]
     pub const fn is_better_than(self, other: Self) -> bool {
@@ -94,7 +94,7 @@ pub struct Hello {
     /// True if the sender, or a cell below it, has no node id yet.
     pub unnumbered: bool,
     /// The rank of the sender; `None` while it is unreachable.
-    pub rank: Option<Rank>,
+    pub rank: Option<TreeRank>,
 }
 
 /// A message over a wire.
@@ -105,7 +105,7 @@ pub enum PortMessage {
     /// Requests to become a child of the receiver and send it sums.
     Join,
     /// Accepts a join, with the sender's rank.
-    Grant(Rank),
+    Grant(TreeRank),
     /// Rejects a join, or answers a hello of a cell that takes the sender for its parent but is not its child.
     Refuse,
     /// Reports that the sender is not a child of the receiver any more.
@@ -119,16 +119,16 @@ pub enum PortMessage {
     /// Reports that the sender is unreachable, and requests a round later than this one.
     Repair(u8),
     /// Passes free node ids to the receiver, for itself and the cells below it.
-    NodeId(Walk),
+    NodeId(NodeIdWalk),
     /// Reports that all cells below the sender have a node id, or that there were not enough, and returns the rest.
-    Return(Walk),
+    Return(NodeIdWalk),
     /// Requests a hello.
     Probe,
 }
 
 /// The free node ids in a walk over the tree, which assigns one to each cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Walk {
+pub struct NodeIdWalk {
     /// Number of the walk.
     pub walk: u8,
     /// First free node id.
@@ -137,10 +137,10 @@ pub struct Walk {
     pub last: u8,
 }
 
-const RECEIVES: u8 = 1 << 3;
+const RECEIVES_FLAG: u8 = 1 << 3;
 const IS_PARENT: u8 = 1 << 4;
-const UNNUMBERED: u8 = 1 << 5;
-const HAS_RANK: u8 = 1 << 6;
+const UNNUMBERED_FLAG: u8 = 1 << 5;
+const HAS_RANK_FLAG: u8 = 1 << 6;
 
 impl PortMessage {
     /// Encodes kind and content of the message, without the CRC.
@@ -149,10 +149,10 @@ impl PortMessage {
         match self {
             Self::Hello(hello) => {
                 let flag = |set, flag| if set { flag } else { 0 };
-                let flags = flag(hello.receives, RECEIVES)
+                let flags = flag(hello.receives, RECEIVES_FLAG)
                     | flag(hello.is_parent, IS_PARENT)
-                    | flag(hello.unnumbered, UNNUMBERED)
-                    | flag(hello.rank.is_some(), HAS_RANK);
+                    | flag(hello.unnumbered, UNNUMBERED_FLAG)
+                    | flag(hello.rank.is_some(), HAS_RANK_FLAG);
                 let (round, depth) = hello.rank.map_or((0, 0), |rank| (rank.round, rank.depth));
                 [1, hello.version, hello.number, (hello.port & 7) | flags, round, depth]
             }
@@ -172,19 +172,19 @@ impl PortMessage {
 
     const fn decode(bytes: [u8; 6]) -> Option<Self> {
         let [kind, a, b, c, d, e] = bytes;
-        let walk = Walk { walk: a, first: b, last: c };
+        let walk = NodeIdWalk { walk: a, first: b, last: c };
         Some(match kind {
             1 => Self::Hello(Hello {
                 version: a,
                 number: b,
                 port: c & 7,
-                receives: c & RECEIVES != 0,
+                receives: c & RECEIVES_FLAG != 0,
                 is_parent: c & IS_PARENT != 0,
-                unnumbered: c & UNNUMBERED != 0,
-                rank: if c & HAS_RANK == 0 { None } else { Some(Rank { round: d, depth: e }) },
+                unnumbered: c & UNNUMBERED_FLAG != 0,
+                rank: if c & HAS_RANK_FLAG == 0 { None } else { Some(TreeRank { round: d, depth: e }) },
             }),
             2 => Self::Join,
-            3 => Self::Grant(Rank { round: a, depth: b }),
+            3 => Self::Grant(TreeRank { round: a, depth: b }),
             4 => Self::Refuse,
             5 => Self::Leave,
             6 => Self::LeaveAck,
@@ -269,7 +269,7 @@ mod tests {
 
     #[test]
     fn a_rank_of_a_later_round_or_a_smaller_depth_is_better() {
-        let rank = |round, depth| Rank { round, depth };
+        let rank = |round, depth| TreeRank { round, depth };
         assert!(rank(1, 9).is_better_than(rank(0, 1)));
         assert!(rank(0, 9).is_better_than(rank(255, 1)));
         assert!(rank(4, 1).is_better_than(rank(4, 2)));
@@ -292,8 +292,8 @@ mod tests {
         fn one_wrong_bit_is_noticed(bit in 0_usize..64, body: [u8; 5]) {
             let [a, b, c, ..] = body;
             let link_id = LinkId { wire: 7, back: false };
-            let frame = link_id.encode_frame(PortMessage::NodeId(Walk { walk: a, first: b, last: c }));
-            let mut data: [u8; BYTES] = frame.data().try_into().unwrap();
+            let frame = link_id.encode_frame(PortMessage::NodeId(NodeIdWalk { walk: a, first: b, last: c }));
+            let mut data: [u8; MESSAGE_BYTES] = frame.data().try_into().unwrap();
             data[bit / 8] ^= 1 << (bit % 8);
             let damaged = Frame::classic(frame.raw_id(), &data).unwrap();
             prop_assert_eq!(link_id.decode_frame(&damaged), None);

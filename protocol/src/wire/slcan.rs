@@ -30,7 +30,7 @@ mod tests;
 
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, dlc_len, fd_dlc};
 
-pub use decoder::{Decoder, Refusal, RejectedLines, SlcanLine};
+pub use decoder::{Decoder, LineRefusal, RejectedLines, SlcanLine};
 #[cfg(feature = "host")]
 pub use report::{AdapterFault, AdapterReport, BusState, ErrorCounters};
 
@@ -85,7 +85,7 @@ pub fn encode(frame: &Frame) -> Option<EncodedLine> {
     if frame.is_error() {
         return None;
     }
-    let data = frame.on_wire();
+    let data = frame.wire_bytes();
     let (kind, dlc) = match frame.format() {
         Format::Classic if frame.is_remote() => (b'r', frame.len()),
         Format::Classic => (b't', frame.len()),

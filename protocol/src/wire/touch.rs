@@ -15,7 +15,7 @@ use crate::message::SkinSensors;
 
 /// The state of a value relative to its threshold.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum Touch {
+pub enum TouchState {
     /// The value has never reached its threshold, or has returned to zero after a release.
     #[default]
     Free,
@@ -25,7 +25,7 @@ pub enum Touch {
     Fading,
 }
 
-impl Touch {
+impl TouchState {
     /// Returns the state after a new value, in the same steps as the threshold. The value may be a sum of several
     /// words. A threshold of 0 counts as one step.
     #[must_use]
@@ -51,11 +51,11 @@ pub fn contact_force(skin: &SkinSensors) -> i32 {
 
 #[cfg(test)]
 mod tests {
-    use super::Touch::{Fading, Free, Touched};
+    use super::TouchState::{Fading, Free, Touched};
     use super::*;
 
-    fn course(hysteresis: f64, values: &[i32]) -> Vec<Touch> {
-        let mut touch = Touch::default();
+    fn course(hysteresis: f64, values: &[i32]) -> Vec<TouchState> {
+        let mut touch = TouchState::default();
         let follow = |&value| {
             touch = touch.next(value, 100, Q1_14::nearest(hysteresis));
             touch
@@ -84,7 +84,7 @@ mod tests {
 
     #[test]
     fn without_a_threshold_everything_is_a_touch() {
-        let next = |touch: Touch, value| touch.next(value, 0, Q1_14::ZERO);
+        let next = |touch: TouchState, value| touch.next(value, 0, Q1_14::ZERO);
         assert_eq!((next(Free, 1), next(Touched, 0), next(Free, 0)), (Touched, Free, Free));
     }
 }

@@ -121,9 +121,9 @@ fn track(from: &mut Unstructured<'_>) -> Result<()> {
                 let silent = cell.handle_timeout(now);
                 assert!(!silent || cell.is_dead());
             }
-            1 => cell.account.interrupt(),
+            1 => cell.account.handle_connection_loss(),
             2 => {
-                cell.account.reject();
+                cell.account.count_rejected();
                 came += 1;
             }
             3 => cell.account.exclude_sums(),

@@ -7,11 +7,11 @@ use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
 use std::os::unix::net::UnixDatagram;
 use std::time::Duration;
 
-use control::controller::{Controller as _, ControllerOutput, Input};
-use control::external::External;
+use control::controller::{Controller as _, ControllerInput, ControllerOutput};
+use control::external::ExternalController;
 use protocol::skin::Skin;
 use tempfile::TempDir;
-use view::server::{Access, Server};
+use view::server::{PageAccess, Server};
 
 /// Returns the HTTP request that upgrades a connection to the WebSocket of a page.
 fn upgrade(port: u16) -> String {
@@ -27,7 +27,7 @@ pub(super) fn page(data: &[u8]) {
     thread_local! {
         static SERVER: Server = {
             let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
-            let access = Access { may_act: true, may_play: true, token: None };
+            let access = PageAccess { may_act: true, may_play: true, token: None };
             Server::start(listener, access, "{}".to_owned(), vec![1, 2, 3]).unwrap()
         };
     }
@@ -55,7 +55,7 @@ fn talk(server: &Server, pieces: &[&[u8]]) -> std::io::Result<Vec<u8>> {
 
 /// An external controller's socket and the gateway's side of it, with the number of the present tick.
 struct Listening {
-    external: External,
+    external: ExternalController,
     client: UnixDatagram,
     skin: Skin,
     tick: u64,
@@ -66,7 +66,7 @@ impl Listening {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let skin = Skin::parse("skin.toml", include_str!("../../fuzz/seeds/skin/generated.toml")).unwrap();
-        let external = External::listen(&folder.path().join("controller"), &skin).unwrap();
+        let external = ExternalController::listen(&folder.path().join("controller"), &skin).unwrap();
         let client = UnixDatagram::bind(folder.path().join("client")).unwrap();
         Self { external, client, skin, tick: 0, folder }
     }
@@ -98,7 +98,7 @@ pub(super) fn controller(data: &[u8]) {
 fn step(listening: &mut Listening) {
     let tick = listening.tick;
     listening.tick += 1;
-    let input = Input { tick, valid: true, ..Input::default() };
+    let input = ControllerInput { tick, valid: true, ..ControllerInput::default() };
     if let ControllerOutput::Move(velocities) = listening.external.step(&input) {
         let limits = listening.skin.controller.max_speed.iter().map(Some).chain(std::iter::repeat(None));
         for (velocity, limit) in velocities.iter().zip(limits) {

@@ -15,7 +15,7 @@ use protocol::packet::crc16;
 use protocol::skin::Skin;
 use robots::{SkinImport, Urdf};
 use tempfile::NamedTempFile;
-use trace::capture::{Item, Reader};
+use trace::capture::{Reader, RecordingItem};
 use trace::recording::recover::recover as recover_into;
 
 /// The skin that scenarios are read for.
@@ -42,8 +42,8 @@ fn read(reader: &mut Reader) -> u64 {
     let mut frames = 0;
     for _ in 0..100_000 {
         match reader.next_item() {
-            Ok(Some(Item::Entry(_))) => frames += 1,
-            Ok(Some(Item::Other(_))) => {}
+            Ok(Some(RecordingItem::Entry(_))) => frames += 1,
+            Ok(Some(RecordingItem::Other(_))) => {}
             Ok(None) | Err(_) => break,
         }
     }

@@ -6,7 +6,7 @@ use analysis::shadow::{Shadow, ShadowOptions};
 use analysis::stats::Stats;
 use arbitrary::{Result, Unstructured};
 use model::decode::json;
-use model::decode::settle::Settler;
+use model::decode::settle::OrderedDecoder;
 use protocol::can::{Format, fd_len};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Id;
@@ -17,7 +17,7 @@ use protocol::slcan::{self, Decoder, SlcanLine};
 use protocol::time::Micros;
 use protocol::wire_time::BitRates;
 
-use vcan_setup::hosts::incoming::{self, Incoming};
+use vcan_setup::hosts::incoming::{self, HostsToBusQueue};
 use vcan_setup::hosts::message;
 
 use super::{frame, packet as any_packet};
@@ -107,7 +107,7 @@ pub(super) fn slcan(data: &[u8]) {
 /// Receives messages of two hosts: all their frames must be accounted for, whatever the messages state.
 pub(super) fn hosts(data: &[u8]) {
     let mut from = Unstructured::new(data);
-    let (mut incoming, mut frames, mut bytes) = (Incoming::default(), Vec::new(), Vec::new());
+    let (mut incoming, mut frames, mut bytes) = (HostsToBusQueue::default(), Vec::new(), Vec::new());
     let mut waiting = 0;
     while let Ok(length @ 1..) = from.int_in_range(0..=600_usize).map(|length| length.min(from.len())) {
         let Ok(message) = from.bytes(length) else { break };
@@ -120,16 +120,16 @@ pub(super) fn hosts(data: &[u8]) {
             assert_eq!(again, frames);
         }
         assert_eq!(incoming.receive(host, message).is_ok(), message::decode(message, &mut frames).is_ok());
-        waiting = waiting.max(incoming.waiting().len());
+        waiting = waiting.max(incoming.waiting_frames().len());
         if from.arbitrary().unwrap_or(false) {
-            incoming.sent(from.int_in_range(0..=9).unwrap_or(0));
+            incoming.remove_sent(from.int_in_range(0..=9).unwrap_or(0));
         } else {
-            incoming.refused(from.int_in_range(0..=9).unwrap_or(0));
+            incoming.remove_refused(from.int_in_range(0..=9).unwrap_or(0));
         }
     }
     assert!(waiting <= incoming::MAX_WAITING_FRAMES);
-    let left = incoming.waiting().len();
-    incoming.sent(left);
+    let left = incoming.waiting_frames().len();
+    incoming.remove_sent(left);
     for (_, it, _) in incoming.accounts() {
         // A host may state numbers whose sum overflows.
         let parts: u128 = [it.before, it.dropped_there, it.lost, it.taken].map(u128::from).iter().sum();
@@ -175,16 +175,16 @@ fn traffic(
 
 /// Decodes traffic: every frame must come out once, in order, as text and as JSON.
 pub(super) fn decoder(data: &[u8]) {
-    let mut settler = Settler::new(None);
+    let mut settler = OrderedDecoder::new(None);
     let (mut sent, mut came) = (0_u64, 0_u64);
     let mut stats = Stats::default();
-    let mut out = |settler: &mut Settler<(u64, u64, &'static str, protocol::can::Frame)>| {
+    let mut out = |settler: &mut OrderedDecoder<(u64, u64, &'static str, protocol::can::Frame)>| {
         while let Some(((number, nanos, bus, frame), decoded)) = settler.pop() {
             assert_eq!(number, came, "in order");
             came += 1;
             let mut text = String::new();
             write!(text, "{decoded}").unwrap();
-            let time = Timestamp::nine_digits(nanos);
+            let time = Timestamp::with_nine_digits(nanos);
             let record = Record { time, interface: bus, frame, direction: None };
             let mut line = Vec::new();
             json::write(&mut line, &record, &decoded, Units::default()).unwrap();

@@ -8,7 +8,7 @@ use cell_node::sum::SumWords;
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, Q3_12, Q7_8};
 use protocol::id::CellId;
-use protocol::message::{Ports, Tree};
+use protocol::message::{PortsPage, TreePage};
 use protocol::parameters::{Contact, MAX_JOINTS, Parameters, Pose, Row};
 use protocol::port::{PORTS, PortMessage};
 use protocol::time::Micros;
@@ -36,9 +36,9 @@ pub struct WiredCell {
     /// True for each port whose incoming direction is down.
     pub deaf: [bool; PORTS + 1],
     /// The last network page by which the cell reported its place in the tree.
-    pub tree: Option<Tree>,
+    pub tree: Option<TreePage>,
     /// The last network page by which the cell reported its ports.
-    pub ports: Option<Ports>,
+    pub ports: Option<PortsPage>,
     /// The cell's own torque, as it enters sums.
     pub(super) own: [i32; MAX_JOINTS],
     pub(super) serial: u32,
@@ -89,7 +89,7 @@ impl WiredCell {
         };
         let force = Force::from_steps(i64::from(dice.random_range(1_000_i32..4_000)) << 6);
         let jacobian = Wrench::new(&parameters).jacobian(&padded(&positions()));
-        let own = Torque::new(&jacobian, force).exact().map(|exact| {
+        let own = Torque::new(&jacobian, force).exact_torques().map(|exact| {
             let word: Q7_8 = exact.round();
             i32::from(word.to_bits())
         });

@@ -6,7 +6,7 @@ use protocol::can::{Format, Frame};
 use protocol::candump::{self, CandumpLine};
 use protocol::fixed::Q;
 use protocol::id::{Kind, Node};
-use protocol::message::{AppliesFrom, Heartbeat, Message, NetworkPage, SensorPage, SkinSensors};
+use protocol::message::{Heartbeat, Message, NetworkPage, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::{Epoch, Lengths, Packet, Reassembler, Reassembly, data_id};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
@@ -147,22 +147,23 @@ fn words(skin: &SkinSensors) -> [i16; 6] {
 /// The contact state of a cell, by the rules of the protocol document.
 #[derive(Default)]
 struct ContactState {
-    waiting: Vec<(AppliesFrom, SkinSensors)>,
+    waiting: Vec<(StimulusStart, SkinSensors)>,
     now: SkinSensors,
 }
 
 impl ContactState {
-    fn push(&mut self, from: AppliesFrom, skin: SkinSensors, last: Option<Epoch>) {
-        let late =
-            matches!((from, last), (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0);
-        self.waiting.push((if late { AppliesFrom::Next } else { from }, skin));
+    fn push(&mut self, from: StimulusStart, skin: SkinSensors, last: Option<Epoch>) {
+        let late = matches!((from, last), (StimulusStart::Epoch(first), Some(last)) if last.epochs_since(first) >= 0);
+        self.waiting.push((if late { StimulusStart::Next } else { from }, skin));
     }
 
     fn latch(&mut self, epoch: Epoch) {
         for (from, skin) in std::mem::take(&mut self.waiting) {
             match from {
-                AppliesFrom::Epoch(first) if epoch.epochs_since(first) < 0 => self.waiting.push((from, skin)),
-                AppliesFrom::Epoch(_) | AppliesFrom::Next => self.now = skin,
+                StimulusStart::Epoch(first) if epoch.epochs_since(first) < 0 => {
+                    self.waiting.push((from, skin))
+                }
+                StimulusStart::Epoch(_) | StimulusStart::Next => self.now = skin,
             }
         }
     }

@@ -7,7 +7,7 @@ use protocol::can::Format;
 use protocol::candump::{self, CandumpLine};
 use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{AppliesFrom, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{Message, Request, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
@@ -71,11 +71,11 @@ pub fn send_every_message(test_client: &TestClient, skin: &Path) {
     test_client.send(&Message::Report);
     test_client.send(&Message::Sync);
     let page = SensorPage::Acceleration([Q3_12::nearest(0.5), Q3_12::ZERO, Q3_12::nearest(-1.0)]);
-    test_client.send(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page });
+    test_client.send(&Message::Stimulus { to: Node::Everyone, from: StimulusStart::Next, page });
     let skin_page = SkinSensors { contact: [Q5_10::nearest(0.7); 3], ..SkinSensors::default() };
     test_client.send(&Message::Stimulus {
         to: Node::Cell(cell(6)),
-        from: AppliesFrom::Next,
+        from: StimulusStart::Next,
         page: SensorPage::Skin(skin_page),
     });
     test_client.waits_for_epoch(20);

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use bench::emulate::Firmware;
 use model::generate::{SkinRequest, generate};
 use protocol::can::Format;
-use protocol::factory::Factory;
+use protocol::factory::FactoryRecord;
 use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Heartbeat, Joints, Message, NetworkPage, Request, State};
 use protocol::packet::{Epoch, Packet};
@@ -60,15 +60,18 @@ impl Alone {
     /// Starts cell 12 with its flash in `flash` of a folder; `named` tells if its identity is written to it first.
     fn start(folder: &Path, named: bool) -> Self {
         let path = PathBuf::from(std::env::var_os("SKINBUS_FIRMWARE").expect("tests/firmware/run names it"));
-        let factory = Factory {
+        let factory = FactoryRecord {
             node: CellId::new(12).ok(),
             serial: SERIAL,
             format: Format::Fd,
             hosted: true,
             link_ids: [None; 5],
         };
-        let elf =
-            if named { Firmware::read(&path).unwrap().for_cell(&factory) } else { fs::read(&path).unwrap() };
+        let elf = if named {
+            Firmware::read(&path).unwrap().image_for_cell(&factory)
+        } else {
+            fs::read(&path).unwrap()
+        };
         fs::write(folder.join("cell.elf"), elf).unwrap();
         let mut command = Command::new("qemu-system-arm");
         command.args([
@@ -153,7 +156,7 @@ impl Alone {
     fn commission(&mut self, parameters: &Parameters) {
         let to = Node::Cell(CellId::new(12).unwrap());
         let hash = parameters.hash().cast_signed();
-        let stored = Parameter::stored(6).map(|it| (it.number(), parameters.words(it)));
+        let stored = Parameter::stored_for_rows(6).map(|it| (it.number(), parameters.words(it)));
         let commit = (Parameter::Commit.number(), [hash, 0, 0, 0, 0, 0]);
         for ((number, words), tag) in stored.chain([commit]).zip(1..) {
             self.send(&Message::Configure { to, tag, request: Request::Write { number, words } });
@@ -258,7 +261,7 @@ fn damaged_flash_is_noticed_and_a_commit_repairs_it() {
     let to = Node::Cell(CellId::new(12).unwrap());
     let words = [parameters.hash().cast_signed(), 0, 0, 0, 0, 0];
     let number = Parameter::Commit.number();
-    let stored = Parameter::stored(6).map(|it| (it.number(), parameters.words(it)));
+    let stored = Parameter::stored_for_rows(6).map(|it| (it.number(), parameters.words(it)));
     for (number, words) in stored.chain([(number, words)]) {
         cell.send(&Message::Configure { to, tag: number, request: Request::Write { number, words } });
     }

@@ -11,7 +11,7 @@ use std::time::Duration;
 use bench::emulate::Firmware;
 use process::{Running, TestDir};
 use protocol::can::Format;
-use protocol::factory::Factory;
+use protocol::factory::FactoryRecord;
 use protocol::id::CellId;
 
 /// A script that starts or restarts the emulator.
@@ -44,9 +44,15 @@ impl Drop for Emulator<'_> {
 fn conforms(format: Format) {
     let place = TestDir::new();
     let path = std::env::var_os("SKINBUS_FIRMWARE").expect("tests/firmware/run names it");
-    let factory =
-        Factory { node: CellId::new(12).ok(), serial: 100_012, format, hosted: true, link_ids: [None; 5] };
-    fs::write(place.path("cell.elf"), Firmware::read(Path::new(&path)).unwrap().for_cell(&factory)).unwrap();
+    let factory = FactoryRecord {
+        node: CellId::new(12).ok(),
+        serial: 100_012,
+        format,
+        hosted: true,
+        link_ids: [None; 5],
+    };
+    fs::write(place.path("cell.elf"), Firmware::read(Path::new(&path)).unwrap().image_for_cell(&factory))
+        .unwrap();
     place.write("restart.sh", RESTART);
     let server = place.start("vcan-setup", "serve vcan0");
     server.wait_for_stdout("serving vcan0 at ");

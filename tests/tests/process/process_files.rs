@@ -21,7 +21,7 @@ use rand::{RngExt, SeedableRng};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::io::ioctl_fionread;
 use rustix::process::Signal;
-use trace::capture::{Entry, Reader};
+use trace::capture::{CaptureEntry, Reader};
 
 const RUN: &str = "run skin.toml --bus-kind embedded --scenario scenario.toml";
 
@@ -34,7 +34,7 @@ fn times(path: &Path) -> Vec<u64> {
     if frames > 0 {
         let mut reader = Reader::open(path).unwrap();
         while let Some(entry) = reader.next().unwrap() {
-            let Entry::Frame(record) = entry else { panic!("{entry:?}") };
+            let CaptureEntry::Frame(record) = entry else { panic!("{entry:?}") };
             times.push(record.time.nanos);
         }
     }

@@ -25,10 +25,10 @@ use protocol::can::Frame;
 use protocol::fixed::Q5_10;
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, Tree,
+    Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart, TreePage,
 };
 use protocol::packet::Epoch;
-use protocol::parameters::{Parameter, Reply as Answers, Slots};
+use protocol::parameters::{Parameter, Reply as Answers, SumSchedule};
 use protocol::port::LinkId;
 use protocol::skin::{Skin, Wires};
 use protocol::time::Micros;
@@ -66,7 +66,7 @@ struct Side {
     uplinks: Uplinks,
     start: Instant,
     heartbeats: BTreeMap<u8, Heartbeat>,
-    trees: BTreeMap<u8, Tree>,
+    trees: BTreeMap<u8, TreePage>,
     /// The last sum's count, by epoch and sender.
     sums: BTreeMap<(u8, u8), u8>,
 }
@@ -238,13 +238,13 @@ fn sums_reach_the_roots_whichever_cells_share_a_process() {
 
         let deepest = side.trees.values().map(|tree| tree.depth).max().unwrap();
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).unwrap();
-        let reply = Answers::Sum(Slots { slot_us, deepest, carry: true });
+        let reply = Answers::Sum(SumSchedule { slot_us, deepest, carry: true });
         let request = Request::Write { number: Parameter::Reply.number(), words: reply.words() };
         side.test_client.send(&Message::Configure { to: Node::Everyone, tag: 1, request });
         let touch = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
         side.test_client.send(&Message::Stimulus {
             to: Node::Everyone,
-            from: AppliesFrom::Next,
+            from: StimulusStart::Next,
             page: SensorPage::Skin(touch),
         });
         // A parent receives a child's sums from the epoch on that the child has announced.

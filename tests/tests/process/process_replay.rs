@@ -13,7 +13,7 @@ use process::replay::{FRESH, Replayed, TOUCHED, by_hand, cell, changed, is_torqu
 use process::{TestDir, example, skin_of};
 use protocol::candump::{CandumpLine, parse};
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
+use protocol::message::{Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart};
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
@@ -174,7 +174,7 @@ fn cells_with_another_history_answer_as_they_did_then() {
             contact: [protocol::fixed::Q5_10::nearest(3.0); 3],
             ..SkinSensors::default()
         });
-        test_client.send(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page });
+        test_client.send(&Message::Stimulus { to: Node::Everyone, from: StimulusStart::Next, page });
         test_client.send(&Message::Joints {
             epoch: protocol::packet::Epoch(3),
             joints: protocol::message::Joints { in_use: 6, ..Default::default() },

@@ -12,7 +12,7 @@ use protocol::bus::{Bus, Inbox};
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q, Q5_10};
 use protocol::id::{CellId, Kind, Node};
-use protocol::message::{Answer, AppliesFrom, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{Answer, Message, NetworkPage, SensorPage, SkinSensors, State, StimulusStart};
 use protocol::packet::Packet;
 use protocol::touch::contact_force;
 use rustix::process::Signal;
@@ -219,7 +219,7 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     });
     let contact = [Q5_10::nearest(1.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    test_client.send(&Message::Stimulus { to: third, from: AppliesFrom::Next, page });
+    test_client.send(&Message::Stimulus { to: third, from: StimulusStart::Next, page });
 
     // A run without touches leaves the cell as it is, and reports that its contact is unknown.
     place.scenario(head);

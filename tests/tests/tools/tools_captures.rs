@@ -14,7 +14,7 @@ use process::program;
 use protocol::can::{FD_FORMAT, Format};
 use protocol::candump::{Direction, Record};
 use tempfile::TempDir;
-use trace::capture::{Entry, NoteKind, Reader};
+use trace::capture::{CaptureEntry, NoteKind, Reader};
 
 /// Frames of every kind that all tools read, on two buses, in candump's notation.
 const PORTABLE: &str = "\
@@ -96,7 +96,7 @@ fn of_python(name: &str) -> PathBuf {
 }
 
 /// Calls `take` with each entry of a capture.
-fn each(path: &Path, mut take: impl FnMut(&Entry<'_>)) {
+fn each(path: &Path, mut take: impl FnMut(&CaptureEntry<'_>)) {
     let mut reader = Reader::open(path).unwrap();
     while let Some(entry) = reader.next().unwrap() {
         take(&entry);
@@ -107,7 +107,7 @@ fn each(path: &Path, mut take: impl FnMut(&Entry<'_>)) {
 fn frames<T>(path: &Path, mut of: impl FnMut(&Record<'_>) -> T) -> Vec<T> {
     let mut all = Vec::new();
     each(path, |entry| {
-        if let Entry::Frame(record) = entry {
+        if let CaptureEntry::Frame(record) = entry {
             all.push(of(record));
         }
     });
@@ -295,13 +295,13 @@ fn of_ros(path: &Path) -> Vec<String> {
     let mut all = Vec::new();
     let mut first = None;
     each(path, |entry| {
-        if let Entry::Frame(record) = entry {
+        if let CaptureEntry::Frame(record) = entry {
             first = first.or(Some(record.time.nanos));
         }
     });
     each(path, |entry| {
         all.push(match entry {
-            Entry::Frame(Record { time, interface, frame, direction }) => {
+            CaptureEntry::Frame(Record { time, interface, frame, direction }) => {
                 let flags =
                     [frame.is_extended(), frame.is_remote(), frame.is_error(), frame.format() == Format::Fd];
                 let flags: String = flags.map(|flag| if flag { '1' } else { '0' }).iter().collect();
@@ -320,7 +320,7 @@ fn of_ros(path: &Path) -> Vec<String> {
                     hex(frame.data())
                 )
             }
-            Entry::Note(note) => {
+            CaptureEntry::Note(note) => {
                 // Notes before the first frame are stored under its time.
                 let nanos = if note.nanos == 0 { first.unwrap() } else { note.nanos };
                 let bus = if note.interface.is_empty() { "-" } else { note.interface };

@@ -15,7 +15,7 @@ use protocol::id::Node;
 use protocol::message::{Answer, BaselinePage, Message, Request, SensorPage};
 use protocol::packet::{Packet, padded_words};
 use protocol::parameters::{Baseline, BaselineSettings, Parameter};
-use protocol::skin::{Skin, Timing};
+use protocol::skin::{Skin, SkinTiming};
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
@@ -25,7 +25,7 @@ use skinbus_tests::skins;
 fn skin() -> Skin {
     let mut skin = skins::arm(6, Format::Fd);
     // The loop has nothing to do between joints.
-    skin.timing = Timing { control_hz: 62.5, ticks_per_broadcast: 1 };
+    skin.timing = SkinTiming { control_hz: 62.5, ticks_per_broadcast: 1 };
     let nodes: Vec<_> = skin.cells.iter().map(|cell| cell.node).collect();
     for (index, cell) in skin.cells.iter_mut().enumerate() {
         let beside = [index.checked_sub(1), Some(index + 1)];
@@ -155,7 +155,7 @@ fn a_tare_while_touched_is_refused_and_reported() {
     let refused = |message| {
         matches!(
             message,
-            Message::Configured { answer: Answer::Refused { number: 12, reason: Answer::TOUCHED }, .. }
+            Message::Configured { answer: Answer::Refused { number: 12, reason: Answer::CELL_TOUCHED }, .. }
         )
     };
     assert!(messages(&bench).any(refused), "the refusal has its reason");

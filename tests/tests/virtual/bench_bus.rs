@@ -7,7 +7,7 @@ use analysis::shadow::{BusShadow, FrameTiming, Shadow, ShadowOptions};
 use model::table::Replies;
 use protocol::can::Format;
 use protocol::id::{Command, Id};
-use protocol::message::AppliesFrom;
+use protocol::message::StimulusStart;
 use protocol::wire_time::BitRates;
 use skinbus_tests::bench::Bench;
 use skinbus_tests::gateway::epoch_of;
@@ -25,7 +25,7 @@ fn pressed(cells: u8, format: Format, rates: BitRates, seed: u64) -> Bench {
     let mut bench = Bench::new(&skins::arm(cells, format), seed).on_a_bus(rates).started();
     // From the same joints on: stimuli have the lowest priority on a bus, and on a full one the last of them never
     // pass.
-    let from = AppliesFrom::Epoch(epoch_of(bench.gateway.broadcasts() + 4));
+    let from = StimulusStart::Epoch(epoch_of(bench.gateway.broadcasts() + 4));
     for place in 0..usize::from(cells) {
         bench.press_from(place, 1.0 + 0.005 * place as f64, from);
     }

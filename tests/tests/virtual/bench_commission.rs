@@ -4,7 +4,7 @@
 
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
-use model::commission::{AbortReason, CommissionOptions, Outcome, Reason, Report};
+use model::commission::{AbortReason, CommissionOptions, FailureReason, Outcome, Report};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::{Kind, Node};
@@ -142,7 +142,10 @@ fn loss_and_repetition_and_damage_cost_time_and_nothing_else() {
         // A cell with six failures in a row is named, and commissioned in the next run.
         for _ in 0..5 {
             for cell in &report.cells {
-                let silent = matches!(cell.outcome, Outcome::Failed(Reason::Silent { .. } | Reason::Gone));
+                let silent = matches!(
+                    cell.outcome,
+                    Outcome::Failed(FailureReason::Silent { .. } | FailureReason::Gone)
+                );
                 let well = matches!(cell.outcome, Outcome::Written | Outcome::AlreadySo);
                 assert!(well || silent, "seed {seed}: {cell:?}");
             }
@@ -209,7 +212,9 @@ fn cells_that_are_switched_off_and_on_in_the_middle_are_rewritten_or_named() {
                     assert_eq!(workshop.pieces[place].flash, FlashState::Valid(new(place)), "seed {seed}");
                     restarted += usize::from(!lost.contains(&place));
                 }
-                Outcome::Failed(Reason::Silent { .. } | Reason::Gone | Reason::Hash { .. }) => {
+                Outcome::Failed(
+                    FailureReason::Silent { .. } | FailureReason::Gone | FailureReason::Hash { .. },
+                ) => {
                     assert!(lost.contains(&place), "seed {seed}: {cell:?} was never lost");
                 }
                 Outcome::AlreadySo | Outcome::Verified | Outcome::WouldWrite | Outcome::Failed(_) => {
@@ -284,7 +289,7 @@ fn missing_cells_are_named_and_unknown_ones_left_alone() {
     let unknown_node = workshop.add(Identity { cell: Some(cell(77)), serial: 9 }, FlashState::Valid(old(0)));
     let report = workshop.commission(&skin, WISH, None);
     let mut expected = vec![Outcome::Written; CELLS.into()];
-    expected[4] = Outcome::Failed(Reason::Missing);
+    expected[4] = Outcome::Failed(FailureReason::Missing);
     assert_eq!(outcomes(&report), expected);
     assert_eq!(
         report.unknown_nodes.iter().map(|it| (it.number.get(), it.serial)).collect::<Vec<_>>(),
@@ -321,7 +326,7 @@ fn two_cells_with_one_serial_number_are_named_and_neither_is_written() {
     workshop.rest(Span::from_millis(700));
     let report = workshop.commission(&skin, WISH, None);
     let mut expected = vec![Outcome::Written; CELLS.into()];
-    expected[2] = Outcome::Failed(Reason::Twins(cell(3), cell(90)));
+    expected[2] = Outcome::Failed(FailureReason::Twins(cell(3), cell(90)));
     assert_eq!(outcomes(&report), expected);
     for place in [2, twin] {
         assert_eq!(workshop.pieces[place].history.len(), 1);

@@ -3,11 +3,11 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use analysis::explain::{Explanation, JointsWatcher, Origin, RequestedJoints, WordVerdict, explain};
+use analysis::explain::{ContactOrigin, Explanation, JointsWatcher, RequestedJoints, WordVerdict, explain};
 use model::decode::{Decoded, Decoder};
 use protocol::can::Format;
 use protocol::id::Kind;
-use protocol::message::AppliesFrom;
+use protocol::message::StimulusStart;
 use protocol::packet::{Epoch, WORDS};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -42,8 +42,11 @@ fn pressed(seed: u64, format: Format) -> Bench {
             (rng.random_range(0..8), [0.0, 0.05, 1.5, 4.0, 8.0, 90.0][rng.random_range(0..6)]);
         // From the next joints on; or ahead, or late.
         let ahead = rng.random_range(0..u8::try_from(EPOCHS).unwrap());
-        let from =
-            if rng.random_range(0..3) == 0 { AppliesFrom::Next } else { AppliesFrom::Epoch(Epoch(ahead)) };
+        let from = if rng.random_range(0..3) == 0 {
+            StimulusStart::Next
+        } else {
+            StimulusStart::Epoch(Epoch(ahead))
+        };
         bench.press_from(place, newtons, from);
         bench.run_epochs(1);
     }
@@ -128,7 +131,7 @@ fn unknown_causes_are_named_and_not_guessed() {
     let explanation = explained(&bench, &late, epoch);
     let cell = |node: u8| explanation.cells.iter().find(|cell| cell.node == node).unwrap();
     assert!(cell(zero).force.is_none() && cell(zero).rows.iter().all(|row| row.verdict == WordVerdict::Open));
-    assert!(matches!(cell(one).force.unwrap().origin, Origin::Stimulus { from_epoch: None, .. }));
+    assert!(matches!(cell(one).force.unwrap().origin, ContactOrigin::Stimulus { from_epoch: None, .. }));
     let said = explanation.missing.join("\n");
     let unknown = format!(
         "vcan0 {zero}: its contact state is not in the capture: no stimulus, start or sensors page of it"

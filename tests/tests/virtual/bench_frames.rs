@@ -5,7 +5,7 @@
 use model::table::{Event, Notice, Replies, Uplink};
 use protocol::can::Format;
 use protocol::id::{Kind, Node};
-use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request};
+use protocol::message::{Heartbeat, Joints, Message, NetworkPage, Request, StimulusStart};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::Parameter;
 use protocol::time::{Micros, Span};
@@ -169,7 +169,7 @@ fn epochs_may_jump_forward_and_back() {
 fn a_late_stimulus_holds_from_the_next_joints_on_and_is_counted() {
     let mut bench = pressed(Format::Fd, 8);
     for late in 0..20 {
-        let from = AppliesFrom::Epoch(epoch_of(bench.gateway.broadcasts() - 1 - late % 3));
+        let from = StimulusStart::Epoch(epoch_of(bench.gateway.broadcasts() - 1 - late % 3));
         bench.press_from(0, 1.5 + 0.05 * late as f64, from);
         bench.run_epochs(2);
     }
@@ -303,7 +303,7 @@ fn neither_the_order_of_starts_nor_that_of_replies_changes_a_single_torque() {
         for step in 0..60_u32 {
             for place in 0..6 {
                 let newtons = f64::from((step * 7 + place * 5) % 11) * 0.3;
-                let from = AppliesFrom::Epoch(epoch_of(bench.gateway.broadcasts() + 2));
+                let from = StimulusStart::Epoch(epoch_of(bench.gateway.broadcasts() + 2));
                 bench.press_from(place as usize, newtons, from);
             }
             bench.run_epochs(1);

@@ -7,8 +7,8 @@ use model::table::Replies;
 use protocol::can::{ERROR, EXTENDED, Format, Frame};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::message::{
-    Answer, Heartbeat, Message, NetworkPage, Ports, ReceivedCounts, RejectedCounts, Request, SensorPage,
-    State, Tree,
+    Answer, Heartbeat, Message, NetworkPage, PortsPage, ReceivedCounts, RejectedCounts, Request, SensorPage,
+    State, TreePage,
 };
 use protocol::packet::{Epoch, Packet};
 use protocol::parameters::Parameter;
@@ -148,8 +148,8 @@ impl HostileFrame {
             Self::Counters => {
                 network(NetworkPage::Rejected(RejectedCounts { crc: 9, ..RejectedCounts::default() }))
             }
-            Self::Place if dice.random() => network(NetworkPage::Tree(Tree::default())),
-            Self::Place => network(NetworkPage::Ports(Ports::default())),
+            Self::Place if dice.random() => network(NetworkPage::Tree(TreePage::default())),
+            Self::Place => network(NetworkPage::Ports(PortsPage::default())),
             Self::Answer => {
                 let answer = Answer::Value { number: Parameter::Reply.number(), written: true, words };
                 Act::Inject(Message::Configured { from, tag: 3, answer })

@@ -5,18 +5,18 @@
 
 use analysis::explain::{JointsWatcher, RequestedJoints};
 use bench::replay::comparator::{Comparator, Tally};
-use bench::replay::replay_plan::{FrameRole, PlayerStep, ReplayPlan, Selection, SenderFilter};
+use bench::replay::replay_plan::{FrameRole, FrameSelection, PlayerStep, ReplayPlan, SenderFilter};
 use bench::replay::survey::{Survey, TimeRange};
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use model::decode::{Decoded, Decoder};
-use model::latched::{LatchedPackets, ReceivedFrame};
-use model::table::{Replies, Table};
+use model::latched::{LatchedFrame, LatchedPackets};
+use model::table::{BusTable, Replies};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{AppliesFrom, Message, Request, SensorPage};
+use protocol::message::{Message, Request, SensorPage, StimulusStart};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
@@ -43,7 +43,7 @@ enum RecordingFault {
 }
 
 /// Records a bench in which cells are pressed and released all the time.
-fn recorded(seed: u64, format: Format, trouble: RecordingFault) -> (Skin, Vec<ReceivedFrame>) {
+fn recorded(seed: u64, format: Format, trouble: RecordingFault) -> (Skin, Vec<LatchedFrame>) {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(&skins::arm(CELLS, format), seed);
     bench.settle();
@@ -55,7 +55,7 @@ fn recorded(seed: u64, format: Format, trouble: RecordingFault) -> (Skin, Vec<Re
         let place = rng.random_range(0..usize::from(CELLS));
         let newtons = [0.0, 0.0, 0.05, 1.5, 4.0, 90.0][rng.random_range(0..6)];
         let ahead = Epoch(u8::try_from((epoch + rng.random_range(0..6)) % 256).unwrap());
-        let from = if rng.random_ratio(1, 3) { AppliesFrom::Next } else { AppliesFrom::Epoch(ahead) };
+        let from = if rng.random_ratio(1, 3) { StimulusStart::Next } else { StimulusStart::Epoch(ahead) };
         // Some of the last cells are pressed permanently.
         if place < 5 || epoch % 60 == 7 {
             bench.press_from(place, newtons, from);
@@ -73,7 +73,7 @@ fn recorded(seed: u64, format: Format, trouble: RecordingFault) -> (Skin, Vec<Re
                     let page = SensorPage::Skin(touch(2.0));
                     bench.act(Act::Inject(Message::Stimulus {
                         to: Address::Everyone,
-                        from: AppliesFrom::Next,
+                        from: StimulusStart::Next,
                         page,
                     }));
                 }
@@ -107,7 +107,7 @@ fn recorded(seed: u64, format: Format, trouble: RecordingFault) -> (Skin, Vec<Re
             || from == Party::UnknownNode
             || !rng.random_ratio(1, 200)
     };
-    let seen = bench.wire.iter().filter(|sent| is_recorded(sent.from, &mut rng)).map(|sent| ReceivedFrame {
+    let seen = bench.wire.iter().filter(|sent| is_recorded(sent.from, &mut rng)).map(|sent| LatchedFrame {
         at_nanos: (sent.at.0 + 1_000_000) * 1_000,
         from_gateway: sent.from == Party::Gateway,
         frame: sent.frame,
@@ -117,7 +117,7 @@ fn recorded(seed: u64, format: Format, trouble: RecordingFault) -> (Skin, Vec<Re
 }
 
 /// Returns the first index from `at` on at which the recorder may begin another file, and the frames latched there.
-fn split(seen: &[ReceivedFrame], at: usize) -> (usize, Vec<capture::LatchedFrame>) {
+fn split(seen: &[LatchedFrame], at: usize) -> (usize, Vec<capture::LatchedFrame>) {
     let mut latched_frames = LatchedPackets::default();
     for (place, frame) in seen.iter().enumerate() {
         if place >= at && !latched_frames.is_within_a_packet(frame.at_nanos) {
@@ -130,7 +130,7 @@ fn split(seen: &[ReceivedFrame], at: usize) -> (usize, Vec<capture::LatchedFrame
 
 fn latched(latched_frames: &LatchedPackets) -> Vec<capture::LatchedFrame> {
     let frames = latched_frames.frames().into_iter();
-    let kept = |seen: ReceivedFrame| capture::LatchedFrame {
+    let kept = |seen: LatchedFrame| capture::LatchedFrame {
         bus: BUS.to_owned(),
         own: seen.from_gateway,
         frame: seen.frame,
@@ -139,9 +139,9 @@ fn latched(latched_frames: &LatchedPackets) -> Vec<capture::LatchedFrame> {
     frames.map(kept).collect()
 }
 
-fn record(seen: &ReceivedFrame) -> Record<'static> {
+fn record(seen: &LatchedFrame) -> Record<'static> {
     let direction = Some(if seen.from_gateway { Direction::Sent } else { Direction::Received });
-    let time = Timestamp::nine_digits(seen.at_nanos);
+    let time = Timestamp::with_nine_digits(seen.at_nanos);
     Record { time, interface: BUS, frame: seen.frame, direction }
 }
 
@@ -183,7 +183,7 @@ impl Cells {
 }
 
 /// Replays a part in lockstep, and returns the comparator.
-fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[ReceivedFrame]) -> Comparator {
+fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[LatchedFrame]) -> Comparator {
     let format = skin.buses[0].format;
     let mut survey = Survey::new(TimeRange::default());
     survey.add_latched(before);
@@ -192,8 +192,8 @@ fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[ReceivedFrame
     let bus = &survey.buses[0];
     let mut comparator = Comparator::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, Some(0));
     comparator.expect_restart();
-    bus.latched.iter().for_each(|message| comparator.expect(0, message, false));
-    let selection = Selection { only: SenderFilter::Inputs, destinations: vec![Some(0)], reads: true };
+    bus.latched.iter().for_each(|message| comparator.expect_message(0, message, false));
+    let selection = FrameSelection { only: SenderFilter::Inputs, destinations: vec![Some(0)], reads: true };
     let mut replay_plan = ReplayPlan::new(&survey, &selection);
     let mut cells = Cells::of(skin);
     cells.tell(&Message::Report, format, &mut comparator);
@@ -201,7 +201,7 @@ fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[ReceivedFrame
         let PlayerStep::Restore(states) = replay_plan.restore_step() else { unreachable!() };
         for message in &states[0].1 {
             if let Message::Joints { epoch, .. } = message {
-                comparator.sent_joints(0, None, *epoch);
+                comparator.announce_joints(0, None, *epoch);
             }
             cells.tell(message, format, &mut comparator);
         }
@@ -215,7 +215,7 @@ fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[ReceivedFrame
     while let Some(step) = replay_plan.next_step() {
         let PlayerStep::Frame(due) = step else { unreachable!() };
         if let FrameRole::Joints(open) = due.role {
-            comparator.sent_joints(0, open.round, open.epoch);
+            comparator.announce_joints(0, open.round, open.epoch);
         }
         cells.take(&due.frame, &mut comparator);
     }
@@ -224,9 +224,9 @@ fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[ReceivedFrame
 }
 
 /// Returns the number of torques in a part.
-fn torques(part: &[ReceivedFrame]) -> u64 {
+fn torques(part: &[LatchedFrame]) -> u64 {
     let mut decoder = Decoder::new(None);
-    let is_torque = |seen: &&ReceivedFrame| {
+    let is_torque = |seen: &&LatchedFrame| {
         let decoded = decoder.decode(Micros(seen.at_nanos / 1_000), BUS, &seen.frame);
         matches!(decoded, Decoded::Message(Message::Torque { .. }))
     };
@@ -240,7 +240,12 @@ fn a_recording_that_is_split_anywhere_replays_from_there() {
         let format = if seed % 3 == 2 { Format::Classic } else { Format::Fd };
         let (skin, seen) = recorded(seed, format, RecordingFault::Late);
         let whole = replayed(&skin, &[], &seen);
-        assert!(whole.tally().is_good(), "seed {seed}: {:#?} {:#?}", whole.tally(), whole.first());
+        assert!(
+            whole.tally().has_only_equal_replies(),
+            "seed {seed}: {:#?} {:#?}",
+            whole.tally(),
+            whole.first()
+        );
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         for _ in 0..12 {
             let (from, before) = split(&seen, rng.random_range(0..seen.len() - 50));
@@ -249,7 +254,7 @@ fn a_recording_that_is_split_anywhere_replays_from_there() {
             let comparator = replayed(&skin, &before, part);
             let Tally { lacking, .. } = *comparator.tally();
             assert!(
-                comparator.tally().is_good(),
+                comparator.tally().has_only_equal_replies(),
                 "seed {seed}, {from} to {to} of {}: {:#?} {:#?}",
                 seen.len(),
                 comparator.tally(),
@@ -276,12 +281,16 @@ fn where_nothing_was_lost_or_late_nothing_is_explained() {
         for at in (0..seen.len() - 200).step_by(seen.len() / 15) {
             let (from, before) = split(&seen, at);
             // Up to the next joints: all requests before are answered.
-            let is_joints = |seen: &&ReceivedFrame| seen.frame.raw_id() == 1;
+            let is_joints = |seen: &&LatchedFrame| seen.frame.raw_id() == 1;
             let last = seen.iter().rposition(|seen| is_joints(&seen)).unwrap();
             let to = if at % 2 == 0 { seen.len() } else { (from + 400).min(last) };
             let comparator = replayed(&skin, &before, &seen[from..to]);
             let tally = comparator.tally();
-            assert!(tally.is_good(), "seed {seed}, {from} to {to}: {tally:#?} {:#?}", comparator.first());
+            assert!(
+                tally.has_only_equal_replies(),
+                "seed {seed}, {from} to {to}: {tally:#?} {:#?}",
+                comparator.first()
+            );
             let mut lacking = tally.lacking;
             assert!(
                 lacking.ended <= u64::from(CELLS) && lacking.joints_earlier <= u64::from(CELLS),
@@ -298,7 +307,7 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
     let (skin, mut seen) = recorded(7, Format::Fd, RecordingFault::Late);
     let mut found = 0;
     for at in (200..seen.len() - 200).step_by(97) {
-        let is_torque = |seen: &ReceivedFrame| {
+        let is_torque = |seen: &LatchedFrame| {
             let packet = protocol::packet::Packet::from_fd(&seen.frame).ok()?;
             let Ok(Message::Torque { torque, .. }) = Message::decode(&packet) else { return None };
             (torque.first_six()[0] != 0).then_some(packet)
@@ -358,12 +367,12 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
                 );
             }
         }
-        let mut table = Table::new(&skin, 0);
-        let take = |table: &mut Table, own, nanos, frame: &Frame| {
+        let mut table = BusTable::new(&skin, 0);
+        let take = |table: &mut BusTable, own, nanos, frame: &Frame| {
             table.handle_frame(Micros(nanos / 1_000), own, frame, &mut |_| None);
         };
         before.iter().for_each(|kept| take(&mut table, kept.own, kept.nanos, &kept.frame));
-        table.begin_accounts();
+        table.reset_counts();
         seen[from..].iter().for_each(|seen| take(&mut table, seen.from_gateway, seen.at_nanos, &seen.frame));
         table.finish();
         let all = Replies::total(table.cells().iter().map(|cell| cell.replies));

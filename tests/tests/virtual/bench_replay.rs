@@ -16,7 +16,7 @@ use model::latched::LatchedState;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{AppliesFrom, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{Joints, Message, Request, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Parameters};
@@ -85,10 +85,10 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
                 let newtons = f64::from(random.random_range(-2..2_i8).max(0)) + 0.2;
                 let contact = [Q5_10::nearest(if newtons < 1.0 { 0.0 } else { newtons }); 3];
                 let from = match random.random_range(0..3) {
-                    0 => AppliesFrom::Next,
-                    _ => {
-                        AppliesFrom::Epoch(epoch.advanced_by(random.random_range(0..6)).advanced_by(u8::MAX))
-                    }
+                    0 => StimulusStart::Next,
+                    _ => StimulusStart::Epoch(
+                        epoch.advanced_by(random.random_range(0..6)).advanced_by(u8::MAX),
+                    ),
                 };
                 Message::Stimulus {
                     to,
@@ -98,7 +98,7 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
             }
             15 => {
                 let page = SensorPage::Acceleration([Q3_12::from_bits(random.random()); 3]);
-                Message::Stimulus { to, from: AppliesFrom::Next, page }
+                Message::Stimulus { to, from: StimulusStart::Next, page }
             }
             16 if random.random_ratio(1, 2) => Message::Halt,
             16 | 17 => Message::Resume,

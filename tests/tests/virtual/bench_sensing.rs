@@ -18,7 +18,7 @@ use protocol::packet::{Lengths, Packet, Reassembler, Reassembly, data_id};
 use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
-use protocol::touch::{Touch, contact_force};
+use protocol::touch::{TouchState, contact_force};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
 use skinbus_tests::fault::{Fault, Harm, Party};
@@ -125,14 +125,14 @@ fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
         }
     }
     let mut stimuli = BTreeMap::<CellId, Vec<(u8, SkinSensors)>>::new();
-    let mut contact_state = BTreeMap::<CellId, (SkinSensors, Touch)>::new();
+    let mut contact_state = BTreeMap::<CellId, (SkinSensors, TouchState)>::new();
     let (mut touches, mut releases) = (0, 0);
     let period = bench.epoch();
     for it in &bench.wire {
         let message = Packet::from_fd(&it.frame).ok().and_then(|packet| Message::decode(&packet).ok());
         match message {
             Some(Message::Stimulus { to: Node::Cell(cell), from, page: SensorPage::Skin(skin) }) => {
-                let protocol::message::AppliesFrom::Epoch(first) = from else { continue };
+                let protocol::message::StimulusStart::Epoch(first) = from else { continue };
                 stimuli.entry(cell).or_default().push((first.0, skin));
             }
             Some(Message::Joints { epoch, .. }) => {
@@ -152,8 +152,8 @@ fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
                         };
                         let frames = by_cell.get(cell).into_iter().flatten().filter(within).count();
                         assert!(frames > 0, "cell {cell} at {:?}: {touch:?} to {next:?} is not told", it.at);
-                        touches += usize::from(next == Touch::Touched);
-                        releases += usize::from(*touch == Touch::Touched);
+                        touches += usize::from(next == TouchState::Touched);
+                        releases += usize::from(*touch == TouchState::Touched);
                     }
                     *touch = next;
                 }

@@ -6,7 +6,7 @@ use model::scenario::Scenario;
 use model::table::{CellStatus, Event, Replies, Uplink};
 use protocol::can::Format;
 use protocol::id::Kind;
-use protocol::message::AppliesFrom;
+use protocol::message::StimulusStart;
 use protocol::packet::WORDS;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
@@ -92,7 +92,7 @@ fn epochs_wrap_around_without_notices() {
     // Pressed from an epoch on that lies beyond the wrap-around.
     bench.run_epochs(200);
     let from = epoch_of(bench.gateway.broadcasts() + 100);
-    bench.press_from(0, 2.0, AppliesFrom::Epoch(from));
+    bench.press_from(0, 2.0, StimulusStart::Epoch(from));
     bench.run_epochs(99);
     assert_eq!(bench.torques(0), [], "not yet");
     bench.run_epochs(400);

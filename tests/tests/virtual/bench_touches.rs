@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use model::central::Central;
+use model::central::CentralComputation;
 use model::scenario::Scenario;
 use protocol::can::Format;
 use protocol::fixed::Q3_12;
@@ -32,7 +32,7 @@ fn the_torque_of_a_cell_follows_the_points_of_a_profile() {
     let mut bench = Bench::with(&skin, &scenario, 7, |_| Micros(0)).started();
     bench.run_epochs(130);
 
-    let central = Central::new(&skin);
+    let central = CentralComputation::new(&skin);
     let frames = central.frames_at_positions(&scenario.motion.start);
     let torques = bench.torques(5);
     let mut pressed = 0;

@@ -12,9 +12,9 @@ use protocol::bus::{Bus, BusError, BusKind, BusOptions, Inbox};
 use protocol::id::CellId;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use rustix::io::Errno;
-use vcan_setup::hosts::incoming::{Incoming, MAX_SOURCES, SourceAccount};
-use vcan_setup::hosts::message::Stamped;
-use vcan_setup::hosts::outgoing::{BusAccount, Outgoing};
+use vcan_setup::hosts::incoming::{HostsToBusQueue, MAX_SOURCES, SourceAccount};
+use vcan_setup::hosts::message::StampedFrame;
+use vcan_setup::hosts::outgoing::{BusAccount, BusToHostsQueue};
 use vcan_setup::hosts::report::{HostReport, LinkReport, listen};
 use vcan_setup::hosts::returned::CircleDetector;
 use zenoh::bytes::ZBytes;
@@ -44,14 +44,14 @@ const MAX_BATCHES: usize = 4;
 
 /// The state that the link's thread shares with the threads of Zenoh.
 struct Shared {
-    incoming: Mutex<Incoming>,
+    incoming: Mutex<HostsToBusQueue>,
     /// By host: the counts that this host has published of the frames received from here.
     ours: Mutex<BTreeMap<String, SourceAccount>>,
     wake: OwnedFd,
 }
 
 impl Shared {
-    fn incoming(&self) -> MutexGuard<'_, Incoming> {
+    fn incoming(&self) -> MutexGuard<'_, HostsToBusQueue> {
         self.incoming.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -78,7 +78,7 @@ pub(crate) struct HostLink {
     /// Subscriptions and liveliness tokens. Dropping them ends them.
     declared: Vec<Box<dyn Send>>,
     bus: Option<Bus>,
-    outgoing: Outgoing,
+    outgoing: BusToHostsQueue,
     returned: CircleDetector,
     began: Instant,
     missed_before: u64,
@@ -140,7 +140,7 @@ impl HostLink {
             events,
             declared: Vec::new(),
             bus: Some(bus),
-            outgoing: Outgoing::new(life()),
+            outgoing: BusToHostsQueue::new(life()),
             returned: CircleDetector::default(),
             began: Instant::now(),
             missed_before: 0,
@@ -256,7 +256,7 @@ impl HostLink {
             if self.returned.count() > 0 && warned.insert(None) {
                 report(LinkEvent::Circle);
             }
-            let shared: Vec<_> = self.shared.incoming().shared().map(str::to_owned).collect();
+            let shared: Vec<_> = self.shared.incoming().shared_names().map(str::to_owned).collect();
             for host in shared {
                 if warned.insert(Some(host.clone())) {
                     report(LinkEvent::SameName(host));
@@ -322,7 +322,7 @@ impl HostLink {
                     continue;
                 }
                 let at_nanos = if received.at_nanos == 0 { wall() } else { received.at_nanos };
-                self.outgoing.push(Stamped { at_nanos, frame: received.frame });
+                self.outgoing.push(StampedFrame { at_nanos, frame: received.frame });
             }
             self.outgoing.set_missed(self.missed_before + u64::from(inbox.dropped()));
             if count == 0 {
@@ -337,25 +337,27 @@ impl HostLink {
         let Some(bus) = &self.bus else { return Ok(()) };
         let now = nanos(self.began.elapsed());
         let mut incoming = self.shared.incoming();
-        while !incoming.waiting().is_empty() {
+        while !incoming.waiting_frames().is_empty() {
             let returned = &mut self.returned;
-            let copies = incoming.waiting().iter().take_while(|frame| returned.is_copy(now, frame)).count();
-            incoming.copies(copies);
-            let frames = incoming.waiting().iter().take_while(|frame| !returned.is_copy(now, frame)).count();
-            let sent = bus.send(incoming.waiting().get(..frames).unwrap_or_default());
+            let copies =
+                incoming.waiting_frames().iter().take_while(|frame| returned.is_copy(now, frame)).count();
+            incoming.remove_copies(copies);
+            let frames =
+                incoming.waiting_frames().iter().take_while(|frame| !returned.is_copy(now, frame)).count();
+            let sent = bus.send(incoming.waiting_frames().get(..frames).unwrap_or_default());
             let count = sent.as_ref().map_or_else(|error| error.sent, |()| frames);
-            for frame in incoming.waiting().iter().take(count) {
-                self.returned.put(now, frame);
+            for frame in incoming.waiting_frames().iter().take(count) {
+                self.returned.record_sent(now, frame);
             }
-            incoming.sent(count);
+            incoming.remove_sent(count);
             match sent {
                 Ok(()) => {}
                 Err(error) => {
                     if matches!(error.cause, BusError::Full { .. }) {
                         return Ok(());
                     }
-                    let count = incoming.waiting().len();
-                    incoming.refused(count);
+                    let count = incoming.waiting_frames().len();
+                    incoming.remove_refused(count);
                     return Err(error.cause);
                 }
             }
@@ -367,13 +369,13 @@ impl HostLink {
     /// these as lost.
     fn publish(&mut self, bytes: &mut Vec<u8>) {
         loop {
-            let count = self.outgoing.message(bytes);
+            let count = self.outgoing.encode_message(bytes);
             if count == 0 {
                 return;
             }
             match self.publisher.put(ZBytes::from(bytes.as_slice())).wait() {
-                Ok(()) => self.outgoing.sent(count),
-                Err(_) => self.outgoing.refused(count),
+                Ok(()) => self.outgoing.remove_sent(count),
+                Err(_) => self.outgoing.remove_refused(count),
             }
         }
     }
@@ -385,7 +387,7 @@ impl HostLink {
         let listener = self.watchers.listener();
         polled.extend(listener.map(|listener| PollFd::from_borrowed_fd(listener, PollFlags::IN)));
         polled.extend(self.bus.as_ref().map(|bus| PollFd::from_borrowed_fd(bus.as_fd(), PollFlags::IN)));
-        let is_full = !self.shared.incoming().waiting().is_empty();
+        let is_full = !self.shared.incoming().waiting_frames().is_empty();
         let until_told = self.tell_at.saturating_duration_since(Instant::now());
         let timeout = match &self.bus {
             None => REOPEN_INTERVAL.min(until_told),

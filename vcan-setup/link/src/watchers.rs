@@ -82,10 +82,10 @@ mod tests {
         let _sleeps = ReportReader::connect(&bus, place.0, place.1).unwrap();
         watchers.accept();
         watchers.send(&report(1));
-        assert_eq!(reads.take().unwrap(), [report(1)], "once");
+        assert_eq!(reads.read_reports().unwrap(), [report(1)], "once");
         for returned in 2..100_000 {
             watchers.send(&report(returned));
-            assert_eq!(reads.take().unwrap(), [report(returned)]);
+            assert_eq!(reads.read_reports().unwrap(), [report(returned)]);
             if watchers.streams.len() == 1 {
                 return;
             }

@@ -6,10 +6,10 @@ use clap::Args;
 use protocol::bus::{BusKind, KindChoice, has_socketcan};
 use protocol::usage::{Failure, print_text};
 use serde::Serialize;
-use vcan_setup::doctor::{BusFacts, Facts, Finding, Level, assess, would_run};
+use vcan_setup::doctor::{BusFacts, Finding, FindingLevel, MachineFacts, assess, would_run};
 use vcan_setup::look;
 
-use super::{json, named, query};
+use super::{buses_from_arguments, json, query_interfaces};
 
 /// Check whether a bench would run on this machine, with a hint for each fault
 ///
@@ -22,7 +22,7 @@ use super::{json, named, query};
   vcan-setup doctor skin.toml                      all that a skin needs
   vcan-setup doctor skin.toml --no-spawn           its cells are on the bus already
   vcan-setup doctor can0 --bus-kind socketcan")]
-pub(crate) struct Doctor {
+pub(crate) struct DoctorOptions {
     /// Names of buses, or skin files, which end in .toml or contain a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
@@ -36,10 +36,10 @@ pub(crate) struct Doctor {
     json: bool,
 }
 
-impl Doctor {
+impl DoctorOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let mut buses = named(&self.what, BusFacts::from_skin, BusFacts::named)?;
-        let present = match (query(), self.bus_kind) {
+        let mut buses = buses_from_arguments(&self.what, BusFacts::from_skin, BusFacts::named)?;
+        let present = match (query_interfaces(), self.bus_kind) {
             (Ok((_, present)), _) => present,
             // Only SocketCAN needs an interface.
             (Err(_), KindChoice::Only(kind)) if !kind.is_interface() => Vec::new(),
@@ -47,22 +47,22 @@ impl Doctor {
             (Err(failure), _) => return Err(failure),
         };
         for BusFacts { target, .. } in buses.iter_mut().filter(|bus| bus.cells.is_none()) {
-            target.take_format_of_hardware(&present);
+            target.adopt_hardware_format(&present);
         }
-        let facts = look::facts(buses, self.bus_kind, self.no_spawn, &present);
+        let facts = look::collect_facts(buses, self.bus_kind, self.no_spawn, &present);
         let findings = assess(&facts);
         let runs = would_run(&findings);
         if self.json {
             let bus_kind = facts.bus_kind().name();
             print_text(&json(&DoctorReport { would_run: runs, bus_kind, findings: &findings })?)?;
         } else {
-            print_text(&text(&facts, &findings, runs))?;
+            print_text(&format_findings(&facts, &findings, runs))?;
         }
         if runs { Ok(()) } else { Err(Failure::already_reported()) }
     }
 }
 
-fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
+fn format_findings(facts: &MachineFacts, findings: &[Finding], runs: bool) -> String {
     let mut text = String::new();
     for Finding { level, text: what, hints } in findings {
         text += &format!("{:<6}{what}\n", level.name());
@@ -70,7 +70,7 @@ fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
             text += &format!("        {hint}\n");
         }
     }
-    let faults = findings.iter().filter(|finding| finding.level == Level::Fault).count();
+    let faults = findings.iter().filter(|finding| finding.level == FindingLevel::Fault).count();
     text + &match (runs, faults) {
         (true, _) => format!("\nA bench would run, on {}.\n", facts.bus_kind().display_name()),
         (false, 1) => "\nNo bench would run: fix the fault first.\n".to_owned(),

@@ -44,12 +44,12 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    Up(up::Up),
-    Down(up::Down),
-    Status(status::Status),
-    Doctor(doctor::Doctor),
-    Serve(serve::Serve),
-    Slcan(slcan::Slcan),
+    Up(up::UpOptions),
+    Down(up::DownOptions),
+    Status(status::StatusOptions),
+    Doctor(doctor::DoctorOptions),
+    Serve(serve::ServeBusOptions),
+    Slcan(slcan::SlcanOptions),
     Link(LinkOptions),
 }
 
@@ -86,7 +86,7 @@ fn json(report: &impl Serialize) -> Result<String, Failure> {
 }
 
 /// Parses the name of a bus.
-fn bus_name(word: &str) -> Result<String, BusError> {
+fn parse_bus_name(word: &str) -> Result<String, BusError> {
     check_name(word).map(|()| word.to_owned())
 }
 
@@ -105,11 +105,11 @@ fn parse_argument(word: &OsStr) -> Result<BusArgument, Failure> {
     let name = word.to_str().ok_or_else(|| {
         Failure::usage(format!("{} is no bus name: it is not UTF-8", shell_quoted_os(word)))
     })?;
-    bus_name(name).map(BusArgument::Name).map_err(Failure::usage)
+    parse_bus_name(name).map(BusArgument::Name).map_err(Failure::usage)
 }
 
 /// Returns the buses that positional arguments name, directly or by a skin.
-fn named<T>(
+fn buses_from_arguments<T>(
     words: &[OsString],
     of_skin: impl Fn(&OsStr, &Skin) -> Vec<T>,
     named: impl Fn(&str) -> T,
@@ -125,17 +125,17 @@ fn named<T>(
 }
 
 /// Returns the interfaces that positional arguments name, directly or by a skin.
-fn targets(words: &[OsString]) -> Result<Vec<InterfaceTarget>, Failure> {
-    named(words, InterfaceTarget::from_skin, InterfaceTarget::named)
+fn targets_from_arguments(words: &[OsString]) -> Result<Vec<InterfaceTarget>, Failure> {
+    buses_from_arguments(words, InterfaceTarget::from_skin, InterfaceTarget::named)
 }
 
 /// Returns the CAN interfaces of this machine, and the netlink socket that listed them.
-fn query() -> Result<(Netlink, Vec<Interface>), Failure> {
-    let mut netlink = Netlink::open().map_err(unreadable)?;
-    let present = netlink.interfaces().map_err(unreadable)?;
+fn query_interfaces() -> Result<(Netlink, Vec<Interface>), Failure> {
+    let mut netlink = Netlink::open().map_err(query_error)?;
+    let present = netlink.interfaces().map_err(query_error)?;
     Ok((netlink, present))
 }
 
-fn unreadable(error: io::Error) -> Failure {
+fn query_error(error: io::Error) -> Failure {
     Failure::run(format!("cannot ask the kernel for its interfaces: {error}"))
 }

@@ -10,7 +10,7 @@ use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::embedded::{BusTotals, Server};
 
-use super::bus_name;
+use super::parse_bus_name;
 
 /// The niceness of the server: the highest priority.
 const HIGHEST_PRIORITY: i32 = -20;
@@ -23,16 +23,16 @@ const HIGHEST_PRIORITY: i32 = -20;
 #[command(
     after_help = "Examples:\n  vcan-setup serve vcan0\n  sleep 10 | vcan-setup serve vcan0 --until-eof"
 )]
-pub(crate) struct Serve {
+pub(crate) struct ServeBusOptions {
     /// The bus's name, as an interface's: at most 15 bytes
-    #[arg(value_parser = bus_name)]
+    #[arg(value_parser = parse_bus_name)]
     name: String,
     /// Also stop when standard input ends or the parent process dies
     #[arg(long)]
     until_eof: bool,
 }
 
-impl Serve {
+impl ServeBusOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
         serve(&self.name, self.until_eof).map_err(|error| Failure::run(with_causes(&error)))
     }

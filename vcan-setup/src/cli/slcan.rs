@@ -13,7 +13,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::slcan::options::{ALLOWED_SETTLE, settle_time};
 use vcan_setup::slcan::{Bridge, BridgeError, BridgeSettings, LineAccount, LineOptions};
 
-use super::{bus_name, json};
+use super::{json, parse_bus_name};
 
 /// Connect serial lines with the slcan protocol to a bus, until SIGINT or SIGTERM
 ///
@@ -29,15 +29,15 @@ use super::{bus_name, json};
   vcan-setup slcan vcan0 /dev/ttyUSB0,cell=12,baud=57600,classic --bit-rates 500k
 
 docs/how-to/adapters.md says which adapters speak slcan.")]
-pub(crate) struct Slcan {
+pub(crate) struct SlcanOptions {
     /// The bus
-    #[arg(value_parser = bus_name)]
+    #[arg(value_parser = parse_bus_name)]
     bus: String,
     /// The lines: PATH, unix:PATH or tcp:HOST:PORT, followed by options after commas
     #[arg(value_name = "LINE", required = true)]
     lines: Vec<LineOptions>,
     /// The cell behind a line: one for each LINE, in their order
-    #[arg(long, value_name = "N", value_parser = cell)]
+    #[arg(long, value_name = "N", value_parser = parse_cell_id)]
     cell: Vec<CellId>,
     /// Bit rates to set in adapters, as 500k or 1M/5M; by default they keep theirs
     #[arg(long, value_name = "RATES")]
@@ -49,7 +49,7 @@ pub(crate) struct Slcan {
     #[arg(long)]
     classic: bool,
     /// Seconds from opening a line to setting its adapter, for boards that are reset by opening (Arduino, ESP32)
-    #[arg(long, value_name = "SECONDS", value_parser = settle)]
+    #[arg(long, value_name = "SECONDS", value_parser = parse_settle)]
     settle: Option<Duration>,
     /// Begin without unavailable lines, and open them later
     #[arg(long)]
@@ -61,12 +61,12 @@ pub(crate) struct Slcan {
     json: bool,
 }
 
-fn cell(word: &str) -> Result<CellId, String> {
+fn parse_cell_id(word: &str) -> Result<CellId, String> {
     let number = word.parse().map_err(|_| "not a number".to_owned())?;
     CellId::new(number).map_err(|error| error.to_string())
 }
 
-fn settle(word: &str) -> Result<Duration, String> {
+fn parse_settle(word: &str) -> Result<Duration, String> {
     settle_time(word).ok_or_else(|| ALLOWED_SETTLE.to_owned())
 }
 
@@ -77,13 +77,13 @@ struct SlcanReport<'a> {
     lines: &'a [LineAccount],
 }
 
-impl Slcan {
+impl SlcanOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let lines = self.lines()?;
-        let (stop, stopped) = UnixStream::pair().map_err(no_signals)?;
+        let (stop, stopped) = UnixStream::pair().map_err(signal_error)?;
         for signal in [SIGINT, SIGTERM] {
-            let stop = stop.try_clone().map_err(no_signals)?;
-            signal_hook::low_level::pipe::register(signal, stop).map_err(no_signals)?;
+            let stop = stop.try_clone().map_err(signal_error)?;
+            signal_hook::low_level::pipe::register(signal, stop).map_err(signal_error)?;
         }
         let settings =
             BridgeSettings { bus: self.bus.clone(), choice: self.bus_kind, directory: None, wait: self.wait };
@@ -91,7 +91,7 @@ impl Slcan {
         let bridge = Bridge::open(settings, lines).map_err(|error| {
             if matches!(error, BridgeError::Twice(_)) { Failure::usage(error) } else { Failure::run(error) }
         })?;
-        let (bus, kind, away) = (&self.bus, bridge.kind(), bridge.away());
+        let (bus, kind, away) = (&self.bus, bridge.kind(), bridge.unavailable_lines());
         let noun = if count == 1 { "line" } else { "lines" };
         let mut ready = format!("{count} {noun} on {bus} ({kind})");
         if !away.is_empty() {
@@ -137,7 +137,7 @@ impl Slcan {
     }
 }
 
-fn no_signals(error: std::io::Error) -> Failure {
+fn signal_error(error: std::io::Error) -> Failure {
     Failure::run(format!("cannot catch signals: {error}"))
 }
 

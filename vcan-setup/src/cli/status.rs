@@ -11,11 +11,11 @@ use protocol::usage::{Failure, print_text};
 use serde::Serialize;
 use vcan_setup::hosts::report as hosts;
 use vcan_setup::link::{
-    CLASSIC_MTU, Counters, FD_MTU, Hardware, HardwareRates, Interface, InterfaceKind, Peer,
+    CLASSIC_MTU, CanHardware, FD_MTU, HardwareRates, Interface, InterfaceCounters, InterfaceKind, Peer,
 };
 use vcan_setup::look::{EmbeddedBus, embedded_buses};
 
-use super::{json, query, targets};
+use super::{json, query_interfaces, targets_from_arguments};
 
 /// The time within which a link must answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
@@ -27,7 +27,7 @@ const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 #[command(after_help = "Examples:
   vcan-setup status
   vcan-setup status skin.toml --json")]
-pub(crate) struct Status {
+pub(crate) struct StatusOptions {
     /// Show only these: names, or skin files, which end in .toml or contain a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
@@ -36,10 +36,10 @@ pub(crate) struct Status {
     json: bool,
 }
 
-impl Status {
+impl StatusOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let target = targets(&self.what)?;
-        let (_, present) = query()?;
+        let target = targets_from_arguments(&self.what)?;
+        let (_, present) = query_interfaces()?;
         let is_requested = |name: &str| target.is_empty() || target.iter().any(|target| target.name == name);
         let named = |interface: &&Interface| {
             if target.is_empty() { interface.is_can() } else { is_requested(&interface.name) }
@@ -48,13 +48,13 @@ impl Status {
         let embedded: Vec<_> = embedded_buses().into_iter().filter(|bus| is_requested(&bus.name)).collect();
         let kernel = interfaces.iter().map(|interface| (interface.name.as_str(), BusKind::SocketCan));
         let user = embedded.iter().filter(|bus| bus.served).map(|bus| (bus.name.as_str(), BusKind::Embedded));
-        let links = links(kernel.chain(user));
+        let links = query_link_reports(kernel.chain(user));
         let text = match (self.json, interfaces.is_empty() && embedded.is_empty()) {
             (true, _) => {
                 let interfaces = interfaces.iter().map(|interface| report(interface)).collect();
                 json(&StatusReport { interfaces, embedded: &embedded, links: &links })?
             }
-            (false, false) => table(&interfaces, &embedded) + &joined(&links),
+            (false, false) => format_table(&interfaces, &embedded) + &format_link_reports(&links),
             (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
             // If a named bus does not exist, an error reports it below.
             (false, true) => String::new(),
@@ -78,7 +78,9 @@ impl Status {
 }
 
 /// Returns the reports of the links of these buses. A link that does not answer in time is left out.
-fn links<'a>(buses: impl Iterator<Item = (&'a str, BusKind)>) -> BTreeMap<&'a str, hosts::LinkReport> {
+fn query_link_reports<'a>(
+    buses: impl Iterator<Item = (&'a str, BusKind)>,
+) -> BTreeMap<&'a str, hosts::LinkReport> {
     let report = |(bus, kind)| {
         let report = hosts::ReportReader::connect(bus, kind, None).and_then(|mut it| it.wait(ANSWER_TIMEOUT));
         Some((bus, report.ok()?))
@@ -86,7 +88,7 @@ fn links<'a>(buses: impl Iterator<Item = (&'a str, BusKind)>) -> BTreeMap<&'a st
     buses.filter_map(report).collect()
 }
 
-fn joined(links: &BTreeMap<&str, hosts::LinkReport>) -> String {
+fn format_link_reports(links: &BTreeMap<&str, hosts::LinkReport>) -> String {
     let host = |(name, host): (&String, &hosts::HostReport)| {
         let cells = host.nodes.len();
         let gone = if host.is_there { "" } else { ", not reached" };
@@ -100,16 +102,22 @@ fn joined(links: &BTreeMap<&str, hosts::LinkReport>) -> String {
     links.iter().map(line).collect()
 }
 
-fn table(interfaces: &[&Interface], embedded: &[EmbeddedBus]) -> String {
+fn format_table(interfaces: &[&Interface], embedded: &[EmbeddedBus]) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
     let right = ["received", "sent", "dropped", "errors"];
     table.set_header(["bus", "kind", "made by", "state", "frames", "bit rates"].into_iter().chain(right));
     for interface in interfaces {
-        let Counters { received, sent, dropped, errors } = interface.counters;
-        let (made_by, frames) = (made_by(interface).to_owned(), frames(interface));
-        let words =
-            [interface.name.clone(), kind(interface), made_by, state(interface), frames, rates(interface)];
+        let InterfaceCounters { received, sent, dropped, errors } = interface.counters;
+        let (made_by, frames) = (made_by(interface).to_owned(), frame_format_text(interface));
+        let words = [
+            interface.name.clone(),
+            kind_text(interface),
+            made_by,
+            state_text(interface),
+            frames,
+            bit_rates_text(interface),
+        ];
         let counts = [received, sent, dropped, errors].map(|count| count.to_string());
         table.add_row(words.into_iter().chain(counts));
     }
@@ -127,7 +135,7 @@ fn table(interfaces: &[&Interface], embedded: &[EmbeddedBus]) -> String {
     text.lines().map(|line| format!("{}\n", line.trim_end())).collect()
 }
 
-fn kind(interface: &Interface) -> String {
+fn kind_text(interface: &Interface) -> String {
     match &interface.kind {
         InterfaceKind::Vxcan(Some(Peer { index, name, namespace, namespace_id })) => {
             let peer = name.clone().unwrap_or_else(|| format!("interface {index}"));
@@ -137,7 +145,7 @@ fn kind(interface: &Interface) -> String {
                 (None, None) => format!("vxcan to {peer}"),
             }
         }
-        InterfaceKind::Hardware(Hardware { driver: Some(driver), .. }) => driver.clone(),
+        InterfaceKind::Hardware(CanHardware { driver: Some(driver), .. }) => driver.clone(),
         InterfaceKind::Other(what) => format!("no CAN: {what}"),
         kind @ (InterfaceKind::Vcan | InterfaceKind::Vxcan(None) | InterfaceKind::Hardware(_)) => {
             kind.name().to_owned()
@@ -153,7 +161,7 @@ const fn made_by(interface: &Interface) -> &'static str {
     }
 }
 
-fn state(interface: &Interface) -> String {
+fn state_text(interface: &Interface) -> String {
     let up = if interface.up { "up" } else { "down" };
     match interface.hardware().and_then(|hardware| hardware.state) {
         Some(state) if interface.up => format!("{up}, {}", state.name()),
@@ -161,7 +169,7 @@ fn state(interface: &Interface) -> String {
     }
 }
 
-const fn format(interface: &Interface) -> &'static str {
+const fn format_name(interface: &Interface) -> &'static str {
     match interface.mtu {
         _ if !interface.is_can() => "",
         CLASSIC_MTU => "classic",
@@ -170,15 +178,15 @@ const fn format(interface: &Interface) -> &'static str {
     }
 }
 
-fn frames(interface: &Interface) -> String {
-    let format = format(interface);
+fn frame_format_text(interface: &Interface) -> String {
+    let format = format_name(interface);
     if format.is_empty() { String::new() } else { format!("{format}, MTU {}", interface.mtu) }
 }
 
-fn rates(interface: &Interface) -> String {
+fn bit_rates_text(interface: &Interface) -> String {
     match interface.kind {
-        InterfaceKind::Hardware(Hardware { bitrate: None, .. }) => "none set".to_owned(),
-        InterfaceKind::Hardware(Hardware { bitrate, data_bitrate, .. }) => {
+        InterfaceKind::Hardware(CanHardware { bitrate: None, .. }) => "none set".to_owned(),
+        InterfaceKind::Hardware(CanHardware { bitrate, data_bitrate, .. }) => {
             HardwareRates { bitrate, data_bitrate }.to_string()
         }
         InterfaceKind::Vcan | InterfaceKind::Vxcan(_) | InterfaceKind::Other(_) => String::new(),
@@ -205,9 +213,9 @@ struct InterfaceReport<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     peer: Option<&'a Peer>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    hardware: Option<&'a Hardware>,
+    hardware: Option<&'a CanHardware>,
     #[serde(flatten)]
-    counters: Counters,
+    counters: InterfaceCounters,
 }
 
 fn report(interface: &Interface) -> InterfaceReport<'_> {
@@ -219,7 +227,7 @@ fn report(interface: &Interface) -> InterfaceReport<'_> {
         made_by_skinbus: ours,
         up,
         mtu,
-        format: format(interface),
+        format: format_name(interface),
         peer: interface.peer(),
         hardware: interface.hardware(),
         counters,

@@ -15,7 +15,7 @@ use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::{self, OtherNamespace, Plan, Step, StepAction, TargetPair};
 
-use super::{BusArgument, parse_argument, query, targets, unreadable};
+use super::{BusArgument, parse_argument, query_error, query_interfaces, targets_from_arguments};
 
 /// Make virtual CAN interfaces, and bring them up
 ///
@@ -30,7 +30,7 @@ use super::{BusArgument, parse_argument, query, targets, unreadable};
   sudo vcan-setup up vcan0 vcan1
   sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair that leads into a namespace
   sudo vcan-setup up skin.toml --set-bit-rates                and set those of real interfaces")]
-pub(crate) struct Up {
+pub(crate) struct UpOptions {
     /// Names of interfaces, or skin files, which end in .toml or contain a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
@@ -56,7 +56,7 @@ pub(crate) struct Up {
 #[command(after_help = "Examples:
   sudo vcan-setup down skin.toml
   vcan-setup down --dry-run vcan0")]
-pub(crate) struct Down {
+pub(crate) struct DownOptions {
     /// Names of interfaces, or skin files, which end in .toml or contain a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
@@ -65,21 +65,21 @@ pub(crate) struct Down {
     dry_run: bool,
 }
 
-impl Up {
+impl UpOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
         if let Some(peer) = &self.peer {
-            return self.pair(peer);
+            return self.make_pair(peer);
         }
-        let target = targets(&self.what)?;
+        let target = targets_from_arguments(&self.what)?;
         for name in target.iter().map(|target| &target.name) {
             check_plain_name(name)?;
         }
-        let (mut netlink, present) = query()?;
-        let plan = plan::up(&target, &present, self.set_bit_rates)?;
-        PlanRunner { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
+        let (mut netlink, present) = query_interfaces()?;
+        let plan = plan::plan_up(&target, &present, self.set_bit_rates)?;
+        PlanRunner { netlink: &mut netlink, there: None }.execute_or_print(&plan, self.dry_run)
     }
 
-    fn pair(&self, peer: &str) -> Result<(), Failure> {
+    fn make_pair(&self, peer: &str) -> Result<(), Failure> {
         let [given] = self.what.as_slice() else {
             return Err(Failure::usage("--peer makes one pair: give one NAME with it"));
         };
@@ -91,34 +91,34 @@ impl Up {
         };
         check_plain_name(&name)?;
         check_plain_name(peer)?;
-        let (mut netlink, present) = query()?;
-        let mut other = self.namespace.as_deref().map(enter).transpose()?.flatten();
+        let (mut netlink, present) = query_interfaces()?;
+        let mut other = self.namespace.as_deref().map(open_namespace).transpose()?.flatten();
         let there = match &mut other {
             Some((namespace, file, inside)) => {
-                let id = netlink.namespace_id(file).map_err(unreadable)?;
-                let present = inside.interfaces().map_err(unreadable)?;
+                let id = netlink.namespace_id(file).map_err(query_error)?;
+                let present = inside.interfaces().map_err(query_error)?;
                 Some(OtherNamespace { name: namespace.clone(), id, present })
             }
             None => None,
         };
-        let plan = plan::up_pair(&TargetPair { name: &name, peer, there: there.as_ref() }, &present)?;
+        let plan = plan::plan_pair_up(&TargetPair { name: &name, peer, there: there.as_ref() }, &present)?;
         let there = other.as_mut().map(|(_, file, inside)| (&*file, inside));
-        PlanRunner { netlink: &mut netlink, there }.finish(&plan, self.dry_run)
+        PlanRunner { netlink: &mut netlink, there }.execute_or_print(&plan, self.dry_run)
     }
 }
 
-impl Down {
+impl DownOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let target = targets(&self.what)?;
-        let (mut netlink, present) = query()?;
-        let plan = plan::down(&target, &present)?;
-        PlanRunner { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
+        let target = targets_from_arguments(&self.what)?;
+        let (mut netlink, present) = query_interfaces()?;
+        let plan = plan::plan_down(&target, &present)?;
+        PlanRunner { netlink: &mut netlink, there: None }.execute_or_print(&plan, self.dry_run)
     }
 }
 
 /// Checks that a name is allowed by the kernel, and needs no quotes in a shell.
 fn check_plain_name(name: &str) -> Result<(), Failure> {
-    super::bus_name(name).map_err(Failure::usage)?;
+    super::parse_bus_name(name).map_err(Failure::usage)?;
     if !is_plain_name(name) || name.starts_with(['-', '.']) {
         return Err(Failure::usage(format!(
             "{name:?} is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0"
@@ -128,9 +128,9 @@ fn check_plain_name(name: &str) -> Result<(), Failure> {
 }
 
 /// Opens the network namespace that an argument names. Returns `None` if that is the current one.
-fn enter(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
+fn open_namespace(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let namespace = Namespace::parse(word);
-    let not_allowed = || not_allowed(&format!("look into the network namespace {namespace}"));
+    let not_allowed = || permission_error(&format!("look into the network namespace {namespace}"));
     let denied = |error: &NamespaceError| matches!(error, NamespaceError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied);
     let file = namespace
         .open()
@@ -156,14 +156,14 @@ fn enter(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     Ok(Some((namespace, file, inside)))
 }
 
-fn not_allowed(what: &str) -> Failure {
+fn permission_error(what: &str) -> Failure {
     if rustix::process::geteuid().is_root() {
         return Failure::run(format!(
             "not allowed to {what}: this root has no CAP_NET_ADMIN; in a container, start that with `--cap-add \
              NET_ADMIN`"
         ));
     }
-    let again: Vec<_> = std::iter::once(look::program())
+    let again: Vec<_> = std::iter::once(look::own_program_command())
         .chain(std::env::args_os().skip(1).map(|word| shell_quoted_os(&word)))
         .collect();
     let again = again.join(" ");
@@ -178,7 +178,7 @@ struct PlanRunner<'a> {
 
 impl PlanRunner<'_> {
     /// Prints which interfaces stay unchanged, and executes the plan. With `dry_run`, prints its steps instead.
-    fn finish(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
+    fn execute_or_print(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
         let mut text = String::new();
         for line in &plan.unchanged {
             text += &format!("{line}\n");
@@ -211,7 +211,7 @@ impl PlanRunner<'_> {
             }
         }
         // The steps are printed at the end, because they are undone if a later one fails.
-        print_text(&plan.steps.iter().map(|step| format!("{}\n", step.done())).collect::<String>())
+        print_text(&plan.steps.iter().map(|step| format!("{}\n", step.done_message())).collect::<String>())
     }
 }
 
@@ -225,7 +225,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
         | StepAction::SetRates { .. }
         | StepAction::Remove { .. } => None,
     };
-    let doing = step.doing();
+    let doing = step.short_description();
     let unknown = |kind: &str, kernel: &Kernel| {
         let hints = kernel.hints(kernel.module(kind));
         let nearest = hints.first().map_or("", String::as_str);
@@ -253,7 +253,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
             // This error does not depend on permissions: root would get it too.
             let kernel = Kernel::detect();
             let missing = kind.filter(|kind| kernel.module(kind) == ModuleState::Missing);
-            missing.map_or_else(|| not_allowed(&doing), |kind| unknown(kind, &kernel))
+            missing.map_or_else(|| permission_error(&doing), |kind| unknown(kind, &kernel))
         }
         (Some(Errno::OPNOTSUPP), None) => {
             Failure::run(format!("cannot {doing}: this hardware cannot ({error})"))

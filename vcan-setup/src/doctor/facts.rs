@@ -14,7 +14,7 @@ use crate::plan::InterfaceTarget;
 
 /// The facts about a machine and its buses that [`assess`](super::assess) needs.
 #[derive(Clone, Debug)]
-pub struct Facts {
+pub struct MachineFacts {
     /// The kind of bus that the user requested.
     pub choice: KindChoice,
     /// True if the cells already run, as with `skinbus run --no-spawn`.

@@ -3,14 +3,14 @@
 use protocol::bus::KindChoice;
 use protocol::can::Format;
 
-use super::{BusFacts, Facts, Finding, User, would_run};
+use super::{BusFacts, Finding, MachineFacts, User, would_run};
 use crate::kernel::ModuleState;
-use crate::link::{ControllerState, FD_MTU, Hardware, Interface, InterfaceKind};
+use crate::link::{CanHardware, ControllerState, FD_MTU, Interface, InterfaceKind};
 use crate::plan::set_fd_mtu_command;
 
-impl Facts {
+impl MachineFacts {
     /// Reports whether interfaces that are missing can be created on this machine.
-    pub(super) fn making(&self) -> Vec<Finding> {
+    pub(super) fn check_creation(&self) -> Vec<Finding> {
         let missing = |bus: &&BusFacts| bus.interface.is_none() && bus.target.hardware().is_none();
         let mut findings = Vec::new();
         if self.buses.iter().find(missing).is_none() && !(self.buses.is_empty() && self.present.is_empty()) {
@@ -25,7 +25,7 @@ impl Facts {
             }
             ModuleState::Loadable => {
                 let text = "the kernel's module vcan is not loaded; making an interface loads it";
-                Some(Finding::note(text).hint(self.sudo("modprobe vcan")))
+                Some(Finding::note(text).hint(self.with_sudo("modprobe vcan")))
             }
             ModuleState::Missing => {
                 let text = format!("the kernel ({}) has CAN and no vcan", self.kernel.release);
@@ -48,21 +48,21 @@ impl Facts {
     }
 
     /// Reports whether any usable CAN interface exists. Does nothing if buses are named.
-    pub(super) fn any_interface(&self) -> Option<Finding> {
+    pub(super) fn check_any_interface(&self) -> Option<Finding> {
         if !self.buses.is_empty() {
             return None;
         }
         let up = self.present.iter().filter(|interface| interface.up);
         Some(match up.max_by_key(|interface| interface.mtu >= FD_MTU) {
             Some(Interface { name, mtu, .. }) => {
-                Finding::ok(format!("{name} is up and carries {}", carries(*mtu)))
+                Finding::ok(format!("{name} is up and carries {}", carried_format(*mtu)))
             }
             None => Finding::fault("no CAN interface is up").hint(self.own_command("up vcan0")),
         })
     }
 
     /// Reports what a bench does without the interface, if the user accepts either kind of bus.
-    pub(super) fn absent(&self, bus: &BusFacts) -> Option<Finding> {
+    pub(super) fn check_absent_interface(&self, bus: &BusFacts) -> Option<Finding> {
         if self.choice != KindChoice::Auto || !self.kernel.has_can {
             return None;
         }
@@ -82,12 +82,12 @@ impl Facts {
         })
     }
 
-    pub(super) fn interface(&self, bus: &BusFacts) -> Vec<Finding> {
+    pub(super) fn check_interface(&self, bus: &BusFacts) -> Vec<Finding> {
         let name = &bus.target.name;
         let Some(interface) = &bus.interface else {
-            if let Some(finding) = self.absent(bus) {
+            if let Some(finding) = self.check_absent_interface(bus) {
                 let mut findings = vec![finding];
-                findings.extend(self.traffic(bus, "the embedded bus"));
+                findings.extend(self.check_traffic(bus, "the embedded bus"));
                 return findings;
             }
             let (text, up) = (format!("there is no interface {name}"), self.up_command(&bus.target));
@@ -109,17 +109,17 @@ impl Facts {
         };
         if would_run(&findings) {
             let what = interface.description();
-            let text = format!("{name} is {what}, up, and carries {}", carries(interface.mtu));
+            let text = format!("{name} is {what}, up, and carries {}", carried_format(interface.mtu));
             findings.insert(0, Finding::ok(text));
             if interface.is_virtual() && bus.target.hardware().is_some() {
                 let command =
-                    if interface.ours { self.own_command("down") } else { self.sudo("ip link del") };
+                    if interface.ours { self.own_command("down") } else { self.with_sudo("ip link del") };
                 let text =
                     format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has");
                 let hint = format!("{command} {name}  # if hardware is to have this name");
                 findings.push(Finding::note(text).hint(hint));
             }
-            findings.extend(self.traffic(bus, name));
+            findings.extend(self.check_traffic(bus, name));
         }
         findings
     }
@@ -141,7 +141,7 @@ impl Facts {
         Vec::new()
     }
 
-    fn hardware_faults(&self, bus: &BusFacts, interface: &Interface, hardware: &Hardware) -> Vec<Finding> {
+    fn hardware_faults(&self, bus: &BusFacts, interface: &Interface, hardware: &CanHardware) -> Vec<Finding> {
         let Interface { name, mtu, up, .. } = interface;
         let what = interface.description();
         let skin = bus.target.skin.as_ref();
@@ -153,7 +153,7 @@ impl Facts {
                     Format::Fd => "bitrate 1000000 dbitrate 5000000 fd on",
                     Format::Classic => "bitrate 1000000",
                 };
-                self.sudo(&format!(
+                self.with_sudo(&format!(
                     "sh -c 'ip link set {name} down; ip link set {name} up type can {rates}'  # or the rates of your bus"
                 ))
             }
@@ -180,7 +180,8 @@ impl Facts {
         }
         if hardware.listen_only {
             let off = "type can listen-only off";
-            let hint = self.sudo(&format!("sh -c 'ip link set {name} down; ip link set {name} up {off}'"));
+            let hint =
+                self.with_sudo(&format!("sh -c 'ip link set {name} down; ip link set {name} up {off}'"));
             let text = format!("{name} only listens: it can neither send nor acknowledge");
             findings.push(Finding::fault(text).hint(hint));
         }
@@ -190,7 +191,7 @@ impl Facts {
                     "{name} is BUS-OFF: it no longer takes part after too many errors; wiring, termination or bit \
                      rates are wrong"
                 ))
-                .hint(self.sudo(&format!("ip link set {name} type can restart"))),
+                .hint(self.with_sudo(&format!("ip link set {name} type can restart"))),
             ),
             Some(state @ (ControllerState::ErrorPassive | ControllerState::ErrorWarning)) => Some(
                 Finding::note(format!(
@@ -218,6 +219,6 @@ impl Facts {
 }
 
 /// Returns the name of the CAN format that an interface of this MTU carries.
-const fn carries(mtu: u32) -> &'static str {
+const fn carried_format(mtu: u32) -> &'static str {
     if mtu >= FD_MTU { "CAN FD" } else { "classic CAN" }
 }

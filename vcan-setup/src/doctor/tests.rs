@@ -1,12 +1,13 @@
 use super::*;
 use crate::kernel::ModuleState;
 use crate::link::{
-    CLASSIC_MTU, ControllerState, Counters, FD_MTU, Hardware, HardwareRates, Interface, InterfaceKind,
+    CLASSIC_MTU, CanHardware, ControllerState, FD_MTU, HardwareRates, Interface, InterfaceCounters,
+    InterfaceKind,
 };
 use crate::plan::SkinBus;
 
 fn interface(name: &str, kind: InterfaceKind) -> Interface {
-    let counters = Counters::default();
+    let counters = InterfaceCounters::default();
     Interface { index: 2, name: name.to_owned(), kind, ours: true, up: true, mtu: FD_MTU, counters }
 }
 
@@ -28,8 +29,8 @@ fn bus(interface: Option<Interface>) -> BusFacts {
 }
 
 /// Returns the facts of a machine without faults.
-fn good() -> Facts {
-    Facts {
+fn good() -> MachineFacts {
+    MachineFacts {
         choice: KindChoice::Auto,
         no_spawn: false,
         program: "vcan-setup".into(),
@@ -52,8 +53,8 @@ fn good() -> Facts {
     }
 }
 
-fn no_can(choice: KindChoice) -> Facts {
-    let mut facts = Facts { choice, ..good() };
+fn no_can(choice: KindChoice) -> MachineFacts {
+    let mut facts = MachineFacts { choice, ..good() };
     facts.kernel.has_can = false;
     facts.kernel.can_raw = ModuleState::Loadable;
     facts.buses = vec![bus(None)];
@@ -61,16 +62,17 @@ fn no_can(choice: KindChoice) -> Facts {
 }
 
 /// Returns all findings as printed, except those that are ok.
-fn complaints(facts: &Facts) -> Vec<String> {
+fn complaints(facts: &MachineFacts) -> Vec<String> {
     let bad = |finding: Finding| {
         let hints = finding.hints.iter().map(|hint| format!(" | {hint}")).collect::<String>();
-        (finding.level != Level::Ok).then(|| format!("{}: {}{hints}", finding.level.name(), finding.text))
+        (finding.level != FindingLevel::Ok)
+            .then(|| format!("{}: {}{hints}", finding.level.name(), finding.text))
     };
     assess(facts).into_iter().filter_map(bad).collect()
 }
 
 /// Changes the facts of a machine without faults, and returns the findings.
-fn about(change: impl FnOnce(&mut Facts)) -> Vec<String> {
+fn about(change: impl FnOnce(&mut MachineFacts)) -> Vec<String> {
     let mut facts = good();
     change(&mut facts);
     let said = complaints(&facts);
@@ -84,10 +86,10 @@ fn about_interface(change: impl FnOnce(&mut Interface)) -> Vec<String> {
 
 fn about_hardware(
     target: impl FnOnce(&mut InterfaceTarget),
-    change: impl FnOnce(&mut Interface, &mut Hardware),
+    change: impl FnOnce(&mut Interface, &mut CanHardware),
 ) -> Vec<String> {
     about(|facts| {
-        let mut hardware = Hardware {
+        let mut hardware = CanHardware {
             driver: Some("kvaser_pci".into()),
             bitrate: Some(1_000_000),
             data_bitrate: Some(5_000_000),
@@ -266,7 +268,7 @@ fn an_interface_that_does_not_fit_is_repaired_by_who_made_it() {
 #[test]
 fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
     let same = |_: &mut InterfaceTarget| ();
-    let fine = |_: &mut Interface, _: &mut Hardware| ();
+    let fine = |_: &mut Interface, _: &mut CanHardware| ();
     assert_eq!(about_hardware(same, fine), Vec::<String>::new());
     let set = "sudo vcan-setup up skin.toml --set-bit-rates";
     assert_eq!(
@@ -417,10 +419,10 @@ fn the_cells_program_is_needed_unless_the_cells_are_there() {
 
 #[test]
 fn sums_run_wherever_nothing_real_is() {
-    let sums = |facts: &mut Facts| facts.buses.iter_mut().for_each(|bus| bus.sums = true);
+    let sums = |facts: &mut MachineFacts| facts.buses.iter_mut().for_each(|bus| bus.sums = true);
     assert_eq!(about(sums), Vec::<String>::new());
     let said = about(|facts| {
-        let hardware = Hardware { bitrate: Some(1_000_000), ..Hardware::default() };
+        let hardware = CanHardware { bitrate: Some(1_000_000), ..CanHardware::default() };
         facts.buses = vec![bus(Some(interface("can0", InterfaceKind::Hardware(hardware))))];
         sums(facts);
     });

@@ -3,7 +3,7 @@
 use std::os::fd::OwnedFd;
 
 use protocol::bus::Filter;
-use protocol::bus::batch::{BATCH, Outgoing, is_memory_shortage};
+use protocol::bus::batch::{MAX_BATCH_DATAGRAMS, Outgoing, is_memory_shortage};
 use protocol::bus::embedded::{encode_dropped, peer_process};
 use protocol::can::FD_BYTES;
 use rustix::event::epoll::{self, EventData, EventFlags};
@@ -86,7 +86,7 @@ impl Client {
             return false;
         }
         // If the client no longer reads, sending fails again at the end of the round, and is handled there.
-        if !self.blocked && self.queue.frames() >= BATCH {
+        if !self.blocked && self.queue.frames() >= MAX_BATCH_DATAGRAMS {
             let _ = self.send(post);
         }
         !self.blocked && !std::mem::replace(&mut self.dirty, true)
@@ -122,7 +122,7 @@ impl Client {
 
     /// Returns true if the client was blocked and can be sent to again.
     pub(super) fn unblock(&mut self, post: &SendContext) -> bool {
-        let free = self.blocked && self.watch(post, EventFlags::IN);
+        let free = self.blocked && self.set_epoll_flags(post, EventFlags::IN);
         self.blocked &= !free;
         free
     }
@@ -141,7 +141,7 @@ impl Client {
                 return SendOutcome::Done;
             }
             post.outgoing.clear();
-            for entry in self.queue.iter().take(BATCH) {
+            for entry in self.queue.iter().take(MAX_BATCH_DATAGRAMS) {
                 match entry {
                     QueueEntry::Frame(parcel) => post.outgoing.push(parcel.bytes(), parcel.byte_len()),
                     QueueEntry::Dropped(total) => {
@@ -161,7 +161,7 @@ impl Client {
                 Err(error) => match Errno::from_io_error(&error) {
                     Some(Errno::INTR) => {}
                     Some(Errno::AGAIN) => {
-                        self.blocked = self.watch(post, EventFlags::IN | EventFlags::OUT);
+                        self.blocked = self.set_epoll_flags(post, EventFlags::IN | EventFlags::OUT);
                         return if self.blocked { SendOutcome::Done } else { SendOutcome::Shortage };
                     }
                     Some(Errno::PIPE | Errno::CONNRESET | Errno::NOTCONN) => return SendOutcome::Gone,
@@ -171,7 +171,7 @@ impl Client {
         }
     }
 
-    fn watch(&self, post: &SendContext, flags: EventFlags) -> bool {
+    fn set_epoll_flags(&self, post: &SendContext, flags: EventFlags) -> bool {
         epoll::modify(&post.epoll, &self.socket, EventData::new_u64(self.id.0 as u64), flags).is_ok()
     }
 }

@@ -1,6 +1,6 @@
 //! The datagrams by which clients and the server of a bus exchange frames.
 
-use protocol::bus::embedded::OWN_BYTE;
+use protocol::bus::embedded::OWN_FRAME_BYTE;
 use protocol::can::{FD_BYTES, FD_FORMAT, Format, Frame};
 
 /// The index of the byte that holds the FD flags.
@@ -21,7 +21,7 @@ impl FrameDatagram {
     /// accepted only if the client has enabled CAN FD (`fd`). An FD frame gets the flag FDF, as in kernels from 6.1 on.
     /// The mark for own frames is removed. All other bytes are forwarded unchanged. Never panics.
     #[must_use]
-    pub fn accept(datagram: &[u8], fd: bool) -> Option<Self> {
+    pub fn from_client_datagram(datagram: &[u8], fd: bool) -> Option<Self> {
         let frame = Frame::from_bytes(datagram).ok()?;
         if frame.format() == Format::Fd && !fd {
             return None;
@@ -31,14 +31,14 @@ impl FrameDatagram {
         if frame.format() == Format::Fd {
             *bytes.get_mut(FLAGS_BYTE)? |= FD_FORMAT;
         }
-        *bytes.get_mut(OWN_BYTE)? = 0;
+        *bytes.get_mut(OWN_FRAME_BYTE)? = 0;
         Some(Self { bytes, id: frame.raw_id(), format: frame.format() })
     }
 
     /// Returns the frame with the mark that tells a client whether the frame is its own.
     #[must_use]
-    pub fn marked(mut self, own: bool) -> Self {
-        if let Some(byte) = self.bytes.get_mut(OWN_BYTE) {
+    pub fn with_own_mark(mut self, own: bool) -> Self {
+        if let Some(byte) = self.bytes.get_mut(OWN_FRAME_BYTE) {
             *byte = own.into();
         }
         self
@@ -78,32 +78,32 @@ mod tests {
     #[test]
     fn what_can_raw_refuses_to_send_is_refused() {
         for case in cases::refused() {
-            assert_eq!(FrameDatagram::accept(&case.datagram, case.fd), None, "{}", case.what);
+            assert_eq!(FrameDatagram::from_client_datagram(&case.datagram, case.fd), None, "{}", case.what);
         }
     }
 
     #[test]
     fn the_fdf_flag_is_set_and_the_own_mark_cannot_be_forged() {
         let mut bytes = Frame::with_data(0x201, Format::Fd, 1, &[7]).unwrap().to_bytes();
-        bytes[OWN_BYTE] = 1;
-        let parcel = FrameDatagram::accept(&bytes, true).unwrap();
+        bytes[OWN_FRAME_BYTE] = 1;
+        let parcel = FrameDatagram::from_client_datagram(&bytes, true).unwrap();
         assert_eq!(parcel.bytes()[4..9], [1, 1 | FD_FORMAT, 0, 0, 7]);
-        assert_eq!(parcel.marked(true).bytes()[OWN_BYTE], 1);
-        assert_eq!(parcel.marked(true).marked(false), parcel);
+        assert_eq!(parcel.with_own_mark(true).bytes()[OWN_FRAME_BYTE], 1);
+        assert_eq!(parcel.with_own_mark(true).with_own_mark(false), parcel);
     }
 
     proptest! {
         #[test]
         fn a_frame_passes_unchanged(id: u32, fd: bool, data in proptest::collection::vec(any::<u8>(), 0..=8)) {
             let frame = if fd { Frame::fd(id, 1, &data) } else { Frame::classic(id, &data) }.unwrap();
-            let parcel = FrameDatagram::accept(&frame.to_bytes()[..frame.byte_len()], true).unwrap();
+            let parcel = FrameDatagram::from_client_datagram(&frame.to_bytes()[..frame.byte_len()], true).unwrap();
             prop_assert_eq!(&parcel.bytes()[..parcel.byte_len()], &frame.to_bytes()[..frame.byte_len()]);
             prop_assert_eq!((parcel.raw_id(), parcel.format()), (frame.raw_id(), frame.format()));
         }
 
         #[test]
         fn no_datagram_panics(bytes in proptest::collection::vec(any::<u8>(), 0..80), fd: bool) {
-            let _ = FrameDatagram::accept(&bytes, fd);
+            let _ = FrameDatagram::from_client_datagram(&bytes, fd);
         }
     }
 }

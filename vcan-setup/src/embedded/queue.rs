@@ -85,7 +85,7 @@ mod tests {
     use protocol::can::Frame;
 
     fn parcel(id: u32) -> FrameDatagram {
-        FrameDatagram::accept(&Frame::classic(id, &[]).unwrap().to_bytes()[..16], true).unwrap()
+        FrameDatagram::from_client_datagram(&Frame::classic(id, &[]).unwrap().to_bytes()[..16], true).unwrap()
     }
 
     #[test]

@@ -100,7 +100,7 @@ impl Router {
         }
         let ClientHello { ref filters, own_frames, fd, error_mask, buffer: _ } = *hello;
         let wants = Subscription { filters: filters.clone(), own_frames, fd, error_mask, last: 0 };
-        self.list(client, &wants);
+        self.add_to_lists(client, &wants);
         if let Some(slot) = self.clients.get_mut(client.0) {
             *slot = Some(wants);
         }
@@ -109,15 +109,15 @@ impl Router {
     /// Replaces the filters of a client. Its other options stay.
     pub fn set_filters(&mut self, client: ClientId, filters: Vec<Filter>) {
         let Some(mut wants) = self.clients.get_mut(client.0).and_then(Option::take) else { return };
-        self.unlist(client, &wants);
+        self.remove_from_lists(client, &wants);
         wants.filters = filters;
-        self.list(client, &wants);
+        self.add_to_lists(client, &wants);
         if let Some(slot) = self.clients.get_mut(client.0) {
             *slot = Some(wants);
         }
     }
 
-    fn list(&mut self, client: ClientId, wants: &Subscription) {
+    fn add_to_lists(&mut self, client: ClientId, wants: &Subscription) {
         for class in wants.classes() {
             match class {
                 FilterClass::Exact(id) => self.exact.entry(id).or_default().push(client),
@@ -129,13 +129,13 @@ impl Router {
     /// Removes a client, if it is present.
     pub fn remove(&mut self, client: ClientId) {
         if let Some(wants) = self.clients.get_mut(client.0).and_then(Option::take) {
-            self.unlist(client, &wants);
+            self.remove_from_lists(client, &wants);
         }
     }
 
     /// Removes a client from the lists of its filters. Only these lists are searched, because hundreds of clients may
     /// change their filters while frames are waiting.
-    fn unlist(&mut self, client: ClientId, wants: &Subscription) {
+    fn remove_from_lists(&mut self, client: ClientId, wants: &Subscription) {
         for class in wants.classes() {
             match class {
                 FilterClass::Exact(id) => {

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use protocol::bus::Filter;
-use protocol::bus::batch::{BATCH, Batch, Datagram, is_memory_shortage};
+use protocol::bus::batch::{Datagram, MAX_BATCH_DATAGRAMS, ReceiveBatch, is_memory_shortage};
 use protocol::bus::embedded::{FilterPart, default_directory};
 use rustix::buffer::spare_capacity;
 use rustix::event::epoll::{self, EventData, EventFlags};
@@ -85,7 +85,7 @@ trait Receive {
     fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>>;
 }
 
-impl Receive for Batch {
+impl Receive for ReceiveBatch {
     fn receive(&mut self, socket: &OwnedFd) -> io::Result<usize> {
         self.receive(socket)
     }
@@ -147,7 +147,7 @@ impl Server {
     /// # Errors
     /// Returns [`ServeError`] if a system call fails, which no client can cause.
     pub fn run(self, stop: impl AsFd) -> Result<BusTotals, ServeError> {
-        self.run_with(stop, Batch::new())
+        self.run_with(stop, ReceiveBatch::new())
     }
 
     fn run_with(mut self, stop: impl AsFd, mut batch: impl Receive) -> Result<BusTotals, ServeError> {
@@ -242,7 +242,7 @@ impl Server {
         if flags.intersects(EventFlags::IN | EventFlags::HUP | EventFlags::ERR) {
             match self.client(id).map(|client| client.greeted) {
                 Some(true) => self.drain(id, batch),
-                Some(false) => self.greet(id),
+                Some(false) => self.receive_hello(id),
                 None => {}
             }
         }
@@ -284,7 +284,7 @@ impl Server {
                         Err(errno) => failure = Some(errno),
                     }
                 }
-                match bytes.and_then(|bytes| FrameDatagram::accept(bytes, fd)) {
+                match bytes.and_then(|bytes| FrameDatagram::from_client_datagram(bytes, fd)) {
                     Some(parcel) => self.route(id, parcel),
                     None if bytes.is_some_and(|bytes| self.refilter(id, bytes)) => {}
                     None => self.post.totals.garbage += 1,
@@ -293,7 +293,7 @@ impl Server {
             if let Some(errno) = failure {
                 return self.handle_failure(id, errno);
             }
-            if batch.datagrams().len() < BATCH {
+            if batch.datagrams().len() < MAX_BATCH_DATAGRAMS {
                 return;
             }
         }
@@ -306,7 +306,7 @@ impl Server {
         let begun = if part.first { Some(Vec::new()) } else { client.filters.take() };
         let Some(mut filters) = begun else { return false };
         filters.append(&mut part.filters);
-        if filters.len() > Filter::MAX {
+        if filters.len() > Filter::MAX_COUNT {
             return false;
         }
         if part.last {
@@ -354,7 +354,7 @@ impl Server {
                 sibling.send_early(post);
             }
             let Some(client) = clients.get_mut(to.0).and_then(Option::as_mut) else { return };
-            if client.enqueue(parcel.marked(own), post) {
+            if client.enqueue(parcel.with_own_mark(own), post) {
                 dirty.push_back(to);
             }
         });

@@ -6,7 +6,7 @@ use protocol::can::Frame;
 use protocol::id::{CellId, Id};
 use serde::{Deserialize, Serialize};
 
-use super::message::{MessageError, MessageHeader, Stamped, decode};
+use super::message::{MessageError, MessageHeader, StampedFrame, decode};
 
 /// The maximum number of frames in the queue to the bus.
 pub const MAX_WAITING_FRAMES: usize = 8_192;
@@ -88,7 +88,7 @@ const fn add(counter: &mut u64, more: u64) {
 }
 
 #[derive(Debug, Default)]
-struct Source {
+struct SourceState {
     head: MessageHeader,
     /// The number that the source's next frame should have.
     next: u64,
@@ -98,9 +98,9 @@ struct Source {
     nodes: NodeSet,
 }
 
-impl Source {
+impl SourceState {
     /// Counts the frames of a message with this header. Returns how many of its first frames were received before.
-    fn account_for(&mut self, head: &MessageHeader, count: u64) -> u64 {
+    fn count_message(&mut self, head: &MessageHeader, count: u64) -> u64 {
         let account = &mut self.account;
         if account.lives == 0 || self.head.life != head.life {
             account.lives += 1;
@@ -130,18 +130,18 @@ impl Source {
 
 /// Counts and queued frames of all other hosts.
 #[derive(Debug, Default)]
-pub struct Incoming {
+pub struct HostsToBusQueue {
     /// The counts of each host, by its name.
-    sources: BTreeMap<String, Source>,
+    sources: BTreeMap<String, SourceState>,
     waiting: VecDeque<Frame>,
     /// The hosts that the queued frames came from: each entry is a host and the number of consecutive frames.
     runs: VecDeque<(String, usize)>,
     /// The number of messages from hosts beyond [`SOURCES`].
     unknown_hosts: u64,
-    frames: Vec<Stamped>,
+    frames: Vec<StampedFrame>,
 }
 
-impl Incoming {
+impl HostsToBusQueue {
     /// Decodes a message of a host, counts its frames, and queues them for the bus.
     ///
     /// # Errors
@@ -152,12 +152,12 @@ impl Incoming {
                 self.unknown_hosts += 1;
                 return Ok(());
             }
-            self.sources.insert(host.to_owned(), Source::default());
+            self.sources.insert(host.to_owned(), SourceState::default());
         }
         let Some(source) = self.sources.get_mut(host) else { return Ok(()) };
         self.frames.clear();
         let head = decode(bytes, &mut self.frames).inspect_err(|_| source.account.garbage += 1)?;
-        let again = source.account_for(&head, self.frames.len() as u64);
+        let again = source.count_message(&head, self.frames.len() as u64);
         let new = self.frames.iter().skip(usize::try_from(again).unwrap_or(usize::MAX));
         new.clone().for_each(|stamped| source.nodes.add_sender(&stamped.frame));
         let room = MAX_WAITING_FRAMES.saturating_sub(self.waiting.len());
@@ -175,26 +175,26 @@ impl Incoming {
 
     /// Returns the oldest frames in the queue. The queue is a ring buffer, so these may not be all frames.
     #[must_use]
-    pub fn waiting(&self) -> &[Frame] {
+    pub fn waiting_frames(&self) -> &[Frame] {
         self.waiting.as_slices().0
     }
 
     /// Removes the first `count` frames, which were sent to the bus.
-    pub fn sent(&mut self, count: usize) {
-        self.gone(count, |account, count| account.sent += count);
+    pub fn remove_sent(&mut self, count: usize) {
+        self.remove_first(count, |account, count| account.sent += count);
     }
 
     /// Removes the first `count` frames. They are copies that went around a circle, and are not sent.
-    pub fn copies(&mut self, count: usize) {
-        self.gone(count, |account, count| account.copies += count);
+    pub fn remove_copies(&mut self, count: usize) {
+        self.remove_first(count, |account, count| account.copies += count);
     }
 
     /// Removes the first `count` frames, which the bus refused.
-    pub fn refused(&mut self, count: usize) {
-        self.gone(count, |account, count| account.refused += count);
+    pub fn remove_refused(&mut self, count: usize) {
+        self.remove_first(count, |account, count| account.refused += count);
     }
 
-    fn gone(&mut self, count: usize, note: impl Fn(&mut SourceAccount, u64)) {
+    fn remove_first(&mut self, count: usize, note: impl Fn(&mut SourceAccount, u64)) {
         let mut left = count.min(self.waiting.len());
         self.waiting.drain(..left);
         while left > 0 {
@@ -216,7 +216,7 @@ impl Incoming {
     }
 
     /// Returns the names that several hosts use at the same time.
-    pub fn shared(&self) -> impl Iterator<Item = &str> {
+    pub fn shared_names(&self) -> impl Iterator<Item = &str> {
         self.sources.iter().filter(|(_, source)| source.account.shared > 0).map(|(host, _)| host.as_str())
     }
 
@@ -236,19 +236,19 @@ mod tests {
 
     fn message(head: MessageHeader, count: u64) -> Vec<u8> {
         let frame = |at: u64| Frame::classic(0x201, &(head.first + at).to_le_bytes()).unwrap();
-        let frames: Vec<_> = (0..count).map(|at| Stamped { at_nanos: at, frame: frame(at) }).collect();
+        let frames: Vec<_> = (0..count).map(|at| StampedFrame { at_nanos: at, frame: frame(at) }).collect();
         let mut bytes = Vec::new();
         encode(&head, &frames, &mut bytes);
         bytes
     }
 
-    fn heard(incoming: &Incoming) -> SourceAccount {
+    fn heard(incoming: &HostsToBusQueue) -> SourceAccount {
         incoming.accounts().next().unwrap().1
     }
 
     #[test]
     fn each_missing_frame_has_its_place() {
-        let mut incoming = Incoming::default();
+        let mut incoming = HostsToBusQueue::default();
         let mut take = |life, first, dropped, missed, count| {
             incoming.receive("b", &message(MessageHeader { life, first, dropped, missed }, count)).unwrap();
         };
@@ -271,16 +271,16 @@ mod tests {
             ..SourceAccount::default()
         };
         assert_eq!(account, expected);
-        assert_eq!(incoming.waiting().len(), 36);
-        incoming.sent(30);
-        incoming.refused(4);
+        assert_eq!(incoming.waiting_frames().len(), 36);
+        incoming.remove_sent(30);
+        incoming.remove_refused(4);
         let account = heard(&incoming);
-        assert_eq!((account.sent, account.refused, incoming.waiting().len()), (30, 4, 2));
+        assert_eq!((account.sent, account.refused, incoming.waiting_frames().len()), (30, 4, 2));
     }
 
     #[test]
     fn two_hosts_of_one_name_are_noticed() {
-        let mut incoming = Incoming::default();
+        let mut incoming = HostsToBusQueue::default();
         for life in [1, 2, 3, 2, 3] {
             incoming.receive("b", &message(MessageHeader { life, ..MessageHeader::default() }, 1)).unwrap();
         }
@@ -289,7 +289,7 @@ mod tests {
 
     #[test]
     fn what_the_bus_does_not_take_is_counted_for_its_host() {
-        let mut incoming = Incoming::default();
+        let mut incoming = HostsToBusQueue::default();
         let head = |first| MessageHeader { life: 1, first, ..MessageHeader::default() };
         for first in (0..MAX_WAITING_FRAMES as u64).step_by(256) {
             incoming.receive(if first % 512 == 0 { "b" } else { "c" }, &message(head(first), 256)).unwrap();
@@ -298,7 +298,7 @@ mod tests {
         let of: Vec<_> = incoming.accounts().map(|(host, it, _)| (host, it.taken, it.dropped_here)).collect();
         let half = MAX_WAITING_FRAMES as u64 / 2;
         assert_eq!(of, [("b", half, 0), ("c", half, 0), ("d", 5, 5)]);
-        incoming.sent(300);
+        incoming.remove_sent(300);
         let sent: Vec<_> = incoming.accounts().map(|(_, it, _)| it.sent).collect();
         assert_eq!(sent, [256, 44, 0]);
         assert!(incoming.receive("b", &[9]).is_err());
@@ -307,8 +307,8 @@ mod tests {
 
     #[test]
     fn it_is_known_which_cells_are_behind_a_host() {
-        let mut incoming = Incoming::default();
-        let sent = |id| Stamped { at_nanos: 0, frame: Frame::classic(id, &[]).unwrap() };
+        let mut incoming = HostsToBusQueue::default();
+        let sent = |id| StampedFrame { at_nanos: 0, frame: Frame::classic(id, &[]).unwrap() };
         let mut bytes = Vec::new();
         let of = |kind, node| u32::from(Id::new(kind, Node::Cell(CellId::new(node).unwrap())).to_bits());
         let frames = [
@@ -325,7 +325,7 @@ mod tests {
 
     #[test]
     fn hosts_without_end_fill_nothing() {
-        let mut incoming = Incoming::default();
+        let mut incoming = HostsToBusQueue::default();
         for host in 0..MAX_SOURCES + 3 {
             incoming.receive(&host.to_string(), &message(MessageHeader::default(), 1)).unwrap();
         }
@@ -334,7 +334,7 @@ mod tests {
 
     #[test]
     fn a_host_that_says_impossible_numbers_is_counted_up_to_the_end() {
-        let mut incoming = Incoming::default();
+        let mut incoming = HostsToBusQueue::default();
         for life in 0..4 {
             let head = MessageHeader { life, first: u64::MAX / 2, dropped: u64::MAX / 2, missed: u64::MAX };
             incoming.receive("b", &message(head, 1)).unwrap();
@@ -348,14 +348,14 @@ mod tests {
     proptest! {
         #[test]
         fn accounts_add_up_whatever_comes(messages in proptest::collection::vec((0..3_u64, 0..400_u64, 0..30_u64, 0..9_u64, 0..20_u64, 0..30_usize), 0..60)) {
-            let mut incoming = Incoming::default();
+            let mut incoming = HostsToBusQueue::default();
             for (life, first, dropped, missed, count, gone) in messages {
                 let head = MessageHeader { life, first, dropped: dropped.min(first), missed };
                 incoming.receive("b", &message(head, count)).unwrap();
                 match gone % 3 {
-                    0 => incoming.sent(gone),
-                    1 => incoming.copies(gone),
-                    _ => incoming.refused(gone),
+                    0 => incoming.remove_sent(gone),
+                    1 => incoming.remove_copies(gone),
+                    _ => incoming.remove_refused(gone),
                 }
             }
             for (_, it, _) in incoming.accounts() {

@@ -27,7 +27,7 @@ const FRAME_HEADER_BYTES: usize = 16;
 
 /// A frame with the time at which it was on the bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Stamped {
+pub struct StampedFrame {
     /// The time in ns since 1970, by the clock of the host whose bus it is.
     pub at_nanos: u64,
     /// The frame.
@@ -81,7 +81,11 @@ pub enum MessageError {
 }
 
 /// Encodes a message with at most [`MAX_FRAMES`] of the given frames.
-pub fn encode<'a>(head: &MessageHeader, frames: impl IntoIterator<Item = &'a Stamped>, bytes: &mut Vec<u8>) {
+pub fn encode<'a>(
+    head: &MessageHeader,
+    frames: impl IntoIterator<Item = &'a StampedFrame>,
+    bytes: &mut Vec<u8>,
+) {
     bytes.clear();
     bytes.extend([VERSION, 0, 0, 0, 0, 0, 0, 0]);
     for word in [head.life, head.first, head.dropped, head.missed] {
@@ -89,7 +93,7 @@ pub fn encode<'a>(head: &MessageHeader, frames: impl IntoIterator<Item = &'a Sta
     }
     bytes.extend([0, 0]);
     let mut count = 0_u16;
-    for Stamped { at_nanos, frame } in frames.into_iter().take(MAX_FRAMES) {
+    for StampedFrame { at_nanos, frame } in frames.into_iter().take(MAX_FRAMES) {
         let is_fd = frame.format() == Format::Fd;
         bytes.extend(at_nanos.to_le_bytes());
         bytes.extend(frame.raw_id().to_le_bytes());
@@ -107,7 +111,7 @@ pub fn encode<'a>(head: &MessageHeader, frames: impl IntoIterator<Item = &'a Sta
 ///
 /// # Errors
 /// Returns [`MessageError`] if the message has another version, is incomplete, or contains an invalid frame.
-pub fn decode(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<MessageHeader, MessageError> {
+pub fn decode(bytes: &[u8], frames: &mut Vec<StampedFrame>) -> Result<MessageHeader, MessageError> {
     let before = frames.len();
     let read = read(bytes, frames);
     if read.is_err() {
@@ -116,7 +120,7 @@ pub fn decode(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<MessageHeader, 
     read
 }
 
-fn read(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<MessageHeader, MessageError> {
+fn read(bytes: &[u8], frames: &mut Vec<StampedFrame>) -> Result<MessageHeader, MessageError> {
     let wrong = MessageError::Length(bytes.len());
     let &version = bytes.first().ok_or(wrong)?;
     if version != VERSION {
@@ -152,7 +156,7 @@ fn read(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<MessageHeader, Messag
         if is_fd == 0 {
             frame = frame.with_raw_dlc(dlc);
         }
-        frames.push(Stamped { at_nanos, frame });
+        frames.push(StampedFrame { at_nanos, frame });
         rest = tail;
     }
     if rest.is_empty() { Ok(MessageHeader { life, first, dropped, missed }) } else { Err(wrong) }
@@ -166,8 +170,8 @@ mod tests {
     const HEAD_OF: MessageHeader =
         MessageHeader { life: 0x0102_0304_0506_0708, first: 9, dropped: 2, missed: 1 };
 
-    fn stamped(at_nanos: u64, frame: Frame) -> Stamped {
-        Stamped { at_nanos, frame }
+    fn stamped(at_nanos: u64, frame: Frame) -> StampedFrame {
+        StampedFrame { at_nanos, frame }
     }
 
     #[test]

@@ -21,7 +21,7 @@ A program of its own does it, vcan-link, beside vcan-setup or on PATH. To instal
   cargo install --locked --path vcan-setup/link")]
 pub struct LinkOptions {
     /// The bus
-    #[arg(value_parser = bus_name)]
+    #[arg(value_parser = parse_bus_name)]
     pub bus: String,
     /// A configuration of Zenoh: certificates, access control, endpoints
     #[arg(long, value_name = "FILE.json5")]
@@ -44,6 +44,6 @@ pub struct LinkOptions {
 }
 
 /// Parses the name of a bus.
-fn bus_name(word: &str) -> Result<String, BusError> {
+fn parse_bus_name(word: &str) -> Result<String, BusError> {
     check_name(word).map(|()| word.to_owned())
 }

@@ -19,9 +19,9 @@ use thiserror::Error;
 pub const PROGRAM: &str = "vcan-link";
 /// The environment variable for the path of `vcan-link`. It is needed if the program is neither beside `vcan-setup` nor
 /// on `PATH`.
-pub const VARIABLE: &str = "SKINBUS_VCAN_LINK";
+pub const PATH_VARIABLE: &str = "SKINBUS_VCAN_LINK";
 /// The environment variable by which `vcan-setup` tells `vcan-link` its version.
-const CALLER: &str = "VCAN_SETUP_VERSION";
+const CALLER_VERSION_VARIABLE: &str = "VCAN_SETUP_VERSION";
 /// The version of this crate, which is part of both programs.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
@@ -35,8 +35,8 @@ pub enum ProgramError {
          `cargo install --locked --path vcan-setup/link`"
     )]
     Missing,
-    /// The system cannot run the file that [`VARIABLE`] names.
-    #[error("cannot run {}: {source}; {VARIABLE} names it", shell_quoted_os(path.as_os_str()))]
+    /// The system cannot run the file that [`PATH_VARIABLE`] names.
+    #[error("cannot run {}: {source}; {PATH_VARIABLE} names it", shell_quoted_os(path.as_os_str()))]
     Named {
         /// The file.
         path: PathBuf,
@@ -62,13 +62,13 @@ pub enum ProgramError {
 /// Replaces this process by `vcan-link`, with the same process id, so that signals and the exit code are those of
 /// `vcan-link`. Returns only if that fails.
 pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
-    let start = |path: &Path| Command::new(path).args(arguments).env(CALLER, VERSION).exec();
-    if let Some(path) = path_from_env(VARIABLE) {
+    let start = |path: &Path| Command::new(path).args(arguments).env(CALLER_VERSION_VARIABLE, VERSION).exec();
+    if let Some(path) = path_from_env(PATH_VARIABLE) {
         let source = start(&path);
         return ProgramError::Named { path, source };
     }
     let own = env::current_exe().ok();
-    match find(own.as_deref().and_then(Path::parent), env::var_os("PATH").as_deref()) {
+    match find_program(own.as_deref().and_then(Path::parent), env::var_os("PATH").as_deref()) {
         Some(path) => {
             let source = start(&path);
             ProgramError::Found { path, source }
@@ -79,7 +79,7 @@ pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
 
 /// Finds `vcan-link` beside `vcan-setup`, or else in the folders of `PATH`. Returns the first file that is executable.
 /// If none is, returns the first file, so that an error can name it.
-fn find(beside: Option<&Path>, path: Option<&OsStr>) -> Option<PathBuf> {
+fn find_program(beside: Option<&Path>, path: Option<&OsStr>) -> Option<PathBuf> {
     let folders = beside.map(Path::to_owned).into_iter();
     let folders = folders.chain(path.into_iter().flat_map(env::split_paths));
     // An empty entry in PATH means the current folder, which is not searched.
@@ -95,10 +95,10 @@ fn find(beside: Option<&Path>, path: Option<&OsStr>) -> Option<PathBuf> {
 ///
 /// Returns [`ProgramError::Version`] if the versions differ.
 pub fn check_caller() -> Result<(), ProgramError> {
-    fits(env::var_os(CALLER).as_deref())
+    check_caller_version(env::var_os(CALLER_VERSION_VARIABLE).as_deref())
 }
 
-fn fits(caller: Option<&OsStr>) -> Result<(), ProgramError> {
+fn check_caller_version(caller: Option<&OsStr>) -> Result<(), ProgramError> {
     match caller {
         Some(version) if version != VERSION => {
             Err(ProgramError::Version(version.to_string_lossy().into_owned()))
@@ -130,7 +130,7 @@ mod tests {
             file
         };
         let path = env::join_paths([Path::new(""), &plain, &odd]).unwrap();
-        let found = || find(Some(&beside), Some(&path));
+        let found = || find_program(Some(&beside), Some(&path));
         assert_eq!(found(), None);
         let in_plain = put(&plain, 0o644);
         assert_eq!(found(), Some(in_plain), "the error is about this one");
@@ -138,16 +138,16 @@ mod tests {
         assert_eq!(found(), Some(in_odd));
         let in_beside = put(&beside, 0o755);
         assert_eq!(found(), Some(in_beside));
-        assert_eq!(find(None, None), None);
+        assert_eq!(find_program(None, None), None);
         fs::create_dir(folder.path().join(PROGRAM)).unwrap();
-        assert_eq!(find(Some(folder.path()), None), None, "a folder");
+        assert_eq!(find_program(Some(folder.path()), None), None, "a folder");
     }
 
     #[test]
     fn another_version_is_refused_with_both() {
-        assert!(fits(None).is_ok() && fits(Some(VERSION.as_ref())).is_ok());
-        let error = fits(Some("0.0.9".as_ref())).unwrap_err().to_string();
+        assert!(check_caller_version(None).is_ok() && check_caller_version(Some(VERSION.as_ref())).is_ok());
+        let error = check_caller_version(Some("0.0.9".as_ref())).unwrap_err().to_string();
         assert!(error.starts_with(&format!("vcan-link {VERSION} was run by vcan-setup 0.0.9: ")), "{error}");
-        assert!(fits(Some("".as_ref())).is_err());
+        assert!(check_caller_version(Some("".as_ref())).is_err());
     }
 }

@@ -101,7 +101,7 @@ impl ReportReader {
     pub fn wait(&mut self, timeout: Duration) -> io::Result<LinkReport> {
         let until = Instant::now() + timeout;
         loop {
-            if let Some(report) = self.take()?.pop() {
+            if let Some(report) = self.read_reports()?.pop() {
                 return Ok(report);
             }
             if Instant::now() >= until {
@@ -115,7 +115,7 @@ impl ReportReader {
     ///
     /// # Errors
     /// Returns an error if the link has ended, or if its data is not a report.
-    pub fn take(&mut self) -> io::Result<Vec<LinkReport>> {
+    pub fn read_reports(&mut self) -> io::Result<Vec<LinkReport>> {
         let mut piece = [0; 4_096];
         loop {
             match self.stream.read(&mut piece) {
@@ -157,7 +157,7 @@ mod tests {
         assert_eq!(connect("/two").unwrap_err().kind(), ErrorKind::ConnectionRefused);
         let mut reports = connect("/one").unwrap();
         let (mut stream, _) = listener.accept().unwrap();
-        assert!(reports.take().unwrap().is_empty());
+        assert!(reports.read_reports().unwrap().is_empty());
         let report = |host: &str| {
             let hosts = [("b".to_owned(), HostReport { nodes: vec![1, 9], ..HostReport::default() })].into();
             LinkReport { host: host.to_owned(), hosts, ..LinkReport::default() }
@@ -166,14 +166,14 @@ mod tests {
         let (whole, cut) = (line("x"), line("y"));
         stream.write_all(whole.as_bytes()).unwrap();
         stream.write_all(&cut.as_bytes()[..40]).unwrap();
-        assert_eq!(reports.take().unwrap(), [report("x")]);
+        assert_eq!(reports.read_reports().unwrap(), [report("x")]);
         stream.write_all(&cut.as_bytes()[40..]).unwrap();
         stream.write_all(whole.as_bytes()).unwrap();
-        assert_eq!(reports.take().unwrap(), [report("y"), report("x")]);
+        assert_eq!(reports.read_reports().unwrap(), [report("y"), report("x")]);
         stream.write_all(b"{}\n").unwrap();
-        assert!(reports.take().is_err(), "not a report");
+        assert!(reports.read_reports().is_err(), "not a report");
         drop(stream);
-        assert_eq!(reports.take().unwrap_err().kind(), ErrorKind::UnexpectedEof);
+        assert_eq!(reports.read_reports().unwrap_err().kind(), ErrorKind::UnexpectedEof);
     }
 
     #[test]
@@ -184,7 +184,7 @@ mod tests {
         let mut reports = ReportReader { stream: other, buffer: Vec::new() };
         let ended = (0..1_000).find_map(|_| {
             let _ = stream.write(&[b'x'; 65_536]);
-            reports.take().err()
+            reports.read_reports().err()
         });
         assert_eq!(ended.unwrap().kind(), ErrorKind::InvalidData);
     }

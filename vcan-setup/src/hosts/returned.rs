@@ -32,7 +32,7 @@ pub struct CircleDetector {
 
 impl CircleDetector {
     /// Stores a frame that the link puts on the bus. `now` is the time of a monotonic clock in ns.
-    pub fn put(&mut self, now: u64, frame: &Frame) {
+    pub fn record_sent(&mut self, now: u64, frame: &Frame) {
         let hash = self.hash(frame);
         self.put.insert(now, hash);
     }
@@ -89,31 +89,31 @@ struct RecentFrames {
 
 impl RecentFrames {
     fn insert(&mut self, now: u64, hash: u64) {
-        self.forget(now);
+        self.remove_expired(now);
         if self.order.len() >= MAX_REMEMBERED {
-            self.forget_one();
+            self.remove_oldest();
         }
         self.order.push_back((now, hash));
         *self.times.entry(hash).or_default() += 1;
     }
 
     fn contains(&mut self, now: u64, hash: u64) -> bool {
-        self.forget(now);
+        self.remove_expired(now);
         self.times.contains_key(&hash)
     }
 
     fn is_empty(&mut self, now: u64) -> bool {
-        self.forget(now);
+        self.remove_expired(now);
         self.order.is_empty()
     }
 
-    fn forget(&mut self, now: u64) {
+    fn remove_expired(&mut self, now: u64) {
         while self.order.front().is_some_and(|&(at, _)| now.saturating_sub(at) > RETURN_WINDOW_NS) {
-            self.forget_one();
+            self.remove_oldest();
         }
     }
 
-    fn forget_one(&mut self) {
+    fn remove_oldest(&mut self) {
         let Some((_, hash)) = self.order.pop_front() else { return };
         if let Some(times) = self.times.get_mut(&hash) {
             *times -= 1;
@@ -139,7 +139,7 @@ mod tests {
         let mut returned = CircleDetector::default();
         let it = frame(0x201, &[1, 2]);
         assert!(!returned.is_returned(0, &it));
-        returned.put(MS, &it);
+        returned.record_sent(MS, &it);
         let others = [frame(0x202, &[1, 2]), frame(0x201, &[1]), Frame::fd(0x201, 0, &[1, 2]).unwrap()];
         assert!(others.iter().all(|other| !returned.is_returned(2 * MS, other)));
         assert!(
@@ -154,7 +154,7 @@ mod tests {
     fn no_more_is_remembered_than_may() {
         let mut returned = CircleDetector::default();
         for number in 0..2 * MAX_REMEMBERED as u64 {
-            returned.put(0, &frame(0x201, &(number / 3).to_le_bytes()));
+            returned.record_sent(0, &frame(0x201, &(number / 3).to_le_bytes()));
         }
         assert_eq!(returned.put.order.len(), MAX_REMEMBERED);
         let sum: u32 = returned.put.times.values().sum();
@@ -170,19 +170,19 @@ mod tests {
         for at in 0..50 {
             assert!(!first.is_returned(at * MS, &it), "it could be sent again and again");
         }
-        first.put(50 * MS, &other);
+        first.record_sent(50 * MS, &other);
         assert!(first.is_returned(51 * MS, &other));
         assert!(!first.is_returned(52 * MS, &it));
         assert!(first.is_returned(53 * MS, &it) && first.is_returned(152 * MS, &it));
         assert!(!first.is_returned(153 * MS, &it), "whoever sends it means it");
 
         let mut second = CircleDetector::default();
-        second.put(0, &it);
+        second.record_sent(0, &it);
         assert!(!second.is_copy(MS, &it), "no circle");
         assert!(second.is_returned(2 * MS, &it));
         assert!(second.is_copy(3 * MS, &it) && !second.is_copy(3 * MS, &other));
         assert!(!second.is_copy(101 * MS, &it));
-        second.put(2_000 * MS, &it);
+        second.record_sent(2_000 * MS, &it);
         assert!(!second.is_copy(2_001 * MS, &it), "the circle is gone");
     }
 }

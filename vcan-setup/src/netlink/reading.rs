@@ -8,10 +8,12 @@ use netlink_packet_route::link::{
 };
 use protocol::bus::netlink::attributes;
 
-use crate::link::{ALIAS_MARK, ControllerState, Counters, Hardware, Interface, InterfaceKind, Peer};
+use crate::link::{
+    ALIAS_MARK, CanHardware, ControllerState, Interface, InterfaceCounters, InterfaceKind, Peer,
+};
 
 /// Decodes the kernel's message about an interface. Returns `None` if it is incomplete.
-pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
+pub(super) fn decode_interface(bytes: &[u8]) -> Option<Interface> {
     let header = LinkHeader::parse(bytes).ok()?;
     let is_can = header.link_layer_type == LinkLayerType::Can;
     let mut interface = Interface {
@@ -21,7 +23,7 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
         ours: false,
         up: header.flags.contains(LinkFlags::Up),
         mtu: 0,
-        counters: Counters::default(),
+        counters: InterfaceCounters::default(),
     };
     let (mut peer, mut namespace, mut info) = (None, None, Vec::new());
     for attribute in attributes(bytes) {
@@ -38,7 +40,7 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
         } else if let LinkAttribute::LinkInfo(given) = attribute {
             info = given;
         } else if let LinkAttribute::Stats64(stats) = attribute {
-            interface.counters = Counters {
+            interface.counters = InterfaceCounters {
                 received: stats.rx_packets,
                 sent: stats.tx_packets,
                 dropped: stats.rx_dropped + stats.tx_dropped,
@@ -65,8 +67,8 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     Some(interface)
 }
 
-fn hardware(data: &[InfoCan]) -> Hardware {
-    let mut hardware = Hardware::default();
+fn hardware(data: &[InfoCan]) -> CanHardware {
+    let mut hardware = CanHardware::default();
     let set = |timing: &CanBitTiming| Some(timing.bitrate).filter(|&rate| rate > 0);
     for attribute in data {
         if let InfoCan::BitTiming(timing) = attribute {

@@ -9,7 +9,7 @@ use crate::link::{FD_MTU, HardwareRates, Interface};
 /// The reason why a plan is refused. Its text is one line that contains a command to fix the cause.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
-pub enum Refusal {
+pub enum PlanRefusal {
     /// The interface does not carry CAN.
     #[error("{name} is real, {what}, and is left alone: choose another name, as `vcan-setup up vcan0` does")]
     NotCan {
@@ -157,7 +157,7 @@ pub enum Refusal {
     },
 }
 
-impl Refusal {
+impl PlanRefusal {
     /// Returns the refusal to make or remove an interface that is not virtual.
     pub(super) fn not_virtual(interface: &Interface) -> Self {
         let (name, what) = (interface.name.clone(), interface.description());
@@ -186,8 +186,8 @@ impl Refusal {
     }
 }
 
-impl From<Refusal> for Failure {
-    fn from(refusal: Refusal) -> Self {
+impl From<PlanRefusal> for Failure {
+    fn from(refusal: PlanRefusal) -> Self {
         if refusal.is_usage() { Self::usage(refusal) } else { Self::run(refusal) }
     }
 }

@@ -61,7 +61,7 @@ pub enum StepAction {
 impl Step {
     /// Returns the step in a short form, such as `make vcan0`.
     #[must_use]
-    pub fn doing(&self) -> String {
+    pub fn short_description(&self) -> String {
         let name = &self.name;
         match &self.action {
             StepAction::MakeVcan => format!("make {name}"),
@@ -75,7 +75,7 @@ impl Step {
 
     /// Returns the line that is printed when the step is done.
     #[must_use]
-    pub fn done(&self) -> String {
+    pub fn done_message(&self) -> String {
         let name = &self.name;
         match &self.action {
             StepAction::MakeVcan => format!("{name} is made, a vcan with MTU {FD_MTU}, and up"),

@@ -1,5 +1,5 @@
 use super::*;
-use crate::link::{CLASSIC_MTU, Counters};
+use crate::link::{CLASSIC_MTU, InterfaceCounters};
 
 mod world;
 
@@ -8,19 +8,19 @@ use world::{SimulatedKernel, THERE};
 fn interface(name: &str, index: u32, kind: InterfaceKind) -> Interface {
     let mtu = if matches!(kind, InterfaceKind::Other(_)) { 1_500 } else { FD_MTU };
     let (ours, up) = (false, true);
-    Interface { index, name: name.to_owned(), kind, ours, up, mtu, counters: Counters::default() }
+    Interface { index, name: name.to_owned(), kind, ours, up, mtu, counters: InterfaceCounters::default() }
 }
 
 fn ours(name: &str, index: u32) -> Interface {
     Interface { ours: true, ..interface(name, index, InterfaceKind::Vcan) }
 }
 
-fn kvaser(bitrate: Option<u32>, data_bitrate: Option<u32>) -> Hardware {
+fn kvaser(bitrate: Option<u32>, data_bitrate: Option<u32>) -> CanHardware {
     let driver = Some("kvaser_pci".to_owned());
-    Hardware { driver, bitrate, data_bitrate, fd: data_bitrate.is_some(), ..Hardware::default() }
+    CanHardware { driver, bitrate, data_bitrate, fd: data_bitrate.is_some(), ..CanHardware::default() }
 }
 
-fn can0(hardware: Hardware, up: bool) -> Interface {
+fn can0(hardware: CanHardware, up: bool) -> Interface {
     let mtu = if hardware.fd { FD_MTU } else { CLASSIC_MTU };
     Interface { up, mtu, ..interface("can0", 4, InterfaceKind::Hardware(hardware)) }
 }
@@ -32,17 +32,17 @@ fn in_skin(name: &str, format: Format, bitrate: Option<u32>, data_bitrate: Optio
 }
 
 fn refused(target: &InterfaceTarget, present: &[Interface]) -> String {
-    up(std::slice::from_ref(target), present, false).unwrap_err().to_string()
+    plan_up(std::slice::from_ref(target), present, false).unwrap_err().to_string()
 }
 
 #[test]
 fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
     let target = ["vcan0", "vcan1"].map(InterfaceTarget::named);
     let world = SimulatedKernel::of(vec![interface("vcan0", 2, InterfaceKind::Vcan)]);
-    let plan = up(&target, &world.here, false).unwrap();
+    let plan = plan_up(&target, &world.here, false).unwrap();
     assert_eq!(plan.steps, [Step { name: "vcan1".into(), action: StepAction::MakeVcan }]);
     assert_eq!(plan.unchanged, ["vcan0 is there already, and fits (a vcan, made by another program)"]);
-    let again = up(&target, &world.carry_out_all(&plan).here, false).unwrap();
+    let again = plan_up(&target, &world.carry_out_all(&plan).here, false).unwrap();
     assert_eq!(again.steps, []);
 }
 
@@ -51,13 +51,13 @@ fn what_is_ours_is_repaired() {
     let narrow = Interface { mtu: CLASSIC_MTU, ..ours("vcan0", 2) };
     let down = Interface { up: false, ..ours("vcan1", 3) };
     let target = ["vcan0", "vcan1"].map(InterfaceTarget::named);
-    let plan = up(&target, &[narrow.clone(), down], false).unwrap();
+    let plan = plan_up(&target, &[narrow.clone(), down], false).unwrap();
     let said: Vec<_> = plan.steps.iter().map(ToString::to_string).collect();
     let expected = ["take vcan0 down, give it MTU 72 instead of 16, and bring it up", "bring vcan1 up"];
     assert_eq!(said, expected);
     assert_eq!(plan.steps[0].command(), "ip link set vcan0 down && ip link set vcan0 mtu 72 up");
     let classic = in_skin("vcan0", Format::Classic, None, None);
-    assert_eq!(up(&[classic], &[narrow], false).unwrap().steps, [], "classic frames fit MTU 16");
+    assert_eq!(plan_up(&[classic], &[narrow], false).unwrap().steps, [], "classic frames fit MTU 16");
 }
 
 #[test]
@@ -76,7 +76,10 @@ fn a_real_bus_is_never_touched_because_it_was_named() {
         "eth0 is real, a network interface (ether), and is left alone: choose another name, as `vcan-setup \
          up vcan0` does"
     );
-    assert!(up(&[InterfaceTarget::named("can0")], &present, true).is_err(), "whatever else was asked for");
+    assert!(
+        plan_up(&[InterfaceTarget::named("can0")], &present, true).is_err(),
+        "whatever else was asked for"
+    );
 }
 
 #[test]
@@ -97,19 +100,19 @@ fn what_somebody_else_made_is_left_alone_and_the_hint_is_told() {
 fn one_bus_that_cannot_be_had_keeps_the_others_from_being_made() {
     let present = [interface("lo", 1, InterfaceKind::Other("the loopback interface".into()))];
     let target = ["vcan0", "lo", "vcan1"].map(InterfaceTarget::named);
-    assert!(matches!(up(&target, &present, false), Err(Refusal::NotCan { .. })));
+    assert!(matches!(plan_up(&target, &present, false), Err(PlanRefusal::NotCan { .. })));
 }
 
 #[test]
 fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
     let target = in_skin("can0", Format::Fd, Some(1_000_000), Some(5_000_000));
     let right = can0(kvaser(Some(1_000_000), Some(5_000_000)), true);
-    let plan = up(std::slice::from_ref(&target), std::slice::from_ref(&right), false).unwrap();
+    let plan = plan_up(std::slice::from_ref(&target), std::slice::from_ref(&right), false).unwrap();
     assert_eq!(plan.steps, []);
     let line = "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, data 5000 kbit/s, as the skin says, and is \
                 left as it is";
     assert_eq!(plan.unchanged, [line]);
-    assert_eq!(up(std::slice::from_ref(&target), &[right], true).unwrap().steps, [], "nor set again");
+    assert_eq!(plan_up(std::slice::from_ref(&target), &[right], true).unwrap().steps, [], "nor set again");
 
     let other = [can0(kvaser(Some(500_000), None), true)];
     assert_eq!(
@@ -125,7 +128,7 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
         "can0 is CAN hardware (kvaser_pci) with MTU 16, and skin.toml says format = \"fd\", which needs 72: \
          `sudo vcan-setup up skin.toml --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
     );
-    let classic = Hardware { fd: false, ..kvaser(Some(1_000_000), Some(5_000_000)) };
+    let classic = CanHardware { fd: false, ..kvaser(Some(1_000_000), Some(5_000_000)) };
     assert!(
         refused(&target, &[can0(classic, true)]).starts_with("can0 is at 1000 kbit/s and skin.toml says"),
         "a rate for data that is not in use is none"
@@ -142,7 +145,7 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
 fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
     let target = in_skin("can0", Format::Fd, Some(1_000_000), Some(5_000_000));
     let present = [can0(kvaser(Some(500_000), None), true)];
-    let plan = up(&[target], &present, true).unwrap();
+    let plan = plan_up(&[target], &present, true).unwrap();
     let [step] = plan.steps.as_slice() else { panic!("{plan:?}") };
     assert_eq!(
         step.to_string(),
@@ -153,7 +156,7 @@ fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
         "ip link set can0 down && ip link set can0 type can bitrate 1000000 dbitrate 5000000 fd on && ip link \
          set can0 up"
     );
-    let set = |target| up(&[target], &present, true).unwrap_err().to_string();
+    let set = |target| plan_up(&[target], &present, true).unwrap_err().to_string();
     assert_eq!(
         set(in_skin("can0", Format::Fd, None, None)),
         "skin.toml has no bitrate for can0: put `bitrate = 1000000` under its [[bus]], then try again"
@@ -167,8 +170,8 @@ fn bit_rates_are_set_only_on_request_and_only_to_what_the_skin_says() {
 #[test]
 fn who_goes_from_can_fd_to_classic_switches_it_off() {
     let target = in_skin("can0", Format::Classic, Some(500_000), None);
-    let fd = Hardware { fd: true, ..kvaser(Some(1_000_000), Some(5_000_000)) };
-    let plan = up(&[target], &[can0(fd, false)], true).unwrap();
+    let fd = CanHardware { fd: true, ..kvaser(Some(1_000_000), Some(5_000_000)) };
+    let plan = plan_up(&[target], &[can0(fd, false)], true).unwrap();
     assert_eq!(
         plan.steps[0].command(),
         "ip link set can0 type can bitrate 500000 fd off && ip link set can0 up"
@@ -180,7 +183,7 @@ fn two_skins_that_give_a_bus_two_bit_rates_are_refused() {
     let skin = |rate| in_skin("can0", Format::Classic, rate, None);
     for set in [false, true] {
         for present in [vec![], vec![can0(kvaser(Some(500_000), None), true)]] {
-            let refusal = up(&[skin(Some(500_000)), skin(Some(250_000))], &present, set).unwrap_err();
+            let refusal = plan_up(&[skin(Some(500_000)), skin(Some(250_000))], &present, set).unwrap_err();
             assert_eq!(
                 refusal.to_string(),
                 "of can0 skin.toml says 500 kbit/s and skin.toml says 250 kbit/s: run `vcan-setup up` with one of \
@@ -191,7 +194,7 @@ fn two_skins_that_give_a_bus_two_bit_rates_are_refused() {
     }
     let present = [can0(kvaser(Some(500_000), None), true)];
     let both = [skin(Some(500_000)), skin(None), skin(Some(500_000))];
-    let plan = up(&both, &present, false).unwrap();
+    let plan = plan_up(&both, &present, false).unwrap();
     assert_eq!(plan.steps, []);
     assert_eq!(plan.unchanged.len(), 2, "each line once: {:?}", plan.unchanged);
 }
@@ -228,7 +231,7 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     };
     let there = named(&world, None);
     let target = TargetPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
-    let plan = up_pair(&target, &world.here).unwrap();
+    let plan = plan_pair_up(&target, &world.here).unwrap();
     let [step] = plan.steps.as_slice() else { panic!("{plan:?}") };
     assert_eq!(
         step.command(),
@@ -238,17 +241,17 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     world = world.carry_out_all(&plan);
     let there = named(&world, Some(THERE));
     let again = TargetPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
-    assert_eq!(up_pair(&again, &world.here).unwrap().steps, []);
+    assert_eq!(plan_pair_up(&again, &world.here).unwrap().steps, []);
 
     let elsewhere = named(&world, Some(THERE + 1));
     let other = TargetPair { there: Some(&elsewhere), ..again };
-    let error = up_pair(&other, &world.here).unwrap_err().to_string();
+    let error = plan_pair_up(&other, &world.here).unwrap_err().to_string();
     assert_eq!(
         error,
         "vcan1 is there already and is a vxcan, not one end of a pair with vcan1: `sudo vcan-setup down vcan1` \
          removes it, or choose another name"
     );
-    let error = up_pair(&TargetPair { name: "vcan5", ..again }, &world.here).unwrap_err().to_string();
+    let error = plan_pair_up(&TargetPair { name: "vcan5", ..again }, &world.here).unwrap_err().to_string();
     assert_eq!(
         error,
         "vcan1 is there already and is a vxcan in blue, not one end of a pair with vcan5: `sudo ip -n blue link \
@@ -256,14 +259,14 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     );
     world.there[0].up = false;
     let there = named(&world, Some(THERE));
-    let error = up_pair(&TargetPair { there: Some(&there), ..again }, &world.here).unwrap_err();
+    let error = plan_pair_up(&TargetPair { there: Some(&there), ..again }, &world.here).unwrap_err();
     assert_eq!(
         error.to_string(),
         "the other end of vcan1, vcan1 in blue, is down, and vcan-setup changes nothing there: `sudo ip -n blue \
          link set vcan1 up` fixes it"
     );
     let same = TargetPair { name: "vcan3", peer: "vcan3", there: None };
-    assert!(matches!(up_pair(&same, &world.here), Err(Refusal::OneName { .. })));
+    assert!(matches!(plan_pair_up(&same, &world.here), Err(PlanRefusal::OneName { .. })));
 }
 
 #[test]
@@ -272,7 +275,7 @@ fn only_what_is_ours_is_removed() {
         [ours("vcan0", 2), interface("vcan1", 3, InterfaceKind::Vcan), can0(kvaser(None, None), true)];
     let names = ["vcan0", "vcan1", "can0", "vcan9"];
     let skin = names.map(|name| in_skin(name, Format::Fd, None, None));
-    let plan = down(&skin, &present).unwrap();
+    let plan = plan_down(&skin, &present).unwrap();
     assert_eq!(plan.steps, [Step { name: "vcan0".into(), action: StepAction::Remove { index: 2 } }]);
     assert_eq!(
         plan.unchanged,
@@ -282,7 +285,7 @@ fn only_what_is_ours_is_removed() {
             "vcan9 is not there",
         ]
     );
-    let named = |name| down(&[InterfaceTarget::named(name)], &present);
+    let named = |name| plan_down(&[InterfaceTarget::named(name)], &present);
     assert_eq!(
         named("vcan1").unwrap_err().to_string(),
         "vcan1 is a vcan that vcan-setup has not made, and is left alone: if it is yours, `sudo ip link del \
@@ -303,7 +306,7 @@ fn the_mark_on_something_real_is_not_believed() {
     ];
     present.iter_mut().for_each(|it| it.ours = true);
     for name in ["can0", "eth0"] {
-        assert!(up(&[InterfaceTarget::named(name)], &present, true).is_err(), "{name}");
-        assert!(down(&[InterfaceTarget::named(name)], &present).is_err(), "{name}");
+        assert!(plan_up(&[InterfaceTarget::named(name)], &present, true).is_err(), "{name}");
+        assert!(plan_down(&[InterfaceTarget::named(name)], &present).is_err(), "{name}");
     }
 }

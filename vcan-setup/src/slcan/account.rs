@@ -106,14 +106,14 @@ pub struct LineAccount {
     /// Frames from the line to the bus.
     pub to_bus: ToBusCounts,
     /// Faults and changes of state that the adapter reported, by name.
-    pub faults: Faults,
+    pub faults: FaultCounts,
 }
 
 /// Counts of the faults and changes of state that an adapter reported, by name.
-pub type Faults = BTreeMap<&'static str, u64>;
+pub type FaultCounts = BTreeMap<&'static str, u64>;
 
 /// Lists the faults that were counted after `before`. The text is empty if there are none.
-pub(super) fn faults_since(before: &Faults, now: &Faults) -> String {
+pub(super) fn faults_since(before: &FaultCounts, now: &FaultCounts) -> String {
     let more = now.iter().map(|(name, count)| (name, count - before.get(name).copied().unwrap_or(0)));
     let words = more.filter(|(_, count)| *count > 0).map(|(name, count)| match count {
         1 => (*name).to_owned(),
@@ -126,10 +126,10 @@ impl ToLineDropped {
     /// Returns the total number of dropped frames.
     #[must_use]
     pub fn total(&self) -> u64 {
-        self.named().into_iter().map(|(count, _)| count).sum()
+        self.named_counts().into_iter().map(|(count, _)| count).sum()
     }
 
-    const fn named(&self) -> [(u64, &'static str); 6] {
+    const fn named_counts(&self) -> [(u64, &'static str); 6] {
         [
             (self.queue_full, "line too slow"),
             (self.line_away, "line away"),
@@ -145,10 +145,10 @@ impl ToBusDropped {
     /// Returns the total number of dropped frames.
     #[must_use]
     pub fn total(&self) -> u64 {
-        self.named().into_iter().map(|(count, _)| count).sum()
+        self.named_counts().into_iter().map(|(count, _)| count).sum()
     }
 
-    const fn named(&self) -> [(u64, &'static str); 4] {
+    const fn named_counts(&self) -> [(u64, &'static str); 4] {
         [
             (self.queue_full, "bus full"),
             (self.bus_away, "bus away"),
@@ -162,10 +162,10 @@ impl RefusedLines {
     /// Returns the total number of lines that could not be decoded.
     #[must_use]
     pub fn total(&self) -> u64 {
-        self.named().into_iter().map(|(count, _)| count).sum()
+        self.named_counts().into_iter().map(|(count, _)| count).sum()
     }
 
-    fn named(self) -> [(u64, &'static str); 5] {
+    fn named_counts(self) -> [(u64, &'static str); 5] {
         [
             (self.garbage.into(), "garbage"),
             (self.long.into(), "too long"),
@@ -179,19 +179,20 @@ impl RefusedLines {
 impl ToLineCounts {
     /// Formats losses as `, 3 dropped (2 line too slow, 1 line away)`; empty if there are none.
     pub(super) fn losses(&self) -> String {
-        losses("dropped", &self.dropped.named())
-            + &losses("not received", &[(self.dropped_by_bus, "dropped by the bus")])
+        format_losses("dropped", &self.dropped.named_counts())
+            + &format_losses("not received", &[(self.dropped_by_bus, "dropped by the bus")])
     }
 }
 
 impl ToBusCounts {
     /// Formats the losses on the way to the bus, including lines that could not be decoded.
     pub(super) fn losses(&self) -> String {
-        losses("dropped", &self.dropped.named()) + &losses("lines refused", &self.refused.named())
+        format_losses("dropped", &self.dropped.named_counts())
+            + &format_losses("lines refused", &self.refused.named_counts())
     }
 }
 
-fn losses(what: &str, named: &[(u64, &'static str)]) -> String {
+fn format_losses(what: &str, named: &[(u64, &'static str)]) -> String {
     let total: u64 = named.iter().map(|(count, _)| count).sum();
     if total == 0 {
         return String::new();
@@ -201,7 +202,7 @@ fn losses(what: &str, named: &[(u64, &'static str)]) -> String {
     format!(", {total} {what} ({})", reasons.join(", "))
 }
 
-fn times(count: u64) -> String {
+fn times_text(count: u64) -> String {
     match count {
         0 => "never".to_owned(),
         1 => "once".to_owned(),
@@ -213,9 +214,9 @@ impl fmt::Display for LineAccount {
     /// Writes three lines, or four if the adapter reported faults, without a line feed at the end.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { line, opened, lost, reopened, to_line, to_bus, faults } = self;
-        write!(f, "{line}: opened {}, lost {}", times(*opened), times(*lost))?;
+        write!(f, "{line}: opened {}, lost {}", times_text(*opened), times_text(*lost))?;
         if *reopened > 0 {
-            write!(f, ", opened again after refusals {}", times(*reopened))?;
+            write!(f, ", opened again after refusals {}", times_text(*reopened))?;
         }
         write!(
             f,
@@ -229,7 +230,7 @@ impl fmt::Display for LineAccount {
             write!(f, ", {} times BEL", to_bus.bells)?;
         }
         if !faults.is_empty() {
-            write!(f, "\n  the adapter reported: {}", faults_since(&Faults::new(), faults))?;
+            write!(f, "\n  the adapter reported: {}", faults_since(&FaultCounts::new(), faults))?;
         }
         Ok(())
     }
@@ -276,7 +277,7 @@ mod tests {
              dropped by the bus)\n  to the bus:  11 received, 1 sent, 10 dropped (1 bus full, 2 bus away, 3 FD frames \
              for a classic bus, 4 at the end), 6 lines refused (1 garbage, 2 too short, 3 wrong identifier), 7 times BEL"
         );
-        (account.reopened, account.faults) = (1, Faults::from([("no ACK", 3), ("bus off", 1)]));
+        (account.reopened, account.faults) = (1, FaultCounts::from([("no ACK", 3), ("bus off", 1)]));
         let text = account.to_string();
         assert!(
             text.starts_with("/dev/ttyACM0: opened 2 times, lost once, opened again after refusals once\n"),

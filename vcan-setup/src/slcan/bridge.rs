@@ -12,7 +12,7 @@ use thiserror::Error;
 use super::account::LineAccount;
 use super::event::LineEvent;
 use super::options::LineOptions;
-use super::participant::{Participant, Ready};
+use super::participant::{Participant, ReadyEnds};
 use super::settings::{BridgeSettings, open};
 
 /// The time that the program takes at its end to complete a line of text and to close the adapters.
@@ -68,7 +68,7 @@ impl Bridge {
             }
             let bus = open(&settings, &line)?;
             let participant = Participant::new(line, bus);
-            participants.push(participant.map_err(|error| refused(name, error))?);
+            participants.push(participant.map_err(|error| line_error(name, error))?);
         }
         let mut bridge = Self { settings, kind, participants };
         for participant in &mut bridge.participants {
@@ -78,7 +78,7 @@ impl Bridge {
                     break;
                 }
                 if let Some(error) = participant.take_reason() {
-                    return Err(refused(participant.name(), error));
+                    return Err(line_error(participant.name(), error));
                 }
                 // A TCP connection is established in the background, so its state is queried until it is known.
                 std::thread::sleep(RETRY_INTERVAL);
@@ -95,7 +95,7 @@ impl Bridge {
 
     /// Returns the lines that are not open, each with the reason if it is known.
     #[must_use]
-    pub fn away(&self) -> Vec<String> {
+    pub fn unavailable_lines(&self) -> Vec<String> {
         let away = self.participants.iter().filter(|it| !it.is_up());
         let words = |it: &Participant| {
             it.reason().map_or_else(|| it.name(), |reason| format!("{} ({reason})", it.name()))
@@ -119,24 +119,25 @@ impl Bridge {
             let Some(ready) = ready else { return self.close(&mut report) };
             for (participant, ready) in self.participants.iter_mut().zip(ready) {
                 let name = participant.name();
-                participant.work(&self.settings, ready, &mut |event| report(&name, event));
+                participant.forward_available(&self.settings, ready, &mut |event| report(&name, event));
             }
         }
     }
 
     fn close(mut self, report: &mut impl FnMut(&str, LineEvent)) -> Result<Vec<LineAccount>, BridgeError> {
         let until = Instant::now() + CLOSE_TIMEOUT;
-        self.participants.iter_mut().for_each(Participant::end);
+        self.participants.iter_mut().for_each(Participant::start_closing);
         loop {
             // `count` visits all participants; `any` would stop at the first that is not finished.
-            let left = self.participants.iter_mut().filter_map(|it| (!it.finish()).then_some(())).count();
+            let left =
+                self.participants.iter_mut().filter_map(|it| (!it.write_remaining()).then_some(())).count();
             if left == 0 || Instant::now() >= until {
                 break;
             }
             self.wait(None, Some(until)).map_err(BridgeError::Wait)?;
         }
         for participant in &mut self.participants {
-            if !participant.give_up() {
+            if !participant.give_up_closing() {
                 report(&participant.name(), LineEvent::NotClosed);
             }
         }
@@ -149,7 +150,7 @@ impl Bridge {
         &mut self,
         stop: Option<BorrowedFd<'_>>,
         until: Option<Instant>,
-    ) -> io::Result<Option<Vec<Ready>>> {
+    ) -> io::Result<Option<Vec<ReadyEnds>>> {
         let now = Instant::now();
         let mut next = until;
         let mut interests = Vec::with_capacity(self.participants.len());
@@ -160,7 +161,7 @@ impl Bridge {
         let mut polled = Vec::with_capacity(1 + 2 * interests.len());
         polled.extend(stop.map(|stop| PollFd::from_borrowed_fd(stop, PollFlags::IN)));
         for (participant, interest) in self.participants.iter().zip(&interests) {
-            let (line, bus) = participant.ends();
+            let (line, bus) = participant.poll_ends();
             polled.extend(
                 line.zip(interest.line).map(|(line, flags)| PollFd::from_borrowed_fd(line.as_fd(), flags)),
             );
@@ -178,15 +179,15 @@ impl Bridge {
             return Ok(None);
         }
         let ready = self.participants.iter().zip(&interests).map(|(participant, interest)| {
-            let (line, bus) = participant.ends();
+            let (line, bus) = participant.poll_ends();
             let line = line.zip(interest.line).is_some() && came.next() == Some(true);
-            Ready { line, bus: bus.is_some() && came.next() == Some(true) }
+            ReadyEnds { line, bus: bus.is_some() && came.next() == Some(true) }
         });
         Ok(Some(ready.collect()))
     }
 }
 
-fn refused(line: String, source: io::Error) -> BridgeError {
+fn line_error(line: String, source: io::Error) -> BridgeError {
     // The texts of these errors already contain advice.
     let says_it = matches!(source.kind(), io::ErrorKind::InvalidInput | io::ErrorKind::ResourceBusy);
     let hint = if says_it {

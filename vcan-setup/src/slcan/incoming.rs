@@ -5,14 +5,14 @@ use std::collections::VecDeque;
 use protocol::can::{Format, Frame};
 use protocol::slcan::{AdapterFault, AdapterReport, BusState, Decoder, SlcanLine};
 
-use super::account::{Faults, ToBusCounts};
+use super::account::{FaultCounts, ToBusCounts};
 
 /// The maximum number of frames queued for the bus.
 pub const MAX_WAITING_FRAMES: usize = 1_024;
 
 /// The decoder of a line and the queue of its frames to the bus.
 #[derive(Debug, Default)]
-pub struct Incoming {
+pub struct LineToBusQueue {
     decoder: Decoder,
     /// True if the bus carries classic frames only.
     classic: bool,
@@ -24,7 +24,7 @@ pub struct Incoming {
     replies: Replies,
     /// The last error state that the adapter reported for its bus.
     state: BusState,
-    faults: Faults,
+    faults: FaultCounts,
 }
 
 /// The replies of an adapter since it was last opened.
@@ -40,7 +40,7 @@ impl Replies {
     const ACCEPTED: Self = Self { accepted: true, refusals: 0 };
 }
 
-impl Incoming {
+impl LineToBusQueue {
     /// Creates an empty queue to a bus that is not open yet.
     #[must_use]
     pub fn new() -> Self {
@@ -49,18 +49,18 @@ impl Incoming {
 
     /// Records that the bus is open. With `classic`, FD frames are dropped. Error frames are sent only if `is_virtual`
     /// is true.
-    pub const fn up(&mut self, classic: bool, is_virtual: bool) {
+    pub const fn bus_opened(&mut self, classic: bool, is_virtual: bool) {
         (self.is_up, self.classic, self.is_virtual) = (true, classic, is_virtual);
     }
 
     /// Records that the adapter was opened. Counting of its replies begins anew, and its bus is taken to be without
     /// errors.
-    pub fn opened(&mut self) {
+    pub fn adapter_opened(&mut self) {
         (self.replies, self.state) = (Replies::default(), BusState::Active);
     }
 
     /// Records that the bus was lost, and drops the frames that are queued for it.
-    pub fn down(&mut self) {
+    pub fn bus_lost(&mut self) {
         self.is_up = false;
         self.account.dropped.bus_away += self.clear();
     }
@@ -93,7 +93,7 @@ impl Incoming {
 
     /// Returns the faults that the adapter reported.
     #[must_use]
-    pub const fn faults(&self) -> &Faults {
+    pub const fn faults(&self) -> &FaultCounts {
         &self.faults
     }
 
@@ -107,7 +107,7 @@ impl Incoming {
             *self.faults.entry(name).or_default() += 1;
             is_empty = false;
         }
-        if let Some(frame) = report.frame(before).filter(|_| self.is_virtual) {
+        if let Some(frame) = report.error_frame(before).filter(|_| self.is_virtual) {
             self.push(frame);
         }
         self.account.other_lines += u64::from(is_empty);
@@ -115,22 +115,22 @@ impl Incoming {
 
     /// Records that the line was lost, and discards the incomplete text at its end.
     pub fn line_lost(&mut self) {
-        self.decoder.restart();
+        self.decoder.discard_unfinished();
     }
 
     /// Returns the queued frames, oldest first.
-    pub fn waiting(&mut self) -> &[Frame] {
+    pub fn waiting_frames(&mut self) -> &[Frame] {
         self.frames.make_contiguous()
     }
 
     /// Removes the first `count` frames from the queue after they were sent.
-    pub fn sent(&mut self, count: usize) {
+    pub fn remove_sent(&mut self, count: usize) {
         let count = self.frames.drain(..count.min(self.frames.len())).count();
         self.account.sent += count as u64;
     }
 
     /// Drops the queued frames, because the program ends.
-    pub fn end(&mut self) {
+    pub fn drop_at_end(&mut self) {
         self.account.dropped.ended += self.clear();
     }
 
@@ -168,18 +168,18 @@ mod tests {
 
     #[test]
     fn frames_wait_in_order_and_the_rest_is_counted() {
-        let mut incoming = Incoming::new();
+        let mut incoming = LineToBusQueue::new();
         incoming.receive(b"t1230\r");
-        incoming.up(true, true);
+        incoming.bus_opened(true, true);
         incoming.receive(b"\rz\r\x07V1013\rt1240\rb1250\rt1239\rS8\rt12");
         incoming.receive(b"60\r");
-        assert_eq!(incoming.waiting().iter().map(Frame::id).collect::<Vec<_>>(), [0x124, 0x126]);
-        incoming.sent(1);
+        assert_eq!(incoming.waiting_frames().iter().map(Frame::id).collect::<Vec<_>>(), [0x124, 0x126]);
+        incoming.remove_sent(1);
         incoming.receive(b"t12");
         incoming.line_lost();
         incoming.receive(b"t1270\r");
-        assert_eq!(incoming.waiting().iter().map(Frame::id).collect::<Vec<_>>(), [0x126, 0x127]);
-        incoming.down();
+        assert_eq!(incoming.waiting_frames().iter().map(Frame::id).collect::<Vec<_>>(), [0x126, 0x127]);
+        incoming.bus_lost();
         let account = incoming.account();
         assert_eq!((account.received, account.sent, account.bells, account.other_lines), (5, 1, 1, 2));
         assert_eq!((account.dropped.bus_away, account.dropped.not_classic), (3, 1));
@@ -189,16 +189,16 @@ mod tests {
     #[test]
     fn faults_are_counted_and_go_to_a_virtual_bus_as_error_frames() {
         for (is_virtual, expected) in [(true, vec![0xA8, 0x40, 0x88, 0x204]), (false, vec![])] {
-            let mut incoming = Incoming::new();
-            incoming.up(true, is_virtual);
+            let mut incoming = LineToBusQueue::new();
+            incoming.bus_opened(true, is_virtual);
             incoming.receive(b"e1a\rsb256256\rsb256256\rF80\rF00\r");
-            incoming.opened();
+            incoming.adapter_opened();
             incoming.receive(b"sp128000\r");
-            let frames: Vec<_> = incoming.waiting().iter().map(Frame::id).collect();
+            let frames: Vec<_> = incoming.waiting_frames().iter().map(Frame::id).collect();
             assert_eq!(frames, expected);
-            assert!(incoming.waiting().iter().all(Frame::is_error));
+            assert!(incoming.waiting_frames().iter().all(Frame::is_error));
             let names = ["bus error", "bus off", "error passive", "no ACK"].map(|name| (name, 1));
-            assert_eq!(*incoming.faults(), Faults::from(names));
+            assert_eq!(*incoming.faults(), FaultCounts::from(names));
             let account = incoming.account();
             assert_eq!((account.received, account.other_lines), (expected.len() as u64, 2));
         }
@@ -206,7 +206,7 @@ mod tests {
 
     #[test]
     fn refusals_in_succession_are_counted_from_the_last_acceptance() {
-        let mut incoming = Incoming::new();
+        let mut incoming = LineToBusQueue::new();
         let mut after = |bytes: &[u8]| {
             incoming.receive(bytes);
             let Replies { accepted, refusals } = incoming.replies();
@@ -216,7 +216,7 @@ mod tests {
         assert_eq!(after(b"z\r\x07"), (true, 1));
         assert_eq!(after(b"\r"), (true, 0));
         assert_eq!(after(b"\x07t1230\r"), (true, 0));
-        incoming.opened();
+        incoming.adapter_opened();
         assert_eq!(incoming.replies(), Replies::default());
         assert_eq!(incoming.account().bells, 4);
     }
@@ -226,20 +226,20 @@ mod tests {
         fn every_frame_is_sent_or_dropped_for_a_reason(
             steps in proptest::collection::vec((0_u8..6, 0_usize..400), 0..60)
         ) {
-            let mut incoming = Incoming::new();
+            let mut incoming = LineToBusQueue::new();
             for (kind, amount) in steps {
                 match kind {
-                    0 => incoming.up(amount % 2 == 0, amount % 3 == 0),
-                    1 => incoming.down(),
-                    2 => incoming.sent(amount),
+                    0 => incoming.bus_opened(amount % 2 == 0, amount % 3 == 0),
+                    1 => incoming.bus_lost(),
+                    2 => incoming.remove_sent(amount),
                     _ => (0..amount).for_each(|_| incoming.receive(b"t1230\rb1230\re1a\rsp128000\r")),
                 }
-                let waiting = incoming.waiting().len();
+                let waiting = incoming.waiting_frames().len();
                 prop_assert!(waiting <= MAX_WAITING_FRAMES);
                 let account = incoming.account();
                 prop_assert_eq!(account.received, account.sent + account.dropped.total() + waiting as u64);
             }
-            incoming.end();
+            incoming.drop_at_end();
             let account = incoming.account();
             prop_assert_eq!(account.received, account.sent + account.dropped.total());
         }

@@ -12,25 +12,25 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, sockopt};
 use rustix::termios::{self, ControlModes, InputModes, OptionalActions, QueueSelector, SpecialCodeIndex};
 
-use super::options::{Address, LineOptions};
+use super::options::{LineAddress, LineOptions};
 
 /// The time within which a TCP connection must be established.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
 /// The send buffer of a socket in bytes. A larger buffer would delay frames and hide that the other side is too slow.
-const SEND_BUFFER: usize = 16 << 10;
+const SEND_BUFFER_BYTES: usize = 16 << 10;
 /// The time without data after which a TCP connection is probed, with three probes a second apart.
 const KEEPALIVE_IDLE: Duration = Duration::from_secs(5);
 
 /// A line that is open or is being opened.
 #[derive(Debug)]
-pub(super) struct Port {
+pub(super) struct LinePort {
     fd: OwnedFd,
     is_tty: bool,
     /// The time at which an attempt to connect is given up; `None` if the line is open.
     connecting: Option<Instant>,
 }
 
-impl AsFd for Port {
+impl AsFd for LinePort {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.fd.as_fd()
     }
@@ -48,8 +48,8 @@ pub(super) struct PortOpener {
 impl PortOpener {
     pub(super) fn new(options: LineOptions) -> io::Result<Self> {
         let hosts = match &options.address {
-            Address::Tcp { host, port } => (host.as_str(), *port).to_socket_addrs()?.collect(),
-            Address::Tty(_) | Address::Unix(_) => Vec::new(),
+            LineAddress::Tcp { host, port } => (host.as_str(), *port).to_socket_addrs()?.collect(),
+            LineAddress::Tty(_) | LineAddress::Unix(_) => Vec::new(),
         };
         Ok(Self { options, hosts, next: 0 })
     }
@@ -58,17 +58,17 @@ impl PortOpener {
         &self.options
     }
 
-    pub(super) fn open(&mut self) -> io::Result<Port> {
+    pub(super) fn open(&mut self) -> io::Result<LinePort> {
         match &self.options.address {
-            Address::Tty(path) => {
+            LineAddress::Tty(path) => {
                 let fd = open_tty(path, self.options.baud)?;
-                Ok(Port { fd, is_tty: true, connecting: None })
+                Ok(LinePort { fd, is_tty: true, connecting: None })
             }
-            Address::Unix(path) => {
+            LineAddress::Unix(path) => {
                 let address = SocketAddrUnix::new(path)?;
                 connect(AddressFamily::UNIX, |fd| rustix::net::connect(fd, &address))
             }
-            Address::Tcp { .. } => {
+            LineAddress::Tcp { .. } => {
                 let host = self.hosts.get(self.next % self.hosts.len().max(1));
                 let host = *host.ok_or_else(|| io::Error::other("its host has no address"))?;
                 self.next += 1;
@@ -85,14 +85,14 @@ impl PortOpener {
     }
 }
 
-impl Port {
+impl LinePort {
     /// Returns true if the connection is not established yet.
     pub(super) const fn is_connecting(&self) -> bool {
         self.connecting.is_some()
     }
 
     /// Checks a connection that was being established. Returns true once it is.
-    pub(super) fn connected(&mut self) -> io::Result<bool> {
+    pub(super) fn check_connected(&mut self) -> io::Result<bool> {
         let Some(until) = self.connecting else { return Ok(true) };
         let mut polled = [PollFd::new(&self.fd, PollFlags::OUT)];
         if poll(&mut polled, Some(&Timespec::default()))? == 0 {
@@ -144,16 +144,16 @@ impl Port {
 fn connect(
     family: AddressFamily,
     connect: impl FnOnce(&OwnedFd) -> rustix::io::Result<()>,
-) -> io::Result<Port> {
+) -> io::Result<LinePort> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let fd = rustix::net::socket_with(family, SocketType::STREAM, flags, None)?;
-    sockopt::set_socket_send_buffer_size(&fd, SEND_BUFFER)?;
+    sockopt::set_socket_send_buffer_size(&fd, SEND_BUFFER_BYTES)?;
     let connecting = match connect(&fd) {
         Ok(()) if family == AddressFamily::UNIX => None,
         Ok(()) | Err(Errno::INPROGRESS) => Some(Instant::now() + CONNECT_TIMEOUT),
         Err(errno) => return Err(errno.into()),
     };
-    Ok(Port { fd, is_tty: false, connecting })
+    Ok(LinePort { fd, is_tty: false, connecting })
 }
 
 /// Opens a terminal in raw mode for reading and writing, and locks it against other programs that use such locks.

@@ -14,7 +14,7 @@ use thiserror::Error;
 
 /// The address of a line.
 #[derive(Clone, Debug, Eq, Hash, PartialEq)]
-pub enum Address {
+pub enum LineAddress {
     /// A terminal: the device of an adapter, or a pseudoterminal.
     Tty(PathBuf),
     /// A Unix socket on which a program listens.
@@ -32,7 +32,7 @@ pub enum Address {
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct LineOptions {
     /// The address.
-    pub address: Address,
+    pub address: LineAddress,
     /// Filters for frames from the bus to the line. A frame passes if it matches any of them, or if there are none.
     pub filters: Vec<Filter>,
     /// The bit rates to set in the adapter; `None` leaves them as they are.
@@ -76,7 +76,7 @@ pub enum LineError {
 }
 
 /// The maximum value of [`LineOptions::settle`], in s.
-const MAX_SETTLE: f64 = 60.0;
+const MAX_SETTLE_S: f64 = 60.0;
 /// The time between two commands that open an adapter. Adapters process one command per USB packet, and answer within
 /// this time.
 const COMMAND_GAP: Duration = Duration::from_millis(10);
@@ -119,14 +119,14 @@ pub const ALLOWED_SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
 /// Parses a value of [`LineOptions::settle`], given in s.
 #[must_use]
 pub fn settle_time(word: &str) -> Option<Duration> {
-    let seconds = word.parse().ok().filter(|seconds| (0.0..=MAX_SETTLE).contains(seconds))?;
+    let seconds = word.parse().ok().filter(|seconds| (0.0..=MAX_SETTLE_S).contains(seconds))?;
     Duration::try_from_secs_f64(seconds).ok()
 }
 
 impl LineOptions {
     /// Returns the options of a line that gets all frames and whose speed and bit rates are left as they are.
     #[must_use]
-    pub const fn new(address: Address) -> Self {
+    pub const fn new(address: LineAddress) -> Self {
         Self {
             address,
             filters: Vec::new(),
@@ -152,9 +152,9 @@ impl LineOptions {
     /// # Errors
     /// Returns an error text if slcan has no command for one of the bit rates.
     pub fn set_bit_rates(&mut self, rates: BitRates) -> Result<(), String> {
-        let data = rates.data();
-        if SlcanCommand::nominal_bit_rate(rates.nominal()).is_none()
-            || (data != rates.nominal() && SlcanCommand::data_bit_rate(data).is_none())
+        let data = rates.data_rate();
+        if SlcanCommand::nominal_bit_rate(rates.nominal_rate()).is_none()
+            || (data != rates.nominal_rate() && SlcanCommand::data_bit_rate(data).is_none())
         {
             return Err(ALLOWED_RATES.to_owned());
         }
@@ -166,11 +166,12 @@ impl LineOptions {
     /// and open the adapter again. The data bit rate is set even if it equals the nominal one, because adapters have
     /// other defaults.
     #[must_use]
-    pub fn opening(&self) -> Vec<OpeningStep> {
+    pub fn opening_steps(&self) -> Vec<OpeningStep> {
         let rates = self.bit_rates;
-        let data = rates.filter(|_| !self.classic).map(BitRates::data).and_then(SlcanCommand::data_bit_rate);
+        let data =
+            rates.filter(|_| !self.classic).map(BitRates::data_rate).and_then(SlcanCommand::data_bit_rate);
         let line = |command: SlcanCommand| command.encode().as_bytes().to_vec();
-        let settings = [rates.and_then(|rates| SlcanCommand::nominal_bit_rate(rates.nominal())), data];
+        let settings = [rates.and_then(|rates| SlcanCommand::nominal_bit_rate(rates.nominal_rate())), data];
         let settings =
             settings.into_iter().flatten().map(|command| (line(command), COMMAND_GAP, OpeningStage::Setting));
         [
@@ -188,7 +189,7 @@ impl LineOptions {
     /// no benefit, and it fails on adapters without a command for the data bit rate.
     #[must_use]
     pub fn switches_bit_rate(&self) -> bool {
-        self.bit_rates.is_none_or(|rates| rates.data() != rates.nominal())
+        self.bit_rates.is_none_or(|rates| rates.data_rate() != rates.nominal_rate())
     }
 
     fn apply(&mut self, option: &str) -> Result<(), LineError> {
@@ -211,11 +212,11 @@ impl LineOptions {
                 CellId::all()
                     .filter(|cell| (first..=last).contains(cell))
                     .for_each(|cell| self.add_cell(cell));
-                if self.filters.len() > Filter::MAX {
+                if self.filters.len() > Filter::MAX_COUNT {
                     return Err(wrong(&format!(
                         "these need {} filters, and a bus has {} for a line: name fewer cells, or none",
                         self.filters.len(),
-                        Filter::MAX
+                        Filter::MAX_COUNT
                     )));
                 }
             }
@@ -275,7 +276,7 @@ impl FromStr for LineOptions {
     }
 }
 
-impl FromStr for Address {
+impl FromStr for LineAddress {
     type Err = LineError;
 
     fn from_str(text: &str) -> Result<Self, LineError> {
@@ -294,7 +295,7 @@ impl FromStr for Address {
     }
 }
 
-impl fmt::Display for Address {
+impl fmt::Display for LineAddress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Tty(path) => path.display().fmt(f),
@@ -359,7 +360,7 @@ mod tests {
     }
 
     fn opening(text: &str) -> Vec<u8> {
-        line(text).opening().into_iter().flat_map(|step| step.bytes).collect()
+        line(text).opening_steps().into_iter().flat_map(|step| step.bytes).collect()
     }
 
     #[test]
@@ -387,9 +388,10 @@ mod tests {
             let with = format!("/dev/x,rates={rates}");
             assert_eq!(opening(&with), expected.as_bytes(), "{rates}");
             let line = line(&with);
-            let is_stated = line.opening().iter().any(|step| step.bytes.starts_with(b"Y"));
+            let is_stated = line.opening_steps().iter().any(|step| step.bytes.starts_with(b"Y"));
             assert!(is_stated || !line.switches_bit_rate(), "{rates}");
-            let [nominal, data] = line.bit_rates.map(|rates| [rates.nominal(), rates.data()]).unwrap();
+            let [nominal, data] =
+                line.bit_rates.map(|rates| [rates.nominal_rate(), rates.data_rate()]).unwrap();
             assert_eq!(line.switches_bit_rate(), nominal != data, "{rates}");
         }
         assert!(line("/dev/x").switches_bit_rate(), "the adapter has its own rates, which somebody has set");

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
 use protocol::slcan::{CR, encode};
-use protocol::wire_time::{BitRates, Bits};
+use protocol::wire_time::{BitRates, FrameBits};
 
 use super::account::ToLineCounts;
 use super::options::{LineOptions, OpeningStage, OpeningStep};
@@ -14,18 +14,18 @@ use super::options::{LineOptions, OpeningStage, OpeningStep};
 /// The maximum number of queued frames: those that a line at 1 Mbaud carries in a tenth of a second.
 pub const MAX_WAITING_FRAMES: usize = 256;
 /// The time by which writing may be ahead of the computed pace. It corresponds to what an adapter buffers.
-pub const MAX_AHEAD: Duration = Duration::from_millis(2);
+pub const MAX_WRITE_AHEAD: Duration = Duration::from_millis(2);
 
 /// The rates from which the time for a frame is computed.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Pace {
+pub struct LinePace {
     /// The bit rates of the bus behind the adapter.
     pub bit_rates: Option<BitRates>,
     /// The speed of the serial line in bit/s. A byte takes ten bits.
     pub baud: Option<u32>,
 }
 
-impl Pace {
+impl LinePace {
     /// Returns the rates of a line and of the bus behind its adapter.
     #[must_use]
     pub const fn from_options(options: &LineOptions) -> Self {
@@ -33,8 +33,10 @@ impl Pace {
     }
 
     fn cost(self, frame: &Frame, bytes: usize) -> Duration {
-        let bus =
-            self.bit_rates.zip(Bits::from_frame(frame)).map_or(0, |(rates, bits)| bits.nanoseconds(rates));
+        let bus = self
+            .bit_rates
+            .zip(FrameBits::from_frame(frame))
+            .map_or(0, |(rates, bits)| bits.nanoseconds(rates));
         let wire = self.baud.map_or(0, |baud| bytes as u64 * 10_000_000_000 / u64::from(baud.max(1)));
         Duration::from_nanos(bus.max(wire))
     }
@@ -42,34 +44,34 @@ impl Pace {
 
 /// A frame or command as text that is queued or being written.
 #[derive(Debug)]
-struct Entry {
+struct QueuedText {
     bytes: usize,
     cost: Duration,
-    kind: EntryKind,
+    kind: QueuedTextKind,
 }
 
 /// The kind of text in an entry.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum EntryKind {
+enum QueuedTextKind {
     Frame,
     /// A command, which is not counted as a frame. The adapter is in this stage once the command is written.
     Command(OpeningStage),
 }
 
-impl Entry {
+impl QueuedText {
     fn is_frame(&self) -> bool {
-        self.kind == EntryKind::Frame
+        self.kind == QueuedTextKind::Frame
     }
 }
 
 /// The queue of frames from the bus to a line.
 #[derive(Debug, Default)]
-pub struct Outgoing {
+pub struct BusToLineQueue {
     classic: bool,
     one_rate: bool,
-    pace: Pace,
+    pace: LinePace,
     text: VecDeque<u8>,
-    entries: VecDeque<Entry>,
+    entries: VecDeque<QueuedText>,
     written: usize,
     /// The number of entries that may be written by now, and the number of their bytes that are not written yet.
     released: usize,
@@ -82,10 +84,10 @@ pub struct Outgoing {
     pub account: ToLineCounts,
 }
 
-impl Outgoing {
+impl BusToLineQueue {
     /// Creates an empty queue to a line that is not open yet. With `classic`, FD frames are dropped.
     #[must_use]
-    pub fn new(classic: bool, pace: Pace) -> Self {
+    pub fn new(classic: bool, pace: LinePace) -> Self {
         Self { classic, pace, ..Self::default() }
     }
 
@@ -93,12 +95,12 @@ impl Outgoing {
     #[must_use]
     pub fn from_options(options: &LineOptions) -> Self {
         let one_rate = !options.switches_bit_rate();
-        Self { one_rate, ..Self::new(options.classic, Pace::from_options(options)) }
+        Self { one_rate, ..Self::new(options.classic, LinePace::from_options(options)) }
     }
 
     /// Records that the line is open. The commands `opening` are written before any frame.
-    pub fn up(&mut self, opening: &[OpeningStep]) {
-        self.down();
+    pub fn line_opened(&mut self, opening: &[OpeningStep]) {
+        self.line_lost();
         self.is_up = true;
         opening.iter().for_each(|step| self.push_step(step));
     }
@@ -124,7 +126,7 @@ impl Outgoing {
     }
 
     /// Records that the adapter refused `lines` lines. As many sent frames are counted as refused instead of sent.
-    pub fn refused(&mut self, lines: u64) {
+    pub fn count_refused(&mut self, lines: u64) {
         let frames = lines.min(self.since_open);
         self.since_open -= frames;
         self.account.sent -= frames;
@@ -132,7 +134,7 @@ impl Outgoing {
     }
 
     /// Records that the line was lost, and drops the queued frames.
-    pub fn down(&mut self) {
+    pub fn line_lost(&mut self) {
         let waiting = self.clear();
         self.account.dropped.line_away += waiting;
         self.is_up = false;
@@ -143,7 +145,7 @@ impl Outgoing {
         self.account.received += 1;
         let dropped = &mut self.account.dropped;
         let one_rate = frame.flags() & BIT_RATE_SWITCH != 0 && self.one_rate;
-        let unswitched = one_rate.then(|| unswitched(frame)).flatten();
+        let unswitched = one_rate.then(|| without_rate_switch(frame)).flatten();
         let frame = unswitched.as_ref().unwrap_or(frame);
         let Some(text) = encode(frame) else {
             dropped.error_frame += 1;
@@ -156,7 +158,7 @@ impl Outgoing {
         } else if self.entries.len() >= MAX_WAITING_FRAMES {
             &mut dropped.queue_full
         } else {
-            self.push(text.as_bytes(), self.pace.cost(frame, text.as_bytes().len()), EntryKind::Frame);
+            self.push(text.as_bytes(), self.pace.cost(frame, text.as_bytes().len()), QueuedTextKind::Frame);
             return;
         };
         *reason += 1;
@@ -164,22 +166,23 @@ impl Outgoing {
 
     /// Returns the bytes that may be written now. If entries remain, also returns the time at which more may be
     /// written.
-    pub fn ready(&mut self, now: Duration) -> (&[u8], Option<Duration>) {
+    pub fn ready_bytes(&mut self, now: Duration) -> (&[u8], Option<Duration>) {
         while let Some(entry) = self.entries.get(self.released) {
-            if self.busy_until > now + MAX_AHEAD {
+            if self.busy_until > now + MAX_WRITE_AHEAD {
                 break;
             }
             self.busy_until = self.busy_until.max(now) + entry.cost;
             self.released += 1;
             self.released_bytes += entry.bytes;
         }
-        let again = (self.released < self.entries.len()).then(|| self.busy_until.saturating_sub(MAX_AHEAD));
+        let again =
+            (self.released < self.entries.len()).then(|| self.busy_until.saturating_sub(MAX_WRITE_AHEAD));
         let (text, _) = self.text.as_slices();
         (text.get(..self.released_bytes.min(text.len())).unwrap_or_default(), again)
     }
 
     /// Removes the first `bytes` bytes after they were written to the line.
-    pub fn wrote(&mut self, bytes: usize) {
+    pub fn remove_written(&mut self, bytes: usize) {
         let bytes = bytes.min(self.released_bytes);
         self.text.drain(..bytes);
         self.released_bytes -= bytes;
@@ -187,11 +190,11 @@ impl Outgoing {
         while let Some(entry) = self.entries.front().filter(|entry| entry.bytes <= self.written) {
             self.written -= entry.bytes;
             match entry.kind {
-                EntryKind::Frame => {
+                QueuedTextKind::Frame => {
                     self.account.sent += 1;
                     self.since_open += 1;
                 }
-                EntryKind::Command(stage) => {
+                QueuedTextKind::Command(stage) => {
                     if stage == OpeningStage::Open {
                         self.since_open = 0;
                     }
@@ -204,7 +207,7 @@ impl Outgoing {
     }
 
     /// Drops the queued frames, except one that is being written, and queues the bytes `closing`.
-    pub fn end(&mut self, closing: &[u8]) {
+    pub fn queue_closing(&mut self, closing: &[u8]) {
         let begun = usize::from(self.written > 0);
         let dropped = self.entries.iter().skip(begun).filter(|entry| entry.is_frame()).count();
         self.account.dropped.ended += dropped as u64;
@@ -215,12 +218,12 @@ impl Outgoing {
         self.released_bytes = rest;
         self.busy_until = Duration::ZERO;
         if self.is_up {
-            self.push(closing, Duration::ZERO, EntryKind::Command(OpeningStage::Closed));
+            self.push(closing, Duration::ZERO, QueuedTextKind::Command(OpeningStage::Closed));
         }
     }
 
     /// Drops the frame that is being written, because the line is closed before its end.
-    pub fn give_up(&mut self) {
+    pub fn drop_unfinished(&mut self) {
         self.account.dropped.ended += self.clear();
         self.is_up = false;
     }
@@ -233,12 +236,12 @@ impl Outgoing {
 
     fn push_step(&mut self, step: &OpeningStep) {
         // Writing ahead of the computed pace must not shorten the gap between commands, so the gap is extended.
-        self.push(&step.bytes, step.gap + MAX_AHEAD, EntryKind::Command(step.stage));
+        self.push(&step.bytes, step.gap + MAX_WRITE_AHEAD, QueuedTextKind::Command(step.stage));
     }
 
-    fn push(&mut self, text: &[u8], cost: Duration, kind: EntryKind) {
+    fn push(&mut self, text: &[u8], cost: Duration, kind: QueuedTextKind) {
         self.text.extend(text);
-        self.entries.push_back(Entry { bytes: text.len(), cost, kind });
+        self.entries.push_back(QueuedText { bytes: text.len(), cost, kind });
     }
 
     /// Empties the queue. Returns the number of frames that were in it.
@@ -251,14 +254,14 @@ impl Outgoing {
 }
 
 /// Returns a copy of an FD frame without the flag that switches to the data bit rate.
-fn unswitched(frame: &Frame) -> Option<Frame> {
+fn without_rate_switch(frame: &Frame) -> Option<Frame> {
     let flags = frame.flags() & !BIT_RATE_SWITCH;
     Frame::with_data(frame.raw_id(), frame.format(), flags, frame.data()).ok()
 }
 
 /// Returns the command that closes an adapter.
 #[must_use]
-pub fn closing() -> Vec<u8> {
+pub fn closing_command() -> Vec<u8> {
     let close = protocol::slcan::SlcanCommand::Close.encode();
     debug_assert!(close.as_bytes().ends_with(&[CR]));
     close.as_bytes().to_vec()
@@ -282,24 +285,24 @@ mod tests {
     }
 
     /// Writes as much as may be written at the time `now`. Returns the written bytes.
-    fn drain(outgoing: &mut Outgoing, now: Duration) -> Vec<u8> {
+    fn drain(outgoing: &mut BusToLineQueue, now: Duration) -> Vec<u8> {
         let mut all = Vec::new();
         loop {
-            let (bytes, _) = outgoing.ready(now);
+            let (bytes, _) = outgoing.ready_bytes(now);
             if bytes.is_empty() {
                 return all;
             }
             let count = bytes.len();
             all.extend_from_slice(bytes);
-            outgoing.wrote(count);
+            outgoing.remove_written(count);
         }
     }
 
     #[test]
     fn frames_follow_the_opening_in_order() {
-        let mut outgoing = Outgoing::new(false, Pace::default());
+        let mut outgoing = BusToLineQueue::new(false, LinePace::default());
         outgoing.push_frame(&frame(0));
-        outgoing.up(&opening(b"\rC\rO\r"));
+        outgoing.line_opened(&opening(b"\rC\rO\r"));
         outgoing.push_frame(&frame(1));
         outgoing.push_frame(&Frame::fd(1, 1, &[2]).unwrap());
         outgoing.push_frame(&Frame::classic(ERROR | 4, &[0; 8]).unwrap());
@@ -312,8 +315,8 @@ mod tests {
     #[test]
     fn the_commands_of_an_opening_leave_one_by_one() {
         let options: LineOptions = "/dev/x,rates=1M/5M".parse().unwrap();
-        let mut outgoing = Outgoing::from_options(&options);
-        outgoing.up(&options.opening());
+        let mut outgoing = BusToLineQueue::from_options(&options);
+        outgoing.line_opened(&options.opening_steps());
         outgoing.push_frame(&frame(1));
         let (mut now, mut written) = (NOW, Vec::new());
         loop {
@@ -321,7 +324,7 @@ mod tests {
             if !text.is_empty() {
                 written.push((text, now - NOW, outgoing.stage()));
             }
-            let Some(again) = outgoing.ready(now).1 else { break };
+            let Some(again) = outgoing.ready_bytes(now).1 else { break };
             now = again;
         }
         let millis = |at: u64| Duration::from_millis(at);
@@ -346,9 +349,9 @@ mod tests {
             (",rates=1M/1M", "d123102\rd123102\rt123103\r"),
             (",rates=250k", "d123102\rd123102\rt123103\r"),
         ] {
-            let mut outgoing = Outgoing::from_options(&format!("/dev/x{rates}").parse().unwrap());
+            let mut outgoing = BusToLineQueue::from_options(&format!("/dev/x{rates}").parse().unwrap());
             for _ in 0..2 {
-                outgoing.up(&[]);
+                outgoing.line_opened(&[]);
                 frames.iter().for_each(|frame| outgoing.push_frame(frame));
                 assert_eq!(drain(&mut outgoing, NOW), expected.as_bytes(), "{rates}");
             }
@@ -357,30 +360,30 @@ mod tests {
 
     #[test]
     fn a_frame_that_the_adapter_refused_was_not_sent() {
-        let mut outgoing = Outgoing::new(false, Pace::default());
-        outgoing.up(&opening(b"O\r"));
+        let mut outgoing = BusToLineQueue::new(false, LinePace::default());
+        outgoing.line_opened(&opening(b"O\r"));
         (0..5).for_each(|number| outgoing.push_frame(&frame(number)));
         drain(&mut outgoing, NOW);
-        outgoing.refused(2);
+        outgoing.count_refused(2);
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.refused), (3, 2));
         // A frame that is being written is completed before the adapter is opened again. The queued frames follow.
         (5..7).for_each(|number| outgoing.push_frame(&frame(number)));
-        outgoing.ready(NOW);
-        outgoing.wrote(3);
+        outgoing.ready_bytes(NOW);
+        outgoing.remove_written(3);
         outgoing.reopen(&opening(b"C\rO\r"));
         assert_eq!(outgoing.stage(), OpeningStage::Away);
-        assert_eq!(drain(&mut outgoing, NOW + MAX_AHEAD), b"3105\rC\rO\rt123106\r");
+        assert_eq!(drain(&mut outgoing, NOW + MAX_WRITE_AHEAD), b"3105\rC\rO\rt123106\r");
         assert_eq!(outgoing.stage(), OpeningStage::Open);
         // If more lines are refused than frames were sent since the opening, the others were commands.
-        outgoing.refused(9);
+        outgoing.count_refused(9);
         let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
         assert_eq!((received, sent, dropped.refused, dropped.total()), (7, 4, 3, 3));
     }
 
     #[test]
     fn a_classic_line_gets_no_fd_frames() {
-        let mut outgoing = Outgoing::new(true, Pace::default());
-        outgoing.up(&[]);
+        let mut outgoing = BusToLineQueue::new(true, LinePace::default());
+        outgoing.line_opened(&[]);
         outgoing.push_frame(&Frame::fd(1, 1, &[2]).unwrap());
         outgoing.push_frame(&frame(1));
         assert_eq!(drain(&mut outgoing, NOW), b"t123101\r");
@@ -389,55 +392,55 @@ mod tests {
 
     #[test]
     fn what_is_cut_off_is_not_sent_and_what_comes_back_begins_afresh() {
-        let mut outgoing = Outgoing::new(false, Pace::default());
-        outgoing.up(&opening(b"O\r"));
+        let mut outgoing = BusToLineQueue::new(false, LinePace::default());
+        outgoing.line_opened(&opening(b"O\r"));
         for number in 0..3 {
             outgoing.push_frame(&frame(number));
         }
-        outgoing.ready(NOW);
-        outgoing.wrote(2 + 8 + 3);
+        outgoing.ready_bytes(NOW);
+        outgoing.remove_written(2 + 8 + 3);
         assert_eq!(outgoing.account.sent, 1);
-        outgoing.down();
+        outgoing.line_lost();
         assert_eq!(outgoing.account.dropped.line_away, 2);
-        outgoing.up(&opening(b"\rO\r"));
+        outgoing.line_opened(&opening(b"\rO\r"));
         outgoing.push_frame(&frame(9));
         assert_eq!(drain(&mut outgoing, NOW), b"\rO\rt123109\r");
     }
 
     #[test]
     fn the_end_finishes_the_line_that_was_begun_and_closes() {
-        let mut outgoing = Outgoing::new(false, Pace::default());
-        outgoing.up(&[]);
+        let mut outgoing = BusToLineQueue::new(false, LinePace::default());
+        outgoing.line_opened(&[]);
         outgoing.push_frame(&frame(1));
         outgoing.push_frame(&frame(2));
-        outgoing.ready(NOW);
-        outgoing.wrote(3);
-        outgoing.end(&closing());
+        outgoing.ready_bytes(NOW);
+        outgoing.remove_written(3);
+        outgoing.queue_closing(&closing_command());
         assert_eq!(drain(&mut outgoing, NOW), b"3101\rC\r");
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.ended), (1, 1));
         // A frame of which only a part was written is not counted as sent.
-        let mut stuck = Outgoing::new(false, Pace::default());
-        stuck.up(&[]);
+        let mut stuck = BusToLineQueue::new(false, LinePace::default());
+        stuck.line_opened(&[]);
         stuck.push_frame(&frame(1));
-        stuck.ready(NOW);
-        stuck.wrote(3);
-        stuck.end(&closing());
-        stuck.give_up();
+        stuck.ready_bytes(NOW);
+        stuck.remove_written(3);
+        stuck.queue_closing(&closing_command());
+        stuck.drop_unfinished();
         assert_eq!((stuck.account.sent, stuck.account.dropped.ended, stuck.is_empty()), (0, 1, true));
         // A line that is not open gets no command to close its adapter.
-        let mut away = Outgoing::new(false, Pace::default());
-        away.end(&closing());
+        let mut away = BusToLineQueue::new(false, LinePace::default());
+        away.queue_closing(&closing_command());
         assert!(away.is_empty());
     }
 
     #[test]
     fn a_bus_at_125k_gets_no_more_than_it_carries() {
-        let pace = Pace { bit_rates: Some("125k".parse().unwrap()), baud: None };
-        let mut outgoing = Outgoing::new(true, pace);
-        outgoing.up(&[]);
+        let pace = LinePace { bit_rates: Some("125k".parse().unwrap()), baud: None };
+        let mut outgoing = BusToLineQueue::new(true, pace);
+        outgoing.line_opened(&[]);
         // The frame has 34 + 8 + 13 bits, and stuff bits in addition.
         let cost = Duration::from_nanos(
-            Bits::from_frame(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()),
+            FrameBits::from_frame(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()),
         );
         let (mut now, mut sent) = (NOW, 0);
         while now < NOW + Duration::from_secs(1) {
@@ -446,20 +449,20 @@ mod tests {
             now += Duration::from_micros(100);
         }
         let carried =
-            usize::try_from((Duration::from_secs(1) + MAX_AHEAD).as_nanos() / cost.as_nanos()).unwrap();
+            usize::try_from((Duration::from_secs(1) + MAX_WRITE_AHEAD).as_nanos() / cost.as_nanos()).unwrap();
         assert!((carried..=carried + 1).contains(&sent), "{sent} of {carried}");
         let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
         assert_eq!(received, sent + dropped.queue_full + outgoing.entries.len() as u64);
         assert!(dropped.queue_full > 5_000);
-        let (_, again) = outgoing.ready(now);
+        let (_, again) = outgoing.ready_bytes(now);
         assert!(again.unwrap() <= now + cost, "it says when to come again");
     }
 
     #[test]
     fn a_wire_at_9600_baud_is_the_slower_one() {
-        let pace = Pace { bit_rates: Some("1M".parse().unwrap()), baud: Some(9_600) };
+        let pace = LinePace { bit_rates: Some("1M".parse().unwrap()), baud: Some(9_600) };
         assert_eq!(pace.cost(&frame(1), 8), Duration::from_nanos(8_333_333));
-        assert_eq!(Pace { baud: None, ..pace }.cost(&frame(1), 8), Duration::from_nanos(58_000));
+        assert_eq!(LinePace { baud: None, ..pace }.cost(&frame(1), 8), Duration::from_nanos(58_000));
     }
 
     proptest! {
@@ -467,17 +470,17 @@ mod tests {
         fn every_frame_is_sent_or_dropped_for_a_reason(
             steps in proptest::collection::vec((0_u8..10, 0_usize..100), 0..100), slow: bool
         ) {
-            let pace = Pace { bit_rates: slow.then(|| "10k".parse().unwrap()), baud: None };
-            let mut outgoing = Outgoing::new(false, pace);
+            let pace = LinePace { bit_rates: slow.then(|| "10k".parse().unwrap()), baud: None };
+            let mut outgoing = BusToLineQueue::new(false, pace);
             let mut now = NOW;
             for (kind, amount) in steps {
                 match kind {
-                    0 => outgoing.up(&opening(b"\rC\rO\r")),
-                    1 => outgoing.down(),
+                    0 => outgoing.line_opened(&opening(b"\rC\rO\r")),
+                    1 => outgoing.line_lost(),
                     2 => now += Duration::from_millis(amount as u64),
                     3 | 4 => {
-                        let bytes = outgoing.ready(now).0.len().min(amount);
-                        outgoing.wrote(bytes);
+                        let bytes = outgoing.ready_bytes(now).0.len().min(amount);
+                        outgoing.remove_written(bytes);
                     }
                     _ => (0..amount).for_each(|_| outgoing.push_frame(&frame(1))),
                 }
@@ -488,7 +491,7 @@ mod tests {
                 prop_assert_eq!(text, outgoing.text.len() + outgoing.written);
                 prop_assert!(waiting <= MAX_WAITING_FRAMES as u64);
             }
-            outgoing.end(b"C\r");
+            outgoing.queue_closing(b"C\r");
             let rest = drain(&mut outgoing, now);
             prop_assert!(rest.is_empty() || rest.ends_with(b"C\r"));
             let ToLineCounts { received, sent, dropped, .. } = outgoing.account;

@@ -6,13 +6,13 @@ use std::time::{Duration, Instant};
 use protocol::bus::{Bus, BusError, Inbox};
 use rustix::event::PollFlags;
 
-use super::account::{Faults, LineAccount, faults_since};
+use super::account::{FaultCounts, LineAccount, faults_since};
 use super::event::LineEvent;
-use super::incoming::Incoming;
-use super::link::{Port, PortOpener};
+use super::incoming::LineToBusQueue;
+use super::link::{LinePort, PortOpener};
 use super::options::{LineOptions, OpeningStage};
-use super::outgoing::{Outgoing, closing};
-use super::refusals::{RefusalAction, Refusals};
+use super::outgoing::{BusToLineQueue, closing_command};
+use super::refusals::{RefusalAction, RefusalHistory};
 use super::settings::{BridgeSettings, open};
 
 /// The interval between two attempts to open an unavailable line or bus.
@@ -26,14 +26,14 @@ const MAX_BATCHES: usize = 4;
 
 /// Flags for the ends of a participant from which data can be read.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Ready {
+pub(super) struct ReadyEnds {
     pub(super) line: bool,
     pub(super) bus: bool,
 }
 
 /// The events to poll for at an open line. The client of the bus is only polled for readability.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Interest {
+pub(super) struct PollInterest {
     pub(super) line: Option<PollFlags>,
 }
 
@@ -41,7 +41,7 @@ pub(super) struct Interest {
 #[derive(Debug)]
 enum LineState {
     Away(Instant),
-    Open(Port),
+    Open(LinePort),
 }
 
 /// The connection to the bus.
@@ -58,15 +58,15 @@ pub(super) struct Participant {
     line: LineState,
     client: ClientState,
     inbox: Inbox,
-    outgoing: Outgoing,
-    incoming: Incoming,
+    outgoing: BusToLineQueue,
+    incoming: LineToBusQueue,
     opened: u64,
     lost: u64,
     dropped_before: u64,
     reported: (u64, u64),
-    reported_faults: Faults,
+    reported_faults: FaultCounts,
     report_at: Instant,
-    refusals: Refusals,
+    refusals: RefusalHistory,
     /// The time at which the adapter is set up; `None` if that need not wait for a board to start.
     settled_at: Option<Instant>,
     /// The reason that was last reported why the line is not open.
@@ -76,9 +76,9 @@ pub(super) struct Participant {
 
 impl Participant {
     pub(super) fn new(options: LineOptions, bus: Bus) -> io::Result<Self> {
-        let outgoing = Outgoing::from_options(&options);
-        let mut incoming = Incoming::new();
-        incoming.up(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
+        let outgoing = BusToLineQueue::from_options(&options);
+        let mut incoming = LineToBusQueue::new();
+        incoming.bus_opened(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
         let now = Instant::now();
         Ok(Self {
             opener: PortOpener::new(options)?,
@@ -91,9 +91,9 @@ impl Participant {
             lost: 0,
             dropped_before: 0,
             reported: (0, 0),
-            reported_faults: Faults::new(),
+            reported_faults: FaultCounts::new(),
             report_at: now,
-            refusals: Refusals::new(),
+            refusals: RefusalHistory::new(),
             settled_at: None,
             reason: None,
             began: now,
@@ -116,7 +116,7 @@ impl Participant {
             line: self.name(),
             opened: self.opened,
             lost: self.lost,
-            reopened: self.refusals.reopened(),
+            reopened: self.refusals.reopen_count(),
             to_line,
             to_bus,
             faults: self.incoming.faults().clone(),
@@ -124,19 +124,19 @@ impl Participant {
     }
 
     /// Returns the events to poll for at the line.
-    pub(super) fn interest(&mut self) -> Interest {
+    pub(super) fn interest(&mut self) -> PollInterest {
         let now = self.began.elapsed();
         let line = match &self.line {
             LineState::Away(_) => None,
             LineState::Open(port) if port.is_connecting() => Some(PollFlags::OUT),
-            LineState::Open(_) if self.outgoing.ready(now).0.is_empty() => Some(PollFlags::IN),
+            LineState::Open(_) if self.outgoing.ready_bytes(now).0.is_empty() => Some(PollFlags::IN),
             LineState::Open(_) => Some(PollFlags::IN | PollFlags::OUT),
         };
-        Interest { line }
+        PollInterest { line }
     }
 
     /// Returns the line and the client to be polled, as far as they are open.
-    pub(super) const fn ends(&self) -> (Option<&Port>, Option<&Bus>) {
+    pub(super) const fn poll_ends(&self) -> (Option<&LinePort>, Option<&Bus>) {
         let port = match &self.line {
             LineState::Open(port) => Some(port),
             LineState::Away(_) => None,
@@ -153,11 +153,13 @@ impl Participant {
         let line = match &self.line {
             LineState::Away(at) => Some(*at),
             LineState::Open(port) if port.is_connecting() => Some(now + REOPEN_INTERVAL),
-            LineState::Open(_) => self.outgoing.ready(elapsed).1.map(|at| self.began + at),
+            LineState::Open(_) => self.outgoing.ready_bytes(elapsed).1.map(|at| self.began + at),
         };
         let client = match &self.client {
             ClientState::Away(at) => Some(*at),
-            ClientState::Open(_) if !self.incoming.waiting().is_empty() => Some(now + SEND_RETRY_INTERVAL),
+            ClientState::Open(_) if !self.incoming.waiting_frames().is_empty() => {
+                Some(now + SEND_RETRY_INTERVAL)
+            }
             ClientState::Open(_) => None,
         };
         let report = self.has_more_to_report().then_some(self.report_at);
@@ -165,16 +167,16 @@ impl Participant {
     }
 
     /// Forwards all data that is available at either end.
-    pub(super) fn work(
+    pub(super) fn forward_available(
         &mut self,
         settings: &BridgeSettings,
-        ready: Ready,
+        ready: ReadyEnds,
         report: &mut impl FnMut(LineEvent),
     ) {
         let now = Instant::now();
         self.open_line(now, report);
         if self.settled_at.is_some_and(|at| at <= now) {
-            self.set_adapter();
+            self.queue_opening();
         }
         if matches!(self.client, ClientState::Away(at) if at <= now) {
             self.open_client(settings, now, report);
@@ -195,7 +197,7 @@ impl Participant {
     }
 
     fn has_more_to_report(&self) -> bool {
-        self.losses() != self.reported || *self.incoming.faults() != self.reported_faults
+        self.lost_frame_counts() != self.reported || *self.incoming.faults() != self.reported_faults
     }
 
     /// Returns true if the adapter has reported a kind of fault for the first time. Such a fault is reported at once.
@@ -210,7 +212,7 @@ impl Participant {
             self.reported_faults = self.incoming.faults().clone();
             report(LineEvent::Reported(faults));
         }
-        let losses = self.losses();
+        let losses = self.lost_frame_counts();
         if losses != self.reported {
             let (to_line, to_bus) = (losses.0 - self.reported.0, losses.1 - self.reported.1);
             report(LineEvent::Lost { to_line, to_bus, account: Box::new(self.account()) });
@@ -222,10 +224,10 @@ impl Participant {
     pub(super) fn open_line(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         let opened = match &mut self.line {
             LineState::Away(at) if *at <= now => self.opener.open(),
-            LineState::Open(port) if port.is_connecting() => match port.connected() {
+            LineState::Open(port) if port.is_connecting() => match port.check_connected() {
                 Ok(false) => return,
                 Ok(true) => {
-                    self.line_is_up(now, report);
+                    self.line_opened(now, report);
                     return;
                 }
                 Err(error) => Err(error),
@@ -237,7 +239,7 @@ impl Participant {
                 let up = !port.is_connecting();
                 self.line = LineState::Open(port);
                 if up {
-                    self.line_is_up(now, report);
+                    self.line_opened(now, report);
                 }
             }
             Err(error) => {
@@ -257,12 +259,12 @@ impl Participant {
         self.reason.take()
     }
 
-    fn line_is_up(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
+    fn line_opened(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         self.opened += 1;
         self.reason = None;
         let settle = self.opener.options().settle;
         if settle.is_zero() {
-            self.set_adapter();
+            self.queue_opening();
         } else {
             self.settled_at = Some(now + settle);
         }
@@ -270,9 +272,9 @@ impl Participant {
     }
 
     /// Queues the commands that open the adapter. Frames follow them.
-    fn set_adapter(&mut self) {
+    fn queue_opening(&mut self) {
         self.settled_at = None;
-        self.outgoing.up(&self.opener.options().opening());
+        self.outgoing.line_opened(&self.opener.options().opening_steps());
     }
 
     /// Handles lines that the adapter refused.
@@ -280,23 +282,23 @@ impl Participant {
         let (bells, replies) = (self.incoming.account().bells, self.incoming.replies());
         match self.refusals.evaluate(now - self.began, self.outgoing.stage(), bells, replies) {
             RefusalAction::Nothing => {}
-            RefusalAction::Count(lines) => self.outgoing.refused(lines),
+            RefusalAction::Count(lines) => self.outgoing.count_refused(lines),
             RefusalAction::ReportSettings => {
-                let opening = self.opener.options().opening();
+                let opening = self.opener.options().opening_steps();
                 let settings = opening.iter().filter(|step| step.stage == OpeningStage::Setting);
                 let names = settings.map(|step| String::from_utf8_lossy(&step.bytes).trim_end().to_owned());
                 report(LineEvent::SettingRefused(names.collect::<Vec<_>>().join(", ")));
             }
             RefusalAction::Reopen(lines) => {
-                self.outgoing.refused(lines);
-                self.outgoing.reopen(&self.opener.options().opening());
+                self.outgoing.count_refused(lines);
+                self.outgoing.reopen(&self.opener.options().opening_steps());
                 report(LineEvent::Reopened);
             }
         }
     }
 
     fn line_lost(&mut self, error: io::Error, now: Instant, report: &mut impl FnMut(LineEvent)) {
-        self.outgoing.down();
+        self.outgoing.line_lost();
         self.incoming.line_lost();
         self.settled_at = None;
         self.line = LineState::Away(now + REOPEN_INTERVAL);
@@ -335,7 +337,7 @@ impl Participant {
         }
         loop {
             let LineState::Open(port) = &self.line else { return };
-            let (bytes, _) = self.outgoing.ready(now - self.began);
+            let (bytes, _) = self.outgoing.ready_bytes(now - self.began);
             if bytes.is_empty() {
                 return;
             }
@@ -343,9 +345,9 @@ impl Participant {
                 Ok(0) => return,
                 Ok(count) => {
                     let before = self.outgoing.stage();
-                    self.outgoing.wrote(count);
+                    self.outgoing.remove_written(count);
                     if before != OpeningStage::Open && self.outgoing.stage() == OpeningStage::Open {
-                        self.incoming.opened();
+                        self.incoming.adapter_opened();
                     }
                 }
                 Err(error) => return self.line_lost(error, now, report),
@@ -371,17 +373,17 @@ impl Participant {
 
     fn write_bus(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         let ClientState::Open(bus) = &self.client else { return };
-        let waiting = self.incoming.waiting();
+        let waiting = self.incoming.waiting_frames();
         if waiting.is_empty() {
             return;
         }
         match bus.send(waiting) {
             Ok(()) => {
                 let count = waiting.len();
-                self.incoming.sent(count);
+                self.incoming.remove_sent(count);
             }
             Err(error) => {
-                self.incoming.sent(error.sent);
+                self.incoming.remove_sent(error.sent);
                 if !matches!(error.cause, BusError::Full { .. }) {
                     self.bus_failed(&error.cause, now, report);
                 }
@@ -391,7 +393,7 @@ impl Participant {
 
     /// Handles an interface that went down or a bus that ended. The frames queued for it are lost.
     fn bus_failed(&mut self, error: &BusError, now: Instant, report: &mut impl FnMut(LineEvent)) {
-        self.incoming.down();
+        self.incoming.bus_lost();
         self.dropped_before += u64::from(self.inbox.dropped());
         self.inbox = Inbox::new();
         self.client = ClientState::Away(now + REOPEN_INTERVAL);
@@ -401,7 +403,7 @@ impl Participant {
     fn open_client(&mut self, settings: &BridgeSettings, now: Instant, report: &mut impl FnMut(LineEvent)) {
         match open(settings, self.opener.options()) {
             Ok(bus) => {
-                self.incoming.up(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
+                self.incoming.bus_opened(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
                 self.client = ClientState::Open(Box::new(bus));
                 report(LineEvent::BusUp);
             }
@@ -409,7 +411,7 @@ impl Participant {
         }
     }
 
-    fn losses(&self) -> (u64, u64) {
+    fn lost_frame_counts(&self) -> (u64, u64) {
         let to_line = &self.outgoing.account;
         let to_bus = self.incoming.account();
         let by_bus = self.dropped_before + u64::from(self.inbox.dropped());
@@ -417,31 +419,31 @@ impl Participant {
     }
 
     /// Reads the remaining input, and queues the command that closes the adapter. The bus is not read any more.
-    pub(super) fn end(&mut self) {
+    pub(super) fn start_closing(&mut self) {
         let now = Instant::now();
         self.read_line(now, &mut |_| {});
         self.write_bus(now, &mut |_| {});
         self.read_bus(now, &mut |_| {});
         self.client = ClientState::Away(Instant::now());
-        self.incoming.end();
-        self.outgoing.end(&closing());
+        self.incoming.drop_at_end();
+        self.outgoing.queue_closing(&closing_command());
     }
 
     /// Writes the remaining output. Returns true when everything is written.
-    pub(super) fn finish(&mut self) -> bool {
+    pub(super) fn write_remaining(&mut self) -> bool {
         self.write_line(Instant::now(), &mut |_| {});
         !self.is_up() || self.outgoing.is_empty()
     }
 
     /// Gives up the remaining output at the end of the time for it. Returns true if the adapter was closed.
-    pub(super) fn give_up(&mut self) -> bool {
-        let closed = self.finish();
+    pub(super) fn give_up_closing(&mut self) -> bool {
+        let closed = self.write_remaining();
         if let LineState::Open(port) = &self.line
             && !closed
         {
             port.discard();
         }
-        self.outgoing.give_up();
+        self.outgoing.drop_unfinished();
         closed
     }
 }

@@ -6,7 +6,7 @@ use super::incoming::Replies;
 use super::options::OpeningStage;
 
 /// The minimum time between two reopenings of an adapter. Each takes the adapter off its bus for a moment.
-const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const MIN_PAUSE: Duration = Duration::from_secs(1);
 /// The maximum time between two reopenings if they have no effect.
 const MAX_PAUSE: Duration = Duration::from_secs(30);
 /// The number of consecutive refusals after which an adapter that accepted lines before is reopened. Fewer are ignored,
@@ -28,23 +28,23 @@ pub enum RefusalAction {
 
 /// The history of an adapter's refusals. It is updated with counts and times, and does no input or output.
 #[derive(Debug)]
-pub struct Refusals {
+pub struct RefusalHistory {
     seen: u64,
     next: Duration,
     pause: Duration,
     reopened: u64,
 }
 
-impl Refusals {
+impl RefusalHistory {
     /// Creates an empty history.
     #[must_use]
     pub const fn new() -> Self {
-        Self { seen: 0, next: Duration::ZERO, pause: FIRST_PAUSE, reopened: 0 }
+        Self { seen: 0, next: Duration::ZERO, pause: MIN_PAUSE, reopened: 0 }
     }
 
     /// Returns the number of times that the adapter was reopened.
     #[must_use]
-    pub const fn reopened(&self) -> u64 {
+    pub const fn reopen_count(&self) -> u64 {
         self.reopened
     }
 
@@ -59,7 +59,7 @@ impl Refusals {
     ) -> RefusalAction {
         let more = bells - std::mem::replace(&mut self.seen, bells);
         if replies.accepted && replies.refusals == 0 {
-            self.pause = FIRST_PAUSE;
+            self.pause = MIN_PAUSE;
         }
         match stage {
             _ if more == 0 => RefusalAction::Nothing,
@@ -82,7 +82,7 @@ impl Refusals {
     }
 }
 
-impl Default for Refusals {
+impl Default for RefusalHistory {
     fn default() -> Self {
         Self::new()
     }
@@ -98,7 +98,7 @@ mod tests {
 
     #[test]
     fn a_closed_adapter_is_opened_at_its_first_refusal_and_then_ever_less_often() {
-        let mut refusals = Refusals::new();
+        let mut refusals = RefusalHistory::new();
         let replies = |refusals| Replies { accepted: false, refusals };
         let mut times = Vec::new();
         for number in 1..=100_000 {
@@ -109,7 +109,7 @@ mod tests {
             }
         }
         assert_eq!(times, [1, 1_001, 3_001, 7_001, 15_001, 31_001, 61_001, 91_001]);
-        assert_eq!(refusals.reopened(), 8);
+        assert_eq!(refusals.reopen_count(), 8);
         // Once the adapter has accepted a line, earlier refusals no longer count.
         refusals.evaluate(at(200_000), OpeningStage::Open, 100_000, Replies { accepted: true, refusals: 0 });
         for (now, expected) in [(200_001, true), (200_900, false), (201_001, true)] {
@@ -120,7 +120,7 @@ mod tests {
 
     #[test]
     fn an_adapter_that_accepts_lines_is_not_opened_for_a_few_refusals() {
-        let mut refusals = Refusals::new();
+        let mut refusals = RefusalHistory::new();
         for refused in 1..=REFUSAL_THRESHOLD {
             let replies = Replies { accepted: true, refusals: refused };
             let expected =
@@ -136,7 +136,7 @@ mod tests {
 
     #[test]
     fn refusals_while_it_is_opened_are_no_reason_to_open_it() {
-        let mut refusals = Refusals::new();
+        let mut refusals = RefusalHistory::new();
         let replies = Replies { accepted: false, refusals: 1 };
         assert_eq!(refusals.evaluate(at(1), OpeningStage::Away, 1, replies), RefusalAction::Count(1));
         assert_eq!(refusals.evaluate(at(2), OpeningStage::Closed, 2, replies), RefusalAction::Count(1));
@@ -145,6 +145,6 @@ mod tests {
             RefusalAction::ReportSettings
         );
         assert_eq!(refusals.evaluate(at(4), OpeningStage::Setting, 3, replies), RefusalAction::Nothing);
-        assert_eq!(refusals.reopened(), 0);
+        assert_eq!(refusals.reopen_count(), 0);
     }
 }

@@ -2,7 +2,7 @@
 
 use cell_node::node::Node;
 use protocol::can::Frame;
-use protocol::factory::Factory;
+use protocol::factory::FactoryRecord;
 use protocol::time::{Micros, Span};
 
 use crate::store::Flash;
@@ -13,10 +13,10 @@ pub trait Board {
     type Flash: Flash;
 
     /// Returns the factory record; `None` if it is blank. The firmware calls this once, at the start.
-    fn factory(&mut self) -> Option<Factory>;
+    fn factory(&mut self) -> Option<FactoryRecord>;
 
     /// Opens the bus. No frames are received before.
-    fn open(&mut self, factory: &Factory);
+    fn open(&mut self, factory: &FactoryRecord);
 
     /// Returns the time since the start, which never decreases. The firmware calls this at least once a second.
     fn now(&mut self) -> Micros;
@@ -30,7 +30,7 @@ pub trait Board {
 
     /// Sets the receive filters to the identifiers that the cell receives in its present state. A board may pass other
     /// frames too, because the node ignores them.
-    fn filter(&mut self, node: &Node, factory: &Factory) {
+    fn filter(&mut self, node: &Node, factory: &FactoryRecord) {
         let _ = (node, factory);
     }
 

@@ -15,7 +15,7 @@ mod start {
     use cell_node::node::Node;
     use cortex_m::peripheral::SCB;
     use cortex_m_rt::{ExceptionFrame, entry, exception};
-    use protocol::factory::Factory;
+    use protocol::factory::FactoryRecord;
 
     #[entry]
     fn main() -> ! {
@@ -33,7 +33,7 @@ mod start {
     fn begin<'a>(
         board: &mut SelectedBoard,
         place: &'a mut MaybeUninit<Node>,
-    ) -> Option<(Factory, &'a mut Node)> {
+    ) -> Option<(FactoryRecord, &'a mut Node)> {
         let beginning = InitialState::read(board)?;
         let now = board.now();
         let node = place::build(place, &beginning, now);

@@ -7,7 +7,7 @@ use cell_node::flash::{self, FlashContent, FlashState};
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use protocol::can::{Format, Frame};
-use protocol::factory::Factory;
+use protocol::factory::FactoryRecord;
 use protocol::id::CellId;
 use protocol::port::LinkId;
 use protocol::time::{Micros, Span};
@@ -19,14 +19,14 @@ use crate::store::{self, StoredImage};
 #[derive(Debug)]
 pub struct Cell<'a, B> {
     board: B,
-    factory: Factory,
+    factory: FactoryRecord,
     node: &'a mut Node,
 }
 
 /// The initial state of a cell: the factory record and the contents of flash.
 #[derive(Debug)]
 pub struct InitialState {
-    factory: Factory,
+    factory: FactoryRecord,
     identity: Identity,
     held: FlashState,
 }
@@ -47,7 +47,7 @@ impl InitialState {
 
     /// Returns the factory record.
     #[must_use]
-    pub const fn factory(&self) -> &Factory {
+    pub const fn factory(&self) -> &FactoryRecord {
         &self.factory
     }
 
@@ -67,12 +67,12 @@ impl InitialState {
 
 impl<'a, B: Board> Cell<'a, B> {
     /// Starts a cell and joins its bus.
-    pub fn start(mut board: B, factory: Factory, node: &'a mut Node) -> Self {
+    pub fn start(mut board: B, factory: FactoryRecord, node: &'a mut Node) -> Self {
         board.open(&factory);
         let wired = factory.link_ids.iter().enumerate();
         let wired = wired.fold(0, |wired, (port, link_id)| wired | u8::from(link_id.is_some()) << port);
         if wired != 0 {
-            node.wire(wired);
+            node.set_wired_ports(wired);
         }
         board.filter(node, &factory);
         Self { board, factory, node }
@@ -132,7 +132,7 @@ impl<'a, B: Board> Cell<'a, B> {
     /// Encodes the node's pending parameters as a flash image. Returns false if there are none.
     // Not inlined, so that the parameters are off the stack when the image is written.
     #[inline(never)]
-    fn image(&self, into: &mut flash::Bytes) -> bool {
+    fn image(&self, into: &mut flash::FlashImage) -> bool {
         let Some(kept) = self.node.poll_store() else { return false };
         flash::encode_into(into, self.node.identity().serial, &kept);
         true
@@ -143,7 +143,7 @@ impl<'a, B: Board> Cell<'a, B> {
     // Not inlined, so that the image is off the stack when the node activates its parameters.
     #[inline(never)]
     fn write(&mut self) -> Option<bool> {
-        let mut image = flash::Bytes::new();
+        let mut image = flash::FlashImage::new();
         if !self.image(&mut image) {
             return None;
         }

@@ -9,7 +9,7 @@ use cell_node::node::Node;
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{AppliesFrom, Joints, Message, SensorPage, SkinSensors};
+use protocol::message::{Joints, Message, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::time::{Micros, Span};
@@ -75,7 +75,7 @@ pub(crate) fn pressed(node: &mut Node, joints: Joints) -> Option<Frame> {
     }
     let skin = SkinSensors { contact: [Q5_10::from_bits(1_024); 3], ..SkinSensors::default() };
     let to = Address::Cell(node.identity().cell?);
-    let press = Message::Stimulus { to, from: AppliesFrom::Next, page: SensorPage::Skin(skin) };
+    let press = Message::Stimulus { to, from: StimulusStart::Next, page: SensorPage::Skin(skin) };
     let frame = |message: &Message| message.encode().frames(Format::Fd).next();
     node.handle_frame(now, Span(0), &frame(&press)?);
     frame(&Message::Joints { epoch: Epoch(1), joints })

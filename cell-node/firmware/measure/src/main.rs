@@ -10,7 +10,7 @@ mod counted;
 mod machine;
 
 use cases::CASES;
-use cell_node::contact::{MAX_J, TorqueRounding};
+use cell_node::contact::{MAX_JACOBIAN_STEPS, TorqueRounding};
 use cell_node::kernel::oracle::Projection;
 use cell_node::kernel::{Kernel, Wrench};
 use cell_node::node::Node;
@@ -53,7 +53,7 @@ fn wrench_words(machine: &mut Machine, case: &cases::Case) {
 fn projection_words(machine: &mut Machine, case: &cases::Case) {
     let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
     counted::projection(&Projection::new(&case.parameters()), &case.joints(), &mut jacobian);
-    torque_words(machine, case, &jacobian, &TorqueRounding::new(TorqueFormat::Q3_12, MAX_J));
+    torque_words(machine, case, &jacobian, &TorqueRounding::new(TorqueFormat::Q3_12, MAX_JACOBIAN_STEPS));
 }
 
 /// Appends the words of J, and of the torques that follow from J.

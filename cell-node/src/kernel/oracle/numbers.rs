@@ -16,10 +16,10 @@ impl Scalar for f64 {
 
 /// Real numbers as reference: the library's sine and cosine, and no rounding to words.
 impl Number for f64 {
-    type Wide = Self;
-    type Fine = Self;
+    type WideSum = Self;
+    type FineNumber = Self;
 
-    fn word(word: Q1_14) -> Self {
+    fn from_word(word: Q1_14) -> Self {
         word.to_f64()
     }
 
@@ -55,11 +55,11 @@ impl Number for f64 {
         [angle.to_radians().sin(), angle.to_radians().cos()]
     }
 
-    fn fine(word: Q1_14) -> Self {
+    fn fine_from_word(word: Q1_14) -> Self {
         word.to_f64()
     }
 
-    fn fine_turn(angle: Q1_14) -> [Self; 3] {
+    fn fine_sine_cosine_one(angle: Q1_14) -> [Self; 3] {
         [angle.to_radians().sin(), angle.to_radians().cos(), 1.0]
     }
 
@@ -73,7 +73,7 @@ std::thread_local! {
 }
 
 impl Operations {
-    /// Runs a computation on [`Counted`] numbers and returns its operation count.
+    /// Runs a computation on [`CountingWord`] numbers and returns its operation count.
     pub fn count<T>(computation: impl FnOnce() -> T) -> (T, Self) {
         OPERATIONS.set(Self::default());
         let result = computation();
@@ -83,9 +83,9 @@ impl Operations {
 
 /// A Q1.14 word whose operations [`Operations::count`] counts.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Counted(pub Q1_14);
+pub struct CountingWord(pub Q1_14);
 
-impl Word for Counted {
+impl Word for CountingWord {
     fn from_word(word: Q1_14) -> Self {
         Self(word)
     }
@@ -94,7 +94,7 @@ impl Word for Counted {
         self.0
     }
 
-    fn note(operation: impl FnOnce(&mut Operations)) {
+    fn record_operation(operation: impl FnOnce(&mut Operations)) {
         let mut done = OPERATIONS.get();
         operation(&mut done);
         OPERATIONS.set(done);

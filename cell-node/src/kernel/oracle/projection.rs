@@ -23,7 +23,10 @@ mod sums;
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
-use self::axes::{Axis, AxisFrame, Height, Level, Rotation, RotationProducts, ToBase, Vector, negate};
+use self::axes::{
+    Axis, AxisFrame, BaseTransform, HorizontalTerms, Rotation, RotationProducts, Vector, VerticalTerms,
+    negate,
+};
 use self::range::is_bounded;
 use self::sums::VectorSums;
 use crate::kernel::joint::Joint;
@@ -42,7 +45,7 @@ pub struct Projection<S: Scalar = Q1_14> {
     /// The position of the cell, in the frame of joint k.
     position: Vector<S::Number>,
     /// The transform of a vector from the frame of joint k to the base.
-    to_base: ToBase,
+    to_base: BaseTransform,
     /// True if no number can leave the range of a word. Saturation is then omitted.
     bounded: bool,
     /// The links from the first row up to the cell. Only the first `rows` are in use.
@@ -76,19 +79,19 @@ struct ChainLink<N> {
 /// Bits for the values that are computed for a row.
 mod due {
     /// Axis x_l, which requires a sine.
-    pub(super) const X: u32 = 1;
+    pub(super) const X_AXIS: u32 = 1;
     /// All three axes, because the row ends a group of parallel axes.
     pub(super) const ENDS_GROUP: u32 = 2;
     /// Axis z_(l-1), stored for the joints of this group of parallel axes.
-    pub(super) const Z: u32 = 4;
+    pub(super) const Z_AXIS: u32 = 4;
     /// The shift by the length a, for which x_l is stored.
-    pub(super) const A: u32 = 8;
+    pub(super) const SHIFT_BY_A: u32 = 8;
     /// The shift by the offset d.
-    pub(super) const D: u32 = 16;
+    pub(super) const SHIFT_BY_D: u32 = 16;
     /// The row has a revolute joint.
     pub(super) const IS_REVOLUTE: u32 = 32;
     /// The row continues a group of parallel axes. Its turn starts from the axes before the group.
-    pub(super) const CONTINUES: u32 = 64;
+    pub(super) const CONTINUES_GROUP: u32 = 64;
 }
 
 /// The axes that are stored for the way down: z_(l-1) of each group of parallel axes, and x_l of its rows.
@@ -104,25 +107,25 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
             let joint = if row.has_joint() { joints.next() } else { None }.unwrap_or(Joint::J1);
             *link = ChainLink::new(row, joint, frame, index + 1 == chain.len());
             if goes_on {
-                link.due |= due::CONTINUES;
+                link.due |= due::CONTINUES_GROUP;
             }
             if index == 0 && row.kind != RowKind::Prismatic {
-                (link.due, link.d) = (link.due & !due::D, Q1_14::ZERO);
+                (link.due, link.d) = (link.due & !due::SHIFT_BY_D, Q1_14::ZERO);
             }
             goes_on = !link.is_due(due::ENDS_GROUP);
             if !goes_on {
-                (frame, _) = frame.after(link.twist);
+                (frame, _) = frame.after_twist(link.twist);
             }
         }
         let (_, below) = chain.split_last().unzip();
         let is_upright = |row: &Row| matches!(row.alpha.to_bits(), 0 | i16::MIN);
         let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
-        let position = parameters.pose.position.map(S::Number::word);
-        let force = parameters.pose.normal.map(|word| S::Number::word(word).negative());
+        let position = parameters.pose.position.map(S::Number::from_word);
+        let force = parameters.pose.normal.map(|word| S::Number::from_word(word).negative());
         Self {
             force,
             position,
-            to_base: ToBase::new(frame, !slides && below.unwrap_or_default().iter().all(is_upright)),
+            to_base: BaseTransform::new(frame, !slides && below.unwrap_or_default().iter().all(is_upright)),
             bounded: !slides && is_bounded(force, position, links.get(..chain.len()).unwrap_or_default()),
             links,
             rows: chain.len(),
@@ -132,14 +135,14 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
         let mut kept = KeptAxes::new();
-        let [zero, one] = [S::Number::zero(), S::Number::word(QUARTER)];
+        let [zero, one] = [S::Number::zero(), S::Number::from_word(QUARTER)];
         let mut axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]];
         let axes = self.axes(joints, axes.each_mut(), &mut kept);
         if self.bounded {
-            self.down::<Bounded>(axes, &kept, None, jacobian);
+            self.write_jacobian_from_axes::<Bounded>(axes, &kept, None, jacobian);
         } else {
             cold_path();
-            self.down_held(axes, &kept, joints, jacobian);
+            self.write_jacobian_saturating(axes, &kept, joints, jacobian);
         }
     }
 }
@@ -162,21 +165,21 @@ impl<S: Scalar> Projection<S> {
         let mut group = Q1_14::ZERO;
         for link in self.links() {
             group = link.angle(group, joints);
-            if !link.is_due(due::X) {
+            if !link.is_due(due::X_AXIS) {
                 continue;
             }
             let turn = Rotation(S::Number::sine_cosine(group));
             let [mix, _] = link.mixes;
             // The capacity is two vectors per row.
             if !link.is_due(due::ENDS_GROUP) {
-                let _ = kept.push(turn.ahead(mix, x, y));
+                let _ = kept.push(turn.rotate_first(mix, x, y));
                 continue;
             }
-            turn.both(mix, x, y);
-            if link.is_due(due::A) {
+            turn.rotate_both(mix, x, y);
+            if link.is_due(due::SHIFT_BY_A) {
                 let _ = kept.push(*x);
             }
-            if link.is_due(due::Z) {
+            if link.is_due(due::Z_AXIS) {
                 let _ = kept.push(*z);
             }
             link.twist_by_alpha(&mut y, &mut z);
@@ -187,7 +190,7 @@ impl<S: Scalar> Projection<S> {
     /// Computes J, from the cell down to the base. `slides` are the joint positions, or `None` if the chain has no
     /// prismatic joints.
     #[inline(always)]
-    fn down<R: VectorSums>(
+    fn write_jacobian_from_axes<R: VectorSums>(
         &self,
         axes: [&Vector<S::Number>; 3],
         kept: &KeptAxes<S::Number>,
@@ -198,19 +201,19 @@ impl<S: Scalar> Projection<S> {
         let [.., mut z] = axes;
         let mut kept = kept.iter().rev();
         for link in self.links().iter().rev() {
-            if link.is_due(due::Z) {
+            if link.is_due(due::Z_AXIS) {
                 let Some(axis) = kept.next() else { return };
                 z = axis;
             }
             let slides = slides.filter(|_| link.kind == RowKind::Prismatic);
             let d = match slides.and_then(|joints| link.joint.get(joints)) {
-                Some(position) => Some(S::Number::word(link.d.saturating_add(*position))),
-                None => link.is_due(due::D).then(|| S::Number::word(link.d)),
+                Some(position) => Some(S::Number::from_word(link.d.saturating_add(*position))),
+                None => link.is_due(due::SHIFT_BY_D).then(|| S::Number::from_word(link.d)),
             };
             let turned = link.step_down::<R>(&mut position, &force, z, d, || kept.next());
             let entry = match turned {
                 Some(entry) => entry,
-                None if slides.is_some() => link.along::<R>(z, &force),
+                None if slides.is_some() => link.force_along_axis::<R>(z, &force),
                 None => continue,
             };
             if let Some(row) = link.joint.get_mut(jacobian) {
@@ -221,14 +224,14 @@ impl<S: Scalar> Projection<S> {
 
     /// Like `down`, with saturation, for chains in which numbers may leave the range of a word.
     #[inline(never)]
-    fn down_held(
+    fn write_jacobian_saturating(
         &self,
         axes: [&Vector<S::Number>; 3],
         kept: &KeptAxes<S::Number>,
         joints: &[Q1_14; MAX_JOINTS],
         jacobian: &mut [S; MAX_JOINTS],
     ) {
-        self.down::<Saturating>(axes, kept, Some(joints), jacobian);
+        self.write_jacobian_from_axes::<Saturating>(axes, kept, Some(joints), jacobian);
     }
 
     /// Transforms the force and the cell's position to the base frame.
@@ -241,20 +244,22 @@ impl<S: Scalar> Projection<S> {
             R::round(R::plus::<S::Number>(R::plus::<S::Number>(a.times(x), b.times(y)), c.times(z)))
         };
         let level = match self.to_base.level {
-            Level::Xz => vectors.map(|[a, _, c]| [two(a, x0, c, z0), two(a, x1, c, z1)]),
-            Level::Xy => vectors.map(|[a, b, _]| [two(a, x0, b, y0), two(a, x1, b, y1)]),
-            Level::All => vectors.map(|vector| [three(vector, x0, y0, z0), three(vector, x1, y1, z1)]),
+            HorizontalTerms::Xz => vectors.map(|[a, _, c]| [two(a, x0, c, z0), two(a, x1, c, z1)]),
+            HorizontalTerms::Xy => vectors.map(|[a, b, _]| [two(a, x0, b, y0), two(a, x1, b, y1)]),
+            HorizontalTerms::All => {
+                vectors.map(|vector| [three(vector, x0, y0, z0), three(vector, x1, y1, z1)])
+            }
         };
         let height = match self.to_base.height {
-            Height::Nothing => [S::Number::zero(); 2],
-            Height::Y => vectors.map(|[_, b, _]| b),
-            Height::MinusY => vectors.map(|[_, b, _]| R::negative(b)),
-            Height::Z => vectors.map(|[_, _, c]| c),
-            Height::MinusZ => vectors.map(|[_, _, c]| R::negative(c)),
-            Height::Yz => vectors.map(|[_, b, c]| two(b, y2, c, z2)),
-            Height::Xz => vectors.map(|[a, _, c]| two(a, x2, c, z2)),
-            Height::Xy => vectors.map(|[a, b, _]| two(a, x2, b, y2)),
-            Height::All => vectors.map(|vector| three(vector, x2, y2, z2)),
+            VerticalTerms::Nothing => [S::Number::zero(); 2],
+            VerticalTerms::Y => vectors.map(|[_, b, _]| b),
+            VerticalTerms::MinusY => vectors.map(|[_, b, _]| R::negative(b)),
+            VerticalTerms::Z => vectors.map(|[_, _, c]| c),
+            VerticalTerms::MinusZ => vectors.map(|[_, _, c]| R::negative(c)),
+            VerticalTerms::Yz => vectors.map(|[_, b, c]| two(b, y2, c, z2)),
+            VerticalTerms::Xz => vectors.map(|[a, _, c]| two(a, x2, c, z2)),
+            VerticalTerms::Xy => vectors.map(|[a, b, _]| two(a, x2, b, y2)),
+            VerticalTerms::All => vectors.map(|vector| three(vector, x2, y2, z2)),
         };
         let ([[f0, f1], [p0, p1]], [f2, p2]) = (level, height);
         [[f0, f1, f2], [p0, p1, p2]]
@@ -268,19 +273,19 @@ impl<N: Number> ChainLink<N> {
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
         let twist = Twist::new(row.alpha);
         let axis = frame.z();
-        let (_, twisting) = frame.after(twist);
+        let (_, twisting) = frame.after_twist(twist);
         let due = [
-            (ends || a, due::X),
+            (ends || a, due::X_AXIS),
             (ends, due::ENDS_GROUP),
-            (ends && !axis.is_upright(), due::Z),
-            (a, due::A),
-            (d, due::D),
+            (ends && !axis.is_upright(), due::Z_AXIS),
+            (a, due::SHIFT_BY_A),
+            (d, due::SHIFT_BY_D),
             (row.kind == RowKind::Revolute, due::IS_REVOLUTE),
         ];
         Self {
             due: due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all }),
             joint,
-            mixes: [frame.turn(), twisting],
+            mixes: [frame.turn_products(), twisting],
             axis,
             kind: row.kind,
             a: row.a,
@@ -304,7 +309,7 @@ impl<N: Number> ChainLink<N> {
         {
             angle = N::plus_angle(*position, angle);
         }
-        if self.is_due(due::CONTINUES) { N::plus_angle(group, angle) } else { angle }
+        if self.is_due(due::CONTINUES_GROUP) { N::plus_angle(group, angle) } else { angle }
     }
 
     /// Computes y_l and z_l from v_l and the previous z axis, in place. For quarter turns the references y and z are
@@ -346,15 +351,15 @@ impl<N: Number> ChainLink<N> {
         N: 'a,
     {
         let ([p0, p1, p2], [z0, z1, z2]) = (p, *z);
-        let a = || N::word(self.a);
+        let a = || N::from_word(self.a);
         let level = |m0: N, m1: N| R::plus::<N>(f0.times(m0), f1.times(m1));
         let moment = match self.axis {
             // Below an upright axis all axes are upright, and no height is needed.
             Axis::Up | Axis::Down => {
-                if self.is_due(due::A) {
+                if self.is_due(due::SHIFT_BY_A) {
                     let ([x0, x1, _], a) = (*kept()?, a());
-                    *p0 = R::more(*p0, a.times(x0));
-                    *p1 = R::more(*p1, a.times(x1));
+                    *p0 = R::add_product(*p0, a.times(x0));
+                    *p1 = R::add_product(*p1, a.times(x1));
                 }
                 if !self.is_due(due::IS_REVOLUTE) {
                     return None;
@@ -366,14 +371,14 @@ impl<N: Number> ChainLink<N> {
                 }
             }
             Axis::Level => {
-                if self.is_due(due::A) {
+                if self.is_due(due::SHIFT_BY_A) {
                     let ([x0, x1, x2], a) = (*kept()?, a());
                     shift::<R, N>(p0, a.times(x0), d, z0);
                     shift::<R, N>(p1, a.times(x1), d, z1);
-                    *p2 = R::more(*p2, a.times(x2));
+                    *p2 = R::add_product(*p2, a.times(x2));
                 } else if let Some(d) = d {
-                    *p0 = R::more(*p0, d.times(z0));
-                    *p1 = R::more(*p1, d.times(z1));
+                    *p0 = R::add_product(*p0, d.times(z0));
+                    *p1 = R::add_product(*p1, d.times(z1));
                 }
                 if !self.is_due(due::IS_REVOLUTE) {
                     return None;
@@ -383,15 +388,15 @@ impl<N: Number> ChainLink<N> {
                 R::plus::<N>(level(m0, m1), f2.times(m2))
             }
             Axis::Any => {
-                if self.is_due(due::A) {
+                if self.is_due(due::SHIFT_BY_A) {
                     let ([x0, x1, x2], a) = (*kept()?, a());
                     shift::<R, N>(p0, a.times(x0), d, z0);
                     shift::<R, N>(p1, a.times(x1), d, z1);
                     shift::<R, N>(p2, a.times(x2), d, z2);
                 } else if let Some(d) = d {
-                    *p0 = R::more(*p0, d.times(z0));
-                    *p1 = R::more(*p1, d.times(z1));
-                    *p2 = R::more(*p2, d.times(z2));
+                    *p0 = R::add_product(*p0, d.times(z0));
+                    *p1 = R::add_product(*p1, d.times(z1));
+                    *p2 = R::add_product(*p2, d.times(z2));
                 }
                 if !self.is_due(due::IS_REVOLUTE) {
                     return None;
@@ -406,7 +411,7 @@ impl<N: Number> ChainLink<N> {
     }
 
     /// Returns z . f, for a prismatic joint.
-    fn along<R: VectorSums>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
+    fn force_along_axis<R: VectorSums>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
         match self.axis {
             Axis::Up => f2,
             Axis::Down => R::negative(f2),
@@ -418,10 +423,10 @@ impl<N: Number> ChainLink<N> {
 
 /// Adds the products with the length a and the offset d to a component of the position.
 #[inline(always)]
-fn shift<R: VectorSums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N) {
+fn shift<R: VectorSums, N: Number>(position: &mut N, by_a: N::WideSum, d: Option<N>, z: N) {
     *position = match d {
-        None => R::more(*position, by_a),
-        Some(d) => R::more_and_more(*position, by_a, d.times(z)),
+        None => R::add_product(*position, by_a),
+        Some(d) => R::add_products(*position, by_a, d.times(z)),
     };
 }
 
@@ -433,5 +438,5 @@ fn twist_by<N: Number>(
     y: &mut Vector<N>,
     z: &mut Vector<N>,
 ) {
-    turn.both(mix, y, z);
+    turn.rotate_both(mix, y, z);
 }

@@ -7,19 +7,19 @@ use protocol::parameters::{Pose, Row};
 use super::{Number, PerComponent};
 
 /// Returns the wrench of the contact, twisted and shifted by joint k's row, and rounded once.
-pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> PerComponent<N> {
-    let (force, moment) = folded(
-        pose.normal.map(N::fine),
-        pose.position.map(N::fine),
-        N::fine_turn(row.alpha),
-        (N::fine(row.a), N::fine(row.d)),
+pub(super) fn constant_wrench<N: Number>(pose: &Pose, row: &Row) -> PerComponent<N> {
+    let (force, moment) = exact_constant_wrench(
+        pose.normal.map(N::fine_from_word),
+        pose.position.map(N::fine_from_word),
+        N::fine_sine_cosine_one(row.alpha),
+        (N::fine_from_word(row.a), N::fine_from_word(row.d)),
     );
     // 14 fraction bits of a word and 28 of the twist; for the moment 14 more of a length.
     PerComponent { force: force.map(N::round_constant::<42>), moment: moment.map(N::round_constant::<56>) }
 }
 
 /// Returns the same wrench before rounding. With words of 16 bits, no intermediate number exceeds 2^61.
-fn folded<N: Copy + Add<Output = N> + Sub<Output = N> + Mul<Output = N> + Neg<Output = N>>(
+fn exact_constant_wrench<N: Copy + Add<Output = N> + Sub<Output = N> + Mul<Output = N> + Neg<Output = N>>(
     [nx, ny, nz]: [N; 3],
     [tx, ty, tz]: [N; 3],
     [sine, cosine, one]: [N; 3],

@@ -3,7 +3,7 @@
 use protocol::parameters::Row;
 
 use super::PerComponent;
-use crate::contact::MAX_J;
+use crate::contact::MAX_JACOBIAN_STEPS;
 use crate::kernel::Number;
 
 /// Returns an upper bound of the moments of a wrench at all of these rows, in steps of 2^-14, for any joint positions.
@@ -16,7 +16,7 @@ pub(super) fn bound<N: Number>(contact: &PerComponent<N>, rows: &[Row]) -> Optio
     let turned = |norm: u32| norm + (norm >> 10) + 2;
     let (mut force, mut moment) = (turned(N::norm(contact.force)?), turned(N::norm(contact.moment)?));
     for row in rows.iter().rev() {
-        let reach = N::norm([N::word(row.a), N::word(row.d), N::zero()])?;
+        let reach = N::norm([N::from_word(row.a), N::from_word(row.d), N::zero()])?;
         (force, moment) = (turned(force), turned(moment));
         if force >= 1 << 15 || reach > 1 << 16 {
             return None;
@@ -24,5 +24,5 @@ pub(super) fn bound<N: Number>(contact: &PerComponent<N>, rows: &[Row]) -> Optio
         moment += ((reach * force) >> 14) + 3;
         (force, moment) = (turned(force), turned(moment));
     }
-    u16::try_from(moment).ok().filter(|bound| *bound < MAX_J - 1 && force < 1 << 15)
+    u16::try_from(moment).ok().filter(|bound| *bound < MAX_JACOBIAN_STEPS - 1 && force < 1 << 15)
 }

@@ -1,7 +1,7 @@
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use protocol::id::{CellId, Kind, Node as Address};
-use protocol::message::{AppliesFrom, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{Joints, Message, Request, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Contact, Events, Parameter, Parameters, Pose, Sensing as Mode};
 use protocol::time::{Micros, Span};
@@ -95,7 +95,7 @@ impl Cell {
     /// Sends a stimulus and then joints, which apply it. Returns the sensor pages that the cell sends.
     fn feels(&mut self, page: SensorPage) -> Vec<SensorPage> {
         let to = Address::Everyone;
-        assert_eq!(self.hears(&Message::Stimulus { to, from: AppliesFrom::Next, page }, Span(0)), []);
+        assert_eq!(self.hears(&Message::Stimulus { to, from: StimulusStart::Next, page }, Span(0)), []);
         self.joints()
     }
 
@@ -252,7 +252,7 @@ fn a_heartbeat_with_an_event_does_not_send_it_twice() {
     let mut cell = eventful();
     cell.now = cell.node.poll_timeout() - Span(1_000);
     let to = Address::Everyone;
-    cell.hears(&Message::Stimulus { to, from: AppliesFrom::Next, page: pressed(500) }, Span(0));
+    cell.hears(&Message::Stimulus { to, from: StimulusStart::Next, page: pressed(500) }, Span(0));
     cell.epoch = cell.epoch.next();
     let joints = Joints { in_use: 1, ..Joints::default() };
     for frame in (Message::Joints { epoch: cell.epoch, joints }).encode().frames(Format::Fd) {
@@ -298,7 +298,7 @@ fn what_is_sensed_during_a_hang_is_sent_with_the_next_joints() {
     let mut cell = eventful();
     let to = Address::Everyone;
     for bits in [500, 700, 900] {
-        cell.hears(&Message::Stimulus { to, from: AppliesFrom::Next, page: pressed(bits) }, Span(0));
+        cell.hears(&Message::Stimulus { to, from: StimulusStart::Next, page: pressed(bits) }, Span(0));
         assert_eq!(cell.joints_aged(Span(16_001)), [], "too old");
     }
     assert_eq!(cell.joints(), [pressed(900)]);

@@ -7,7 +7,7 @@ use protocol::message::{Joints, Message};
 use protocol::packet::Epoch;
 use protocol::skin::Skin;
 
-use super::Both;
+use super::PerCapture;
 use super::numbering::Numbering;
 
 /// Maximum number of joints of a capture that are kept, counted from its start; a day at 62.5 Hz has 5.4 million.
@@ -47,7 +47,7 @@ impl JointTrace {
     }
 
     /// Records the next message; ignores messages other than joints, and other buses than the traced one.
-    pub fn take(&mut self, nanos: u64, bus: &str, message: &Message) {
+    pub fn record(&mut self, nanos: u64, bus: &str, message: &Message) {
         let Message::Joints { epoch, joints } = message else { return };
         if self.bus.as_deref() != Some(bus) {
             return;
@@ -75,8 +75,8 @@ fn joints_hash(joints: &Joints) -> u32 {
 
 /// Returns for each of two captures of one skin the number of its first joints since the run began; `None` if unknown.
 #[must_use]
-pub fn start_numbers(a: &JointTrace, b: &JointTrace) -> Both<Option<u64>> {
-    let (Some(first_a), Some(first_b)) = (a.first, b.first) else { return Both { a: None, b: None } };
+pub fn start_numbers(a: &JointTrace, b: &JointTrace) -> PerCapture<Option<u64>> {
+    let (Some(first_a), Some(first_b)) = (a.first, b.first) else { return PerCapture { a: None, b: None } };
     let of = |first: Epoch, laps: usize| u64::from(first.0) + 256 * laps as u64;
     let mut best = (equal_share(a, b, of(first_a, 0), of(first_b, 0)).unwrap_or(0.0), 0, 0);
     let most = a.joints.len().max(b.joints.len()) / 256 + 1;
@@ -88,7 +88,7 @@ pub fn start_numbers(a: &JointTrace, b: &JointTrace) -> Both<Option<u64>> {
             }
         }
     }
-    Both { a: Some(of(first_a, best.1)), b: Some(of(first_b, best.2)) }
+    PerCapture { a: Some(of(first_a, best.1)), b: Some(of(first_b, best.2)) }
 }
 
 /// Returns the share of joints that are equal if the captures begin with the numbers `start_a` and `start_b`; `None` if

@@ -22,8 +22,8 @@ use protocol::skin::Skin;
 use serde::Serialize;
 
 use self::numbering::JointsKey;
-use self::pair::{FirstDifferences, FoundDifference, Tally, compare};
-use self::side::{AnsweredJoints, Side};
+use self::pair::{FirstDifferences, FoundDifference, Tally, compare_joints};
+use self::side::{AnsweredJoints, ComparedCapture};
 use crate::explain::NotFound;
 
 pub use self::align::{JointTrace, start_numbers};
@@ -49,14 +49,14 @@ impl CaptureSide {
 
 /// A pair of values, one for each capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Both<T> {
+pub struct PerCapture<T> {
     /// The value of capture A.
     pub a: T,
     /// The value of capture B.
     pub b: T,
 }
 
-impl<T> Both<T> {
+impl<T> PerCapture<T> {
     /// Returns the value of one capture.
     #[must_use]
     pub const fn get(&self, which: CaptureSide) -> &T {
@@ -91,7 +91,7 @@ pub struct CompareOptions {
 pub struct Comparison<'a> {
     skin: &'a Skin,
     options: CompareOptions,
-    sides: Both<Side<'a>>,
+    sides: PerCapture<ComparedCapture<'a>>,
     tallies: Vec<Tally>,
     epochs: EpochCounts,
     /// The first difference that counts in any case, and the first missing item, each with its joints and bus.
@@ -108,13 +108,13 @@ impl<'a> Comparison<'a> {
     /// Creates a comparison of two captures that have not been read yet. The first joints of each capture get the
     /// number in `starts`, or else the number of their epoch.
     #[must_use]
-    pub fn new(skin: &'a Skin, options: CompareOptions, starts: Both<Option<u64>>) -> Self {
+    pub fn new(skin: &'a Skin, options: CompareOptions, starts: PerCapture<Option<u64>>) -> Self {
         let period = period_ns(skin);
-        let side = |start| Side::new(skin, period, start);
+        let side = |start| ComparedCapture::new(skin, period, start);
         Self {
             skin,
             options,
-            sides: Both { a: side(starts.a), b: side(starts.b) },
+            sides: PerCapture { a: side(starts.a), b: side(starts.b) },
             tallies: skin.buses.iter().map(|_| Tally::default()).collect(),
             epochs: EpochCounts::default(),
             first: None,
@@ -126,7 +126,7 @@ impl<'a> Comparison<'a> {
     /// have ended.
     #[must_use]
     pub fn next_side(&self) -> Option<CaptureSide> {
-        let Both { a, b } = &self.sides;
+        let PerCapture { a, b } = &self.sides;
         match (a.is_ended, b.is_ended) {
             (true, true) => None,
             (true, false) => Some(CaptureSide::B),
@@ -154,7 +154,7 @@ impl<'a> Comparison<'a> {
     }
 
     /// Declares that the time stamps of a capture are meaningless.
-    pub fn without_times(&mut self, which: CaptureSide) {
+    pub fn mark_untimed(&mut self, which: CaptureSide) {
         self.sides.get_mut(which).has_times = false;
     }
 
@@ -189,13 +189,14 @@ impl<'a> Comparison<'a> {
     /// Compares the next joints of all buses, as long as their answers are complete in both captures.
     fn compare_complete(&mut self) {
         for bus in 0..self.skin.buses.len() {
-            while self.pair_on(bus).is_some() {}
+            while self.compare_next_joints(bus).is_some() {}
         }
     }
 
     /// Compares the next joints of one bus; `None` if their answers may not be complete.
-    fn pair_on(&mut self, bus: usize) -> Option<()> {
-        let front = |side: &Side<'_>| side.buses.get(bus).and_then(|it| it.ready.front()).map(|it| it.key);
+    fn compare_next_joints(&mut self, bus: usize) -> Option<()> {
+        let front =
+            |side: &ComparedCapture<'_>| side.buses.get(bus).and_then(|it| it.ready.front()).map(|it| it.key);
         let both = (front(&self.sides.a), front(&self.sides.b));
         let which = match both {
             (Some(a), Some(b)) if a == b => {
@@ -223,8 +224,8 @@ impl<'a> Comparison<'a> {
     fn compare_moments(&mut self, bus: usize, a: &AnsweredJoints, b: &AnsweredJoints) {
         self.epochs.compared += 1;
         let Some(tally) = self.tallies.get_mut(bus) else { return };
-        let found = compare(tally, (self.skin, bus), Both { a, b }, &self.options);
-        self.keep_first(bus, Both { a: Some(a), b: Some(b) }, found);
+        let found = compare_joints(tally, (self.skin, bus), PerCapture { a, b }, &self.options);
+        self.keep_first(bus, PerCapture { a: Some(a), b: Some(b) }, found);
     }
 
     /// Counts joints that only one capture has.
@@ -232,18 +233,18 @@ impl<'a> Comparison<'a> {
         let other = self.sides.get(which.other());
         let is_a = which == CaptureSide::A;
         match (other.first, other.newest()) {
-            (Some((first, _)), _) if moment.key < first => self.epochs.before.count(is_a),
-            (None, _) => self.epochs.before.count(is_a),
+            (Some((first, _)), _) if moment.key < first => self.epochs.before.count_one(is_a),
+            (None, _) => self.epochs.before.count_one(is_a),
             (_, Some(last)) if other.is_ended && moment.key > last && !other.counts.unfinished => {
-                self.epochs.after.count(is_a);
+                self.epochs.after.count_one(is_a);
             }
             _ => {
                 let missing =
                     if is_a { &mut self.epochs.missing_in_b } else { &mut self.epochs.missing_in_a };
                 *missing += 1;
                 let moments = match which {
-                    CaptureSide::A => Both { a: Some(moment), b: None },
-                    CaptureSide::B => Both { a: None, b: Some(moment) },
+                    CaptureSide::A => PerCapture { a: Some(moment), b: None },
+                    CaptureSide::B => PerCapture { a: None, b: Some(moment) },
                 };
                 self.keep_first(bus, moments, FoundDifference::missing_epoch(!is_a));
             }
@@ -252,7 +253,12 @@ impl<'a> Comparison<'a> {
 
     /// Keeps the first differences of these joints if they are the earliest so far; buses are not compared in order of
     /// time.
-    fn keep_first(&mut self, bus: usize, moments: Both<Option<&AnsweredJoints>>, firsts: FirstDifferences) {
+    fn keep_first(
+        &mut self,
+        bus: usize,
+        moments: PerCapture<Option<&AnsweredJoints>>,
+        firsts: FirstDifferences,
+    ) {
         let Some(key) = moments.a.or(moments.b).map(|moment| moment.key) else { return };
         let is_first = |kept: &Option<(JointsKey, usize, FirstDifference)>| {
             kept.as_ref().is_none_or(|(first, on, _)| (*first, *on) > (key, bus))
@@ -268,7 +274,7 @@ impl<'a> Comparison<'a> {
     fn describe(
         &self,
         bus: usize,
-        moments: &Both<Option<&AnsweredJoints>>,
+        moments: &PerCapture<Option<&AnsweredJoints>>,
         mut found: FoundDifference,
     ) -> Option<FirstDifference> {
         if let Some(cell) = found.cell()
@@ -276,8 +282,8 @@ impl<'a> Comparison<'a> {
         {
             found.inputs.push("restart");
         }
-        let Both { a, b } = &self.sides;
-        let time_s = Both {
+        let PerCapture { a, b } = &self.sides;
+        let time_s = PerCapture {
             a: moments.a.and_then(|moment| a.seconds(moment.watched.at_ns)),
             b: moments.b.and_then(|moment| b.seconds(moment.watched.at_ns)),
         };

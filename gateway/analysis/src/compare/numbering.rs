@@ -16,9 +16,9 @@ pub(super) struct JointsKey {
 }
 
 /// Maximum number of epochs by which one bus may lag another.
-const MAX_BUS_LAG: u64 = 16;
+const MAX_BUS_LAG_EPOCHS: u64 = 16;
 /// Maximum deviation of the elapsed time from the number of epochs, in epochs.
-const ELAPSED_TOLERANCE: u64 = 4;
+const ELAPSED_TOLERANCE_EPOCHS: u64 = 4;
 
 /// Numbers the joints of all buses of a capture, which share one counter.
 #[derive(Debug)]
@@ -27,11 +27,11 @@ pub(super) struct Numbering {
     period_ns: u64,
     /// The number of the first joints in the capture, if known.
     start: Option<u64>,
-    newest: Option<Newest>,
+    newest: Option<NewestJoints>,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Newest {
+struct NewestJoints {
     key: JointsKey,
     epoch: Epoch,
     nanos: u64,
@@ -59,13 +59,13 @@ impl Numbering {
     ) -> Option<JointsKey> {
         let Some(newest) = self.newest else {
             let key = JointsKey { run: 0, number: self.start.unwrap_or_else(|| epoch.0.into()) };
-            self.newest = Some(Newest { key, epoch, nanos });
+            self.newest = Some(NewestJoints { key, epoch, nanos });
             return Some(key);
         };
         let elapsed = nanos.saturating_sub(newest.nanos) / self.period_ns;
         // The joints of another bus, or out of order.
         let back = u64::from(newest.epoch.0.wrapping_sub(epoch.0));
-        if back <= MAX_BUS_LAG && elapsed <= MAX_BUS_LAG {
+        if back <= MAX_BUS_LAG_EPOCHS && elapsed <= MAX_BUS_LAG_EPOCHS {
             let number = newest.key.number.checked_sub(back)?;
             let key = JointsKey { number, ..newest.key };
             return last.is_none_or(|last| last < key).then_some(key);
@@ -74,17 +74,17 @@ impl Numbering {
             Some(steps) => JointsKey { number: newest.key.number + steps, ..newest.key },
             None => JointsKey { run: newest.key.run + 1, number: epoch.0.into() },
         };
-        self.newest = Some(Newest { key, epoch, nanos });
+        self.newest = Some(NewestJoints { key, epoch, nanos });
         last.is_none_or(|last| last < key).then_some(key)
     }
 
     /// Returns the number of epochs from the newest joints to those of `epoch`, which arrive `elapsed` periods later;
     /// `None` if the numbering restarted.
-    fn steps(&self, newest: Newest, epoch: Epoch, elapsed: u64) -> Option<u64> {
+    fn steps(&self, newest: NewestJoints, epoch: Epoch, elapsed: u64) -> Option<u64> {
         let modulo = u64::from(epoch.0.wrapping_sub(newest.epoch.0));
         let laps = (elapsed + 128).saturating_sub(modulo) / 256;
         let steps = modulo + 256 * laps;
-        let fits = steps.abs_diff(elapsed) <= ELAPSED_TOLERANCE + elapsed / 1_000;
+        let fits = steps.abs_diff(elapsed) <= ELAPSED_TOLERANCE_EPOCHS + elapsed / 1_000;
         match modulo {
             // A step of one after a pause is common, 257 lost joints in a row are rare.
             1 if elapsed < 252 => Some(1),

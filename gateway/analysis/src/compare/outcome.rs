@@ -5,14 +5,14 @@ use protocol::id::CellId;
 
 use super::numbering::JointsKey;
 use super::report::{CaptureFigures, CellRow, CompareReport, ExtraCell, Losses, ReplyCounts};
-use super::side::{ComparedCell, Side};
-use super::{ASPECTS, Both, CaptureSide, Comparison};
+use super::side::{ComparedCapture, ComparedCell};
+use super::{ASPECTS, CaptureSide, Comparison, PerCapture};
 
 impl Comparison<'_> {
     /// Returns the report; call it after both captures have ended.
     #[must_use]
     pub fn report(self) -> CompareReport {
-        let captures = Both { a: capture_figures(&self.sides.a), b: capture_figures(&self.sides.b) };
+        let captures = PerCapture { a: capture_figures(&self.sides.a), b: capture_figures(&self.sides.b) };
         let mut report = CompareReport {
             equal: false,
             differs: Vec::new(),
@@ -44,7 +44,7 @@ impl Comparison<'_> {
         let epochs = &report.epochs;
         let lost = epochs.missing_in_a + epochs.missing_in_b;
         let are_missing = lost + report.torques.missing() + report.sums.missing() > self.options.missing;
-        report.differs = differs(&report, lost, are_missing);
+        report.differs = differing_aspects(&report, lost, are_missing);
         report.equal = report.differs.is_empty();
         let firsts = [self.first, self.first_missing.filter(|_| are_missing)];
         let first = firsts.into_iter().flatten().min_by_key(|(key, bus, _)| (*key, *bus));
@@ -58,8 +58,8 @@ impl Comparison<'_> {
         for (at, (bus, tally)) in self.skin.buses.iter().zip(&self.tallies).enumerate() {
             for (node, replies) in tally.cells.iter() {
                 let of = |which| self.cell(which, at, node).map(losses).unwrap_or_default();
-                let losses = Both { a: of(CaptureSide::A), b: of(CaptureSide::B) };
-                let is_quiet = losses == Both::default()
+                let losses = PerCapture { a: of(CaptureSide::A), b: of(CaptureSide::B) };
+                let is_quiet = losses == PerCapture::default()
                     && replies.different + replies.tolerated + replies.missing() == 0;
                 if !is_quiet {
                     rows.push(CellRow { bus: bus.name.clone(), node: node.get(), replies: *replies, losses });
@@ -100,7 +100,7 @@ impl Comparison<'_> {
 }
 
 /// Returns the names of the aspects in which the captures differ.
-fn differs(report: &CompareReport, lost: u64, are_missing: bool) -> Vec<&'static str> {
+fn differing_aspects(report: &CompareReport, lost: u64, are_missing: bool) -> Vec<&'static str> {
     let CompareReport { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = report;
     let replies = |it: &ReplyCounts| it.different > 0 || are_missing && it.missing() > 0;
     let differs = [
@@ -120,18 +120,18 @@ fn losses(cell: &ComparedCell) -> Losses {
     Losses { late: cell.late, too_late: cell.too_late, lost: uplink.lost, restarts: uplink.restarts.into() }
 }
 
-fn capture_figures(side: &Side<'_>) -> CaptureFigures {
+fn capture_figures(side: &ComparedCapture<'_>) -> CaptureFigures {
     let mut source = side.counts.clone();
     source.first = side.first.map(|(first, _)| first.number);
     source.last = side.newest().map(|last| last.number);
-    source.last_s = side.last_s();
+    source.last_s = side.last_joints_s();
     for cell in side.buses.iter().flat_map(|bus| bus.cells.iter()).map(|(_, cell)| losses(cell)) {
         source.late += cell.late;
         source.too_late += cell.too_late;
         source.lost += cell.lost;
         source.restarts += cell.restarts;
     }
-    let histogram = side.reply().histogram();
+    let histogram = side.reply_times().histogram();
     source.reply_us =
         (side.has_times && !histogram.is_empty()).then(|| Quantiles::from_histogram(histogram, 1e-3));
     source

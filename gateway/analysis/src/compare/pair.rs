@@ -10,7 +10,7 @@ use protocol::skin::{JointKind, Skin};
 
 use super::report::{ContactCounts, FirstDifference, JointCounts, ReplyCounts, UnpairedCounts};
 use super::side::AnsweredJoints;
-use super::{Both, CompareOptions};
+use super::{CompareOptions, PerCapture};
 use crate::explain::ObservedCellState;
 
 /// The counts of a comparison for one bus.
@@ -74,8 +74,8 @@ impl FoundDifference {
     pub(super) fn describe(
         self,
         (skin, bus): (&Skin, usize),
-        moments: &Both<Option<&AnsweredJoints>>,
-        time_s: Both<Option<f64>>,
+        moments: &PerCapture<Option<&AnsweredJoints>>,
+        time_s: PerCapture<Option<f64>>,
     ) -> Option<FirstDifference> {
         let moment = moments.a.or(moments.b)?;
         let words = self.word.as_ref();
@@ -93,13 +93,13 @@ impl FoundDifference {
             epoch: moment.epoch.0,
             number: moment.key.number,
             time_s,
-            words: Both { a: word_a, b: word_b },
-            values: Both { a: value_a, b: value_b },
+            words: PerCapture { a: word_a, b: word_b },
+            values: PerCapture { a: value_a, b: value_b },
             unit: words.map(|word| word.unit),
             steps: words.map(|word| word.steps),
             inputs: self.inputs,
             unknown_inputs: self.unknown,
-            occurrence: Both {
+            occurrence: PerCapture {
                 a: moments.a.map(|moment| moment.occurrence),
                 b: moments.b.map(|moment| moment.occurrence),
             },
@@ -112,13 +112,13 @@ const fn missing(in_a: bool) -> &'static str {
 }
 
 /// Compares a joints packet that both captures have, and the answers to it. Returns the first differences.
-pub(super) fn compare(
+pub(super) fn compare_joints(
     tally: &mut Tally,
     (skin, bus): (&Skin, usize),
-    moments: Both<&AnsweredJoints>,
+    moments: PerCapture<&AnsweredJoints>,
     options: &CompareOptions,
 ) -> FirstDifferences {
-    let Both { a, b } = moments;
+    let PerCapture { a, b } = moments;
     let mut first = FirstDifferences::default();
     let joints = largest_joint_difference(skin, bus, moments);
     let steps = joints.as_ref().map_or(0, |joints| joints.steps);
@@ -138,7 +138,7 @@ pub(super) fn compare(
         });
     }
     if a.watched.halted != b.watched.halted {
-        tally.halts.count(a.watched.halted);
+        tally.halts.count_one(a.watched.halted);
         first.note(FoundDifference {
             what: "halt",
             how: missing(!a.watched.halted),
@@ -159,7 +159,7 @@ pub(super) fn compare(
         };
         let inputs = || differing_inputs(moments, same_joints, (in_a, in_b));
         let all = (&mut tally.torques, tally.cells.get_mut(cell));
-        reply.compare(all, moments, (Units::for_bus(skin, bus), options.tolerance), inputs, &mut first);
+        reply.compare_reply(all, moments, (Units::for_bus(skin, bus), options.tolerance), inputs, &mut first);
     }
     compare_sums(tally, (skin, bus), moments, (options.tolerance, same_joints), &mut first);
     first
@@ -169,11 +169,11 @@ pub(super) fn compare(
 fn compare_sums(
     tally: &mut Tally,
     (skin, bus): (&Skin, usize),
-    moments: Both<&AnsweredJoints>,
+    moments: PerCapture<&AnsweredJoints>,
     (tolerance, same_joints): (u32, bool),
     first: &mut FirstDifferences,
 ) {
-    let Both { a, b } = moments;
+    let PerCapture { a, b } = moments;
     let of = |moment: &AnsweredJoints, root: CellId| {
         let sum = moment.sums.iter().find(|(cell, _)| *cell == root);
         sum.map(|(_, sum)| (sum.words, sum.count))
@@ -208,7 +208,7 @@ fn compare_sums(
             all
         };
         let all = (&mut tally.sums, tally.cells.get_mut(*root));
-        reply.compare(all, moments, (Units::for_bus(skin, bus), tolerance), inputs, first);
+        reply.compare_reply(all, moments, (Units::for_bus(skin, bus), tolerance), inputs, first);
     }
 }
 
@@ -223,10 +223,10 @@ struct ReplyPair {
 }
 
 impl ReplyPair {
-    fn compare(
+    fn compare_reply(
         &self,
         (all, of_cell): (&mut ReplyCounts, Option<&mut ReplyCounts>),
-        moments: Both<&AnsweredJoints>,
+        moments: PerCapture<&AnsweredJoints>,
         (units, tolerance): (Units, u32),
         inputs: impl Fn() -> (Vec<&'static str>, Vec<&'static str>),
         first: &mut FirstDifferences,
@@ -310,9 +310,9 @@ impl ReplyCounts {
 fn largest_joint_difference(
     skin: &Skin,
     bus: usize,
-    moments: Both<&AnsweredJoints>,
+    moments: PerCapture<&AnsweredJoints>,
 ) -> Option<DifferingWords> {
-    let Both { a, b } = moments;
+    let PerCapture { a, b } = moments;
     let pairs = a.watched.joints.positions.iter().zip(&b.watched.joints.positions);
     let kinds = skin.joints_on_bus(bus).map(|(_, joint)| joint.kind);
     let differing = pairs.zip(kinds).enumerate().map(|(place, ((a, b), kind))| {
@@ -349,7 +349,7 @@ fn compare_contact(
     match both {
         Some((true, true)) => contacts.both += 1,
         Some((is_in_a, is_in_b)) if is_in_a != is_in_b => {
-            contacts.only.count(is_in_a);
+            contacts.only.count_one(is_in_a);
             first.note(FoundDifference {
                 what: "contact",
                 how: missing(is_in_b),
@@ -363,7 +363,7 @@ fn compare_contact(
 
 /// Returns the names of a cell's inputs that differ between the captures, and of those that are unknown in one of them.
 fn differing_inputs(
-    Both { a, b }: Both<&AnsweredJoints>,
+    PerCapture { a, b }: PerCapture<&AnsweredJoints>,
     same_joints: bool,
     (in_a, in_b): (&ObservedCellState, &ObservedCellState),
 ) -> (Vec<&'static str>, Vec<&'static str>) {

@@ -3,7 +3,7 @@
 use model::quantiles::Quantiles;
 use serde::Serialize;
 
-use super::Both;
+use super::PerCapture;
 
 /// The outcome of a comparison.
 #[derive(Clone, Debug, Serialize)]
@@ -13,7 +13,7 @@ pub struct CompareReport {
     /// The aspects that differ, in the order of [`ASPECTS`].
     pub differs: Vec<&'static str>,
     /// The two captures.
-    pub captures: Both<CaptureFigures>,
+    pub captures: PerCapture<CaptureFigures>,
     /// Counts of joints packets that are in both captures or missing from one.
     pub epochs: EpochCounts,
     /// Comparison of the words of joints.
@@ -99,7 +99,7 @@ pub struct UnpairedCounts {
 }
 
 impl UnpairedCounts {
-    pub(super) const fn count(&mut self, is_a: bool) {
+    pub(super) const fn count_one(&mut self, is_a: bool) {
         *(if is_a { &mut self.only_a } else { &mut self.only_b }) += 1;
     }
 
@@ -173,7 +173,7 @@ pub struct CellRow {
     #[serde(flatten)]
     pub replies: ReplyCounts,
     /// Losses of the cell in each capture.
-    pub losses: Both<Losses>,
+    pub losses: PerCapture<Losses>,
 }
 
 /// Losses of a cell in one capture.
@@ -218,11 +218,11 @@ pub struct FirstDifference {
     /// The number of that epoch's joints since the run began.
     pub number: u64,
     /// The time of the joints in s of each run; absent if a capture lacks the joints or has no times.
-    pub time_s: Both<Option<f64>>,
+    pub time_s: PerCapture<Option<f64>>,
     /// The differing words in each capture.
-    pub words: Both<Option<i16>>,
+    pub words: PerCapture<Option<i16>>,
     /// The values of the differing words, in [`FirstDifference::unit`].
-    pub values: Both<Option<f64>>,
+    pub values: PerCapture<Option<f64>>,
     /// Unit of `values`: Nm, N, rad or m; absent without words.
     pub unit: Option<&'static str>,
     /// The difference in steps of the tolerance; absent without words.
@@ -233,5 +233,5 @@ pub struct FirstDifference {
     /// The inputs of the cell that are unknown in at least one capture.
     pub unknown_inputs: Vec<&'static str>,
     /// The number of the epoch's occurrence in each capture, from 1, for `skinbus explain --occurrence`.
-    pub occurrence: Both<Option<u32>>,
+    pub occurrence: PerCapture<Option<u32>>,
 }

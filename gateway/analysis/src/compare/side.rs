@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use model::quantiles::Times;
+use model::quantiles::TimeHistogram;
 use model::tracker::{CellTracker, MAX_LATE_EPOCHS, PerCell};
 use protocol::id::CellId;
 use protocol::message::{Joints, Message};
@@ -64,7 +64,7 @@ pub(super) struct ComparedCell {
 }
 
 #[derive(Debug, Default)]
-pub(super) struct BusSide {
+pub(super) struct ComparedBus {
     /// Number of joints of the bus's chain.
     chain: usize,
     roots: Vec<CellId>,
@@ -85,34 +85,34 @@ const fn is_far_behind(newest: JointsKey, key: JointsKey) -> bool {
 
 /// One capture of a comparison, as far as it has been read.
 #[derive(Debug)]
-pub(super) struct Side<'a> {
+pub(super) struct ComparedCapture<'a> {
     skin: &'a Skin,
     watch: JointsWatcher<'a>,
     numbering: Numbering,
     period_ns: u64,
-    pub(super) buses: Vec<BusSide>,
+    pub(super) buses: Vec<ComparedBus>,
     /// The first joints packet and its time in ns.
     pub(super) first: Option<(JointsKey, u64)>,
     /// The time of the last joints packet in ns.
     last_nanos: Option<u64>,
     pub(super) is_ended: bool,
     pub(super) has_times: bool,
-    reply: Times,
+    reply: TimeHistogram,
     /// The counts of the report that grow with each frame.
     pub(super) counts: CaptureFigures,
 }
 
-impl<'a> Side<'a> {
+impl<'a> ComparedCapture<'a> {
     pub(super) fn new(skin: &'a Skin, period_ns: u64, start: Option<u64>) -> Self {
-        let bus_side = |bus| BusSide {
+        let bus_side = |bus| ComparedBus {
             chain: skin.joints_on_bus(bus).len(),
             roots: skin.cells_on_bus(bus).filter(|cell| cell.root).map(|cell| cell.node).collect(),
             occurrences: vec![0; 256],
-            ..BusSide::default()
+            ..ComparedBus::default()
         };
         Self {
             skin,
-            watch: JointsWatcher::all(skin),
+            watch: JointsWatcher::for_all_joints(skin),
             numbering: Numbering::new(period_ns, start),
             period_ns,
             buses: (0..skin.buses.len()).map(bus_side).collect(),
@@ -120,7 +120,7 @@ impl<'a> Side<'a> {
             last_nanos: None,
             is_ended: false,
             has_times: true,
-            reply: Times::default(),
+            reply: TimeHistogram::default(),
             counts: CaptureFigures::default(),
         }
     }
@@ -135,7 +135,7 @@ impl<'a> Side<'a> {
         }
     }
 
-    fn bus(&mut self, name: &str) -> Option<&mut BusSide> {
+    fn bus(&mut self, name: &str) -> Option<&mut ComparedBus> {
         let at = self.skin.bus_named(name)?;
         self.buses.get_mut(at)
     }
@@ -155,7 +155,7 @@ impl<'a> Side<'a> {
         }
         self.watch.receive(nanos, bus, message);
         if is_new {
-            self.collect(false);
+            self.collect_complete_joints(false);
         }
         is_new
     }
@@ -220,11 +220,11 @@ impl<'a> Side<'a> {
 
     /// Ends the capture: all answers count as complete.
     pub(super) fn end(&mut self) {
-        self.collect(true);
+        self.collect_complete_joints(true);
         self.is_ended = true;
     }
 
-    fn collect(&mut self, is_end: bool) {
+    fn collect_complete_joints(&mut self, is_end: bool) {
         let newest = self.numbering.newest();
         for (at, bus) in self.buses.iter_mut().enumerate() {
             while let Some(first) = bus.pending.front() {
@@ -275,12 +275,12 @@ impl<'a> Side<'a> {
     }
 
     /// Returns the time of the last joints in s of the run.
-    pub(super) fn last_s(&self) -> Option<f64> {
+    pub(super) fn last_joints_s(&self) -> Option<f64> {
         self.seconds(self.last_nanos?)
     }
 
     /// Returns the times from joints to their answers.
-    pub(super) const fn reply(&self) -> &Times {
+    pub(super) const fn reply_times(&self) -> &TimeHistogram {
         &self.reply
     }
 
@@ -292,7 +292,7 @@ impl<'a> Side<'a> {
 
     /// Returns the reason why the capture has no joints of the skin; `None` if it has some.
     pub(super) fn not_found(&mut self) -> Option<NotFound> {
-        let watch = std::mem::replace(&mut self.watch, JointsWatcher::all(self.skin));
+        let watch = std::mem::replace(&mut self.watch, JointsWatcher::for_all_joints(self.skin));
         if self.first.is_some() { None } else { watch.moments().err() }
     }
 }

@@ -4,7 +4,7 @@ use super::*;
 use model::testing::SKIN;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Heartbeat, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{Heartbeat, NetworkPage, SensorPage, SkinSensors, State, StimulusStart};
 use protocol::packet::{Epoch, padded, padded_words};
 
 mod property;
@@ -58,7 +58,7 @@ fn heartbeat(skin: &Skin, sent: u16) -> Message {
     Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }
 }
 
-fn press(from: AppliesFrom, newtons: f64) -> Message {
+fn press(from: StimulusStart, newtons: f64) -> Message {
     let contact = [Q5_10::nearest(newtons); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
     Message::Stimulus { to: Node::Cell(cell(1)), from, page }
@@ -71,7 +71,7 @@ fn run(skin: &Skin, numbers: std::ops::Range<u64>) -> Frames {
     let mut frames = vec![(at(numbers.start) - 20_000_000, "vcan0", heartbeat(skin, sent))];
     for number in numbers {
         if number == 5 {
-            frames.push((at(5) - 1_000_000, "vcan0", press(AppliesFrom::Epoch(Epoch(5)), 1.0)));
+            frames.push((at(5) - 1_000_000, "vcan0", press(StimulusStart::Epoch(Epoch(5)), 1.0)));
         }
         frames.push((at(number), "vcan0", joints(number)));
         if number >= 5 {
@@ -84,12 +84,12 @@ fn run(skin: &Skin, numbers: std::ops::Range<u64>) -> Frames {
 /// Reads two captures in lockstep; also returns the maximum number of joints that were held.
 pub(super) fn read<'a>(
     skin: &'a Skin,
-    (options, starts): (CompareOptions, Both<Option<u64>>),
+    (options, starts): (CompareOptions, PerCapture<Option<u64>>),
     a: &Frames,
     b: &Frames,
 ) -> (Comparison<'a>, usize) {
     let mut comparison = Comparison::new(skin, options, starts);
-    let mut frames = Both { a: a.iter(), b: b.iter() };
+    let mut frames = PerCapture { a: a.iter(), b: b.iter() };
     let mut held = 0;
     while let Some(which) = comparison.next_side() {
         match frames.get_mut(which).next() {
@@ -102,7 +102,7 @@ pub(super) fn read<'a>(
 }
 
 fn compared(skin: &Skin, options: CompareOptions, a: &Frames, b: &Frames) -> CompareReport {
-    read(skin, (options, Both::default()), a, b).0.report()
+    read(skin, (options, PerCapture::default()), a, b).0.report()
 }
 
 fn equal(skin: &Skin, a: &Frames, b: &Frames) -> CompareReport {
@@ -165,8 +165,8 @@ fn a_word_that_is_one_step_off_is_found_and_explained() {
     let report = equal(&skin, &a, &late);
     let first = report.first.unwrap();
     assert_eq!((first.epoch, first.number), (14, 270));
-    assert_eq!(first.occurrence, Both { a: Some(2), b: Some(2) });
-    assert_eq!(first.words, Both { a: Some(100), b: Some(98) });
+    assert_eq!(first.occurrence, PerCapture { a: Some(2), b: Some(2) });
+    assert_eq!(first.words, PerCapture { a: Some(100), b: Some(98) });
     assert_eq!(
         (first.steps, first.inputs.as_slice(), first.unknown_inputs.as_slice()),
         (Some(2), &[][..], &[][..])
@@ -186,7 +186,7 @@ fn an_input_that_differs_is_named() {
     let b = changed(
         &a,
         |it| matches!(it, Message::Stimulus { .. }),
-        Some(press(AppliesFrom::Epoch(Epoch(5)), 2.0)),
+        Some(press(StimulusStart::Epoch(Epoch(5)), 2.0)),
     );
     let b = changed(&b, is_torque_of(5), Some(torque(1, 5, 200)));
     let first = equal(&skin, &a, &b).first.unwrap();
@@ -195,7 +195,7 @@ fn an_input_that_differs_is_named() {
     let b = changed(
         &a,
         |it| matches!(it, Message::Stimulus { .. }),
-        Some(press(AppliesFrom::Epoch(Epoch(6)), 1.0)),
+        Some(press(StimulusStart::Epoch(Epoch(6)), 1.0)),
     );
     let b = changed(&b, is_torque_of(5), None);
     let report = equal(&skin, &a, &b);
@@ -270,7 +270,7 @@ fn what_one_has_before_and_after_the_other_is_no_difference_but_a_missing_epoch_
     assert_eq!((first.what, first.how, first.number, first.epoch), ("epoch", "missing in b", 256, 0));
     assert_eq!(first.time_s.b, None);
     // A recording that was cut off lacks joints that the other one has.
-    let mut comparison = Comparison::new(&skin, CompareOptions::default(), Both::default());
+    let mut comparison = Comparison::new(&skin, CompareOptions::default(), PerCapture::default());
     for (which, frames) in [(CaptureSide::A, &a), (CaptureSide::B, &run(&skin, 0..300))] {
         frames.iter().for_each(|(nanos, bus, message)| comparison.receive(which, *nanos, bus, Some(message)));
     }
@@ -362,7 +362,7 @@ fn few_joints_are_held_however_long_the_captures_are() {
     b.retain(|(nanos, ..)| !(at(3_000)..at(6_000)).contains(nanos));
     // The cell is touched but does not answer.
     b.retain(|(nanos, _, it)| *nanos < at(8_000) || !matches!(it, Message::Torque { .. }));
-    let (comparison, held) = read(&skin, (CompareOptions::default(), Both::default()), &a, &b);
+    let (comparison, held) = read(&skin, (CompareOptions::default(), PerCapture::default()), &a, &b);
     assert!(held <= 80, "{held} joints were held");
     let report = comparison.report();
     assert_eq!((report.epochs.missing_in_b, report.torques.missing_in_b), (3_000, 3_996));
@@ -375,7 +375,7 @@ fn few_joints_are_held_however_long_the_captures_are() {
     for end in [5_000, 9_000] {
         let mut b = a.clone();
         b.retain(|(nanos, bus, _)| *bus == "vcan1" || !(at(1_000)..at(end)).contains(nanos));
-        let (comparison, held) = read(&skin, (CompareOptions::default(), Both::default()), &a, &b);
+        let (comparison, held) = read(&skin, (CompareOptions::default(), PerCapture::default()), &a, &b);
         assert!(held <= 300, "{held} joints were held");
         let report = comparison.report();
         assert_eq!((report.epochs.missing_in_b, report.epochs.compared), (end - 1_000, 19_000 - end));
@@ -387,14 +387,14 @@ fn a_part_is_put_where_its_joints_are() {
     let skin = skin();
     let trace = |frames: &Frames| {
         let mut trace = JointTrace::new(&skin);
-        frames.iter().for_each(|(nanos, bus, message)| trace.take(*nanos, bus, message));
+        frames.iter().for_each(|(nanos, bus, message)| trace.record(*nanos, bus, message));
         trace
     };
     let a = run(&skin, 0..2_000);
     for first in [1, 100, 256, 300, 1_000, 1_900] {
         let b = run(&skin, first..2_000);
         let starts = start_numbers(&trace(&a), &trace(&b));
-        assert_eq!(starts, Both { a: Some(0), b: Some(first) });
+        assert_eq!(starts, PerCapture { a: Some(0), b: Some(first) });
         let report = read(&skin, (CompareOptions::default(), starts), &a, &b).0.report();
         assert_eq!((report.equal, report.epochs.before.only_a), (true, first));
         assert_eq!(report.captures.b.first, Some(first));
@@ -411,7 +411,7 @@ fn a_part_is_put_where_its_joints_are() {
         frames.iter().map(|(nanos, bus, message)| (*nanos, *bus, same(message))).collect()
     };
     let found = start_numbers(&trace(&standing(&a)), &trace(&standing(&run(&skin, 300..900))));
-    assert_eq!(found, Both { a: Some(0), b: Some(44) });
+    assert_eq!(found, PerCapture { a: Some(0), b: Some(44) });
 }
 
 #[test]
@@ -419,7 +419,7 @@ fn a_capture_of_another_skin_is_known_by_its_buses_joints_and_configurations() {
     let skin = skin();
     let a = run(&skin, 0..10);
     let not_found = |b: &Frames| {
-        read(&skin, (CompareOptions::default(), Both::default()), &a, b).0.not_found(CaptureSide::B)
+        read(&skin, (CompareOptions::default(), PerCapture::default()), &a, b).0.not_found(CaptureSide::B)
     };
     assert_eq!(not_found(&a), None);
     let elsewhere: Frames = a.iter().map(|(nanos, _, message)| (*nanos, "can9", *message)).collect();
@@ -439,7 +439,7 @@ fn a_capture_of_another_skin_is_known_by_its_buses_joints_and_configurations() {
         0,
         (at(0) - 5, "vcan0", Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }),
     );
-    let comparison = read(&skin, (CompareOptions::default(), Both::default()), &a, &configured).0;
+    let comparison = read(&skin, (CompareOptions::default(), PerCapture::default()), &a, &configured).0;
     assert_eq!(comparison.other_configurations(CaptureSide::A), None);
     assert_eq!(comparison.other_configurations(CaptureSide::B), Some((1, 0)));
 }

@@ -38,7 +38,7 @@ const HEARTBEAT_MS: u32 = 250;
 pub fn dbc(skin: &Skin, bus: usize) -> String {
     let mut out = String::new();
     if let Some(description) = skin.buses.get(bus) {
-        text::write(&mut out, skin, bus, description, &messages(skin, bus))
+        text::write_dbc(&mut out, skin, bus, description, &messages(skin, bus))
             .expect("writing to a string cannot fail");
     }
     out

@@ -6,7 +6,9 @@ use protocol::id::Kind;
 use protocol::message::State;
 use protocol::packet::{Length, WORDS};
 use protocol::parameters::Parameter;
-use protocol::schema::{Field, FieldFormat, FieldRange, Layout, PacketSchema, Units, parameters, reasons};
+use protocol::schema::{
+    Field, FieldFormat, FieldRange, Layout, PacketSchema, Units, parameter_layouts, refusal_reasons,
+};
 
 /// Position after the last word in a packet of six words, in bits.
 const WORDS_END_BIT: usize = WORDS * 16;
@@ -25,11 +27,11 @@ pub(super) struct BusChain {
 impl BusChain {
     /// Returns true if packets of this kind can have the page `layout` on the bus. A page for a row of the chain exists
     /// only up to the number of rows of the chain, or the minimum of a firmware image.
-    fn has(&self, kind: Kind, layout: &Layout) -> bool {
+    fn has_page(&self, kind: Kind, layout: &Layout) -> bool {
         let is_parameter = matches!(kind, Kind::Configure | Kind::Configured);
         match Parameter::from_number(layout.number) {
             Some(parameter @ Parameter::Row(_)) if is_parameter => {
-                Parameter::stored(self.rows).any(|stored| stored == parameter)
+                Parameter::stored_for_rows(self.rows).any(|stored| stored == parameter)
             }
             Some(_) | None => true,
         }
@@ -83,7 +85,8 @@ pub(super) fn packet_signals(schema: &'static PacketSchema, length: Length, chai
             })
             .map(move |it| Signal { page, ..it })
     };
-    let layouts: Vec<_> = schema.layouts.iter().filter(|layout| chain.has(schema.kind, layout)).collect();
+    let layouts: Vec<_> =
+        schema.layouts.iter().filter(|layout| chain.has_page(schema.kind, layout)).collect();
     let mut signals: Vec<_> = layouts.iter().copied().flat_map(of_layout).collect();
     for field in &schema.end {
         let is_number = matches!(field.format, FieldFormat::Page(_) | FieldFormat::Parameter(_));
@@ -97,7 +100,7 @@ pub(super) fn packet_signals(schema: &'static PacketSchema, length: Length, chai
         signals
             .extend(signals_of.map(placed).map(|signal| if is_number { numbered(signal) } else { signal }));
     }
-    signals.push(bits("crc".to_owned(), length.bytes() * 8 - 16, 16));
+    signals.push(unsigned_signal("crc".to_owned(), length.bytes() * 8 - 16, 16));
     let words = length.words() * 16;
     signals.sort_by_key(|signal| if signal.start < words { 0 } else { signal.start });
     signals
@@ -109,7 +112,7 @@ fn layout_names(layouts: impl IntoIterator<Item = &'static Layout>) -> Vec<(i64,
 }
 
 /// Returns an unscaled, unsigned signal.
-fn bits(name: String, start: usize, bits: u8) -> Signal {
+fn unsigned_signal(name: String, start: usize, bits: u8) -> Signal {
     let max = f64::from(u32::MAX >> (32 - u32::from(bits.clamp(1, 32))));
     Signal {
         name,
@@ -133,13 +136,22 @@ fn field_signals(field: &'static Field, prefix: &str, units: Units) -> Vec<Signa
     }
     if field.format == FieldFormat::State {
         let bit = |(bit, name): (State, &str)| {
-            bits(format!("state_{}", name.replace('-', "_")), at + bit.0.trailing_zeros() as usize, 1)
+            unsigned_signal(
+                format!("state_{}", name.replace('-', "_")),
+                at + bit.0.trailing_zeros() as usize,
+                1,
+            )
         };
-        let parts = [bits("state_joint".to_owned(), at + 8, 4), bits("state_version".to_owned(), at + 12, 4)];
+        let parts = [
+            unsigned_signal("state_joint".to_owned(), at + 8, 4),
+            unsigned_signal("state_version".to_owned(), at + 12, 4),
+        ];
         return State::NAMES.into_iter().map(bit).chain(parts).collect();
     }
     if let FieldFormat::Ports(_, ports) = field.format {
-        return (0..usize::from(ports)).map(|port| bits(named(&port.to_string()), at + port, 1)).collect();
+        return (0..usize::from(ports))
+            .map(|port| unsigned_signal(named(&port.to_string()), at + port, 1))
+            .collect();
     }
     if field.labels.is_empty() {
         return vec![element_signal(field, 0, units, named(""))];
@@ -159,8 +171,8 @@ fn field_signals(field: &'static Field, prefix: &str, units: Units) -> Vec<Signa
 
 /// Returns the signal of one element of a field.
 fn element_signal(field: &'static Field, element: usize, units: Units, name: String) -> Signal {
-    let unscaled = bits(name, field.first_bit(), field.width());
-    let factor = field.step_in(element, units);
+    let unscaled = unsigned_signal(name, field.first_bit(), field.width());
+    let factor = field.element_step_size(element, units);
     let signed = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
     let [min, max] = if field.is_signed() { signed } else { unscaled.range };
     let range = match field.range {
@@ -170,16 +182,16 @@ fn element_signal(field: &'static Field, element: usize, units: Units, name: Str
     };
     let named = |(value, name): &'static (i16, String)| (i64::from(*value), name.as_str());
     let names = if let FieldFormat::Parameter(_) = field.format {
-        layout_names(parameters())
+        layout_names(parameter_layouts())
     } else if field.is_saturating() {
         [i16::MAX, i16::MIN].map(|end| (i64::from(end), "saturated")).to_vec()
     } else if field.format == FieldFormat::Reason {
-        reasons().iter().map(named).collect()
+        refusal_reasons().iter().map(named).collect()
     } else {
         field.names.iter().map(named).collect()
     };
     // Readers differ in the non-ASCII bytes that they accept.
-    let unit = match field.unit_in(element, units) {
+    let unit = match field.element_unit(element, units) {
         "°C" => "degC",
         unit => unit,
     };

@@ -35,7 +35,7 @@ const STANDARD_CAN_FD: u8 = 14;
 /// The values of `GenMsgSendType`.
 const SEND_TYPES: [&str; 3] = ["NoMsgSendType", "Cyclic", "CyclicIfActive"];
 
-pub(super) fn write(
+pub(super) fn write_dbc(
     out: &mut impl Write,
     skin: &Skin,
     index: usize,

@@ -19,7 +19,7 @@ mod watch;
 pub use not_found::{NotFound, other_robot_text};
 pub use read::{FoundJoints, read_to_joints};
 pub use row::{MAX_JACOBIAN_ERROR_STEPS, TorqueRow, WordVerdict};
-pub use watch::{JointsWatcher, ObservedCellState, ObservedJoints, Origin, RequestedJoints};
+pub use watch::{ContactOrigin, JointsWatcher, ObservedCellState, ObservedJoints, RequestedJoints};
 
 use protocol::fixed::{Q, is_saturated};
 use protocol::message::{SkinSensors, State};
@@ -27,8 +27,8 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, MAX_ROBOT_JOINTS, Skin, SkinReply};
 use serde::Serialize;
 
-use self::row::{joint_number, max_jacobian_error_steps, row};
-use model::central::Central;
+use self::row::{joint_number, max_jacobian_error_steps, torque_row};
+use model::central::CentralComputation;
 
 /// The derivation of all torques of one epoch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -85,7 +85,7 @@ pub struct CellExplained {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ForceSteps {
     /// The packet from which the cell's contact state is known.
-    pub origin: Origin,
+    pub origin: ContactOrigin,
     /// The three contact words in N.
     pub contact_n: [f64; 3],
     /// The proximity.
@@ -148,7 +148,7 @@ pub struct Explainer<'a> {
     skin: &'a Skin,
     /// For each bus, the skin reduced to that bus, and two central computations: with the cells' words, and with the
     /// file's numbers.
-    buses: Vec<(Skin, [Central; 2])>,
+    buses: Vec<(Skin, [CentralComputation; 2])>,
 }
 
 impl<'a> Explainer<'a> {
@@ -157,7 +157,7 @@ impl<'a> Explainer<'a> {
     pub fn new(skin: &'a Skin) -> Self {
         let parts = (0..skin.buses.len()).map(|bus| {
             let part = skin.with_cells_of_bus(bus);
-            let both = [Central::new(&part), Central::unquantised(&part)];
+            let both = [CentralComputation::new(&part), CentralComputation::unquantised(&part)];
             (part, both)
         });
         Self { skin, buses: parts.collect() }
@@ -173,7 +173,7 @@ impl<'a> Explainer<'a> {
 
 fn explain_with(
     skin: &Skin,
-    parts: &[(Skin, [Central; 2])],
+    parts: &[(Skin, [CentralComputation; 2])],
     moments: &[Option<ObservedJoints>],
 ) -> Explanation {
     let mut explanation =
@@ -243,7 +243,7 @@ fn explain_with(
             let rows = chain.iter().enumerate().map(|(at, joint)| {
                 let moves = at < usize::from(cell.joint);
                 let steps = moves.then_some(steps);
-                row(joint, at, steps, force.as_ref(), &exact, &unit, format, words.as_ref())
+                torque_row(joint, at, steps, force.as_ref(), &exact, &unit, format, words.as_ref())
             });
             let rows: Vec<_> = rows.collect();
             for (at, (joint, _)) in chain.iter().enumerate() {
@@ -338,7 +338,7 @@ fn usable_contact(
     cell: &Cell,
     said: &ObservedCellState,
     missing: &mut Vec<String>,
-) -> Option<(SkinSensors, Origin)> {
+) -> Option<(SkinSensors, ContactOrigin)> {
     let node = cell.node;
     let target = skin.parameters(cell).hash();
     let answered = said.answer.is_some();
@@ -380,7 +380,7 @@ impl ForceSteps {
 
 /// Computes Algorithm 1 in `f64`, in which every word, sum and product is exact.
 #[expect(clippy::cast_possible_truncation, reason = "at most 2^36 steps of 2^-24: exact")]
-fn force_steps_of(cell: &Cell, sensors: &SkinSensors, origin: Origin) -> ForceSteps {
+fn force_steps_of(cell: &Cell, sensors: &SkinSensors, origin: ContactOrigin) -> ForceSteps {
     let rule = &cell.contact;
     let contact_n = sensors.contact.map(Q::to_f64);
     let touch_n = contact_n.iter().sum();

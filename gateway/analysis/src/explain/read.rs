@@ -3,7 +3,7 @@
 use model::decode::{Decoded, Decoder};
 use protocol::skin::Skin;
 use protocol::time::Micros;
-use trace::capture::{CaptureError, Entry, NoteKind, Reader};
+use trace::capture::{CaptureEntry, CaptureError, NoteKind, Reader};
 
 use super::NotFound;
 use super::watch::{JointsWatcher, ObservedJoints, RequestedJoints};
@@ -45,11 +45,11 @@ pub fn read_to_joints(
     }
     let mut zero = reader.extras().run_began();
     let is_of_run = zero.is_some();
-    zero.into_iter().for_each(|zero| watch.count_from(zero));
+    zero.into_iter().for_each(|zero| watch.set_zero_time(zero));
     let (mut is_empty, mut dropped, mut unreadable) = (true, 0_u64, 0_u64);
     while let Some(entry) = reader.next()? {
         match entry {
-            Entry::Frame(record) => {
+            CaptureEntry::Frame(record) => {
                 let nanos = record.time.nanos;
                 zero.get_or_insert(nanos);
                 is_empty = false;
@@ -59,7 +59,7 @@ pub fn read_to_joints(
                     break;
                 }
             }
-            Entry::Note(note) => match note.kind {
+            CaptureEntry::Note(note) => match note.kind {
                 NoteKind::Dropped(frames) => dropped = dropped.saturating_add(frames),
                 NoteKind::Unreadable(_) => unreadable += 1,
                 NoteKind::Text | NoteKind::CanXl => {}

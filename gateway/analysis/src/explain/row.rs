@@ -1,6 +1,6 @@
 //! One word of a cell's torque: its expected value, and the cause if it differs.
 
-use protocol::fixed::{Acc, TorqueFormat, is_saturated};
+use protocol::fixed::{Accumulator, TorqueFormat, is_saturated};
 use protocol::packet::Words;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Joint;
@@ -62,7 +62,7 @@ pub(super) fn joint_number(joint: usize) -> u8 {
 }
 
 #[expect(clippy::too_many_arguments, reason = "each is a column of the row")]
-pub(super) fn row(
+pub(super) fn torque_row(
     &(joint, described): &(usize, &Joint),
     at: usize,
     steps: Option<i64>,
@@ -74,12 +74,12 @@ pub(super) fn row(
 ) -> TorqueRow {
     let of = |values: &[f64; MAX_JOINTS]| force.and_then(|_| values.get(at).copied());
     let (jacobian_m, product_nm) = (of(unit), of(exact));
-    let nearest = product_nm.map(|product| format.nearest(product));
+    let nearest = product_nm.map(|product| format.nearest_word(product));
     let word = words.and_then(|words| words.as_slice().get(at).copied());
     let difference = nearest.zip(word).map(|(nearest, word)| i32::from(word) - i32::from(nearest));
     let verdict = match (force, jacobian_m, nearest, word) {
         (Some(force), Some(jacobian), Some(nearest), Some(word)) => {
-            verdict(force.force_steps, jacobian, steps, format, nearest, word)
+            word_verdict(force.force_steps, jacobian, steps, format, nearest, word)
         }
         (_, _, _, _) => WordVerdict::Open,
     };
@@ -109,7 +109,7 @@ pub(super) fn max_jacobian_error_steps(rows: usize) -> i64 {
     clippy::cast_precision_loss,
     reason = "J is within +-2 m: 2^15 steps"
 )]
-fn verdict(
+fn word_verdict(
     force_steps: i64,
     jacobian_m: f64,
     steps: Option<i64>,
@@ -126,7 +126,7 @@ fn verdict(
     let mut near: Vec<i64> = (middle - within - 1..=middle + within + 1).collect();
     let off = |steps: i64| steps as f64 - exact;
     near.sort_by(|one, other| off(*one).abs().total_cmp(&off(*other).abs()));
-    let gives = |steps: i64| format.round(Acc::<30>::from_steps(steps * force_steps)) == word;
+    let gives = |steps: i64| format.round(Accumulator::<30>::from_steps(steps * force_steps)) == word;
     let found = near.into_iter().find(|&steps| off(steps).abs() <= within as f64 && gives(steps));
     found.map_or(WordVerdict::Unexplained, |steps| WordVerdict::Rounded {
         jacobian_m: steps as f64 / 16_384.0,

@@ -10,13 +10,13 @@ use protocol::packet::Epoch;
 use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
 use thiserror::Error;
-use trace::capture::{CaptureError, Entry, Note, Reader};
+use trace::capture::{CaptureEntry, CaptureError, CaptureNote, Reader};
 
 use super::watch::{JointsWatcher, ObservedJoints};
 use super::{Explainer, Explanation, NotFound};
 
 /// Number of epochs that a bus may be behind the others before they no longer wait for it.
-const MAX_BUS_LAG: i64 = 64;
+const MAX_BUS_LAG_EPOCHS: i64 = 64;
 
 /// The torques of one epoch.
 #[derive(Clone, Debug, PartialEq)]
@@ -68,7 +68,7 @@ pub struct SeriesTotals {
 pub fn each_epoch<E>(
     reader: &mut Reader,
     skin: &Skin,
-    mut note: impl FnMut(&Note<'_>),
+    mut note: impl FnMut(&CaptureNote<'_>),
     mut take: impl FnMut(u64, &EpochTorque) -> Result<(), E>,
 ) -> Result<SeriesTotals, SeriesError<E>> {
     let mut series = EpochJoiner::new(skin);
@@ -83,8 +83,8 @@ pub fn each_epoch<E>(
     let mut zero = reader.extras().run_began();
     while let Some(entry) = reader.next()? {
         let record = match entry {
-            Entry::Frame(record) => record,
-            Entry::Note(of_reader) => {
+            CaptureEntry::Frame(record) => record,
+            CaptureEntry::Note(of_reader) => {
                 note(&of_reader);
                 continue;
             }
@@ -94,13 +94,13 @@ pub fn each_epoch<E>(
         let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
         let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
         series.watch.receive(nanos, record.interface, message);
-        series.collect(false);
+        series.collect_complete_joints(false);
         while let Some(epoch) = series.next(false) {
             counted.epochs += 1;
             take(counted.zero_ns, &epoch).map_err(SeriesError::Consumer)?;
         }
     }
-    series.collect(true);
+    series.collect_complete_joints(true);
     while let Some(epoch) = series.next(true) {
         counted.epochs += 1;
         take(counted.zero_ns, &epoch).map_err(SeriesError::Consumer)?;
@@ -139,7 +139,7 @@ impl<'a> EpochJoiner<'a> {
         let with_cells = (0..skin.buses.len()).filter(|bus| skin.cells_on_bus(*bus).next().is_some());
         Self {
             skin,
-            watch: JointsWatcher::all(skin),
+            watch: JointsWatcher::for_all_joints(skin),
             explainer: Explainer::new(skin),
             waiting: BTreeMap::new(),
             last: with_cells.map(|bus| (bus, None)).collect(),
@@ -148,7 +148,7 @@ impl<'a> EpochJoiner<'a> {
     }
 
     /// Collects the joints of each bus whose answers are complete; at the end of the capture, all joints.
-    fn collect(&mut self, is_end: bool) {
+    fn collect_complete_joints(&mut self, is_end: bool) {
         for (bus, last) in &mut self.last {
             while let Some((epoch, moment)) = self.watch.pop(*bus, is_end) {
                 let (newest, of_newest) = self.newest.unwrap_or((0, epoch));
@@ -174,7 +174,7 @@ impl<'a> EpochJoiner<'a> {
         let (number, _) = self.waiting.first_key_value()?;
         let newest = self.newest.map_or(*number, |(newest, _)| newest);
         let is_passed = self.last.iter().all(|(_, last)| last.is_some_and(|last| last >= *number));
-        if !is_end && !is_passed && newest - number <= MAX_BUS_LAG {
+        if !is_end && !is_passed && newest - number <= MAX_BUS_LAG_EPOCHS {
             return None;
         }
         let (_, (epoch, moments)) = self.waiting.pop_first()?;

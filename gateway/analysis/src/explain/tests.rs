@@ -3,7 +3,7 @@
 use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, State};
+use protocol::message::{Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, State, StimulusStart};
 use protocol::packet::padded;
 use protocol::packet::{self, Epoch};
 use protocol::parameters::Parameter;
@@ -33,7 +33,7 @@ fn joints(epoch: u8) -> Message {
     Message::Joints { epoch: Epoch(epoch), joints: Joints { positions: padded(&positions), in_use: 6 } }
 }
 
-fn press(from: AppliesFrom, newtons: f64) -> Message {
+fn press(from: StimulusStart, newtons: f64) -> Message {
     let page =
         SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() });
     Message::Stimulus { to: Node::Cell(cell()), from, page }
@@ -67,13 +67,13 @@ fn first(epoch: u8) -> RequestedJoints {
 #[test]
 fn the_worked_example_of_the_document_is_explained_step_by_step() {
     let skin = skin();
-    let said = [heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
+    let said = [heartbeat(0x266D), press(StimulusStart::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     assert_eq!(explanation.missing, Vec::<String>::new());
     let [cell] = explanation.cells.as_slice() else { panic!("{explanation:?}") };
     let force = cell.force.unwrap();
     assert_eq!((force.force_steps, force.touch_n.to_bits()), (196_608, 3.0_f64.to_bits()));
-    assert_eq!(force.origin, Origin::Stimulus { at_ns: 2_000_000, from_epoch: None, late: false });
+    assert_eq!(force.origin, ContactOrigin::Stimulus { at_ns: 2_000_000, from_epoch: None, late: false });
     assert_eq!(cell.answered_after_ns, Some(1_000_000));
     let jacobian: Vec<_> =
         cell.rows.iter().map(|row| Q1_14::nearest(row.jacobian_m.unwrap()).to_bits()).collect();
@@ -91,7 +91,7 @@ fn the_worked_example_of_the_document_is_explained_step_by_step() {
 fn a_word_that_no_jacobian_near_makes_is_not_explained() {
     let skin = skin();
     let verdicts = |words| {
-        let said = [heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7), torque(7, words)];
+        let said = [heartbeat(0x266D), press(StimulusStart::Next, 1.0), joints(7), torque(7, words)];
         let explanation = explained(&skin, &said, first(7)).unwrap();
         [0, 1].map(|at| explanation.cells[0].rows[at].verdict)
     };
@@ -111,7 +111,7 @@ fn a_torque_in_a_joint_that_does_not_move_the_cell_is_not_explained() {
     if let Message::Torque { torque, .. } = &mut wrong {
         *torque = [-1075, 3195, 1, 0, 0, 0].into();
     }
-    let said = [heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7), wrong];
+    let said = [heartbeat(0x266D), press(StimulusStart::Next, 1.0), joints(7), wrong];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     assert_eq!(explanation.cells[0].rows[2].verdict, WordVerdict::Unexplained);
 }
@@ -120,7 +120,8 @@ fn a_torque_in_a_joint_that_does_not_move_the_cell_is_not_explained() {
 fn beyond_the_word_saturated_is_right_and_anything_else_is_not() {
     let skin = skin();
     let verdict = |word| {
-        let said = [heartbeat(0x266D), press(AppliesFrom::Next, 30.0), joints(7), torque(7, [-32_250, word])];
+        let said =
+            [heartbeat(0x266D), press(StimulusStart::Next, 30.0), joints(7), torque(7, [-32_250, word])];
         explained(&skin, &said, first(7)).unwrap().cells[0].rows[1].verdict
     };
     assert_eq!(verdict(i16::MAX), WordVerdict::Saturated);
@@ -130,7 +131,7 @@ fn beyond_the_word_saturated_is_right_and_anything_else_is_not() {
 #[test]
 fn another_configuration_is_named_and_nothing_computed() {
     let skin = skin();
-    let said = [heartbeat(0x1234), press(AppliesFrom::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
+    let said = [heartbeat(0x1234), press(StimulusStart::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     let expected = "vcan0 12: it computes with configuration 1234, the skin has 266D: its force and its torque cannot \
                     be computed from this skin";
@@ -138,7 +139,7 @@ fn another_configuration_is_named_and_nothing_computed() {
     assert!(explanation.cells[0].force.is_none());
     assert_eq!((explanation.total[0].open, explanation.total[0].word_steps), (1, -1075));
     // Its first report follows the torque; its configuration was the same before.
-    let said = [press(AppliesFrom::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
+    let said = [press(StimulusStart::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
     assert_eq!(explained(&skin, &said, first(7)).unwrap().missing, [expected]);
     let without = explained(&skin, &said[..3], first(7)).unwrap();
     let expected = "vcan0 12: it did not report its configuration; assumed to be the skin's, 266D";
@@ -163,7 +164,7 @@ fn a_measuring_cell_is_known_by_its_own_page_of_that_epoch_only() {
         Message::Sensors { from: cell(), epoch: Epoch(epoch), page: SensorPage::Skin(skin) }
     };
     // A measuring cell refuses a stimulus.
-    let said = [measuring, press(AppliesFrom::Next, 9.0), page(6), joints(7), torque(7, [-1075, 3195])];
+    let said = [measuring, press(StimulusStart::Next, 9.0), page(6), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     let expected = "vcan0 12: its contact state is not in the capture: it measures, and sent no sensors page in this epoch";
     assert_eq!(explanation.missing, [expected]);
@@ -222,7 +223,7 @@ fn joints_that_a_cell_drops_are_none() {
 fn a_torque_after_four_more_joints_is_named_and_not_used() {
     let skin = skin();
     let said = |more: u8| {
-        let mut said = vec![heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7)];
+        let mut said = vec![heartbeat(0x266D), press(StimulusStart::Next, 1.0), joints(7)];
         said.extend((8..8 + more).map(joints));
         said.push(torque(7, [-1075, 3195]));
         said
@@ -245,7 +246,7 @@ fn a_claim_of_an_owned_node_id_changes_nothing() {
     };
     let mut said = vec![
         heartbeat(0x266D),
-        press(AppliesFrom::Next, 1.0),
+        press(StimulusStart::Next, 1.0),
         joints(6),
         joints(7),
         torque(7, [-1075, 3195]),
@@ -261,17 +262,17 @@ fn a_claim_of_an_owned_node_id_changes_nothing() {
 #[test]
 fn a_late_stimulus_is_called_late_and_a_written_mode_forgets_it() {
     let skin = skin();
-    let said = [heartbeat(0x266D), joints(6), press(AppliesFrom::Epoch(Epoch(6)), 1.0), joints(7)];
+    let said = [heartbeat(0x266D), joints(6), press(StimulusStart::Epoch(Epoch(6)), 1.0), joints(7)];
     let origin = |said: &[Message]| {
         let force =
             explained(&skin, &[said, &[torque(7, [0, 0])]].concat(), first(7)).unwrap().cells[0].force;
         force.map(|force| (force.origin, force.force_steps))
     };
-    let late = Origin::Stimulus { at_ns: 3_000_000, from_epoch: Some(6), late: true };
+    let late = ContactOrigin::Stimulus { at_ns: 3_000_000, from_epoch: Some(6), late: true };
     assert_eq!(origin(&said), Some((late, 196_608)));
     let request = Request::Write { number: Parameter::Mode.number(), words: [1, 0, 0, 0, 0, 0] };
     let mode = Message::Configure { to: Node::Everyone, tag: 0, request };
     let (before, joints) = said.split_at(3);
     let written = [before, &[mode], joints].concat();
-    assert_eq!(origin(&written), Some((Origin::Mode { at_ns: 4_000_000 }, 0)));
+    assert_eq!(origin(&written), Some((ContactOrigin::Mode { at_ns: 4_000_000 }, 0)));
 }

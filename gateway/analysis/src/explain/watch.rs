@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use model::tracker::{AddressClaim, ContactState, HeartbeatKind, MAX_LATE_EPOCHS, PerCell, is_late};
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+    Answer, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart,
 };
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::Parameter;
@@ -25,7 +25,7 @@ const MAX_LISTED_RUNS: usize = 8;
 /// The packet from which a cell's contact state is known.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case", tag = "by")]
-pub enum Origin {
+pub enum ContactOrigin {
     /// A start of the cell, which ends its contact.
     Start {
         /// Time of the report of the start.
@@ -80,7 +80,7 @@ pub struct ObservedJoints {
 #[derive(Clone, Debug, Default)]
 pub struct ObservedCellState {
     /// The contact state of the cell, and the packet from which it is known; `None` if unknown.
-    pub contact_state: Option<(SkinSensors, Origin)>,
+    pub contact_state: Option<(SkinSensors, ContactOrigin)>,
     /// True if the cell is in test mode and obeys stimuli; `None` if it has not reported its mode.
     pub test_mode: Option<bool>,
     /// The state flags in the cell's last heartbeat.
@@ -135,7 +135,7 @@ struct OpenJoints {
 #[derive(Clone, Debug, Default)]
 struct WatchedCell {
     claim: AddressClaim,
-    contact: ContactState<Origin>,
+    contact: ContactState<ContactOrigin>,
     hash: Option<u16>,
 }
 
@@ -156,7 +156,7 @@ impl<'a> JointsWatcher<'a> {
 
     /// Creates a watch that returns all joints, by [`JointsWatcher::pop`].
     #[must_use]
-    pub fn all(skin: &'a Skin) -> Self {
+    pub fn for_all_joints(skin: &'a Skin) -> Self {
         Self::with_request(skin, None)
     }
 
@@ -168,7 +168,7 @@ impl<'a> JointsWatcher<'a> {
     }
 
     /// Sets the time that counts as 0 s, in ns since 1970; the default is the time of the first frame.
-    pub const fn count_from(&mut self, zero: u64) {
+    pub const fn set_zero_time(&mut self, zero: u64) {
         self.zero = Some(zero);
     }
 
@@ -182,7 +182,7 @@ impl<'a> JointsWatcher<'a> {
                     bus_watch.latch(epoch);
                 }
             } else {
-                bus_watch.take(nanos, 0, message, self.requested, joints);
+                bus_watch.receive_message(nanos, 0, message, self.requested, joints);
             }
         }
     }
@@ -200,7 +200,7 @@ impl<'a> JointsWatcher<'a> {
         };
         bus_watch.is_in_capture = true;
         if let Some(message) = message {
-            bus_watch.take(
+            bus_watch.receive_message(
                 nanos,
                 nanos.saturating_sub(zero),
                 message,
@@ -264,7 +264,7 @@ impl<'a> JointsWatcher<'a> {
             if from_ns > 0 {
                 requested += &format!(" at {} s or later", seconds(from_ns));
             }
-            let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.text(zero)).collect();
+            let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.describe(zero)).collect();
             if bus_watch.further_runs > 0 {
                 runs.push(format!("{} further runs", bus_watch.further_runs));
             }
@@ -281,7 +281,7 @@ fn seconds(nanos: u64) -> String {
 }
 
 impl EpochRun {
-    fn text(&self, zero: u64) -> String {
+    fn describe(&self, zero: u64) -> String {
         let Self { first, last, joints } = *self;
         let [from, to] = [first, last].map(|(_, at)| format!("{:.3}", seconds_since(zero, at)));
         let (first, last) = (first.0, last.0);
@@ -317,7 +317,7 @@ impl BusWatch {
         self.open.front().is_some_and(OpenJoints::is_complete)
     }
 
-    fn take(
+    fn receive_message(
         &mut self,
         nanos: u64,
         after: u64,
@@ -335,12 +335,12 @@ impl BusWatch {
                 if came != robot {
                     self.other_joints = Some(came);
                 } else if last != Some(epoch) {
-                    self.joints(nanos, after, epoch, joints, requested);
+                    self.receive_joints(nanos, after, epoch, joints, requested);
                 }
             }
             Message::Stimulus { to, from, page } => {
-                let from_epoch = if let AppliesFrom::Epoch(epoch) = from { Some(epoch.0) } else { None };
-                let origin = Origin::Stimulus { at_ns: nanos, from_epoch, late: is_late(from, last) };
+                let from_epoch = if let StimulusStart::Epoch(epoch) = from { Some(epoch.0) } else { None };
+                let origin = ContactOrigin::Stimulus { at_ns: nanos, from_epoch, late: is_late(from, last) };
                 self.cells
                     .addressed_mut(to)
                     .iter_mut()
@@ -348,7 +348,7 @@ impl BusWatch {
             }
             Message::Configure { to, request: Request::Write { number, words }, .. } => {
                 if Parameter::from_number(number) == Some(Parameter::Mode) {
-                    let (obeys, origin) = (words.first() == Some(&1), Origin::Mode { at_ns: nanos });
+                    let (obeys, origin) = (words.first() == Some(&1), ContactOrigin::Mode { at_ns: nanos });
                     self.cells.addressed_mut(to).iter_mut().for_each(|cell| cell.set_mode(obeys, origin));
                 }
             }
@@ -370,24 +370,26 @@ impl BusWatch {
                 }
             }
             Message::Network { from: Node::Cell(from), page: NetworkPage::Received(heard), .. } => {
-                let cell = self.cells.get_mut(from).filter(|cell| cell.contact.obeys() != Some(false));
+                let cell =
+                    self.cells.get_mut(from).filter(|cell| cell.contact.obeys_stimuli() != Some(false));
                 cell.into_iter().for_each(|cell| {
-                    cell.contact.compare_count(heard.stimuli, Origin::Said { at_ns: nanos })
+                    cell.contact.compare_count(heard.stimuli, ContactOrigin::Said { at_ns: nanos })
                 });
             }
             Message::Sensors { from, epoch, page: page @ SensorPage::Skin(skin) } => {
-                let origin = Origin::Said { at_ns: nanos };
-                let cell = self.cells.get_mut(from).filter(|cell| cell.contact.obeys() != Some(false));
+                let origin = ContactOrigin::Said { at_ns: nanos };
+                let cell =
+                    self.cells.get_mut(from).filter(|cell| cell.contact.obeys_stimuli() != Some(false));
                 if let Some(cell) = cell.filter(|_| last.is_none_or(|last| last == epoch)) {
                     cell.contact.apply_reported_page(page, origin);
                 }
                 // A measuring cell has read its sensors at these very joints.
-                if let Some((cell, _)) = self.answering(from, epoch) {
+                if let Some((cell, _)) = self.answering_cell(from, epoch) {
                     cell.contact_state.get_or_insert((skin, origin));
                 }
             }
             Message::Torque { from, epoch, torque } => {
-                if let Some((cell, in_time)) = self.answering(from, epoch) {
+                if let Some((cell, in_time)) = self.answering_cell(from, epoch) {
                     if cell.answer.is_some() {
                         cell.repeated += 1;
                     } else if in_time {
@@ -407,7 +409,7 @@ impl BusWatch {
         }
     }
 
-    fn joints(
+    fn receive_joints(
         &mut self,
         nanos: u64,
         after: u64,
@@ -428,8 +430,8 @@ impl BusWatch {
         if opens {
             let cells =
                 self.cells.iter().map(|(_, WatchedCell { claim, contact, hash })| ObservedCellState {
-                    contact_state: contact.skin().copied(),
-                    test_mode: contact.obeys(),
+                    contact_state: contact.presumed_skin().copied(),
+                    test_mode: contact.obeys_stimuli(),
                     state: claim.heartbeat().map(|heartbeat| heartbeat.state),
                     hash: *hash,
                     ..ObservedCellState::default()
@@ -458,7 +460,7 @@ impl BusWatch {
     }
 
     /// Returns the cell as of the newest joints of this epoch, and true if an answer to them is still in time.
-    fn answering(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut ObservedCellState, bool)> {
+    fn answering_cell(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut ObservedCellState, bool)> {
         let open = self.open.iter_mut().rev().find(|open| open.epoch == epoch)?;
         let in_time = !open.is_too_late();
         Some((open.moment.cells.get_mut(from.index())?, in_time))
@@ -481,25 +483,25 @@ impl WatchedCell {
         let obeys = heartbeat.state.has(State::TEST_MODE);
         match self.claim.receive(Micros(at_ns / 1_000), heartbeat) {
             HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken => return false,
-            HeartbeatKind::Started { .. } => self.set_mode(obeys, Origin::Start { at_ns }),
+            HeartbeatKind::Started { .. } => self.set_mode(obeys, ContactOrigin::Start { at_ns }),
             // The apparent start was none, and the contact state before it was not kept.
             HeartbeatKind::Shared => self.contact.reset(),
             HeartbeatKind::First | HeartbeatKind::Continued if !obeys => self.contact.reset(),
             HeartbeatKind::First | HeartbeatKind::Continued => {}
         }
-        self.contact.set_obeys(obeys);
+        self.contact.set_obeys_stimuli(obeys);
         self.hash = Some(heartbeat.configuration);
         true
     }
 
     /// Sets the mode of the cell. In test mode it starts without contact; a cell that measures has a contact state that
     /// the bus does not show.
-    fn set_mode(&mut self, obeys: bool, origin: Origin) {
+    fn set_mode(&mut self, obeys: bool, origin: ContactOrigin) {
         if obeys {
-            self.contact.start(origin);
+            self.contact.record_start(origin);
         } else {
             self.contact.reset();
         }
-        self.contact.set_obeys(obeys);
+        self.contact.set_obeys_stimuli(obeys);
     }
 }

@@ -6,17 +6,17 @@ use protocol::message::SensorPage;
 use protocol::packet::Length;
 use protocol::parameters::Sensing;
 use protocol::skin::{Skin, SkinReply};
-use protocol::wire_time::{BitRates, Coding, Shape};
+use protocol::wire_time::{BitRates, FrameCoding, FrameShape};
 
 use super::response::{Response, Stream, response};
 
 /// Period of heartbeats, in ns.
 const HEARTBEAT_NS: u64 = 250_000_000;
 /// With sensors on, the pages other than the skin's follow every fourth heartbeat.
-const OTHERS_NS: u64 = 4 * HEARTBEAT_NS;
+const OTHER_PAGES_PERIOD_NS: u64 = 4 * HEARTBEAT_NS;
 /// Number of these pages.
 #[expect(clippy::cast_possible_truncation, reason = "a few pages")]
-const OTHERS: u32 = SensorPage::SIMULATED.len() as u32 - 1;
+const OTHER_PAGE_COUNT: u32 = SensorPage::SIMULATED.len() as u32 - 1;
 /// Share of the period that `skinbus skin generate` gives to slots, in percent.
 const SLOTS_SHARE_PERCENT: u64 = 75;
 
@@ -129,7 +129,7 @@ pub struct WorstCaseTimes {
 impl WorstCaseTimes {
     /// Returns the smaller of the two bounds of the last answer, in ns.
     #[must_use]
-    pub fn last_ns(&self) -> Option<u64> {
+    pub fn last_answer_ns(&self) -> Option<u64> {
         self.chain_ns.into_iter().chain(self.response_ns.map(|it| it.worst_ns)).min()
     }
 }
@@ -165,15 +165,15 @@ impl BusCase {
     /// Returns the longest time of a frame of joints or of an answer; on a classic bus, of any frame.
     #[must_use]
     pub fn frame_ns(&self) -> u64 {
-        self.frame_of_ns(self.length)
+        self.frame_time_ns(self.length)
     }
 
-    fn frame_of_ns(&self, length: Length) -> u64 {
+    fn frame_time_ns(&self, length: Length) -> u64 {
         let (coding, len) = match self.format {
-            Format::Fd => (Coding::FdSwitched, u8::try_from(length.bytes()).unwrap_or(u8::MAX)),
-            Format::Classic => (Coding::Classic, 8),
+            Format::Fd => (FrameCoding::FdSwitched, u8::try_from(length.bytes()).unwrap_or(u8::MAX)),
+            Format::Classic => (FrameCoding::Classic, 8),
         };
-        Shape { coding, extended: false, len }.max_bits().nanoseconds(self.rates)
+        FrameShape { coding, extended: false, len }.max_bits().nanoseconds(self.rates)
     }
 
     /// Returns the number of frames that a packet of this length takes.
@@ -198,7 +198,7 @@ impl BusCase {
 
     /// Returns the duration of an arbitration bit in ns, rounded up.
     fn bit_ns(&self) -> u64 {
-        1_000_000_000_u64.div_ceil(u64::from(self.rates.nominal()))
+        1_000_000_000_u64.div_ceil(u64::from(self.rates.nominal_rate()))
     }
 
     /// Returns the periodic streams on the bus, highest priority first: joints, answers, sensors (page 0, page 1),
@@ -209,11 +209,11 @@ impl BusCase {
         let (cells, early_ns) = (self.answers.cells(), self.period_ns);
         let of = |length, senders: u32, period_ns, jitter_ns| {
             let count = senders.saturating_mul(self.frames_of(length));
-            Stream { count, period_ns, jitter_ns, frame_ns: self.frame_of_ns(length) }
+            Stream { count, period_ns, jitter_ns, frame_ns: self.frame_time_ns(length) }
         };
         let stream = |senders, period_ns, jitter_ns| of(Length::Six, senders, period_ns, jitter_ns);
-        let none = stream(0, OTHERS_NS, early_ns);
-        let others = stream(cells.saturating_mul(OTHERS), OTHERS_NS, early_ns);
+        let none = stream(0, OTHER_PAGES_PERIOD_NS, early_ns);
+        let others = stream(cells.saturating_mul(OTHER_PAGE_COUNT), OTHER_PAGES_PERIOD_NS, early_ns);
         let [page_0, others] = match self.sensing {
             Sensing::Off => [none; 2],
             Sensing::Continuous { period_ms } => {

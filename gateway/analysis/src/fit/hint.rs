@@ -48,7 +48,7 @@ fn more_buses(case: &BusCase) -> Vec<Hint> {
     let cells = case.answers.cells();
     let need = NeededBuses::for_cells(&MaxCells::for_case(case), cells);
     let mut numbers: Vec<_> =
-        [need.in_time(), need.buses()].into_iter().flatten().filter(|&it| it > 1).collect();
+        [need.buses_for_timing(), need.buses()].into_iter().flatten().filter(|&it| it > 1).collect();
     numbers.dedup();
     let spread = |buses: u32| {
         let each = cells.div_ceil(buses);

@@ -39,7 +39,7 @@ pub(super) fn needed<S: Serializer>(need: &NeededBuses, serializer: S) -> Result
         "deadline": deadline,
         "nodes": nodes,
         "buses": need.buses(),
-        "binding": need.binding(),
+        "binding": need.binding_limits(),
     })
     .serialize(serializer)
 }
@@ -57,8 +57,8 @@ impl Serialize for AssessedBus {
             "name": rates_name(case.format, case.rates),
             "verdict": self.verdict(),
             "format": if case.format == Format::Fd { "fd" } else { "classic" },
-            "nominal": case.rates.nominal(),
-            "data": case.rates.data(),
+            "nominal": case.rates.nominal_rate(),
+            "data": case.rates.data_rate(),
             "cells": case.answers.cells(),
             "answers": answers,
             "period_us": micros(case.period_ns),
@@ -72,7 +72,7 @@ impl Serialize for AssessedBus {
                 "total": load.total(),
             },
             "joints_us": times.joints_ns.map(micros),
-            "last_answer_us": times.last_ns().map(micros),
+            "last_answer_us": times.last_answer_ns().map(micros),
             "by_chain_us": times.chain_ns.map(micros),
             "by_response_us": times.response_ns.map(|it| micros(it.worst_ns)),
             "deadline_us": micros(case.deadline_ns()),

@@ -78,7 +78,7 @@ impl MaxCells {
 
     /// Returns the maximum number of cells for which the bus is fast enough: the smaller of bandwidth and deadline.
     #[must_use]
-    pub fn in_time(&self) -> u32 {
+    pub fn max_cells_in_time(&self) -> u32 {
         self.bandwidth.min(self.deadline)
     }
 }
@@ -139,7 +139,7 @@ impl NeededBuses {
         };
         // The two chains may be bound by different limits.
         let buses = sum(self.buses(), other.buses());
-        for limit in both.binding() {
+        for limit in both.binding_limits() {
             *match limit {
                 Limit::Bandwidth => &mut both.bandwidth,
                 Limit::Deadline => &mut both.deadline,
@@ -151,19 +151,19 @@ impl NeededBuses {
 
     /// Returns the number of buses that bandwidth and deadline require; `None` if not even one cell is in time.
     #[must_use]
-    pub fn in_time(&self) -> Option<u32> {
+    pub fn buses_for_timing(&self) -> Option<u32> {
         Some(self.bandwidth?.max(self.deadline?))
     }
 
     /// Returns the number of buses that all limits together require.
     #[must_use]
     pub fn buses(&self) -> Option<u32> {
-        Some(self.in_time()?.max(self.nodes?))
+        Some(self.buses_for_timing()?.max(self.nodes?))
     }
 
     /// Returns the limits that require the largest number of buses.
     #[must_use]
-    pub fn binding(&self) -> Vec<Limit> {
+    pub fn binding_limits(&self) -> Vec<Limit> {
         // `None` counts as more than any number.
         let key = |buses: Option<u32>| buses.unwrap_or(u32::MAX);
         let most = [self.bandwidth, self.deadline, self.nodes].map(key).into_iter().max();
@@ -173,12 +173,12 @@ impl NeededBuses {
     /// Returns the number of buses and the limits that require it, as a short text such as `3 nodes`. Bandwidth and
     /// deadline are both called time.
     #[must_use]
-    pub fn in_short(&self) -> String {
+    pub fn short_text(&self) -> String {
         let word = |limit| match limit {
             Limit::Bandwidth | Limit::Deadline => "time",
             Limit::Nodes => "nodes",
         };
-        let mut words: Vec<_> = self.binding().into_iter().map(word).collect();
+        let mut words: Vec<_> = self.binding_limits().into_iter().map(word).collect();
         words.dedup();
         match self.buses() {
             Some(1) => "1".to_owned(),
@@ -203,14 +203,14 @@ mod tests {
     fn the_larger_need_binds_and_equal_ones_both() {
         let need =
             |bandwidth, deadline| NeededBuses::for_cells(&MaxCells { bandwidth, deadline, nodes: 109 }, 253);
-        assert_eq!((need(212, 223).buses(), need(212, 223).binding()), (Some(3), vec![Limit::Nodes]));
-        assert_eq!(need(212, 223).in_time(), Some(2));
+        assert_eq!((need(212, 223).buses(), need(212, 223).binding_limits()), (Some(3), vec![Limit::Nodes]));
+        assert_eq!(need(212, 223).buses_for_timing(), Some(2));
         assert_eq!(
-            (need(58, 57).buses(), need(58, 57).binding()),
+            (need(58, 57).buses(), need(58, 57).binding_limits()),
             (Some(5), vec![Limit::Bandwidth, Limit::Deadline])
         );
-        assert_eq!((need(2, 0).buses(), need(2, 0).binding()), (None, vec![Limit::Deadline]));
-        assert_eq!(need(90, 91).binding(), Limit::all());
+        assert_eq!((need(2, 0).buses(), need(2, 0).binding_limits()), (None, vec![Limit::Deadline]));
+        assert_eq!(need(90, 91).binding_limits(), Limit::all());
     }
 
     impl Limit {

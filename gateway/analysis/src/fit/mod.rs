@@ -148,7 +148,7 @@ pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Assessed
     let format = skin.buses.get(index)?.format;
     let rates = match format {
         Format::Fd => rates,
-        Format::Classic => BitRates::classic(rates.nominal()).ok()?,
+        Format::Classic => BitRates::classic(rates.nominal_rate()).ok()?,
     };
     Some(AssessedBus::assess(&BusCase::from_skin(skin, index, format, rates, COMPUTATION_NS)?))
 }
@@ -162,12 +162,12 @@ pub struct SkinFit {
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: NeededBuses,
     /// The fit for increasing numbers of buses.
-    pub spread: Vec<Spread>,
+    pub spread: Vec<SpreadFit>,
 }
 
 /// The fit of all cells on one number of buses.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Spread {
+pub struct SpreadFit {
     /// Number of buses.
     pub buses: u32,
     /// The bus with the most cells.
@@ -186,11 +186,11 @@ pub fn spread_over_buses(skin: &Skin, buses: &[BusFit]) -> Option<SkinFit> {
     let numbers = 1..=most;
     // Show only informative numbers: all below the required one are too small.
     let is_shown =
-        |buses: &u32| *buses <= 6 || Some(*buses) == need.in_time() || Some(*buses) == need.buses();
+        |buses: &u32| *buses <= 6 || Some(*buses) == need.buses_for_timing() || Some(*buses) == need.buses();
     let spread = numbers
         .filter(is_shown)
         .map(|buses| (buses, fullest.rated.case.with_cells(cells.div_ceil(buses))))
-        .map(|(buses, case)| Spread { buses, fullest: AssessedBus::assess(&case) });
+        .map(|(buses, case)| SpreadFit { buses, fullest: AssessedBus::assess(&case) });
     Some(SkinFit { cells, need, spread: spread.collect() })
 }
 

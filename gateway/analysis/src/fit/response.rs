@@ -14,7 +14,7 @@
 //! All instances of the busy period are examined: the first one is not always the slowest.
 
 /// A busy period longer than this, in ns, counts as unbounded.
-const HORIZON_NS: u64 = 60_000_000_000;
+const MAX_BUSY_PERIOD_NS: u64 = 60_000_000_000;
 
 /// Periodic frames of one priority class.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -100,7 +100,7 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
 /// [`HORIZON_NS`].
 fn fixed_point(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
     let mut at_ns = from_ns;
-    while at_ns <= HORIZON_NS {
+    while at_ns <= MAX_BUSY_PERIOD_NS {
         let next_ns = next_ns(at_ns);
         if next_ns == at_ns {
             return Some(at_ns);

@@ -55,12 +55,12 @@ fn the_whole_arm_is_too_much_for_one_bus_at_1m_5m_and_three_are_needed_electrica
     assert!((load.heartbeats - share(253.0 * 0.064)).abs() < 1e-12);
     assert_eq!(load.sensors.to_bits(), 0);
     assert_eq!(fit.rated.exceeded, [Limit::Bandwidth, Limit::Deadline, Limit::Nodes]);
-    assert_eq!(fit.rated.times.last_ns(), None);
+    assert_eq!(fit.rated.times.last_answer_ns(), None);
     assert_eq!(fit.rated.times.heartbeat_ns, None);
     // 212 * 70.4 * 1.064 + 70.4 = 15 950 of 16 000 us; 223 * 70.4 + 3 * 70.4 + 68.5 = 15 979 us.
     assert_eq!(fit.most, MaxCells { bandwidth: 212, deadline: 223, nodes: 109 });
-    assert_eq!((fit.need.in_time(), fit.need.buses()), (Some(2), Some(3)));
-    assert_eq!(fit.need.binding(), [Limit::Nodes]);
+    assert_eq!((fit.need.buses_for_timing(), fit.need.buses()), (Some(2), Some(3)));
+    assert_eq!(fit.need.binding_limits(), [Limit::Nodes]);
 }
 
 #[test]
@@ -73,7 +73,7 @@ fn at_1m_8m_it_is_in_time_and_the_chain_is_the_smaller_bound() {
     let response = fit.rated.times.response_ns.unwrap();
     // Response-time analysis counts joints and blocking once more for the torque itself.
     assert_eq!(response.worst_ns, 56_000 * (4 + 253) + 68_500);
-    assert_eq!(fit.rated.times.last_ns(), fit.rated.times.chain_ns);
+    assert_eq!(fit.rated.times.last_answer_ns(), fit.rated.times.chain_ns);
     assert!(fit.hints.iter().all(|it| it.change == "3 buses of 85 cells"));
 }
 
@@ -156,7 +156,10 @@ fn sums_of_all_cells_save_no_frame_and_those_of_roots_all_others() {
     let fit = fit(&skin, "1M/5M");
     let [shared, roots] = &fit.answers[..] else { panic!("{:?}", fit.answers) };
     assert_eq!(shared.after.load, fit.rated.load);
-    assert!(shared.after.times.last_ns() > fit.rated.times.last_ns(), "parents wait for their children");
+    assert!(
+        shared.after.times.last_answer_ns() > fit.rated.times.last_answer_ns(),
+        "parents wait for their children"
+    );
     assert_eq!(roots.after.case.answers.cells(), 1);
     let packets = roots.after.load.total() / (70.4 / 16_000.0);
     assert!((packets - 2.064).abs() < 1e-9, "joints, one sum, and that cell's heartbeats: {packets}");

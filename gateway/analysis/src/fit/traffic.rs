@@ -160,12 +160,14 @@ impl TrafficClassifier {
                 bench(BenchFrame::Sync)
             }
             Message::Report => ClassifiedFrame { says: RunEvent::Preparation, ..bench(BenchFrame::Report) },
-            Message::Sensors { from, page, .. } if page.simulated().is_some() => self.page(*from, |owed| {
-                let bit = 1 << page.number();
-                let is_owed = owed.sensors & bit != 0;
-                owed.sensors &= !bit;
-                is_owed
-            }),
+            Message::Sensors { from, page, .. } if page.simulated_index().is_some() => {
+                self.classify_page(*from, |owed| {
+                    let bit = 1 << page.number();
+                    let is_owed = owed.sensors & bit != 0;
+                    owed.sensors &= !bit;
+                    is_owed
+                })
+            }
             Message::Sensors { .. } => ClassifiedFrame::OTHER,
             Message::Network { from, page, .. } => {
                 let Node::Cell(from) = *from else { return ClassifiedFrame::OTHER };
@@ -188,14 +190,18 @@ impl TrafficClassifier {
                     }
                     bench(BenchFrame::Report)
                 } else {
-                    self.page(from, |owed| std::mem::take(&mut owed.tree))
+                    self.classify_page(from, |owed| std::mem::take(&mut owed.tree))
                 }
             }
         }
     }
 
     /// Classifies a page that a cell sends on a report command and also at other times.
-    fn page(&mut self, from: CellId, take: impl FnOnce(&mut PendingReplies) -> bool) -> ClassifiedFrame {
+    fn classify_page(
+        &mut self,
+        from: CellId,
+        take: impl FnOnce(&mut PendingReplies) -> bool,
+    ) -> ClassifiedFrame {
         let is_owed = self.cells().get_mut(from.index()).is_some_and(take);
         ClassifiedFrame { bench: is_owed.then_some(BenchFrame::Report), ..ClassifiedFrame::OTHER }
     }
@@ -215,7 +221,7 @@ impl TrafficClassifier {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use protocol::message::{Heartbeat, ReceivedCounts, RejectedCounts, SensorPage, SkinSensors, Tree};
+    use protocol::message::{Heartbeat, ReceivedCounts, RejectedCounts, SensorPage, SkinSensors, TreePage};
 
     fn said(traffic: &mut TrafficClassifier, format: Format, message: &Message) -> Vec<Option<BenchFrame>> {
         message.encode().frames(format).map(|frame| traffic.classify(0, &frame).bench).collect()
@@ -240,7 +246,7 @@ mod tests {
             let mut traffic = TrafficClassifier::default();
             let mut last = |message: &Message| *said(&mut traffic, format, message).last().unwrap();
             let (alive, tree) =
-                (heartbeat(1, State::CONFIGURED), page(1, NetworkPage::Tree(Tree::default())));
+                (heartbeat(1, State::CONFIGURED), page(1, NetworkPage::Tree(TreePage::default())));
             assert_eq!([last(&alive), last(&skin(1)), last(&tree)], [None; 3]);
             assert_eq!(last(&Message::Sync), Some(BenchFrame::Sync));
             assert_eq!(last(&heartbeat(2, State::CLAIMING)), None, "it leaves sync unanswered");
@@ -270,7 +276,7 @@ mod tests {
         let mut traffic = TrafficClassifier::default();
         let stimulus = Message::Stimulus {
             to: Node::Everyone,
-            from: protocol::message::AppliesFrom::Next,
+            from: protocol::message::StimulusStart::Next,
             page: SensorPage::Skin(SkinSensors::default()),
         };
         assert_eq!(said(&mut traffic, Format::Classic, &stimulus), [None, Some(BenchFrame::Stimulus)]);

@@ -81,7 +81,7 @@ pub enum AnsweringCells {
 impl AnsweringCells {
     /// Returns the number of cells on the bus.
     #[must_use]
-    pub const fn on_the_bus(self) -> u32 {
+    pub const fn cells_on_bus(self) -> u32 {
         match self {
             Self::All { cells } | Self::Some { cells, .. } => cells,
             Self::Foreign => 0,
@@ -144,8 +144,8 @@ impl FitSummary {
     /// Returns the load and the verdict of a run. `load` is that of its busiest second, and `late` is the number of
     /// answers that ended after the next joints.
     #[must_use]
-    pub fn this_run(load: f64, late: u64, rates: String, cells: AnsweringCells) -> Self {
-        let on_the_bus = cells.on_the_bus();
+    pub fn for_run(load: f64, late: u64, rates: String, cells: AnsweringCells) -> Self {
+        let on_the_bus = cells.cells_on_bus();
         let holds = ByLimit { bandwidth: load <= 1.0, deadline: late == 0, nodes: on_the_bus < MAX_NODES };
         Self { load, rates, cells, verdict: FitVerdict::from_limits(&holds.exceeded(), on_the_bus) }
     }
@@ -186,7 +186,7 @@ mod tests {
 
     fn this_run(load: f64, late: u64, cells: u32) -> String {
         let cells = AnsweringCells::Some { most: 120, cells, described: true };
-        FitSummary::this_run(load, late, "1M/5M".to_owned(), cells).to_string()
+        FitSummary::for_run(load, late, "1M/5M".to_owned(), cells).to_string()
     }
 
     #[test]

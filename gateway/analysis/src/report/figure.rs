@@ -6,7 +6,7 @@ use serde::Serialize;
 
 pub use super::finding::{Finding, FindingVerdict, Quantity};
 pub use super::number::{number, quantity};
-pub use super::skin::{Drawing, Legend, Map, MapCell, Panel, Strip, StripGroup, StripRow};
+pub use super::skin::{CellMap, CellStrip, Drawing, Legend, MapCell, Panel, StripGroup, StripRow};
 
 /// The contents of an HTML page: a title, facts, and sections with figures and tables.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -98,10 +98,10 @@ pub struct Figure {
     pub x: Axis,
     /// The vertical axis.
     pub y: Axis,
-    /// The series in drawing order. Their colours follow this order, and repeat after [`Figure::COLOURS`].
+    /// The series in drawing order. Their colours follow this order, and repeat after [`Figure::COLOUR_COUNT`].
     pub series: Vec<Series>,
     /// Lines across the diagram at given positions, such as limits.
-    pub marks: Vec<Mark>,
+    pub marks: Vec<MarkLine>,
     /// A second diagram below this one, with the same horizontal axis.
     pub below: Option<LowerDiagram>,
 }
@@ -114,12 +114,12 @@ pub struct LowerDiagram {
     /// The series, as in a [`Figure`].
     pub series: Vec<Series>,
     /// Lines across the lower diagram at given positions.
-    pub marks: Vec<Mark>,
+    pub marks: Vec<MarkLine>,
 }
 
 impl Figure {
     /// Number of distinguishable colours; further series repeat them from the first.
-    pub const COLOURS: usize = 7;
+    pub const COLOUR_COUNT: usize = 7;
 
     /// Creates an empty figure of full width.
     #[must_use]
@@ -129,7 +129,7 @@ impl Figure {
 
     /// Makes the figure half as wide as the page.
     #[must_use]
-    pub const fn half(mut self) -> Self {
+    pub const fn half_width(mut self) -> Self {
         self.size = FigureWidth::Half;
         self
     }
@@ -150,14 +150,14 @@ impl Figure {
 
     /// Adds lines across the diagram.
     #[must_use]
-    pub fn marks(mut self, marks: impl IntoIterator<Item = Mark>) -> Self {
+    pub fn marks(mut self, marks: impl IntoIterator<Item = MarkLine>) -> Self {
         self.marks.extend(marks);
         self
     }
 
     /// Adds a second diagram below this one.
     #[must_use]
-    pub fn below(mut self, below: LowerDiagram) -> Self {
+    pub fn with_lower_diagram(mut self, below: LowerDiagram) -> Self {
         self.below = Some(below);
         self
     }
@@ -266,7 +266,7 @@ pub enum Shape {
 
 /// A line across a whole diagram.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Mark {
+pub struct MarkLine {
     /// The axis on which the line has its position.
     pub on: MarkAxis,
     /// The position of the line on that axis.
@@ -275,16 +275,16 @@ pub struct Mark {
     pub caption: String,
 }
 
-impl Mark {
+impl MarkLine {
     /// Creates a vertical line at a position on the horizontal axis.
     #[must_use]
-    pub fn x(at: f64, caption: impl Into<String>) -> Self {
+    pub fn at_x(at: f64, caption: impl Into<String>) -> Self {
         Self { on: MarkAxis::X, at, caption: caption.into() }
     }
 
     /// Creates a horizontal line at a position on the vertical axis.
     #[must_use]
-    pub fn y(at: f64, caption: impl Into<String>) -> Self {
+    pub fn at_y(at: f64, caption: impl Into<String>) -> Self {
         Self { on: MarkAxis::Y, at, caption: caption.into() }
     }
 }

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::number::{interval, quantity};
+use super::number::{format_interval, quantity};
 
 /// A result compared with the paper's number or with a limit.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -33,7 +33,8 @@ impl Finding {
     /// the same.
     #[must_use]
     pub fn less_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
-        let finding = Self::stated(what, ours).with_paper_value(paper).with_reference("below the paper's");
+        let finding =
+            Self::new_unrated(what, ours).with_paper_value(paper).with_reference("below the paper's");
         Self { verdict: FindingVerdict::less_is_better(paper, finding.ours.value), ..finding }
     }
 
@@ -41,13 +42,14 @@ impl Finding {
     /// the same.
     #[must_use]
     pub fn more_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
-        let finding = Self::stated(what, ours).with_paper_value(paper).with_reference("above the paper's");
+        let finding =
+            Self::new_unrated(what, ours).with_paper_value(paper).with_reference("above the paper's");
         Self { verdict: FindingVerdict::less_is_better(finding.ours.value, paper), ..finding }
     }
 
     /// Creates a finding for information, without a rating.
     #[must_use]
-    pub fn stated(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
+    pub fn new_unrated(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
         Self {
             what: what.into(),
             paper: None,
@@ -187,7 +189,7 @@ impl From<f64> for Quantity {
 
 impl fmt::Display for Quantity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&interval(self.value, self.plus_minus, &self.unit))
+        f.write_str(&format_interval(self.value, self.plus_minus, &self.unit))
     }
 }
 
@@ -210,7 +212,7 @@ mod tests {
         );
         assert_eq!(less(f64::NAN), FindingVerdict::Stated);
         assert_eq!(
-            Finding::stated("", quantity(0.0)).with_requirement("none", true).verdict,
+            Finding::new_unrated("", quantity(0.0)).with_requirement("none", true).verdict,
             FindingVerdict::Better
         );
     }

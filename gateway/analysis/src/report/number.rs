@@ -61,20 +61,21 @@ fn to_three_digits(value: f64) -> f64 {
 /// ```
 #[must_use]
 pub fn quantity(value: f64, unit: &str) -> String {
-    interval(value, None, unit)
+    format_interval(value, None, unit)
 }
 
 /// Formats a number and half the width of its 95 % confidence interval: the half width with two digits, and the number
 /// to the same decimal place.
-pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
+pub(super) fn format_interval(value: f64, half: Option<f64>, unit: &str) -> String {
     let size = value.abs().max(half.unwrap_or(0.0));
     if !value.is_finite() || unit.is_empty() && half.is_none() {
-        return fraction(value);
+        return format_unitless(value);
     }
     let PrefixedUnit { factor, unit } =
         prefixed(size, unit).unwrap_or_else(|| PrefixedUnit { factor: 1.0, unit: unit.to_owned() });
     let value = value * factor;
-    let of_half = half.map(|half| half * factor).and_then(|half| Some((half, second_digit(half)?)));
+    let of_half =
+        half.map(|half| half * factor).and_then(|half| Some((half, decimals_for_two_digits(half)?)));
     let (value, half) = match of_half {
         Some((half, digits)) => (with_decimals(value, digits), format!(" ± {}", with_decimals(half, digits))),
         None => {
@@ -87,7 +88,7 @@ pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
 
 /// Returns the number of decimals up to the second significant digit; `None` for a number that is zero, not finite, or
 /// written with a power of ten.
-fn second_digit(value: f64) -> Option<usize> {
+fn decimals_for_two_digits(value: f64) -> Option<usize> {
     let text = format!("{value:.1e}");
     let power: i32 = text.split_once('e')?.1.parse().ok()?;
     let is_plain = value.is_finite() && value != 0.0 && (-4..6).contains(&power);
@@ -102,7 +103,7 @@ fn with_decimals(value: f64, digits: usize) -> String {
 
 /// Formats a number without a unit. Values close to 1 keep more digits, so that a difference down to a millionth is
 /// visible: 0.9995.
-fn fraction(value: f64) -> String {
+fn format_unitless(value: f64) -> String {
     let digits = (4..=6).find(|digits| 1.0 - value >= 10_f64.powi(-digits));
     match digits.and_then(|digits| usize::try_from(digits).ok()) {
         Some(digits) if value > 0.999 && value < 1.0 => with_decimals(value, digits),
@@ -180,8 +181,8 @@ mod tests {
         ] {
             assert_eq!(quantity(value, unit).replace('\u{a0}', " "), text);
         }
-        assert_eq!(interval(0.25, Some(0.5), "Nm"), "250 ± 500\u{a0}mNm");
-        assert_eq!(interval(0.25, Some(0.5), ""), "0.25 ± 0.5");
+        assert_eq!(format_interval(0.25, Some(0.5), "Nm"), "250 ± 500\u{a0}mNm");
+        assert_eq!(format_interval(0.25, Some(0.5), ""), "0.25 ± 0.5");
     }
 
     #[test]
@@ -197,7 +198,11 @@ mod tests {
             (3.88, 1e-9, "3.88 ± 1e-9 ns"),
             (3.88, f64::INFINITY, "3.88 ± – ns"),
         ] {
-            assert_eq!(interval(value, Some(half), "ns").replace('\u{a0}', " "), text, "{value} {half}");
+            assert_eq!(
+                format_interval(value, Some(half), "ns").replace('\u{a0}', " "),
+                text,
+                "{value} {half}"
+            );
         }
     }
 

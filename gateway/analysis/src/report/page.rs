@@ -23,7 +23,7 @@ pub fn html(page: &Page) -> String {
          <style>\n{STYLE}{}\n</style>\n</head>\n<body>\n<header>\n<h1>{title}</h1>\n",
         svg::dark_rules()
     );
-    paragraph(&mut out, &page.intro);
+    write_paragraph(&mut out, &page.intro);
     out.push_str("</header>\n");
     if page.sections.len() > 2 {
         out.push_str("<nav><ul>\n");
@@ -35,7 +35,7 @@ pub fn html(page: &Page) -> String {
     }
     out.push_str("<main>\n");
     for part in &page.sections {
-        section(&mut out, part);
+        write_section(&mut out, part);
     }
     out.push_str("</main>\n");
     if !page.facts.is_empty() {
@@ -49,20 +49,20 @@ pub fn html(page: &Page) -> String {
     out
 }
 
-fn paragraph(out: &mut String, text: &str) {
+fn write_paragraph(out: &mut String, text: &str) {
     if !text.is_empty() {
         let _ = writeln!(out, "<p>{}</p>", escaped(text));
     }
 }
 
-fn section(out: &mut String, section: &Section) {
+fn write_section(out: &mut String, section: &Section) {
     let (name, title) = (escaped(&section.name), escaped(&section.title));
     let _ = writeln!(out, "<section id=\"{name}\">\n<h2>{title}</h2>");
     for text in &section.text {
-        paragraph(out, text);
+        write_paragraph(out, text);
     }
     if !section.findings.is_empty() {
-        findings(out, &section.findings);
+        write_findings(out, &section.findings);
     }
     for drawing in &section.drawings {
         let (name, title) = (escaped(drawing.name()), escaped(drawing.title()));
@@ -74,26 +74,26 @@ fn section(out: &mut String, section: &Section) {
     if !section.figures.is_empty() {
         out.push_str("<div class=\"figures\">\n");
         for part in &section.figures {
-            figure(out, part);
+            write_figure(out, part);
         }
         out.push_str("</div>\n");
     }
     for part in &section.tables {
-        table(out, part);
+        write_table(out, part);
     }
     out.push_str("</section>\n");
 }
 
-fn figure(out: &mut String, figure: &Figure) {
+fn write_figure(out: &mut String, figure: &Figure) {
     let class = if figure.size == FigureWidth::Wide { "wide" } else { "half" };
     let _ = writeln!(out, "<figure class=\"{class}\" id=\"{}\">", escaped(&figure.name));
-    let natural = svg::height(figure, figure.size);
+    let natural = svg::figure_size(figure, figure.size);
     if figure.size == FigureWidth::Wide {
         // Letters that are readable on a desktop are too small on a phone, which gets its own drawing.
-        out.push_str(&svg::inline(figure, natural, "desk"));
-        out.push_str(&svg::inline(figure, svg::height(figure, FigureWidth::Half), "hand"));
+        out.push_str(&svg::draw_inline(figure, natural, "desk"));
+        out.push_str(&svg::draw_inline(figure, svg::figure_size(figure, FigureWidth::Half), "hand"));
     } else {
-        out.push_str(&svg::inline(figure, natural, "both"));
+        out.push_str(&svg::draw_inline(figure, natural, "both"));
     }
     let _ = writeln!(out, "<figcaption>{}</figcaption>\n</figure>", escaped(&figure.title));
 }
@@ -101,13 +101,13 @@ fn figure(out: &mut String, figure: &Figure) {
 /// The attribute of right-aligned cells.
 const NUMBER_CLASS: &str = " class=\"n\"";
 
-fn findings(out: &mut String, findings: &[Finding]) {
+fn write_findings(out: &mut String, findings: &[Finding]) {
     let paper = findings.iter().any(|finding| finding.paper.is_some());
     let limit = findings.iter().any(|finding| finding.bar.is_some() || finding.against.is_some());
     let shown = [true, paper, true, limit, paper || limit];
     out.push_str("<div class=\"scroll\"><table class=\"findings\">\n<thead>");
     let head = [("figure", ""), ("paper", NUMBER_CLASS), ("here", NUMBER_CLASS), ("limit", ""), ("", "")];
-    row(out, "th", shown_cells(head, shown));
+    write_row(out, "th", shown_cells(head, shown));
     out.push_str("</thead>\n<tbody>\n");
     for finding in findings {
         let (class, verdict) = match (finding.verdict, &finding.bar) {
@@ -122,7 +122,7 @@ fn findings(out: &mut String, findings: &[Finding]) {
         let limit = finding.bar.as_ref().or(finding.against.as_ref());
         let limit = limit.map(|limit| format!("{limit}{origin}")).unwrap_or_default();
         let papers = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
-        let command = finding.command.as_deref().map(command);
+        let command = finding.command.as_deref().map(command_html);
         let command = command.map_or_else(String::new, |command| format!("<br/>{command}"));
         let _ = write!(out, "<tr><td>{}{command}</td>", escaped(&finding.what));
         let cells: [(&str, &str); 4] = [
@@ -132,13 +132,13 @@ fn findings(out: &mut String, findings: &[Finding]) {
             (verdict, &format!(" class=\"verdict {class}\"")),
         ];
         let [_, paper, ours, limit, verdict] = shown;
-        self::cells(out, "td", shown_cells(cells, [paper, ours, limit, verdict]));
+        write_cells(out, "td", shown_cells(cells, [paper, ours, limit, verdict]));
         out.push_str("</tr>\n");
     }
     out.push_str("</tbody>\n</table></div>\n");
 }
 
-fn table(out: &mut String, table: &Table) {
+fn write_table(out: &mut String, table: &Table) {
     // A heading, not a caption: a caption would be as wide as the table, even if that is wider than the screen.
     if !table.title.is_empty() {
         let _ = writeln!(out, "<h3>{}</h3>", escaped(&table.title));
@@ -149,16 +149,16 @@ fn table(out: &mut String, table: &Table) {
         columns.map(|column| if is_number_column(table, column) { NUMBER_CLASS } else { "" }).collect();
     let classes = || classes.iter().copied().chain(std::iter::repeat(""));
     out.push_str("<thead>");
-    row(out, "th", table.head.iter().map(String::as_str).zip(classes()));
+    write_row(out, "th", table.head.iter().map(String::as_str).zip(classes()));
     out.push_str("</thead>\n<tbody>\n");
     for cells in &table.rows {
         match cells.split_last() {
             Some((command, cells)) if table.commands => {
                 out.push_str("<tr>");
-                self::cells(out, "td", cells.iter().map(String::as_str).zip(classes()));
-                let _ = write!(out, "<td>{}</td></tr>", self::command(command));
+                write_cells(out, "td", cells.iter().map(String::as_str).zip(classes()));
+                let _ = write!(out, "<td>{}</td></tr>", command_html(command));
             }
-            _ => row(out, "td", cells.iter().map(String::as_str).zip(classes())),
+            _ => write_row(out, "td", cells.iter().map(String::as_str).zip(classes())),
         }
         out.push('\n');
     }
@@ -166,7 +166,7 @@ fn table(out: &mut String, table: &Table) {
 }
 
 /// Formats a command without line breaks inside the names of options, where a break could follow a hyphen.
-fn command(text: &str) -> String {
+fn command_html(text: &str) -> String {
     let word = |word: &str| match word.starts_with('-') {
         true => format!("<span>{}</span>", escaped(word)),
         false => escaped(word),
@@ -180,13 +180,13 @@ fn shown_cells<T, const N: usize>(cells: [T; N], shown: [bool; N]) -> impl Itera
 }
 
 /// Writes a row of an HTML table; `cells` gives the text and the attributes of each cell.
-fn row<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
+fn write_row<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
     out.push_str("<tr>");
-    self::cells(out, tag, cells);
+    write_cells(out, tag, cells);
     out.push_str("</tr>");
 }
 
-fn cells<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
+fn write_cells<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
     for (text, attributes) in cells {
         let _ = write!(out, "<{tag}{attributes}>{}</{tag}>", escaped(text));
     }
@@ -229,7 +229,7 @@ mod tests {
             findings: vec![
                 Finding::less_is_better("error", 0.0054, nm(6.3e-5))
                     .with_command(Some("look <here>".to_owned())),
-                Finding::stated("slope", nm(0.25).plus_minus(0.5))
+                Finding::new_unrated("slope", nm(0.25).plus_minus(0.5))
                     .with_requirement("below 1 Nm", false)
                     .with_origin("--limit"),
             ],

@@ -34,14 +34,14 @@ impl AxisSpan {
     }
 
     /// Returns the unit of a linear axis with the SI prefix that fits its ends.
-    fn fitted(&self) -> Option<PrefixedUnit> {
+    fn prefixed_unit(&self) -> Option<PrefixedUnit> {
         let unit = self.unit.filter(|_| self.scale == Scale::Linear)?;
         prefixed(self.from.abs().max(self.to.abs()), unit)
     }
 
     /// Returns the axis title: the quantity and its unit, unless each tick shows the unit.
     pub(crate) fn title(&self, axis: &Axis) -> String {
-        let unit = match (self.fitted(), self.unit) {
+        let unit = match (self.prefixed_unit(), self.unit) {
             (Some(fitted), _) => fitted.unit,
             (None, Some(_)) => String::new(),
             (None, None) => axis.unit.clone(),
@@ -76,7 +76,7 @@ impl AxisSpan {
 
     /// Formats the number at a tick, with enough digits to differ from its neighbours.
     pub(crate) fn caption(&self, tick: f64, most: usize) -> String {
-        let factor = self.fitted().map_or(1.0, |fitted| fitted.factor);
+        let factor = self.prefixed_unit().map_or(1.0, |fitted| fitted.factor);
         let size = self.from.abs().max(self.to.abs()) * factor;
         match self.scale {
             Scale::Log if (0.01..1e5).contains(&tick) && self.unit.is_none() => format!("{}", round(tick)),

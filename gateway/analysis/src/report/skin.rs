@@ -6,9 +6,9 @@ use serde::Serialize;
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub enum Drawing {
     /// The cells' values over time.
-    Strip(Strip),
+    Strip(CellStrip),
     /// The cells' values at their positions on the links.
-    Map(Map),
+    Map(CellMap),
 }
 
 impl Drawing {
@@ -33,7 +33,7 @@ impl Drawing {
 
 /// A chart of cells over time: time to the right, one row for each cell, and values as colours.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Strip {
+pub struct CellStrip {
     /// Name of the drawing, unique on the page, of letters, digits and `-`.
     pub name: String,
     /// Caption of the drawing.
@@ -66,7 +66,7 @@ pub struct StripRow {
 
 /// A map of the cells at their positions on the links, with values as colours.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Map {
+pub struct CellMap {
     /// Name of the drawing, unique on the page, of letters, digits and `-`.
     pub name: String,
     /// Caption of the drawing.

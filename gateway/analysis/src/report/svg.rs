@@ -6,7 +6,7 @@
 mod cells;
 mod colour;
 
-pub use cells::{draw as draw_cells, inline as inline_cells};
+pub use cells::{draw as draw_cells, draw_inline as inline_cells};
 
 use std::fmt::Write as _;
 
@@ -20,7 +20,7 @@ use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use plotters_svg::SVGBackend;
 use protocol::xml::escaped;
 
-use super::figure::{Axis, Figure, FigureWidth, Mark, MarkAxis, Series, Shape};
+use super::figure::{Axis, Figure, FigureWidth, MarkAxis, MarkLine, Series, Shape};
 use super::scale::AxisSpan;
 use super::thin::thin_points;
 
@@ -40,7 +40,7 @@ const DASHES: [(u32, &str); 2] = [(DASHED_WIDTH, "56 36"), (DOTTED_WIDTH, "16 24
 /// Colour on paper, CSS class, and colour on a dark screen: for text, faint text, the grid, and each series. The series
 /// have Okabe and Ito's colours, which colour-blind readers can distinguish; their yellow is omitted because it is
 /// invisible on white.
-const CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOURS] = [
+const CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOUR_COUNT] = [
     (INK, "ink", "#E4E4E4"),
     (FAINT, "faint", "#A6A6A6"),
     (GRID, "grid", "#3A3D42"),
@@ -84,7 +84,7 @@ pub const fn natural_size(size: FigureWidth) -> (u32, u32) {
 
 /// Returns the width and the height of a figure in pixels, including a diagram below it.
 #[must_use]
-pub(crate) const fn height(figure: &Figure, size: FigureWidth) -> (u32, u32) {
+pub(crate) const fn figure_size(figure: &Figure, size: FigureWidth) -> (u32, u32) {
     let (width, height) = natural_size(size);
     (width, if figure.below.is_some() { height + LOWER_DIAGRAM_HEIGHT } else { height })
 }
@@ -92,7 +92,7 @@ pub(crate) const fn height(figure: &Figure, size: FigureWidth) -> (u32, u32) {
 /// Draws a standalone SVG file, for a paper or a document.
 #[must_use]
 pub fn draw(figure: &Figure) -> String {
-    let (width, height) = height(figure, figure.size);
+    let (width, height) = figure_size(figure, figure.size);
     let style = format!("<style>{}</style>\n", dark_rules());
     let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
     document(figure, (width, height), &attributes, &style)
@@ -101,7 +101,7 @@ pub fn draw(figure: &Figure) -> String {
 /// Draws a figure as an element of a page that contains the CSS rules of [`dark_rules()`]; `size` is the size in pixels
 /// before scaling.
 #[must_use]
-pub fn inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
+pub fn draw_inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
     document(figure, size, &format!("class=\"{class}\""), "")
 }
 
@@ -110,7 +110,7 @@ fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, styl
     let mut drawing = String::new();
     let area = SVGBackend::with_string(&mut drawing, (width * unit, height * unit)).into_drawing_area();
     // A drawing in memory can only fail if the area is too small.
-    let drawn = drawing_of(figure, &area).and_then(|()| area.present());
+    let drawn = draw_diagrams(figure, &area).and_then(|()| area.present());
     drop(area);
     let body = drawing.split_once(">\n").map_or("", |(_, body)| body);
     let body = if drawn.is_ok() { with_classes(body) } else { "</svg>\n".to_owned() };
@@ -151,7 +151,7 @@ struct Diagram<'a> {
     x: AxisSpan,
     y: AxisSpan,
     series: &'a [Series],
-    marks: &'a [Mark],
+    marks: &'a [MarkLine],
     /// True if the labels of the horizontal axis belong below this diagram.
     is_lowest: bool,
 }
@@ -163,7 +163,7 @@ impl<'a> Diagram<'a> {
         let drawn = || std::iter::once(upper).chain(lower);
         let points = || drawn().flat_map(|(_, series, _)| series).flat_map(|series| &series.points);
         let marks =
-            |marks: &'a [Mark], on| marks.iter().filter(move |mark| mark.on == on).map(|mark| mark.at);
+            |marks: &'a [MarkLine], on| marks.iter().filter(move |mark| mark.on == on).map(|mark| mark.at);
         let across = points().filter(|point| point.1.is_finite()).map(|point| point.0);
         let x = AxisSpan::new(&figure.x, across.chain(marks(&figure.marks, MarkAxis::X)), 0.0);
         let count = drawn().count();
@@ -176,45 +176,49 @@ impl<'a> Diagram<'a> {
     }
 
     /// Returns the maximum number of ticks of the vertical axis, for a height in drawing units.
-    const fn ticks(height: u32) -> usize {
+    const fn max_ticks(height: u32) -> usize {
         // A low diagram needs closer ticks.
-        let distance = if height > pixels(LOWER_DIAGRAM_HEIGHT) { 42 } else { 32 };
-        (height / pixels(distance)) as usize
+        let distance = if height > pixels_to_units(LOWER_DIAGRAM_HEIGHT) { 42 } else { 32 };
+        (height / pixels_to_units(distance)) as usize
     }
 
     /// Returns the number of letters of the longest label on the vertical axis.
-    fn letters(&self, height: u32) -> usize {
-        let most = Self::ticks(height);
+    fn longest_label_letters(&self, height: u32) -> usize {
+        let most = Self::max_ticks(height);
         let ticks = self.y.ticks(most).into_iter();
         ticks.map(|tick| self.y.caption(tick, most).chars().count()).max().unwrap_or(1)
     }
 }
 
-fn drawing_of(figure: &Figure, area: &Area<'_>) -> DrawResult {
+fn draw_diagrams(figure: &Figure, area: &Area<'_>) -> DrawResult {
     let diagrams = Diagram::from_figure(figure);
     let (_, height) = area.dim_in_pixel();
     let (upper, lower) = match figure.below {
-        Some(_) => area.split_vertically(height.saturating_sub(pixels(LOWER_DIAGRAM_HEIGHT))),
+        Some(_) => area.split_vertically(height.saturating_sub(pixels_to_units(LOWER_DIAGRAM_HEIGHT))),
         None => area.split_vertically(height),
     };
     let areas = [upper, lower];
-    let digits = diagrams.iter().zip(&areas).map(|(diagram, area)| diagram.letters(area.dim_in_pixel().1));
+    let digits = diagrams
+        .iter()
+        .zip(&areas)
+        .map(|(diagram, area)| diagram.longest_label_letters(area.dim_in_pixel().1));
     // Both diagrams have the same left edge.
-    let left = pixels(34) + in_pixels(0.62 * LETTER_SIZE * digits.max().unwrap_or(1) as f64).unsigned_abs();
-    diagrams.iter().zip(&areas).try_for_each(|(diagram, area)| diagram_of(diagram, area, left))
+    let left = pixels_to_units(34)
+        + pixels_to_signed_units(0.62 * LETTER_SIZE * digits.max().unwrap_or(1) as f64).unsigned_abs();
+    diagrams.iter().zip(&areas).try_for_each(|(diagram, area)| draw_diagram(diagram, area, left))
 }
 
-fn diagram_of(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> DrawResult {
+fn draw_diagram(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> DrawResult {
     let Diagram { axes, x, y, series, marks, is_lowest } = *diagram;
     let (width, height) = area.dim_in_pixel();
-    let (x_most, y_most) = ((width / pixels(80)) as usize, Diagram::ticks(height));
+    let (x_most, y_most) = ((width / pixels_to_units(80)) as usize, Diagram::max_ticks(height));
     let rows = legend(series, width);
-    let top = pixels(8) + pixels(20) * u32::try_from(rows.len()).unwrap_or(0);
+    let top = pixels_to_units(8) + pixels_to_units(20) * u32::try_from(rows.len()).unwrap_or(0);
     let (above, below) = area.split_vertically(top);
     let mut chart = ChartBuilder::on(&below)
-        .margin_right(pixels(24))
-        .margin_top(pixels(4))
-        .x_label_area_size(pixels(if is_lowest { 44 } else { 12 }))
+        .margin_right(pixels_to_units(24))
+        .margin_top(pixels_to_units(4))
+        .x_label_area_size(pixels_to_units(if is_lowest { 44 } else { 12 }))
         .y_label_area_size(left)
         .build_cartesian_2d(x, y)?;
     chart
@@ -223,11 +227,11 @@ fn diagram_of(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> DrawResult {
         .y_labels(y_most)
         .max_light_lines(1)
         .light_line_style(GRID.mix(0.0))
-        .bold_line_style(GRID.stroke_width(pixels(1)))
-        .axis_style(FAINT.stroke_width(pixels(1)))
-        .label_style(letters(&INK, LETTER_SIZE))
-        .axis_desc_style(letters(&INK, LETTER_SIZE))
-        .set_all_tick_mark_size(pixels(5))
+        .bold_line_style(GRID.stroke_width(pixels_to_units(1)))
+        .axis_style(FAINT.stroke_width(pixels_to_units(1)))
+        .label_style(text_style(&INK, LETTER_SIZE))
+        .axis_desc_style(text_style(&INK, LETTER_SIZE))
+        .set_all_tick_mark_size(pixels_to_units(5))
         .x_label_formatter(&|tick| if is_lowest { x.caption(*tick, x_most) } else { String::new() })
         .y_label_formatter(&|tick| y.caption(*tick, y_most))
         .x_desc(if is_lowest { x.title(axes.0) } else { String::new() })
@@ -236,20 +240,20 @@ fn diagram_of(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> DrawResult {
     let (columns, lines) = chart.plotting_area().dim_in_pixel();
     let grain = (columns / UNITS_PER_PIXEL.unsigned_abs(), lines / UNITS_PER_PIXEL.unsigned_abs());
     for (series, colour) in series.iter().zip(colours()) {
-        series_of(&mut chart, series, colour, (&x, &y), grain)?;
+        draw_series(&mut chart, series, colour, (&x, &y), grain)?;
     }
     for mark in marks {
-        mark_of(&mut chart, mark, (&x, &y))?;
+        draw_mark(&mut chart, mark, (&x, &y))?;
     }
     for (row, entries) in (0..).zip(&rows) {
         for (at, series, colour) in entries {
-            entry_of(&above, series, *colour, (*at, row))?;
+            draw_legend_entry(&above, series, *colour, (*at, row))?;
         }
     }
     Ok(())
 }
 
-fn series_of(
+fn draw_series(
     chart: &mut Chart<'_, '_>,
     series: &Series,
     colour: RGBColor,
@@ -266,7 +270,7 @@ fn series_of(
             for run in line_pieces(&placed.collect::<Vec<_>>()) {
                 let run = thin_points(run, columns);
                 let run = if series.shape == Shape::Steps { stairs(&run) } else { run };
-                for piece in clipped(&run) {
+                for piece in clip_line(&run) {
                     let points = back(piece);
                     chart.draw_series([PathElement::new(points, style)])?;
                 }
@@ -282,7 +286,8 @@ fn series_of(
                 points.sort_by(|a, b| cell(a).partial_cmp(&cell(b)).unwrap_or(std::cmp::Ordering::Equal));
                 points.dedup_by(|a, b| cell(a) == cell(b));
             }
-            let radius = if points.len() > 300 { in_pixels(1.2) } else { in_pixels(2.6) };
+            let radius =
+                if points.len() > 300 { pixels_to_signed_units(1.2) } else { pixels_to_signed_units(2.6) };
             chart.draw_series(
                 back(points).into_iter().map(|point| Circle::new(point, radius, colour.filled())),
             )?;
@@ -325,7 +330,7 @@ pub(crate) fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
 }
 
 /// Returns the pieces of a line that are inside the diagram, cut at its edges.
-fn clipped(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
+fn clip_line(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
     if let [point] = points {
         // A single point would be an invisible line of no length.
         let dash = vec![(point.0 - 0.001, point.1), (point.0 + 0.001, point.1)];
@@ -359,7 +364,7 @@ fn clipped(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
     pieces
 }
 
-fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&AxisSpan, &AxisSpan)) -> DrawResult {
+fn draw_mark(chart: &mut Chart<'_, '_>, mark: &MarkLine, (x, y): (&AxisSpan, &AxisSpan)) -> DrawResult {
     let place = if mark.on == MarkAxis::X { x.position(mark.at) } else { y.position(mark.at) };
     if !(0.0..=1.0).contains(&place) {
         return Ok(());
@@ -376,7 +381,7 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&AxisSpan, &AxisSpan
         MarkAxis::Y => (1.0, place, HPos::Right, VPos::Bottom),
     };
     let gap = if matches!(side, HPos::Left) { 0.006 } else { -0.006 };
-    let style = letters(&FAINT, LETTER_SIZE - 1.0).pos(Pos::new(side, end));
+    let style = text_style(&FAINT, LETTER_SIZE - 1.0).pos(Pos::new(side, end));
     let at = (x.value(across + gap), y.value(up - if mark.on == MarkAxis::X { 0.02 } else { 0.0 }));
     chart.draw_series([Text::new(mark.caption.clone(), at, style)])?;
     Ok(())
@@ -388,10 +393,10 @@ fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
     let mut rows: Vec<Vec<_>> = Vec::new();
     let mut at = i32::MAX;
     for (series, colour) in named {
-        let room = in_pixels(48.0 + 0.56 * LETTER_SIZE * series.caption.chars().count() as f64);
+        let room = pixels_to_signed_units(48.0 + 0.56 * LETTER_SIZE * series.caption.chars().count() as f64);
         if at.saturating_add(room) > i32::try_from(width).unwrap_or(i32::MAX) {
             rows.push(Vec::new());
-            at = in_pixels(12.0);
+            at = pixels_to_signed_units(12.0);
         }
         if let Some(row) = rows.last_mut() {
             row.push((at, series, colour));
@@ -401,42 +406,54 @@ fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
     rows
 }
 
-fn entry_of(area: &Area<'_>, series: &Series, colour: RGBColor, (at, row): (i32, i32)) -> DrawResult {
-    let middle = in_pixels(15.0) + row * in_pixels(20.0);
-    let end = at + in_pixels(22.0);
-    let style: ShapeStyle = colour.stroke_width(pixels(2));
+fn draw_legend_entry(
+    area: &Area<'_>,
+    series: &Series,
+    colour: RGBColor,
+    (at, row): (i32, i32),
+) -> DrawResult {
+    let middle = pixels_to_signed_units(15.0) + row * pixels_to_signed_units(20.0);
+    let end = at + pixels_to_signed_units(22.0);
+    let style: ShapeStyle = colour.stroke_width(pixels_to_units(2));
     match series.shape {
         Shape::Line | Shape::Steps => area.draw(&PathElement::new([(at, middle), (end, middle)], style))?,
         Shape::Dashed => {
-            for from in [at, at + in_pixels(13.0)] {
-                area.draw(&PathElement::new([(from, middle), (from + in_pixels(9.0), middle)], style))?;
+            for from in [at, at + pixels_to_signed_units(13.0)] {
+                area.draw(&PathElement::new(
+                    [(from, middle), (from + pixels_to_signed_units(9.0), middle)],
+                    style,
+                ))?;
             }
         }
         Shape::Points => {
-            area.draw(&Circle::new((at + in_pixels(11.0), middle), in_pixels(3.0), colour.filled()))?;
+            area.draw(&Circle::new(
+                (at + pixels_to_signed_units(11.0), middle),
+                pixels_to_signed_units(3.0),
+                colour.filled(),
+            ))?;
         }
         Shape::Band => {
-            let half = in_pixels(5.0);
+            let half = pixels_to_signed_units(5.0);
             let corners = [(at, middle - half), (end, middle + half)];
             area.draw(&Rectangle::new(corners, colour.mix(0.25).filled()))?;
         }
     }
-    let style = letters(&INK, LETTER_SIZE).pos(Pos::new(HPos::Left, VPos::Center));
-    area.draw(&Text::new(series.caption.clone(), (end + in_pixels(6.0), middle), style))
+    let style = text_style(&INK, LETTER_SIZE).pos(Pos::new(HPos::Left, VPos::Center));
+    area.draw(&Text::new(series.caption.clone(), (end + pixels_to_signed_units(6.0), middle), style))
 }
 
 /// Returns the text style for letters of a size in pixels. The plotting library draws them smaller by a factor of 1.24,
 /// which is corrected here.
-fn letters<'a>(colour: &RGBColor, size: f64) -> TextStyle<'a> {
+fn text_style<'a>(colour: &RGBColor, size: f64) -> TextStyle<'a> {
     ("sans-serif", size * 1.24 * f64::from(UNITS_PER_PIXEL)).into_font().color(colour)
 }
 
-const fn pixels(count: u32) -> u32 {
+const fn pixels_to_units(count: u32) -> u32 {
     count * UNITS_PER_PIXEL.unsigned_abs()
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "a length in a picture")]
-fn in_pixels(count: f64) -> i32 {
+fn pixels_to_signed_units(count: f64) -> i32 {
     (count * f64::from(UNITS_PER_PIXEL)).round() as i32
 }
 

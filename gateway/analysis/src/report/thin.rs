@@ -16,7 +16,7 @@ impl Column {
         Self { first: point, min: point, max: point, last: point }
     }
 
-    fn join(&mut self, later: &Self) {
+    fn merge_later(&mut self, later: &Self) {
         if later.min.1 < self.min.1 {
             self.min = later.min;
         }
@@ -83,15 +83,15 @@ impl ThinnedLine {
             return;
         }
         self.count += 1;
-        let mut at = self.column(x - from);
+        let mut at = self.column_index(x - from);
         while self.columns.len() >= self.most && self.columns.last().is_some_and(|(last, ..)| *last != at)
             || self.columns.first().is_some_and(|(first, ..)| at - first >= 2 * self.most as u64)
         {
             self.merge();
-            at = self.column(x - from);
+            at = self.column_index(x - from);
         }
         let (gap, new) = (std::mem::take(&mut self.gap), Column::new((x, y)));
-        join(&mut self.columns, (at, gap, new));
+        append_or_merge(&mut self.columns, (at, gap, new));
     }
 
     #[expect(
@@ -99,7 +99,7 @@ impl ThinnedLine {
         clippy::cast_sign_loss,
         reason = "not negative; far ones saturate, and merge"
     )]
-    fn column(&self, distance: f64) -> u64 {
+    fn column_index(&self, distance: f64) -> u64 {
         (distance / self.width) as u64
     }
 
@@ -107,7 +107,9 @@ impl ThinnedLine {
     fn merge(&mut self) {
         self.width *= 2.0;
         let mut merged = Vec::with_capacity(self.columns.len());
-        self.columns.iter().for_each(|&(at, gap, column)| join(&mut merged, (at / 2, gap, column)));
+        self.columns
+            .iter()
+            .for_each(|&(at, gap, column)| append_or_merge(&mut merged, (at / 2, gap, column)));
         self.columns = merged;
     }
 
@@ -126,11 +128,11 @@ impl ThinnedLine {
 
 /// Appends a column, or merges it into the last one if it is not to the right of it: a late point counts to the newest
 /// column.
-fn join(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, Column)) {
+fn append_or_merge(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, Column)) {
     match columns.last_mut() {
         Some((last, before, joined)) if *last >= at => {
             *before |= gap;
-            joined.join(&column);
+            joined.merge_later(&column);
         }
         _ => columns.push((at, gap, column)),
     }
@@ -147,7 +149,7 @@ pub fn thin_points(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
         .chunk_by(|a, b| (place(a.0) - place(b.0)).abs() < 0.5)
         .filter_map(|points| {
             points.iter().map(|point| Column::new(*point)).reduce(|mut sum, next| {
-                sum.join(&next);
+                sum.merge_later(&next);
                 sum
             })
         })

@@ -4,11 +4,11 @@ use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
 use protocol::packet::Epoch;
-use protocol::wire_time::{BitRates, Bits};
+use protocol::wire_time::{BitRates, FrameBits};
 
 use super::epochs::Epochs;
-use super::phase::{ByPhase, Figures, Phase, Phases};
-use super::report::{BusShadow, Counts, Delays, Loads, Peak, Stretches};
+use super::phase::{ByPhase, Phase, PhaseFigures, Phases};
+use super::report::{BusShadow, BusyStretches, Counts, Delays, Loads, Peak};
 use super::reported::FrameTimings;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
 use crate::fit;
@@ -36,10 +36,10 @@ struct FrameTag {
 
 /// A frame that waits until no frame with an earlier time can follow.
 #[derive(Clone, Copy, Debug)]
-struct Pending {
+struct PendingFrame {
     at: u64,
     priority: Priority,
-    bits: Bits,
+    bits: FrameBits,
     place: u64,
     /// Identifier of the frame; `None` for one of 29 bits.
     id: Option<u16>,
@@ -65,7 +65,7 @@ pub(super) struct BusTiming {
     pub(super) counts: Counts,
     known: BusProperties,
     model: BusModel<FrameTag>,
-    pending: VecDeque<Pending>,
+    pending: VecDeque<PendingFrame>,
     frames: u64,
     /// Earliest and latest time of a frame in the capture, in ns.
     span: Option<(u64, u64)>,
@@ -76,7 +76,7 @@ pub(super) struct BusTiming {
     traffic: TrafficClassifier,
     has_fd: bool,
     phases: Phases,
-    figures: ByPhase<Figures>,
+    figures: ByPhase<PhaseFigures>,
     epochs: Epochs,
     queued: Vec<u32>,
 }
@@ -104,7 +104,7 @@ impl BusTiming {
     }
 
     /// Handles a packet from before the start of the capture, which still has an effect.
-    pub(super) fn latched(&mut self, nanos: u64, frame: &Frame) {
+    pub(super) fn receive_latched(&mut self, nanos: u64, frame: &Frame) {
         match self.traffic.classify(nanos, frame).says {
             RunEvent::Joints(_) => self.phases.beginning.is_mid_run = true,
             says @ (RunEvent::Halt | RunEvent::Resume) => _ = self.epochs.receive(nanos, says, None),
@@ -124,7 +124,7 @@ impl BusTiming {
         &mut self,
         nanos: u64,
         frame: &Frame,
-        bits: Bits,
+        bits: FrameBits,
         place: u64,
         reported: Option<&mut FrameTimings>,
     ) {
@@ -137,7 +137,8 @@ impl BusTiming {
             first.into_iter().for_each(|first| first.sorted.bench = sorted.bench);
         }
         self.phases.beginning.record(nanos, sorted.says);
-        let pending = Pending { at: nanos, priority: Priority::from_frame(frame), bits, place, id, sorted };
+        let pending =
+            PendingFrame { at: nanos, priority: Priority::from_frame(frame), bits, place, id, sorted };
         match self.pending.back() {
             Some(last) if last.at > nanos => {
                 self.counts.out_of_order += 1;
@@ -150,7 +151,8 @@ impl BusTiming {
             }
         }
         let newest = self.pending.back().map_or(nanos, |last| last.at);
-        let waits = |first: &Pending, count: usize| newest - first.at <= WINDOW_NS && count <= WINDOW_FRAMES;
+        let waits =
+            |first: &PendingFrame, count: usize| newest - first.at <= WINDOW_NS && count <= WINDOW_FRAMES;
         let mut reported = reported;
         while let Some(first) =
             self.pending.front().filter(|first| !waits(first, self.pending.len())).copied()
@@ -170,13 +172,13 @@ impl BusTiming {
     }
 
     /// Passes the next frame in order of time to the model, which requests its transmission.
-    fn request_frame(&mut self, pending: Pending, mut reported: Option<&mut FrameTimings>) {
-        let Pending { at, priority, bits, place, id, sorted } = pending;
+    fn request_frame(&mut self, pending: PendingFrame, mut reported: Option<&mut FrameTimings>) {
+        let PendingFrame { at, priority, bits, place, id, sorted } = pending;
         let ClassifiedFrame { says, bench, from, .. } = sorted;
         if let Some(bench) = bench {
             self.counts.bench.count(bench, 1);
             if !self.known.bench_traffic {
-                reported.into_iter().for_each(|reported| reported.omitted(place));
+                reported.into_iter().for_each(|reported| reported.mark_omitted(place));
                 return;
             }
         }
@@ -185,14 +187,14 @@ impl BusTiming {
         self.released = at;
         self.model.run_until(at);
         self.collect_sent(reported.as_deref_mut());
-        let phase = self.phases.at(at, says, self.traffic.is_ours());
+        let phase = self.phases.phase_at(at, says, self.traffic.is_ours());
         let answer = self.epochs.receive(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
-        let figures = self.figures.of(phase);
-        figures.request(at, took);
+        let figures = self.figures.get_mut(phase);
+        figures.record_request(at, took);
         if self.model.waiting() >= MAX_QUEUE {
             self.counts.no_room += 1;
-            reported.into_iter().for_each(|reported| reported.sent(place, None));
+            reported.into_iter().for_each(|reported| reported.record_sent(place, None));
             return;
         }
         let queued = id.and_then(|id| Some((self.queued.get_mut(usize::from(id))?, id)));
@@ -202,7 +204,7 @@ impl BusTiming {
         });
         let tag = FrameTag { place, id, phase, answer };
         self.model.request(Request { at, priority, bits, queue: None, tag });
-        figures.queue(at, self.model.waiting(), of_one);
+        figures.record_queue(at, self.model.waiting(), of_one);
     }
 
     /// Takes completed transmissions from the model and records them.
@@ -210,20 +212,20 @@ impl BusTiming {
         while let Some(attempt) = self.model.poll() {
             let Attempt { tag: FrameTag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
             self.wire_end = end;
-            self.figures.of(self.phases.now()).busy.record(start, end, SATURATED_NS);
+            self.figures.get_mut(self.phases.now()).busy.record(start, end, SATURATED_NS);
             if is_damaged {
                 self.counts.damaged += 1;
                 continue;
             }
             self.counts.sent += 1;
-            self.figures.of(phase).sent(id, end - at);
+            self.figures.get_mut(phase).record_sent(id, end - at);
             let queued = id.and_then(|id| self.queued.get_mut(usize::from(id)));
             queued.into_iter().for_each(|queued| *queued -= 1);
             if let Some((epoch, was_late)) = answer {
                 self.epochs.record_answer(epoch, was_late, (at, end));
             }
             if let Some(reported) = &mut reported {
-                reported.sent(place, Some((start, end)));
+                reported.record_sent(place, Some((start, end)));
             }
         }
     }
@@ -234,7 +236,7 @@ impl BusTiming {
             return worst.rates.clone();
         }
         let rates = self.known.rates;
-        match BitRates::classic(rates.nominal()) {
+        match BitRates::classic(rates.nominal_rate()) {
             Ok(classic) if !self.has_fd => fit::rates_name(Format::Classic, classic),
             _ => fit::rates_name(Format::Fd, rates),
         }
@@ -242,7 +244,7 @@ impl BusTiming {
 
     pub(super) fn report(&self, has_times: bool) -> BusShadow {
         let (first, last) = self.span.unwrap_or_default();
-        let timed = self.timed(first, last);
+        let timed = self.timed_report(first, last);
         if has_times && first < last {
             return timed;
         }
@@ -251,7 +253,7 @@ impl BusTiming {
             this_run: None,
             start_up: None,
             load: Loads::default(),
-            stretches: Stretches::default(),
+            stretches: BusyStretches::default(),
             delay_us: Delays::default(),
             kinds: Vec::new(),
             replies: None,
@@ -262,7 +264,7 @@ impl BusTiming {
         }
     }
 
-    fn timed(&self, first: u64, last: u64) -> BusShadow {
+    fn timed_report(&self, first: u64, last: u64) -> BusShadow {
         let ByPhase { start_up, operation } = &self.figures;
         let span = self.phases.spans.operation;
         let overrun = self.wire_end.saturating_sub(self.released);
@@ -273,7 +275,7 @@ impl BusTiming {
         let this_run = (operation.frames > 0).then(|| {
             let who = if is_ours { answering.cells() } else { AnsweringCells::Foreign };
             let late = replies.late - replies.late_when_ready;
-            FitSummary::this_run(load.worst_1_s.value, late, self.named_rates(), who)
+            FitSummary::for_run(load.worst_1_s.value, late, self.named_rates(), who)
         });
         BusShadow {
             bus: self.name.clone(),

@@ -1,6 +1,6 @@
 //! Counts the cells that answered each epoch's joints, and measures the times of their replies.
 
-use model::quantiles::Times;
+use model::quantiles::TimeHistogram;
 use protocol::id::CellId;
 use protocol::packet::Epoch;
 
@@ -42,7 +42,7 @@ pub(super) struct Epochs {
     closed: EpochTotals,
     epochs_halted: u64,
     replies: Replies,
-    after_joints: Times,
+    after_joints: TimeHistogram,
 }
 
 /// Counts over all epochs.
@@ -54,7 +54,7 @@ struct EpochTotals {
 }
 
 impl EpochTotals {
-    fn close(&mut self, answered: CellSet) {
+    fn add_epoch(&mut self, answered: CellSet) {
         self.epochs += 1;
         self.answers += u64::from(answered.len());
         self.most = self.most.max(answered.len());
@@ -69,7 +69,7 @@ impl Epochs {
         match says {
             RunEvent::Joints(epoch) => self.receive_joints(at, epoch),
             RunEvent::Answer(epoch) => {
-                let answered = &mut self.numbered(epoch).answered;
+                let answered = &mut self.answers_to(epoch).answered;
                 from.into_iter().zip(answered).for_each(|(cell, answered)| answered.insert(cell));
                 return Some((epoch, self.newest.is_some_and(|newest| newest != epoch)));
             }
@@ -83,18 +83,18 @@ impl Epochs {
     /// Records joints at the time `at` in ns; joints that repeat an epoch count once.
     fn receive_joints(&mut self, at: u64, epoch: Epoch) {
         let halted = self.halted;
-        let numbered = self.numbered(epoch);
+        let numbered = self.answers_to(epoch);
         numbered.at = at;
         if self.newest.replace(epoch) == Some(epoch) {
             return;
         }
-        let numbered = self.numbered(epoch);
+        let numbered = self.answers_to(epoch);
         let before = std::mem::replace(&mut numbered.answered, (!halted).then(CellSet::default));
-        before.into_iter().for_each(|answered| self.closed.close(answered));
+        before.into_iter().for_each(|answered| self.closed.add_epoch(answered));
         self.epochs_halted += u64::from(halted);
     }
 
-    fn numbered(&mut self, epoch: Epoch) -> &mut EpochAnswers {
+    fn answers_to(&mut self, epoch: Epoch) -> &mut EpochAnswers {
         self.numbered.resize(256, EpochAnswers::default());
         self.numbered.get_mut(usize::from(epoch.0)).expect("an epoch is one byte")
     }
@@ -108,10 +108,10 @@ impl Epochs {
             self.replies.late_before += 1;
             return;
         }
-        let joints = self.numbered(epoch).at;
+        let joints = self.answers_to(epoch).at;
         if newest != epoch {
             self.replies.late += 1;
-            let next = Some(self.numbered(epoch.next()).at).filter(|&next| next > joints).unwrap_or(end);
+            let next = Some(self.answers_to(epoch.next()).at).filter(|&next| next > joints).unwrap_or(end);
             let period = next.saturating_sub(joints);
             let is_slow = at.saturating_sub(joints) > period / 8 * 7;
             self.replies.late_when_ready += u64::from(is_slow);
@@ -128,7 +128,7 @@ impl Epochs {
     /// given, else that of the cells that sent something.
     pub(super) fn answering(&self, described: Option<u32>) -> Answering {
         let mut all = self.closed;
-        self.numbered.iter().filter_map(|it| it.answered).for_each(|answered| all.close(answered));
+        self.numbered.iter().filter_map(|it| it.answered).for_each(|answered| all.add_epoch(answered));
         Answering {
             epochs: all.epochs,
             epochs_halted: self.epochs_halted,

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::report::{Peak, Stretches};
+use super::report::{BusyStretches, Peak};
 
 /// Maximum number of different times within a window; requests beyond that count to the last of them.
 const MAX_WINDOW_TIMES: usize = 1 << 16;
@@ -19,7 +19,7 @@ pub(super) struct Window<const SPAN: u64> {
 
 impl<const SPAN: u64> Window<SPAN> {
     /// Records a request at `at` for `nanos` ns of transmission; times never decrease.
-    pub(super) fn request(&mut self, at: u64, nanos: u64) {
+    pub(super) fn record_request(&mut self, at: u64, nanos: u64) {
         while let Some(&(then, gone)) = self.requested.front().filter(|(then, _)| then + SPAN <= at) {
             self.requested.pop_front();
             self.sum -= gone;
@@ -43,7 +43,7 @@ pub(super) struct BusyTime {
     pub(super) total: u64,
     begin: u64,
     end: u64,
-    stretches: Stretches,
+    stretches: BusyStretches,
 }
 
 impl BusyTime {
@@ -52,13 +52,13 @@ impl BusyTime {
     pub(super) fn record(&mut self, start: u64, end: u64, saturated: u64) {
         self.total += end - start;
         if start > self.end {
-            self.close(saturated);
+            self.close_stretch(saturated);
             self.begin = start;
         }
         self.end = end;
     }
 
-    fn close(&mut self, saturated: u64) {
+    fn close_stretch(&mut self, saturated: u64) {
         let length = self.end - self.begin;
         if length >= saturated {
             self.stretches.count += 1;
@@ -68,10 +68,10 @@ impl BusyTime {
     }
 
     /// Returns the number, total and longest of the stretches. Those of at least `saturated` ns count as saturated.
-    pub(super) fn stretches(&self, saturated: u64) -> Stretches {
+    pub(super) fn stretches(&self, saturated: u64) -> BusyStretches {
         let mut last = Self { stretches: self.stretches, ..Self::default() };
         (last.begin, last.end) = (self.begin, self.end);
-        last.close(saturated);
+        last.close_stretch(saturated);
         last.stretches
     }
 }
@@ -87,7 +87,7 @@ mod tests {
             let mut window = Window::<50>::default();
             let mut now = 0;
             let requested: Vec<_> = steps.into_iter().map(|(step, nanos)| { now += step; (now, nanos) }).collect();
-            requested.iter().for_each(|&(at, nanos)| window.request(at, nanos));
+            requested.iter().for_each(|&(at, nanos)| window.record_request(at, nanos));
             let within = |end: u64| -> u64 { requested.iter().filter(|(at, _)| *at <= end && at + 50 > end).map(|(_, n)| n).sum() };
             let most = requested.iter().map(|(at, _)| within(*at)).max().unwrap();
             prop_assert!((window.most.value - most as f64 / 50.0).abs() < 1e-12);

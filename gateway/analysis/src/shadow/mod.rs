@@ -23,7 +23,7 @@ use std::fmt::{self, Display, Formatter};
 
 use protocol::can::{ERROR, Frame};
 use protocol::skin::Skin;
-use protocol::wire_time::{BitRates, Bits};
+use protocol::wire_time::{BitRates, FrameBits};
 
 use crate::fit;
 use crate::fit::verdict::FitSummary;
@@ -34,7 +34,8 @@ use reported::FrameTimings;
 pub use bus_timing::MAX_QUEUE;
 pub use phase::PAUSE_NS;
 pub use report::{
-    Answering, BusShadow, Counts, Delays, KindDelays, Loads, Peak, Replies, ShadowReport, StartUp, Stretches,
+    Answering, BusShadow, BusyStretches, Counts, Delays, KindDelays, Loads, Peak, Replies, ShadowReport,
+    StartUp,
 };
 pub use reported::FrameTiming;
 pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
@@ -54,7 +55,7 @@ pub struct ShadowOptions {
     pub rates: BitRates,
     /// Bit rates of single buses, by name.
     pub rates_by_bus: Vec<(String, BitRates)>,
-    /// Share of bits that the model damages, in [0, [`BitErrors::MAX`]].
+    /// Share of bits that the model damages, in [0, [`BitErrors::MAX_RATE`]].
     pub bit_errors: f64,
     /// Seed of the random bit errors; each bus derives its own.
     pub seed: u64,
@@ -126,7 +127,7 @@ impl Shadow {
         let place = self.frames;
         self.frames += 1;
         let bus_timing = self.bus_timing(bus);
-        let bits = bus_timing.and_then(|_| Bits::from_frame(frame));
+        let bits = bus_timing.and_then(|_| FrameBits::from_frame(frame));
         if let Some(reported) = &mut self.reported {
             let (id, extended) =
                 (frame.id() | frame.raw_id() & ERROR, frame.is_extended() || frame.is_error());
@@ -146,7 +147,7 @@ impl Shadow {
     /// Handles a packet from before the start of the capture, which still has an effect.
     pub fn receive_latched(&mut self, bus: &str, nanos: u64, frame: &Frame) {
         let bus_timing = self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing));
-        bus_timing.into_iter().for_each(|bus_timing| bus_timing.latched(nanos, frame));
+        bus_timing.into_iter().for_each(|bus_timing| bus_timing.receive_latched(nanos, frame));
     }
 
     /// Records a number of frames that the recorder lost on a bus.

@@ -1,6 +1,6 @@
 //! Splits the traffic of a bus into start-up and operation, and keeps the figures of each phase.
 
-use model::quantiles::Times;
+use model::quantiles::TimeHistogram;
 use protocol::id::{Id, Kind};
 
 use super::load::{BusyTime, Window};
@@ -32,7 +32,7 @@ pub(super) struct ByPhase<T> {
 }
 
 impl<T> ByPhase<T> {
-    pub(super) const fn of(&mut self, phase: Phase) -> &mut T {
+    pub(super) const fn get_mut(&mut self, phase: Phase) -> &mut T {
         match phase {
             Phase::StartUp => &mut self.start_up,
             Phase::Operation => &mut self.operation,
@@ -88,17 +88,17 @@ pub(super) struct Phases {
 
 impl Phases {
     /// Returns the phase to which a frame belongs; `says` is the role of the frame in the run. Times never decrease.
-    pub(super) fn at(&mut self, at: u64, says: RunEvent, is_ours: bool) -> Phase {
+    pub(super) fn phase_at(&mut self, at: u64, says: RunEvent, is_ours: bool) -> Phase {
         let mut now = *self.now.get_or_insert_with(|| {
             self.until = at;
             self.beginning.phase(is_ours)
         });
         let over = self.joints.map(|joints| joints.saturating_add(PAUSE_NS)).filter(|&over| over < at);
         if let (Phase::Operation, Some(over)) = (now, over) {
-            self.count(now, over.max(self.until));
+            self.count_duration(now, over.max(self.until));
             now = Phase::StartUp;
         }
-        self.count(now, at);
+        self.count_duration(now, at);
         if matches!(says, RunEvent::Joints(_)) {
             now = Phase::Operation;
             self.joints = Some(at);
@@ -107,8 +107,8 @@ impl Phases {
         now
     }
 
-    fn count(&mut self, phase: Phase, at: u64) {
-        *self.spans.of(phase) += at - self.until;
+    fn count_duration(&mut self, phase: Phase, at: u64) {
+        *self.spans.get_mut(phase) += at - self.until;
         self.until = at;
     }
 
@@ -119,31 +119,31 @@ impl Phases {
 
 /// The load, delays and queues in one phase.
 #[derive(Debug, Default)]
-pub(super) struct Figures {
+pub(super) struct PhaseFigures {
     pub(super) frames: u64,
     requested: u64,
     in_16_ms: Window<SATURATED_NS>,
     in_1_s: Window<SECOND_NS>,
     pub(super) busy: BusyTime,
-    pub(super) all: Times,
-    kinds: [Times; 8],
+    pub(super) all: TimeHistogram,
+    kinds: [TimeHistogram; 8],
     /// The largest number of waiting frames in all; in the next field, of one identifier.
     pub(super) queue: Peak,
     pub(super) queue_of_one: Peak,
     pub(super) queue_of_one_id: u16,
 }
 
-impl Figures {
+impl PhaseFigures {
     /// Records a frame that is requested at `at` and takes `took` ns of the bus.
-    pub(super) fn request(&mut self, at: u64, took: u64) {
+    pub(super) fn record_request(&mut self, at: u64, took: u64) {
         self.frames += 1;
         self.requested += took;
-        self.in_16_ms.request(at, took);
-        self.in_1_s.request(at, took);
+        self.in_16_ms.record_request(at, took);
+        self.in_1_s.record_request(at, took);
     }
 
     /// Records the number of frames that wait at `at`, in all and of one identifier.
-    pub(super) fn queue(&mut self, at: u64, waiting: usize, of_one: Option<(u32, u16)>) {
+    pub(super) fn record_queue(&mut self, at: u64, waiting: usize, of_one: Option<(u32, u16)>) {
         self.queue.raise(waiting as f64, at);
         if let Some((queued, id)) = of_one.filter(|(queued, _)| f64::from(*queued) > self.queue_of_one.value)
         {
@@ -153,7 +153,7 @@ impl Figures {
     }
 
     /// Records a frame that was sent `nanos` ns after its request.
-    pub(super) fn sent(&mut self, id: Option<u16>, nanos: u64) {
+    pub(super) fn record_sent(&mut self, id: Option<u16>, nanos: u64) {
         self.all.record(nanos);
         let kind = id.and_then(|id| self.kinds.get_mut(Id::from_bits(id).kind as usize));
         kind.into_iter().for_each(|kind| kind.record(nanos));

@@ -1,6 +1,6 @@
 //! The figures of a timing model: loads, delays, replies and queues of each bus.
 
-use model::quantiles::Times;
+use model::quantiles::TimeHistogram;
 use protocol::wire_time::BitRates;
 use serde::{Serialize, Serializer};
 
@@ -57,7 +57,7 @@ pub struct BusShadow {
     /// The requested load of the bus.
     pub load: Loads,
     /// Stretches in which the bus carries frames without a pause.
-    pub stretches: Stretches,
+    pub stretches: BusyStretches,
     /// Delays from the request of a frame to the end of its intermission, in µs, over all frames.
     pub delay_us: Delays,
     /// Delays by kind; empty if the bus carries another protocol.
@@ -105,7 +105,7 @@ pub struct StartUp {
     /// The requested load of the bus.
     pub load: Loads,
     /// Stretches in which the bus carries frames without a pause.
-    pub stretches: Stretches,
+    pub stretches: BusyStretches,
     /// Delays from the request of a frame to the end of its intermission, in µs.
     pub delay_us: Delays,
 }
@@ -144,7 +144,7 @@ impl Peak {
 
 /// Counts and times of stretches in which the bus had no pause.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Stretches {
+pub struct BusyStretches {
     /// Number of stretches of at least 16 ms.
     pub count: u64,
     /// Total duration of these stretches in s.
@@ -217,7 +217,7 @@ pub struct Replies {
 }
 
 impl Delays {
-    pub(super) fn from_times(times: &Times) -> Self {
+    pub(super) fn from_times(times: &TimeHistogram) -> Self {
         let (histogram, most) = (times.histogram(), times.longest());
         let micros = |nanos: u64| nanos as f64 / 1e3;
         let quantile = |share| micros(histogram.value_at_quantile(share).min(most));

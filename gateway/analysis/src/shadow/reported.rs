@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use protocol::wire_time::Bits;
+use protocol::wire_time::FrameBits;
 
 /// The transmission of a frame on a real bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -17,7 +17,7 @@ pub struct FrameTiming {
     pub extended: bool,
     /// Bits of the frame, including the intermission. `None` for a frame that real buses do not carry: one that only a
     /// bench sends, or the driver's error frame.
-    pub bits: Option<Bits>,
+    pub bits: Option<FrameBits>,
     /// Start of the first bit and end of the intermission of the successful transmission, in ns of the capture's clock;
     /// `None` if the frame was not sent.
     pub sent: Option<(u64, u64)>,
@@ -44,16 +44,16 @@ impl FrameTimings {
     }
 
     /// Marks a frame as one that a real bus does not carry.
-    pub(super) fn omitted(&mut self, place: u64) {
-        self.settle(place, |shaded| shaded.bits = None);
+    pub(super) fn mark_omitted(&mut self, place: u64) {
+        self.settle_frame(place, |shaded| shaded.bits = None);
     }
 
     /// Records when a frame was sent; `None` if it was not sent.
-    pub(super) fn sent(&mut self, place: u64, sent: Option<(u64, u64)>) {
-        self.settle(place, |shaded| shaded.sent = sent);
+    pub(super) fn record_sent(&mut self, place: u64, sent: Option<(u64, u64)>) {
+        self.settle_frame(place, |shaded| shaded.sent = sent);
     }
 
-    fn settle(&mut self, place: u64, change: impl FnOnce(&mut FrameTiming)) {
+    fn settle_frame(&mut self, place: u64, change: impl FnOnce(&mut FrameTiming)) {
         let index = usize::try_from(place - self.first).ok();
         if let Some(entry) = index.and_then(|index| self.entries.get_mut(index)) {
             change(&mut entry.shaded);

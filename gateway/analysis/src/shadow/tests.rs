@@ -30,7 +30,7 @@ fn classic(id: u32, bytes: &[u8]) -> Frame {
 
 /// Returns the duration of a frame at 1M/5M, in ns.
 fn took(frame: &Frame) -> u64 {
-    Bits::from_frame(frame).unwrap().nanoseconds(options().rates)
+    FrameBits::from_frame(frame).unwrap().nanoseconds(options().rates)
 }
 
 fn joints(epoch: u8) -> Message {
@@ -62,7 +62,7 @@ fn frames_come_back_in_the_files_order_with_the_times_of_the_wire() {
         frames.iter().map(|frame| (frame.nanos, frame.id)).collect::<Vec<_>>(),
         [(5, 0x700), (10, 0x700), (10, 0x700), (11, 0x100)]
     );
-    assert_eq!(frames[1].bits, Bits::from_frame(&slow));
+    assert_eq!(frames[1].bits, FrameBits::from_frame(&slow));
     let [can0, can1] = report.buses.as_slice() else { panic!("{report:?}") };
     assert_eq!((can0.counts.sent, can1.counts.sent, report.frames), (3, 1, 4));
     assert_eq!((can0.queue.value, can0.queue_of_one.value, can0.queue_of_one_id), (3.0, 2.0, 0x700));

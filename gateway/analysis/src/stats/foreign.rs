@@ -7,7 +7,7 @@ use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
 use serde::Serialize;
 
 use super::{TimedCount, seconds};
-use model::decode::Foreign;
+use model::decode::ForeignReason;
 use protocol::packet::{Length, Lengths, PacketError, data_id};
 
 /// Maximum number of identifiers of a bus that are counted separately. Frames with further identifiers share one count.
@@ -91,17 +91,20 @@ pub struct ForeignId {
 }
 
 impl ForeignCounter {
-    pub(super) fn record(&mut self, nanos: u64, frame: &Frame, why: Foreign) {
+    pub(super) fn record(&mut self, nanos: u64, frame: &Frame, why: ForeignReason) {
         let of = match why {
-            Foreign::Error(_) => FrameType::Error,
-            Foreign::Remote => FrameType::Remote,
-            Foreign::Extended | Foreign::Data(_) => FrameType::Data,
+            ForeignReason::Error(_) => FrameType::Error,
+            ForeignReason::Remote => FrameType::Remote,
+            ForeignReason::Extended | ForeignReason::Data(_) => FrameType::Data,
         };
-        let wrong_crc = u64::from(matches!(why, Foreign::Data(PacketError::Crc { .. })));
+        let wrong_crc = u64::from(matches!(why, ForeignReason::Data(PacketError::Crc { .. })));
         self.checked_groups += match why {
-            Foreign::Data(PacketError::Crc { .. }) => 1,
-            Foreign::Data(PacketError::Incomplete) => completed_lengths(frame),
-            Foreign::Data(_) | Foreign::Extended | Foreign::Remote | Foreign::Error(_) => 0,
+            ForeignReason::Data(PacketError::Crc { .. }) => 1,
+            ForeignReason::Data(PacketError::Incomplete) => completed_lengths(frame),
+            ForeignReason::Data(_)
+            | ForeignReason::Extended
+            | ForeignReason::Remote
+            | ForeignReason::Error(_) => 0,
         };
         let key = (of, frame.raw_id());
         if self.identifiers.len() == MAX_IDENTIFIERS && !self.identifiers.contains_key(&key) {
@@ -162,7 +165,7 @@ impl IdentifierCounts {
             },
             of,
             frames: count.packets,
-            frames_per_s: count.per_s(),
+            frames_per_s: count.packets_per_s(),
             first_s: since(count.first),
             last_s: since(count.last),
             bytes_min: bytes.0,

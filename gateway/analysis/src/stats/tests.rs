@@ -1,16 +1,16 @@
 use super::*;
-use model::decode::settle::Settler;
+use model::decode::settle::OrderedDecoder;
 use protocol::can::{Format, Frame};
 use protocol::candump::Timestamp;
 use protocol::id::Node;
-use protocol::message::{self, Heartbeat, Tree};
+use protocol::message::{self, Heartbeat, TreePage};
 use protocol::port;
 
 /// A capture under construction.
 #[derive(Default)]
 struct Tape {
     stats: Stats,
-    settler: Option<Settler<(u64, String, Frame)>>,
+    settler: Option<OrderedDecoder<(u64, String, Frame)>>,
     ms: u64,
 }
 
@@ -18,11 +18,11 @@ impl Tape {
     fn frame(&mut self, bus: &str, frame: Frame) {
         self.ms += 1;
         let nanos = self.ms * 1_000_000;
-        let settler = self.settler.get_or_insert_with(|| Settler::new(None));
+        let settler = self.settler.get_or_insert_with(|| OrderedDecoder::new(None));
         settler.push(Micros(nanos / 1_000), bus, &frame, (nanos, bus.to_owned(), frame));
         settler.finish();
         while let Some(((nanos, bus, frame), decoded)) = settler.pop() {
-            let time = Timestamp::six_digits(nanos);
+            let time = Timestamp::with_six_digits(nanos);
             self.stats.record(&Record { time, interface: &bus, frame, direction: None }, &decoded);
         }
     }
@@ -202,7 +202,7 @@ fn resent_sums_and_the_place_in_the_tree_are_counted() {
     }
     assert_eq!((tape.cell().parent, tape.cell().depth), (None, None));
     let tree = |parent, depth| {
-        let page = NetworkPage::Tree(Tree { parent, depth, ..Tree::default() });
+        let page = NetworkPage::Tree(TreePage { parent, depth, ..TreePage::default() });
         Message::Network { from: Node::Cell(cell()), epoch: Epoch(2), page }
     };
     tape.say(&tree(Some(7), 3));
@@ -229,11 +229,11 @@ fn a_rate_needs_two_times_of_its_own_bus() {
     let mut stats = Stats::default();
     let frame = Frame::classic(0x7F0, &[1]).unwrap();
     for (bus, nanos) in [("a", 5), ("b", 7), ("a", 5), ("a", 5), ("b", 1_000_000_007)] {
-        let mut settler = Settler::new(None);
+        let mut settler = OrderedDecoder::new(None);
         settler.push(Micros(0), bus, &frame, ());
         settler.finish();
         let ((), decoded) = settler.pop().unwrap();
-        let time = Timestamp::nine_digits(nanos);
+        let time = Timestamp::with_nine_digits(nanos);
         stats.record(&Record { time, interface: bus, frame, direction: None }, &decoded);
     }
     let rates = |stats: &Stats| {
@@ -242,7 +242,7 @@ fn a_rate_needs_two_times_of_its_own_bus() {
         stats.report().buses.iter().map(rate).collect::<Vec<_>>()
     };
     assert_eq!(rates(&stats), [(false, false), (true, true)]);
-    stats.without_times();
+    stats.mark_untimed();
     assert_eq!(rates(&stats), [(false, false); 2]);
 }
 

@@ -17,8 +17,8 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::batch::BATCH;
-use protocol::bus::{Bus, BusError, Inbox, Received};
+use protocol::bus::batch::MAX_BATCH_DATAGRAMS;
+use protocol::bus::{Bus, BusError, Inbox, ReceivedFrame};
 use protocol::id::CellId;
 
 use super::roots::RootWires;
@@ -29,7 +29,7 @@ const DOWN_PAUSE: Duration = Duration::from_millis(50);
 const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Provides the open bus to a [`Follower`], and opens the bus again after a loss.
-pub trait Source {
+pub trait BusSource {
     /// The open bus, or `None` before it was opened for the first time.
     fn bus(&self) -> Option<&Bus>;
 
@@ -44,7 +44,7 @@ pub trait Source {
 #[derive(Debug)]
 pub struct OpenedOnce<'a>(pub &'a Bus);
 
-impl Source for OpenedOnce<'_> {
+impl BusSource for OpenedOnce<'_> {
     fn bus(&self) -> Option<&Bus> {
         Some(self.0)
     }
@@ -77,7 +77,7 @@ pub enum FollowStep {
 #[derive(Debug)]
 pub enum FollowedItem {
     /// A frame from a cell, from the gateway or from another program.
-    Frame(Received),
+    Frame(ReceivedFrame),
     /// A root starts (true) or stops (false) feeding its sum to the gateway.
     Feeds(CellId, bool),
 }
@@ -128,7 +128,7 @@ impl Follower {
 
     /// Sends the messages that are due on the wires to the roots, then receives frames or handles a loss. Returns after
     /// about `wait` plus the time to gather frames, or earlier.
-    pub fn step(&mut self, source: &mut impl Source, wait: Duration) -> FollowStep {
+    pub fn step(&mut self, source: &mut impl BusSource, wait: Duration) -> FollowStep {
         let bus = match source.bus() {
             Some(bus) if !matches!(self.state, FollowState::Gone { .. }) => bus,
             Some(_) | None => return self.reopen(source, wait),
@@ -142,7 +142,7 @@ impl Follower {
             return self.drain(|inbox| bus.receive(inbox));
         }
         // A full inbox has more frames behind it: do not wait.
-        if (1..BATCH).contains(&self.inbox.frames().len()) {
+        if (1..MAX_BATCH_DATAGRAMS).contains(&self.inbox.frames().len()) {
             thread::sleep(self.gather);
         }
         self.receive(|inbox| receive_batch(bus, inbox, timeout))
@@ -155,7 +155,7 @@ impl Follower {
             if let Some(roots) = &mut self.roots
                 && roots.handle_frame(&received.frame)
             {
-                roots.changes().for_each(|(root, feeds)| each(FollowedItem::Feeds(root, feeds)));
+                roots.uplink_changes().for_each(|(root, feeds)| each(FollowedItem::Feeds(root, feeds)));
                 continue;
             }
             each(FollowedItem::Frame(received));
@@ -163,7 +163,7 @@ impl Follower {
     }
 
     /// Frames received in the last step, including those on the wires to the roots.
-    pub fn frames(&self) -> impl ExactSizeIterator<Item = Received> + '_ {
+    pub fn frames(&self) -> impl ExactSizeIterator<Item = ReceivedFrame> + '_ {
         self.inbox.frames()
     }
 
@@ -224,7 +224,7 @@ impl Follower {
         FollowStep::Gone(error)
     }
 
-    fn reopen(&mut self, source: &mut impl Source, wait: Duration) -> FollowStep {
+    fn reopen(&mut self, source: &mut impl BusSource, wait: Duration) -> FollowStep {
         self.inbox.clear();
         let now = Instant::now();
         if let FollowState::Gone { retry: Some(retry) } = self.state
@@ -280,7 +280,7 @@ mod tests {
     /// A source whose `reopen` returns these results, last one first.
     struct Scripted(Vec<Result<(), BusError>>);
 
-    impl Source for Scripted {
+    impl BusSource for Scripted {
         fn bus(&self) -> Option<&Bus> {
             None
         }

@@ -12,7 +12,7 @@ use protocol::bus::{Bus, BusError, BusKind, BusOptions, KindChoice, SendError};
 use protocol::can::Frame;
 use vcan_setup::hosts::report::ReportReader;
 
-use super::follow::Source;
+use super::follow::BusSource;
 use control::cycle::turn::BusState;
 
 /// A bus shared by the threads of a run.
@@ -106,7 +106,7 @@ impl ReceiveEnd {
     }
 }
 
-impl Source for ReceiveEnd {
+impl BusSource for ReceiveEnd {
     fn bus(&self) -> Option<&Bus> {
         Some(&self.bus)
     }

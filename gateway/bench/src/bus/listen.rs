@@ -3,13 +3,13 @@
 use std::time::Duration;
 
 use model::decode::{Decoded, Decoder};
-use protocol::bus::{Bus, BusError, BusOptions, Inbox, KindChoice, Received};
+use protocol::bus::{Bus, BusError, BusOptions, Inbox, KindChoice, ReceivedFrame};
 use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::time::Micros;
 
 use super::follow::receive_batch;
-use super::realtime::wall;
+use super::realtime::wall_clock_ns;
 
 /// Opens a bus for frames of this format. `None` means FD frames, or classic frames if the interface carries only
 /// those.
@@ -34,7 +34,7 @@ pub fn open(
 /// Returns the present time on the clock that stamps received frames.
 #[must_use]
 pub fn now() -> Micros {
-    Micros(wall() / 1_000)
+    Micros(wall_clock_ns() / 1_000)
 }
 
 /// Sends one packet in frames of this format.
@@ -82,12 +82,12 @@ impl Listener {
     }
 
     /// The frames received last.
-    pub fn frames(&self) -> impl Iterator<Item = Received> + '_ {
+    pub fn frames(&self) -> impl Iterator<Item = ReceivedFrame> + '_ {
         self.inbox.frames()
     }
 
     /// The frames received last, decoded.
-    pub fn decoded(&mut self) -> impl Iterator<Item = (Received, Decoded)> + '_ {
+    pub fn decoded(&mut self) -> impl Iterator<Item = (ReceivedFrame, Decoded)> + '_ {
         let Self { bus, inbox, decoder } = self;
         inbox.frames().map(|received| {
             let at = Micros(received.at_nanos / 1_000);

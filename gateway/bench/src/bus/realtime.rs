@@ -13,11 +13,11 @@ use rustix::time::{Timespec, clock_gettime};
 
 use crate::system_calls;
 use control::cycle::Tick;
-use control::cycle::turn::{Shared, TickDriver};
+use control::cycle::turn::{SharedRunState, TickDriver};
 use model::quantiles::histogram;
 
 /// Priority of the control loop: above ordinary threads, below the kernel's own.
-const PRIORITY: i32 = 40;
+const CONTROL_LOOP_PRIORITY: i32 = 40;
 /// Priority of a receiver: above simulated cells on the same processor, so that it reads what they send in time.
 const RECEIVER_PRIORITY: i32 = 30;
 
@@ -26,7 +26,7 @@ const IDLE_WAKEUPS: u32 = 100;
 
 /// Privileges that the machine granted to a thread.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Granted {
+pub struct GrantedPrivileges {
     /// True if the thread runs with `SCHED_FIFO`.
     pub fifo: bool,
     /// True if all memory is locked.
@@ -35,9 +35,9 @@ pub struct Granted {
 
 /// Requests `SCHED_FIFO`, locked memory and punctual wake-ups for the calling thread. Returns the privileges that the
 /// machine granted.
-pub fn prepare() -> Granted {
-    let granted = Granted {
-        fifo: system_calls::set_fifo(PRIORITY),
+pub fn request_realtime() -> GrantedPrivileges {
+    let granted = GrantedPrivileges {
+        fifo: system_calls::set_fifo(CONTROL_LOOP_PRIORITY),
         // Lock only touched pages: locking each thread's whole stack would exceed the limit.
         locked: mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).is_ok(),
     };
@@ -59,7 +59,7 @@ pub fn now() -> u64 {
 
 /// Wall clock in ns since 1970.
 #[must_use]
-pub fn wall() -> u64 {
+pub fn wall_clock_ns() -> u64 {
     let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX)
 }
@@ -77,7 +77,7 @@ pub(crate) fn sleep_until(deadline: u64) {
 /// Measures how late this machine wakes a punctual, idle thread, in ns, at the period of a loop.
 pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
     let measure = move || {
-        prepare();
+        request_realtime();
         let (mut histogram, mut deadline) = (histogram(), now());
         for _ in 0..IDLE_WAKEUPS {
             deadline += period_ns;
@@ -94,7 +94,7 @@ pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
 /// Runs `ticks` ticks, or fewer if the loop is stopped. Skips whole periods that were missed; never resets the phase.
 pub fn run(
     turn: &mut TickDriver,
-    shared: &Shared,
+    shared: &SharedRunState,
     period_ns: u64,
     ticks: u64,
     mut send: impl FnMut(usize, &[Frame]) -> bool,

@@ -62,7 +62,7 @@ impl ReceiveFilter {
         let wires = roots.iter().map(|(_, link_id)| Filter::for_link(link_id.reversed()));
         let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
         let few = sums_of_roots();
-        let all_sums = everything || few.len() + others.len() > Filter::MAX;
+        let all_sums = everything || few.len() + others.len() > Filter::MAX_COUNT;
         let standard = if all_sums { vec![standard(0, 0)] } else { few };
         Self { filters: standard.into_iter().chain(others).collect(), all_sums }
     }
@@ -96,7 +96,7 @@ impl RootWires {
     }
 
     /// Roots that started (true) or stopped (false) feeding the gateway since the last call.
-    pub fn changes(&mut self) -> impl Iterator<Item = (CellId, bool)> {
+    pub fn uplink_changes(&mut self) -> impl Iterator<Item = (CellId, bool)> {
         let uplinks = &self.uplinks;
         self.roots.iter_mut().enumerate().filter_map(|(place, (root, _, feeds))| {
             let now = uplinks.is_child(place);
@@ -159,7 +159,7 @@ mod tests {
     use protocol::can::Format;
     use protocol::message::{Message, VERSION};
     use protocol::packet::Epoch;
-    use protocol::port::{Hello, Rank};
+    use protocol::port::{Hello, TreeRank};
 
     fn skin(reply: &str) -> Skin {
         let head = model::testing::SKIN.replace("reply = \"torque\"", reply);
@@ -236,7 +236,7 @@ mod tests {
         let answer = roots.uplinks.poll_transmit();
         assert!(matches!(answer, Some((0, protocol::port::PortMessage::Grant(_)))), "{answer:?}");
         let root = CellId::new(1).unwrap();
-        assert_eq!(roots.changes().collect::<Vec<_>>(), [], "a grant may be lost");
+        assert_eq!(roots.uplink_changes().collect::<Vec<_>>(), [], "a grant may be lost");
         let hello = Hello {
             version: VERSION,
             number: 1,
@@ -244,15 +244,15 @@ mod tests {
             receives: true,
             is_parent: true,
             unnumbered: false,
-            rank: Some(Rank { round: 1, depth: 1 }),
+            rank: Some(TreeRank { round: 1, depth: 1 }),
         };
         assert!(roots.handle_frame(
             &LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Hello(hello))
         ));
-        assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, true)]);
-        assert_eq!(roots.changes().collect::<Vec<_>>(), []);
+        assert_eq!(roots.uplink_changes().collect::<Vec<_>>(), [(root, true)]);
+        assert_eq!(roots.uplink_changes().collect::<Vec<_>>(), []);
         assert!(roots.handle_frame(&leave));
-        assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, false)]);
+        assert_eq!(roots.uplink_changes().collect::<Vec<_>>(), [(root, false)]);
         assert!(!roots.handle_frame(&sum(1)));
         assert!(RootWires::for_bus(&self::skin("reply = \"torque\""), 0).is_none());
     }

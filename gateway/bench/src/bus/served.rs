@@ -54,7 +54,7 @@ impl ServedBus {
         self.child.id()
     }
 
-    /// Name under which the bus is served: [`protocol::bus::BusKind::served_as`].
+    /// Name under which the bus is served: [`protocol::bus::BusKind::served_name`].
     #[must_use]
     pub fn bus(&self) -> &str {
         &self.bus
@@ -128,7 +128,7 @@ pub fn open_or_serve_all(
         begun.push(match opened {
             Err(_) if is_served => {
                 let program = program_path("vcan-setup")?;
-                let name = kind.served().served_as(name);
+                let name = kind.served_kind().served_name(name);
                 Err(ServedBus::spawn_server(&program, &name, target.directory.as_deref())
                     .map(|served| (program, served))?)
             }
@@ -143,7 +143,7 @@ pub fn open_or_serve_all(
                 served.wait_until_serving(&program)?;
                 all_served.push(served);
                 // Not by the user's choice: an interface of this name may have appeared meanwhile.
-                Bus::open(name, KindChoice::Only(kind.served()), target)?
+                Bus::open(name, KindChoice::Only(kind.served_kind()), target)?
             }
         });
     }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use object::{Architecture, Object, ObjectSection};
-use protocol::factory::{self, Factory};
+use protocol::factory::{self, FactoryRecord};
 use protocol::input;
 use thiserror::Error;
 
@@ -79,9 +79,9 @@ impl Firmware {
         if !FLASH.contains(&section.address()) {
             return Err(FirmwareError::OtherBoard { path });
         }
-        let record = section.file_range().filter(|(_, len)| *len == factory::BYTES as u64);
+        let record = section.file_range().filter(|(_, len)| *len == factory::RECORD_BYTES as u64);
         let record = record.and_then(|(at, _)| usize::try_from(at).ok());
-        match record.filter(|at| bytes.get(*at..*at + factory::BYTES).is_some()) {
+        match record.filter(|at| bytes.get(*at..*at + factory::RECORD_BYTES).is_some()) {
             Some(record) => Ok(Self { bytes, record }),
             None => Err(FirmwareError::NoCell { path }),
         }
@@ -89,9 +89,9 @@ impl Firmware {
 
     /// Returns the image with the factory's record of one cell.
     #[must_use]
-    pub fn for_cell(&self, factory: &Factory) -> Vec<u8> {
+    pub fn image_for_cell(&self, factory: &FactoryRecord) -> Vec<u8> {
         let mut bytes = self.bytes.clone();
-        if let Some(record) = bytes.get_mut(self.record..self.record + factory::BYTES) {
+        if let Some(record) = bytes.get_mut(self.record..self.record + factory::RECORD_BYTES) {
             record.copy_from_slice(&factory.encode());
         }
         bytes

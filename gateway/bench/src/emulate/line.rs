@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
 
 use protocol::bus::{Filter, KindChoice};
-use vcan_setup::slcan::{Address, Bridge, BridgeSettings, LineOptions};
+use vcan_setup::slcan::{Bridge, BridgeSettings, LineAddress, LineOptions};
 
 use super::EmulateError;
 
@@ -26,14 +26,14 @@ struct LineThread {
 
 /// slcan lines that are yet to be joined to their buses.
 #[derive(Debug, Default)]
-pub(super) struct PlannedLines {
+pub(super) struct PlannedSlcanLines {
     by_bus: BTreeMap<String, (KindChoice, Vec<LineOptions>)>,
 }
 
-impl PlannedLines {
+impl PlannedSlcanLines {
     /// Adds a line to a bus: its socket and the filters of its cell.
     pub(super) fn add(&mut self, bus: &str, kind: KindChoice, socket: PathBuf, filters: Vec<Filter>) {
-        let line = LineOptions { filters, ..LineOptions::new(Address::Unix(socket)) };
+        let line = LineOptions { filters, ..LineOptions::new(LineAddress::Unix(socket)) };
         self.by_bus.entry(bus.to_owned()).or_insert((kind, Vec::new())).1.push(line);
     }
 
@@ -41,7 +41,7 @@ impl PlannedLines {
     ///
     /// # Errors
     /// Returns [`EmulateError`] if a bus does not open or a thread cannot be started.
-    pub(super) fn join(self, directory: Option<&Path>) -> Result<SlcanLines, EmulateError> {
+    pub(super) fn connect_to_buses(self, directory: Option<&Path>) -> Result<SlcanLines, EmulateError> {
         let mut lines = SlcanLines::default();
         for (bus, (choice, options)) in self.by_bus {
             let settings =

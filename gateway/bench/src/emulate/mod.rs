@@ -16,7 +16,7 @@ use std::time::Instant;
 
 use model::commission::{CommissionOptions, Outcome};
 use protocol::bus::{Filter, KindChoices};
-use protocol::factory::Factory;
+use protocol::factory::FactoryRecord;
 use protocol::id::{Id, Kind, Node};
 use protocol::skin::{Cell, Skin, SkinReply};
 use rustix::fs::{FlockOperation, flock};
@@ -30,14 +30,14 @@ use crate::processes::{LaunchError, Processes, START_TIMEOUT};
 use crate::setup::Timeout;
 
 pub use firmware::{Firmware, FirmwareError};
-use line::{PlannedLines, SlcanLines};
+use line::{PlannedSlcanLines, SlcanLines};
 
 /// Name of the emulator's program.
 const QEMU: &str = "qemu-system-arm";
 
 /// The cells to emulate.
 #[derive(Clone, Debug)]
-pub struct Emulated {
+pub struct EmulatedCells {
     /// Path of the firmware's file.
     pub firmware: PathBuf,
     /// Indices into the skin's cells.
@@ -155,7 +155,7 @@ impl<'a> Emulator<'a> {
     ///
     /// # Errors
     /// Returns [`EmulateError`] if either is missing.
-    pub(crate) fn new(emulated: &'a Emulated) -> Result<Self, EmulateError> {
+    pub(crate) fn new(emulated: &'a EmulatedCells) -> Result<Self, EmulateError> {
         let firmware = Firmware::read(&emulated.firmware)?;
         let path = std::env::var_os("PATH").unwrap_or_default();
         let qemu = std::env::split_paths(&path).map(|folder| folder.join(QEMU)).find(|path| path.is_file());
@@ -174,17 +174,17 @@ impl<'a> Emulator<'a> {
         let files =
             tempfile::Builder::new().prefix("skinbus-cells-").tempdir().map_err(EmulateError::Files)?;
         let _flash = bench.flash.map(lock_directory).transpose()?;
-        let mut planned = PlannedLines::default();
+        let mut planned = PlannedSlcanLines::default();
         for cell in self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell)) {
-            let place = CellFiles::of(bench, files.path(), cell)?;
+            let place = CellFiles::for_cell(bench, files.path(), cell)?;
             let factory = factory(bench.skin, cell);
-            fs::write(&place.program, self.firmware.for_cell(&factory)).map_err(EmulateError::Files)?;
+            fs::write(&place.program, self.firmware.image_for_cell(&factory)).map_err(EmulateError::Files)?;
             let log = File::create(&place.log).map_err(EmulateError::Files)?;
             let name = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
             processes.emulate(cell, name, self.command(&place, log), &place.log)?;
             planned.add(name, bench.kinds.kind_of(name), place.socket, filters(cell, &factory));
         }
-        let _lines = planned.join(bench.directory)?;
+        let _lines = planned.connect_to_buses(bench.directory)?;
         Ok(Emulation { _lines, _files: files, _flash })
     }
 
@@ -227,7 +227,7 @@ impl<'a> Emulator<'a> {
         let done = commission::commission(benches, &skin, wish, &stop, |far| {
             ended = ended.take().or_else(|| processes.ended().into_iter().next());
             // The timeout also ends the commissioning of a cell that restarts again and again.
-            is_over |= timeout.is_over(far.iter().map(|far| far.found + far.done).sum());
+            is_over |= timeout.has_stalled(far.iter().map(|far| far.found + far.done).sum());
             if ended.is_some() || is_over || signalled.load(Ordering::Relaxed) {
                 stop.store(true, Ordering::Relaxed);
             }
@@ -236,7 +236,7 @@ impl<'a> Emulator<'a> {
             return Err(EmulateError::Interrupted);
         }
         if let Some(ended) = ended {
-            return Err(EmulateError::Ended { cells: ended.to_string(), how: ended.how() });
+            return Err(EmulateError::Ended { cells: ended.to_string(), how: ended.status_text() });
         }
         for done in &done {
             if let Some(failure) = &done.failure {
@@ -267,7 +267,7 @@ struct CellFiles {
 }
 
 impl CellFiles {
-    fn of(bench: &EmulationSetup<'_>, files: &Path, cell: &Cell) -> Result<Self, EmulateError> {
+    fn for_cell(bench: &EmulationSetup<'_>, files: &Path, cell: &Cell) -> Result<Self, EmulateError> {
         let bus = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
         let name = format!("{bus}-{}", cell.node);
         let flash = bench.flash.unwrap_or(files);
@@ -296,10 +296,10 @@ fn lock_directory(directory: &Path) -> Result<File, EmulateError> {
 }
 
 /// The record that the factory would write into a cell.
-fn factory(skin: &Skin, cell: &Cell) -> Factory {
+fn factory(skin: &Skin, cell: &Cell) -> FactoryRecord {
     let bus = skin.buses.get(cell.bus);
     let sums = bus.is_some_and(|bus| bus.reply != SkinReply::Torque);
-    Factory {
+    FactoryRecord {
         node: Some(cell.node),
         serial: cell.serial,
         format: bus.map_or(protocol::can::Format::Fd, |bus| bus.format),
@@ -310,7 +310,7 @@ fn factory(skin: &Skin, cell: &Cell) -> Factory {
 
 /// The filters of a cell's CAN controller: its own identifiers, frames on its simulated wires, and the sums of the
 /// cells at their other ends.
-fn filters(cell: &Cell, &Factory { link_ids, .. }: &Factory) -> Vec<Filter> {
+fn filters(cell: &Cell, &FactoryRecord { link_ids, .. }: &FactoryRecord) -> Vec<Filter> {
     let mut filters: Vec<_> = Id::received_by_cell(cell.node).map(Filter::exact).into();
     if link_ids.iter().any(Option::is_some) {
         filters.extend(link_ids.into_iter().flatten().map(|link_id| Filter::for_link(link_id.reversed())));

@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-use super::Ended;
+use super::EndedProcess;
 use crate::summary::{CellError, ErrorCells};
 
 /// Time within which processes must end to be reported in the same note.
@@ -16,7 +16,7 @@ const MAX_NAMED: usize = 6;
 #[derive(Debug, Default)]
 pub(crate) struct EndedProcesses {
     /// Ended processes that no note has reported yet.
-    pending: Vec<Ended>,
+    pending: Vec<EndedProcess>,
     /// Time at which the last end of a process was found.
     last_found_at: Option<Instant>,
     /// Cells whose processes failed, by reason and by bus.
@@ -26,7 +26,7 @@ pub(crate) struct EndedProcesses {
 impl EndedProcesses {
     /// Adds processes that ended. Once no process has ended for 50 ms, or if `last` is set, returns notes on all that
     /// have not been reported.
-    pub(crate) fn add_ended(&mut self, ended: Vec<Ended>, last: bool) -> Vec<String> {
+    pub(crate) fn add_ended(&mut self, ended: Vec<EndedProcess>, last: bool) -> Vec<String> {
         if !ended.is_empty() {
             self.last_found_at = Some(Instant::now());
             self.pending.extend(ended);
@@ -36,16 +36,16 @@ impl EndedProcesses {
         {
             return Vec::new();
         }
-        let mut groups = BTreeMap::<(String, String), Vec<Ended>>::new();
+        let mut groups = BTreeMap::<(String, String), Vec<EndedProcess>>::new();
         for ended in self.pending.drain(..) {
-            groups.entry((ended.bus.clone(), ended.how())).or_default().push(ended);
+            groups.entry((ended.bus.clone(), ended.status_text())).or_default().push(ended);
         }
-        groups.into_iter().map(|((bus, how), group)| self.note((&bus, &how), &group)).collect()
+        groups.into_iter().map(|((bus, how), group)| self.format_note((&bus, &how), &group)).collect()
     }
 
     /// Returns the note on processes of one bus that ended in the same way. A reason that an earlier note gave is not
     /// repeated.
-    fn note(&mut self, (bus, how): (&str, &str), group: &[Ended]) -> String {
+    fn format_note(&mut self, (bus, how): (&str, &str), group: &[EndedProcess]) -> String {
         let error = group.first().and_then(|ended| Some((ended.status, ended.error()?)));
         let how = error.map_or_else(
             || how.to_owned(),
@@ -87,9 +87,14 @@ mod tests {
     use std::os::unix::process::ExitStatusExt;
     use std::process::ExitStatus;
 
-    fn ended(nodes: (u8, u8), raw_status: i32, said: Option<&str>) -> Ended {
+    fn ended(nodes: (u8, u8), raw_status: i32, said: Option<&str>) -> EndedProcess {
         let said = said.map(str::to_owned);
-        Ended { bus: "vcan0".to_owned(), nodes, status: ExitStatus::from_raw(raw_status), reason: said }
+        EndedProcess {
+            bus: "vcan0".to_owned(),
+            nodes,
+            status: ExitStatus::from_raw(raw_status),
+            reason: said,
+        }
     }
 
     #[test]

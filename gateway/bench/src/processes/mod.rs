@@ -33,7 +33,7 @@ pub const GATEWAY_DETECTION_TIME: Duration = Duration::from_millis(500);
 /// Maximum time without progress while started cells become ready.
 pub const START_TIMEOUT: Duration = Duration::from_secs(15);
 /// Number of files that a gateway or a bus server opens besides its buses and clients.
-const OTHER_FILES: usize = 26;
+const OTHER_OPEN_FILES: usize = 26;
 /// Number of files that a gateway opens for each bus.
 const FILES_OF_A_BUS: usize = 4;
 /// Time that processes have to end after SIGTERM.
@@ -99,7 +99,7 @@ pub struct MemoryError(#[source] std::io::Error);
 /// # Errors
 /// Returns [`LaunchError::Files`] if the system forbids it.
 pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
-    let needed = (OTHER_FILES + FILES_OF_A_BUS * buses + clients) as u64;
+    let needed = (OTHER_OPEN_FILES + FILES_OF_A_BUS * buses + clients) as u64;
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     let Some(limit) = current.filter(|limit| *limit < needed) else { return Ok(()) };
     setrlimit(Resource::Nofile, Rlimit { current: Some(needed), maximum })
@@ -154,7 +154,7 @@ struct Process {
 
 /// A process that ended by itself or was killed. Displayed as its cells and their bus.
 #[derive(Clone, Debug)]
-pub struct Ended {
+pub struct EndedProcess {
     /// Name of the bus.
     pub bus: String,
     /// Node ids of the first and the last cell.
@@ -165,7 +165,7 @@ pub struct Ended {
     pub reason: Option<String>,
 }
 
-impl Ended {
+impl EndedProcess {
     /// Range of the process's cells.
     #[must_use]
     pub const fn cells(&self) -> CellRange {
@@ -174,7 +174,7 @@ impl Ended {
 
     /// Returns the exit status, with the reason that the process gave, if any.
     #[must_use]
-    pub fn how(&self) -> String {
+    pub fn status_text(&self) -> String {
         let status = self.status;
         self.reason.as_ref().map_or_else(|| status.to_string(), |said| format!("{status}: {said}"))
     }
@@ -187,7 +187,7 @@ impl Ended {
     }
 }
 
-impl Display for Ended {
+impl Display for EndedProcess {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         write!(f, "{} on {}", self.cells(), self.bus)
     }
@@ -202,7 +202,7 @@ pub struct Processes {
     /// Standard error of the processes; `None` before the first start.
     error: Option<StandardError>,
     /// Processes that had already ended by themselves when they were to be restarted.
-    ended_at_restart: Vec<Ended>,
+    ended_at_restart: Vec<EndedProcess>,
 }
 
 /// Settings for starting cells.
@@ -295,7 +295,7 @@ impl Processes {
 
     /// Returns the processes that have ended since the last call. Prints what the other processes have written to their
     /// standard error.
-    pub fn ended(&mut self) -> Vec<Ended> {
+    pub fn ended(&mut self) -> Vec<EndedProcess> {
         self.error.iter_mut().for_each(StandardError::read);
         let mut ended = std::mem::take(&mut self.ended_at_restart);
         if !self.changed.swap(false, Ordering::Relaxed) {
@@ -349,7 +349,7 @@ impl Process {
     }
 
     /// Creates the record of a process that ended with `status`.
-    fn end_record(&self, status: ExitStatus, error: Option<&mut StandardError>) -> Ended {
+    fn end_record(&self, status: ExitStatus, error: Option<&mut StandardError>) -> EndedProcess {
         let said = match (&self.log, error) {
             (Some(log), _) => last_line(log),
             (None, Some(error)) => {
@@ -359,7 +359,7 @@ impl Process {
             }
             (None, None) => None,
         };
-        Ended { bus: self.bus_name.clone(), nodes: self.nodes, status, reason: said }
+        EndedProcess { bus: self.bus_name.clone(), nodes: self.nodes, status, reason: said }
     }
 
     /// Sends a signal and enters `phase`. Ended processes are left alone.

@@ -17,7 +17,7 @@ pub type Metadata = BTreeMap<String, String>;
 
 /// Metadata of the program and its command line.
 #[must_use]
-pub fn program(command_line: &[String], began_nanos: u64) -> Metadata {
+pub fn program_metadata(command_line: &[String], began_nanos: u64) -> Metadata {
     metadata([
         ("program", format!("skinbus {}", env!("CARGO_PKG_VERSION"))),
         ("git_revision", env!("SKINBUS_GIT_REVISION").to_owned()),
@@ -28,7 +28,7 @@ pub fn program(command_line: &[String], began_nanos: u64) -> Metadata {
 
 /// Metadata of the kernel, its clock, and the wake-up lateness of an idle thread.
 #[must_use]
-pub fn machine(idle: &Quantiles) -> Metadata {
+pub fn machine_metadata(idle: &Quantiles) -> Metadata {
     let about = uname();
     let text = |text: &std::ffi::CStr| text.to_string_lossy().into_owned();
     let clocks = "/sys/devices/system/clocksource/clocksource0/";

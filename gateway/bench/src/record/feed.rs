@@ -7,7 +7,7 @@ use protocol::message::SkinSensors;
 
 use crate::view::BusView;
 use control::cycle::turn::{BusState, TimedRecord};
-use model::latched::ReceivedFrame;
+use model::latched::LatchedFrame;
 use model::table::CellStatus;
 use trace::capture::BusNote;
 
@@ -30,9 +30,9 @@ pub const EPOCH_QUEUE: usize = 128;
 
 /// An item from the receiver of a bus, in order of arrival.
 #[derive(Clone, Copy, Debug)]
-pub enum Captured {
+pub enum CapturedItem {
     /// A received frame.
-    Frame(ReceivedFrame),
+    Frame(LatchedFrame),
     /// Frames that the bus dropped because they were not read in time.
     Dropped {
         /// Time of detection in ns since 1970.
@@ -69,8 +69,8 @@ pub struct EpochContacts {
 
 /// The receiver's end of the queues to the recorder.
 #[derive(Debug)]
-pub struct Outlet {
-    frames: rtrb::Producer<Captured>,
+pub struct RecorderSender {
+    frames: rtrb::Producer<CapturedItem>,
     touched: Option<rtrb::Producer<EpochContacts>>,
     /// Total number of frames that did not fit into the queue.
     unrecorded: u64,
@@ -82,20 +82,20 @@ pub struct Outlet {
 
 /// Items that did not fit into queues.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Unrecorded {
+pub struct UnrecordedCounts {
     /// Number of frames.
     pub frames: u64,
     /// Number of epochs whose contact states are missing.
     pub epochs: u64,
 }
 
-impl Outlet {
+impl RecorderSender {
     /// Queues a frame.
-    pub fn frame(&mut self, seen: ReceivedFrame) {
+    pub fn push_frame(&mut self, seen: LatchedFrame) {
         if self.unreported > 0 {
             self.report_unrecorded(seen.at_nanos);
         }
-        if self.unreported > 0 || self.frames.push(Captured::Frame(seen)).is_err() {
+        if self.unreported > 0 || self.frames.push(CapturedItem::Frame(seen)).is_err() {
             self.unrecorded += 1;
             self.unreported += 1;
         }
@@ -103,20 +103,20 @@ impl Outlet {
 
     /// Returns the number of frames for which the queue has room.
     #[must_use]
-    pub fn free(&self) -> usize {
+    pub fn free_slots(&self) -> usize {
         self.frames.slots()
     }
 
     /// Queues a report that the bus dropped frames.
-    pub fn dropped(&mut self, at_nanos: u64, frames: u64) {
+    pub fn push_dropped(&mut self, at_nanos: u64, frames: u64) {
         // The queue counts frames that do not fit, which is reported separately.
-        let _ = self.frames.push(Captured::Dropped { at_nanos, frames });
+        let _ = self.frames.push(CapturedItem::Dropped { at_nanos, frames });
     }
 
     /// Queues a report that the bus was lost or works again.
-    pub fn bus(&mut self, at_nanos: u64, what: BusNote) {
+    pub fn push_bus_note(&mut self, at_nanos: u64, what: BusNote) {
         // A full queue loses frames, which is reported separately.
-        let _ = self.frames.push(Captured::Bus { at_nanos, what });
+        let _ = self.frames.push(CapturedItem::Bus { at_nanos, what });
     }
 
     /// Returns true if contact states are recorded.
@@ -138,7 +138,7 @@ impl Outlet {
     /// reported.
     pub fn report_unrecorded(&mut self, at_nanos: u64) -> bool {
         let frames = self.unreported;
-        if frames > 0 && self.frames.push(Captured::Unrecorded { at_nanos, frames }).is_ok() {
+        if frames > 0 && self.frames.push(CapturedItem::Unrecorded { at_nanos, frames }).is_ok() {
             self.unreported = 0;
         }
         self.unreported == 0
@@ -146,15 +146,15 @@ impl Outlet {
 
     /// Returns the numbers of items that did not fit into the queues.
     #[must_use]
-    pub const fn unrecorded(&self) -> Unrecorded {
-        Unrecorded { frames: self.unrecorded, epochs: self.unrecorded_epochs }
+    pub const fn unrecorded(&self) -> UnrecordedCounts {
+        UnrecordedCounts { frames: self.unrecorded, epochs: self.unrecorded_epochs }
     }
 }
 
 /// The recorder's end of the queues of a bus.
 #[derive(Debug)]
 pub struct BusFeed {
-    pub(super) frames: rtrb::Consumer<Captured>,
+    pub(super) frames: rtrb::Consumer<CapturedItem>,
     pub(super) touched: Option<rtrb::Consumer<EpochContacts>>,
     /// State of the bus's cells.
     pub(super) view: Arc<Mutex<BusView>>,
@@ -170,16 +170,16 @@ pub fn bus_feed(
     all: bool,
     view: Arc<Mutex<BusView>>,
     state: Arc<BusState>,
-) -> (Outlet, BusFeed) {
+) -> (RecorderSender, BusFeed) {
     let (frames, taken) = rtrb::RingBuffer::new(frame_queue_length(buses));
     let (touched, states) = all.then(|| rtrb::RingBuffer::new(EPOCH_QUEUE)).unzip();
-    let outlet = Outlet { frames, touched, unrecorded: 0, unreported: 0, unrecorded_epochs: 0 };
+    let outlet = RecorderSender { frames, touched, unrecorded: 0, unreported: 0, unrecorded_epochs: 0 };
     (outlet, BusFeed { frames: taken, touched: states, view, state })
 }
 
 /// All inputs of the recorder.
 #[derive(Debug)]
-pub struct Feed {
+pub struct RecorderFeed {
     /// Queues of each bus.
     pub bus_feeds: Vec<BusFeed>,
     /// Ticks of the control loop.
@@ -202,22 +202,22 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_reported_where_it_is_missing() {
         let (mut outlet, mut bus_feed) = bus_feed(1, false, Arc::default(), Arc::default());
-        let frame = |at_nanos| ReceivedFrame { at_nanos, from_gateway: false, frame: Frame::EMPTY };
+        let frame = |at_nanos| LatchedFrame { at_nanos, from_gateway: false, frame: Frame::EMPTY };
         let all = FRAME_QUEUE as u64;
-        (0..all + 7).for_each(|at| outlet.frame(frame(at)));
-        assert_eq!(outlet.unrecorded(), Unrecorded { frames: 7, epochs: 0 });
+        (0..all + 7).for_each(|at| outlet.push_frame(frame(at)));
+        assert_eq!(outlet.unrecorded(), UnrecordedCounts { frames: 7, epochs: 0 });
         let mut taken = 0;
-        while let Ok(Captured::Frame(seen)) = bus_feed.frames.pop() {
+        while let Ok(CapturedItem::Frame(seen)) = bus_feed.frames.pop() {
             assert_eq!(seen.at_nanos, taken);
             taken += 1;
         }
         assert_eq!(taken, all);
-        outlet.frame(frame(1_000_000));
-        outlet.frame(frame(1_000_001));
+        outlet.push_frame(frame(1_000_000));
+        outlet.push_frame(frame(1_000_001));
         let said = bus_feed.frames.pop().unwrap();
-        assert!(matches!(said, Captured::Unrecorded { at_nanos: 1_000_000, frames: 7 }), "{said:?}");
+        assert!(matches!(said, CapturedItem::Unrecorded { at_nanos: 1_000_000, frames: 7 }), "{said:?}");
         assert!(
-            matches!(bus_feed.frames.pop().unwrap(), Captured::Frame(seen) if seen.at_nanos == 1_000_000)
+            matches!(bus_feed.frames.pop().unwrap(), CapturedItem::Frame(seen) if seen.at_nanos == 1_000_000)
         );
         assert_eq!(outlet.unrecorded().frames, 7);
     }

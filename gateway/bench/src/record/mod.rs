@@ -22,7 +22,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 
-use feed::{Feed, Unrecorded};
+use feed::{RecorderFeed, UnrecordedCounts};
 use text::CandumpWriter;
 use thiserror::Error;
 use topics::Topics;
@@ -32,7 +32,7 @@ use trace::recording::repair;
 use trace::recording::robot::RecordedRobot;
 use trace::recording::series::{AttachedFile, FileHead, SplitLimits, SplitRecording};
 
-use crate::bus::realtime::wall;
+use crate::bus::realtime::wall_clock_ns;
 use crate::threads::{ThreadError, spawn};
 use trace::files::check_regular;
 
@@ -109,7 +109,7 @@ impl Outputs {
     ///
     /// # Errors
     /// Returns [`OutputError`] with the file that cannot be written.
-    pub fn claim(
+    pub fn open_outputs(
         options: &RecordOptions,
         stopped: &AtomicBool,
         say: impl FnMut(&str),
@@ -153,7 +153,7 @@ impl Outputs {
     ///
     /// # Errors
     /// Returns [`ThreadError`] if the system grants no thread.
-    pub fn start(self, feed: Feed, layout: Layout, head: FileHead) -> Result<Recorder, ThreadError> {
+    pub fn start(self, feed: RecorderFeed, layout: Layout, head: FileHead) -> Result<Recorder, ThreadError> {
         let stop = Arc::new(StopRequest::default());
         let (tell, said) = mpsc::channel();
         let (notes, noted) = mpsc::channel();
@@ -191,7 +191,7 @@ impl Recorder {
     /// Adds a note about an intervention to the recording; a candump log holds frames only.
     pub fn note(&self, text: &str) {
         // After the thread has ended, notes are lost.
-        let _ = self.notes.send((wall(), text.to_owned()));
+        let _ = self.notes.send((wall_clock_ns(), text.to_owned()));
     }
 
     /// Ends the recording of a run that never began. Removes all outputs except a candump log that contains frames.
@@ -206,7 +206,7 @@ impl Recorder {
     /// Records all queued items and ends the files. Call it after all threads have stopped queuing. `unrecorded` counts
     /// items that did not fit into the receivers' queues; `ticks` counts ticks that did not fit into theirs.
     #[must_use]
-    pub fn finish(self, unrecorded: Unrecorded, ticks: u64) -> RecordingAccount {
+    pub fn finish(self, unrecorded: UnrecordedCounts, ticks: u64) -> RecordingAccount {
         self.stop.now.store(true, Ordering::Release);
         let mut recording = self.thread.join().unwrap_or_else(|_| {
             let errors =

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use protocol::candump::{Record, Timestamp, write_record};
 
 use super::Candump;
-use model::latched::ReceivedFrame;
+use model::latched::LatchedFrame;
 use trace::files::LogFile;
 use trace::recording::account::WrittenFile;
 
@@ -64,12 +64,12 @@ impl CandumpWriter {
     ///
     /// # Errors
     /// Returns [`io::Error`] once if the log cannot be written.
-    pub fn frame(&mut self, interface: &str, seen: &ReceivedFrame) -> io::Result<()> {
+    pub fn add_frame(&mut self, interface: &str, seen: &LatchedFrame) -> io::Result<()> {
         if self.failed {
             self.lost += 1;
             return Ok(());
         }
-        let time = Timestamp::six_digits(seen.at_nanos);
+        let time = Timestamp::with_six_digits(seen.at_nanos);
         let record = Record { time, interface, frame: seen.frame, direction: None };
         // Writing to a string never fails.
         let _ = write_record(&mut self.lines, &record);
@@ -117,7 +117,7 @@ impl CandumpWriter {
         if self.moved || self.failed {
             return Ok(());
         }
-        let looked = self.log.check();
+        let looked = self.log.check_unchanged();
         self.moved = looked.is_err();
         looked
     }
@@ -139,7 +139,8 @@ impl CandumpWriter {
     /// it, and the first error.
     pub fn finish(mut self) -> (Option<WrittenFile>, u64, io::Result<()>) {
         let (put, looked) = (self.write(), self.check_name());
-        let there = if self.moved { self.log.lines("(").ok().flatten() } else { Some(self.frames) };
+        let there =
+            if self.moved { self.log.count_lines_with_prefix("(").ok().flatten() } else { Some(self.frames) };
         let Self { log, frames: written, lost, .. } = self;
         let frames = there.unwrap_or(0).min(written);
         let path = log.path().display().to_string();
@@ -174,9 +175,9 @@ mod tests {
         CandumpWriter::create(&target, false, &AtomicBool::new(false)).unwrap()
     }
 
-    fn seen(at: u64) -> ReceivedFrame {
+    fn seen(at: u64) -> LatchedFrame {
         let frame = Frame::classic(0x123, &[1, 2, 3]).unwrap();
-        ReceivedFrame { at_nanos: at * 1_000, from_gateway: false, frame }
+        LatchedFrame { at_nanos: at * 1_000, from_gateway: false, frame }
     }
 
     #[test]
@@ -184,9 +185,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.log");
         let mut text = text(&path);
-        text.frame("vcan0", &seen(1)).unwrap();
+        text.add_frame("vcan0", &seen(1)).unwrap();
         text.note("DROPCOUNT: dropped 3 CAN frames on 'vcan0' socket (total drops 3)").unwrap();
-        text.frame("vcan0", &seen(2)).unwrap();
+        text.add_frame("vcan0", &seen(2)).unwrap();
         let (written, lost, finished) = text.finish();
         finished.unwrap();
         let (log, written) = (fs::read_to_string(&path).unwrap(), written.unwrap());
@@ -199,7 +200,7 @@ mod tests {
     #[test]
     fn a_full_disk_is_reported_once_and_every_frame_is_counted() {
         let mut text = text(Path::new("/dev/full"));
-        let errors = (0..10_000).filter(|&at| text.frame("vcan0", &seen(at)).is_err()).count();
+        let errors = (0..10_000).filter(|&at| text.add_frame("vcan0", &seen(at)).is_err()).count();
         assert_eq!(errors, 1);
         let (written, lost, _) = text.finish();
         assert_eq!((written.unwrap().frames, lost), (0, 10_000));
@@ -214,7 +215,7 @@ mod tests {
         let mut said = Vec::new();
         let mut frames = |log: &mut CandumpWriter, count| {
             for at in 0..count {
-                log.frame("vcan0", &seen(at)).unwrap();
+                log.add_frame("vcan0", &seen(at)).unwrap();
                 log.checked_at = Instant::now().checked_sub(CHECK_INTERVAL).unwrap();
                 said.extend(log.flush().err());
             }
@@ -258,7 +259,7 @@ mod tests {
         let path = folder.path().join("run.log");
         let mut log = text(&path);
         for at in 1..4 {
-            log.frame("vcan0", &seen(at)).unwrap();
+            log.add_frame("vcan0", &seen(at)).unwrap();
             log.flush().unwrap();
             let there = fs::read_to_string(&path).unwrap();
             assert!(there.ends_with(&format!("(0.{at:06}) vcan0 123#010203\n")), "{there}");
@@ -272,7 +273,7 @@ mod tests {
         assert!(text(&path).discard().is_none());
         assert!(!path.exists());
         let mut log = text(&path);
-        log.frame("vcan0", &seen(1)).unwrap();
+        log.add_frame("vcan0", &seen(1)).unwrap();
         assert_eq!(log.discard().unwrap().frames, 1);
         assert_eq!(fs::read_to_string(&path).unwrap(), "(0.000001) vcan0 123#010203\n");
     }

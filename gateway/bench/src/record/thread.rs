@@ -12,19 +12,19 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::backlog;
 use super::facts::realtime_minus_monotonic;
-use super::feed::{BusFeed, Captured, Feed, frame_queue_length};
+use super::feed::{BusFeed, CapturedItem, RecorderFeed, frame_queue_length};
 use super::text::CandumpWriter;
 use super::topics::{ROBOT_MESSAGES, Topics};
 use super::{Outputs, StopRequest};
-use crate::bus::realtime::wall;
+use crate::bus::realtime::wall_clock_ns;
 use model::latched::LatchedPackets;
-use trace::capture::{Note, NoteKind, RUN_METADATA, run_metadata};
+use trace::capture::{CaptureNote, NoteKind, RUN_METADATA, run_metadata};
 use trace::recording::account::{MessageCount, RecordingAccount};
 use trace::recording::layout::Layout;
 use trace::recording::series::{FileHead, RecordingEvent, SplitRecording};
 use trace::recording::window::{ReorderWindow, WINDOW_NS};
 use trace::ros2::skin::ContactState;
-use trace::ros2::standard::{Diagnosis, Level, Point};
+use trace::ros2::standard::{Diagnosis, DiagnosisLevel, Point};
 
 /// Pause between rounds of the thread.
 const ROUND_PAUSE: Duration = Duration::from_millis(10);
@@ -61,7 +61,7 @@ struct OutputFiles {
 /// State of the recorder's thread.
 pub(super) struct RecorderThread {
     files: OutputFiles,
-    feed: Feed,
+    feed: RecorderFeed,
     layout: Layout,
     /// Notes about interventions, with their times.
     notes: Receiver<(u64, String)>,
@@ -100,7 +100,7 @@ impl Interval {
 impl RecorderThread {
     pub(super) fn new(
         outputs: Outputs,
-        feed: Feed,
+        feed: RecorderFeed,
         layout: Layout,
         (noted, tell): (Receiver<(u64, String)>, Sender<String>),
     ) -> Self {
@@ -115,7 +115,7 @@ impl RecorderThread {
             reported: 0,
             buses,
             q: None,
-            backlog: backlog::dropped(),
+            backlog: backlog::dropped_packets(),
             start_is_written: false,
             ticks: 0,
             ticks_skipped: 0,
@@ -167,7 +167,7 @@ impl RecorderThread {
     fn drain_queues(&mut self) -> usize {
         let offset = realtime_minus_monotonic();
         if let Some(series) = &mut self.files.series {
-            series.set_time(wall());
+            series.set_time(wall_clock_ns());
         }
         let mut most = 0;
         self.drain_ticks(offset);
@@ -193,28 +193,35 @@ impl RecorderThread {
         let taken = waiting.len();
         for captured in waiting {
             match captured {
-                Captured::Frame(frame) => {
+                CapturedItem::Frame(frame) => {
                     seen.frames += 1;
                     seen.latched.receive(frame);
-                    seen.missing += u64::from(self.files.is_between());
-                    self.files.text(|text| text.frame(name, &frame));
-                    self.files
-                        .put(MessageCount::FRAME, |window, topics| topics.frame(window, bus, name, &frame));
+                    seen.missing += u64::from(self.files.is_between_files());
+                    self.files.write_text(|text| text.add_frame(name, &frame));
+                    self.files.put(MessageCount::ONE_FRAME, |window, topics| {
+                        topics.write_frame(window, bus, name, &frame)
+                    });
                 }
-                Captured::Dropped { at_nanos, frames } => {
+                CapturedItem::Dropped { at_nanos, frames } => {
                     seen.dropped += frames;
                     let place = format!("CAN frames on '{name}' socket");
-                    self.files.dropped(at_nanos, Some((bus, name)), frames, &place, seen.dropped);
+                    self.files.note_dropped_frames(at_nanos, Some((bus, name)), frames, &place, seen.dropped);
                 }
-                Captured::Bus { at_nanos, what } => {
+                CapturedItem::Bus { at_nanos, what } => {
                     let line = what.text(name);
-                    self.files.text(|text| text.note(&format!("# {line}")));
+                    self.files.write_text(|text| text.note(&format!("# {line}")));
                     self.files.note(at_nanos, Some((bus, name)), NoteKind::Text, &line);
                 }
-                Captured::Unrecorded { at_nanos, frames } => {
+                CapturedItem::Unrecorded { at_nanos, frames } => {
                     seen.unrecorded += frames;
                     let place = format!("CAN frames on '{name}' in the queue to the recorder");
-                    self.files.dropped(at_nanos, Some((bus, name)), frames, &place, seen.unrecorded);
+                    self.files.note_dropped_frames(
+                        at_nanos,
+                        Some((bus, name)),
+                        frames,
+                        &place,
+                        seen.unrecorded,
+                    );
                 }
             }
         }
@@ -237,8 +244,8 @@ impl RecorderThread {
                 series.add_metadata(RUN_METADATA, run_metadata(nanos.saturating_sub(since)));
             }
             let messages = 4 + u64::from(layout.records_poses_at(timed.record.tick.number));
-            self.files.put(MessageCount::others(messages), |window, topics| {
-                topics.tick(window, layout, nanos, &timed)
+            self.files.put(MessageCount::other_messages(messages), |window, topics| {
+                topics.write_tick(window, layout, nanos, &timed)
             });
         }
     }
@@ -255,8 +262,8 @@ impl RecorderThread {
             let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
             for (place, _) in patches {
                 let messages = if q.is_some() { 2 } else { 1 };
-                self.files.put(MessageCount::others(messages), |window, topics| {
-                    topics.patch(window, &self.layout, place, &touched, q, &mut self.scratch)
+                self.files.put(MessageCount::other_messages(messages), |window, topics| {
+                    topics.write_patch(window, &self.layout, place, &touched, q, &mut self.scratch)
                 });
             }
         }
@@ -264,19 +271,19 @@ impl RecorderThread {
 
     /// Records new drops in the kernel's backlog; their bus is unknown.
     fn record_backlog(&mut self) {
-        let (Some(total), Some(before)) = (backlog::dropped(), self.backlog) else { return };
+        let (Some(total), Some(before)) = (backlog::dropped_packets(), self.backlog) else { return };
         let frames = total.saturating_sub(before);
         self.backlog = Some(total);
         if frames > 0 {
             let place = "packets of any network in the kernel's backlog";
-            self.files.dropped(wall(), None, frames, place, total);
+            self.files.note_dropped_frames(wall_clock_ns(), None, frames, place, total);
         }
     }
 
     fn diagnose(&mut self) {
         let Some(series) = &mut self.files.series else { return };
         let mut parts = vec![Diagnosis {
-            level: if self.ticks_skipped > 0 { Level::Warn } else { Level::Ok },
+            level: if self.ticks_skipped > 0 { DiagnosisLevel::Warn } else { DiagnosisLevel::Ok },
             name: "gateway: control loop".to_owned(),
             message: if self.ticks_skipped > 0 { "ticks were skipped" } else { "in time" }.to_owned(),
             values: vec![
@@ -291,7 +298,7 @@ impl RecorderThread {
         let unrecorded: u64 = self.buses.iter().map(|bus| bus.unrecorded).sum();
         let all_well = lost.frames + lost.others + unrecorded == 0;
         parts.push(Diagnosis {
-            level: if all_well { Level::Ok } else { Level::Error },
+            level: if all_well { DiagnosisLevel::Ok } else { DiagnosisLevel::Error },
             name: "gateway: recorder".to_owned(),
             message: if all_well { "everything is recorded" } else { "something is missing" }.to_owned(),
             values: vec![
@@ -299,18 +306,20 @@ impl RecorderThread {
                 ("frames_not_written", lost.frames.to_string()),
                 ("others_not_written", lost.others.to_string()),
                 ("frames_queue_full", unrecorded.to_string()),
-                ("messages_late", series.late().to_string()),
+                ("messages_late", series.late_messages().to_string()),
             ],
         });
-        let now = wall();
-        series.put(MessageCount::others(1), |window, topics| topics.diagnostics(window, now, &parts));
+        let now = wall_clock_ns();
+        series.add_messages(MessageCount::other_messages(1), |window, topics| {
+            topics.write_diagnostics(window, now, &parts)
+        });
     }
 
     fn flush(&mut self) {
-        self.files.text(CandumpWriter::flush);
+        self.files.write_text(CandumpWriter::flush);
         let Some(series) = &mut self.files.series else { return };
         // Both segments of a packet to the cells must be in one file.
-        let now = wall();
+        let now = wall_clock_ns();
         let holds = self.buses.iter().any(|bus| bus.latched.is_within_a_packet(now));
         if !series.flush(holds) || !series.begin_next(|writer| Topics::new(writer, &self.layout)) {
             return;
@@ -321,8 +330,8 @@ impl RecorderThread {
         write_robot(series, &self.layout, began);
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.latched.frames() {
-                series.put(MessageCount::others(1), |window, topics| {
-                    topics.latched(window, began, (bus, name), &frame);
+                series.add_messages(MessageCount::other_messages(1), |window, topics| {
+                    topics.write_latched_frame(window, began, (bus, name), &frame);
                 });
             }
         }
@@ -332,8 +341,8 @@ impl RecorderThread {
             if frames > 0 {
                 let place = format!("CAN frames on '{name}' while nothing could be written");
                 // The log contains these frames.
-                let line = dropped(frames, &place, frames);
-                self.files.note(wall(), Some((bus, name)), NoteKind::Dropped(frames), &line);
+                let line = dropped_frames_line(frames, &place, frames);
+                self.files.note(wall_clock_ns(), Some((bus, name)), NoteKind::Dropped(frames), &line);
             }
         }
     }
@@ -368,7 +377,7 @@ impl RecorderThread {
         if let Some(mut series) = self.files.series.take() {
             let (files, unwritten) = series.finish();
             recording.files = files;
-            recording.messages_late = series.late();
+            recording.messages_late = series.late_messages();
             lost = unwritten.frames;
             if unwritten.others > 0 {
                 recording.messages_lost.insert("unwritten", unwritten.others);
@@ -399,12 +408,12 @@ impl RecorderThread {
 
 impl OutputFiles {
     /// Returns true between the end of one file of a recording and the start of the next.
-    fn is_between(&self) -> bool {
+    fn is_between_files(&self) -> bool {
         self.series.as_ref().is_some_and(|series| !series.is_open())
     }
 
     /// Writes to the candump log, if there is one.
-    fn text(&mut self, write: impl FnOnce(&mut CandumpWriter) -> io::Result<()>) {
+    fn write_text(&mut self, write: impl FnOnce(&mut CandumpWriter) -> io::Result<()>) {
         if let Some(text) = &mut self.text
             && let Err(error) = write(text)
         {
@@ -420,15 +429,22 @@ impl OutputFiles {
     /// Writes to the MCAP recording, if there is one.
     fn put(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut Topics)) {
         if let Some(series) = &mut self.series {
-            series.put(count, write);
+            series.add_messages(count, write);
         }
     }
 
     /// Notes in all outputs that `frames` frames are missing at this point. `place` says where they were lost, `total`
     /// is the number of frames lost there so far, and `bus` is their bus, if known.
-    fn dropped(&mut self, nanos: u64, bus: Option<(usize, &str)>, frames: u64, place: &str, total: u64) {
-        let line = dropped(frames, place, total);
-        self.text(|text| text.note(&line));
+    fn note_dropped_frames(
+        &mut self,
+        nanos: u64,
+        bus: Option<(usize, &str)>,
+        frames: u64,
+        place: &str,
+        total: u64,
+    ) {
+        let line = dropped_frames_line(frames, place, total);
+        self.write_text(|text| text.note(&line));
         self.note(nanos, bus, NoteKind::Dropped(frames), &line);
     }
 
@@ -436,36 +452,37 @@ impl OutputFiles {
     fn note(&mut self, nanos: u64, bus: Option<(usize, &str)>, kind: NoteKind, line: &str) {
         let (bus, interface) = bus.unzip();
         let interface = interface.unwrap_or_default();
-        let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
-        self.put(MessageCount::others(1), |window, topics| topics.note(window, bus, &note));
+        let note = CaptureNote { kind, nanos, interface, line: 0, text: line.as_bytes() };
+        self.put(MessageCount::other_messages(1), |window, topics| topics.write_note(window, bus, &note));
     }
 }
 
 /// Writes the robot's description, once per file.
 fn write_robot(series: &mut SplitRecording<Topics>, layout: &Layout, nanos: u64) {
     if layout.robot.is_some() {
-        series
-            .put(MessageCount::others(ROBOT_MESSAGES), |window, topics| topics.robot(window, layout, nanos));
+        series.add_messages(MessageCount::other_messages(ROBOT_MESSAGES), |window, topics| {
+            topics.write_robot(window, layout, nanos)
+        });
     }
 }
 
-fn dropped(frames: u64, place: &str, total: u64) -> String {
+fn dropped_frames_line(frames: u64, place: &str, total: u64) -> String {
     format!("DROPCOUNT: dropped {frames} {place} (total drops {total})")
 }
 
 /// Returns the diagnosis of a bus for the diagnostics topic.
 fn diagnose_bus(bus_feed: &BusFeed, name: &str, seen: &BusRecord) -> Diagnosis {
-    let works = bus_feed.state.is_there();
+    let works = bus_feed.state.is_working();
     let (mut cells, mut silent) = (0, 0);
     if let Ok(view) = bus_feed.view.lock() {
         cells = view.cells.len();
         silent = view.cells.iter().filter(|cell| !cell.seen || cell.dead).count();
     }
     let (level, message) = match (works, silent, seen.dropped) {
-        (false, _, _) => (Level::Error, "the bus does not work"),
-        (true, 0, 0) => (Level::Ok, "all cells are there"),
-        (true, 0, _) => (Level::Warn, "frames were dropped"),
-        (true, _, _) => (Level::Warn, "cells are silent"),
+        (false, _, _) => (DiagnosisLevel::Error, "the bus does not work"),
+        (true, 0, 0) => (DiagnosisLevel::Ok, "all cells are there"),
+        (true, 0, _) => (DiagnosisLevel::Warn, "frames were dropped"),
+        (true, _, _) => (DiagnosisLevel::Warn, "cells are silent"),
     };
     Diagnosis {
         level,

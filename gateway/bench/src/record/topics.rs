@@ -9,15 +9,15 @@ use super::feed::EpochContacts;
 use control::controller::BadCycle;
 use control::cycle::Halt;
 use control::cycle::turn::TimedRecord;
-use model::latched::ReceivedFrame;
+use model::latched::LatchedFrame;
 use model::table::CellStatus;
-use trace::capture::Note;
+use trace::capture::CaptureNote;
 use trace::recording::NOTES_TOPIC;
 use trace::recording::file::Channel;
 use trace::recording::layout::{Layout, Patch};
 use trace::recording::series::Writer;
 use trace::recording::window::ReorderWindow;
-use trace::ros2::robot::{Text, Transforms};
+use trace::ros2::robot::{StringMessage, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
 
@@ -35,7 +35,7 @@ const TF: &str = "/tf";
 const TF_STATIC: &str = "/tf_static";
 const DESCRIPTION: &str = "/robot_description";
 
-/// Number of messages that [`Topics::robot`] writes.
+/// Number of messages that [`Topics::write_robot`] writes.
 pub const ROBOT_MESSAGES: u64 = 2;
 
 /// Channels of one file.
@@ -79,12 +79,16 @@ impl Topics {
         let robot = layout.robot.is_some().then(|| {
             let moving = writer.channel::<Transforms<'_>>(TF, &[])?;
             let still = writer.channel::<Transforms<'_>>(TF_STATIC, &[LATCHED_QOS])?;
-            Ok::<_, io::Error>([moving, still, writer.channel::<Text<'_>>(DESCRIPTION, &[LATCHED_QOS])?])
+            Ok::<_, io::Error>([
+                moving,
+                still,
+                writer.channel::<StringMessage<'_>>(DESCRIPTION, &[LATCHED_QOS])?,
+            ])
         });
         Ok(Self {
             can,
             state,
-            notes: writer.channel::<Note<'_>>(NOTES_TOPIC, &[])?,
+            notes: writer.channel::<CaptureNote<'_>>(NOTES_TOPIC, &[])?,
             joint_states: writer.channel::<JointState<'_>>(states, &[])?,
             joint_commands: writer.channel::<JointState<'_>>(commands, &[])?,
             torques: writer.channel::<Torques<'_>>(torques, &[])?,
@@ -96,55 +100,62 @@ impl Topics {
     }
 
     /// Writes the robot's fixed transforms and description, if known.
-    pub fn robot(&mut self, window: &mut ReorderWindow, layout: &Layout, nanos: u64) {
+    pub fn write_robot(&mut self, window: &mut ReorderWindow, layout: &Layout, nanos: u64) {
         let (Some(robot), Some([_, still, description])) = (&layout.robot, &mut self.robot) else { return };
         window.write(still, nanos, &Transforms { nanos, transforms: &robot.fixed_transforms() });
-        window.write(description, nanos, &Text(&robot.description));
+        window.write(description, nanos, &StringMessage(&robot.description));
     }
 
     /// Writes a frame of a bus.
-    pub fn frame(&mut self, window: &mut ReorderWindow, bus: usize, name: &str, seen: &ReceivedFrame) {
+    pub fn write_frame(&mut self, window: &mut ReorderWindow, bus: usize, name: &str, seen: &LatchedFrame) {
         if let Some(channel) = self.can.get_mut(bus) {
-            window.write(channel, seen.at_nanos, &message(name, seen));
+            window.write(channel, seen.at_nanos, &frame_record(name, seen));
         }
     }
 
     /// Writes a frame that was latched when the file began, under the time `nanos`, at which the file begins. Its own
     /// time may be much earlier, and viewers would start there.
-    pub fn latched(
+    pub fn write_latched_frame(
         &mut self,
         window: &mut ReorderWindow,
         nanos: u64,
         (bus, name): (usize, &str),
-        seen: &ReceivedFrame,
+        seen: &LatchedFrame,
     ) {
         if let Some(channel) = self.state.get_mut(bus) {
-            window.write_at(channel, nanos, seen.at_nanos, &message(name, seen));
+            window.write_at(channel, nanos, seen.at_nanos, &frame_record(name, seen));
         }
     }
 
     /// Writes a note between frames. A note about a bus comes after the frames recorded from that bus.
-    pub fn note(&mut self, window: &mut ReorderWindow, bus: Option<usize>, note: &Note<'_>) {
+    pub fn write_note(&mut self, window: &mut ReorderWindow, bus: Option<usize>, note: &CaptureNote<'_>) {
         let channel = bus.and_then(|bus| self.can.get(bus));
-        let heard = channel.map(|channel| window.latest(channel)).filter(|heard| *heard > 0);
+        let heard = channel.map(|channel| window.latest_ns(channel)).filter(|heard| *heard > 0);
         window.write_at(&mut self.notes, heard.unwrap_or(note.nanos), note.nanos, note);
     }
 
     /// Writes a control tick that was due at `nanos`.
-    pub fn tick(&mut self, window: &mut ReorderWindow, layout: &Layout, nanos: u64, timed: &TimedRecord) {
+    pub fn write_tick(
+        &mut self,
+        window: &mut ReorderWindow,
+        layout: &Layout,
+        nanos: u64,
+        timed: &TimedRecord,
+    ) {
         let names = &layout.joints;
-        fn of(joints: usize, values: &[f64; MAX_ROBOT_JOINTS]) -> &[f64] {
+        fn first_values(joints: usize, values: &[f64; MAX_ROBOT_JOINTS]) -> &[f64] {
             values.get(..joints).unwrap_or_default()
         }
         let record = &timed.record;
         let [position, velocity, effort, command] =
-            [&record.q, &record.qdot, &record.torque, &record.command].map(|values| of(names.len(), values));
+            [&record.q, &record.qdot, &record.torque, &record.command]
+                .map(|values| first_values(names.len(), values));
         let state = JointState { nanos, names, position, velocity, effort };
         window.write(&mut self.joint_states, nanos, &state);
         let command = JointState { nanos, names, position, velocity: command, effort };
         window.write(&mut self.joint_commands, nanos, &command);
         let (central, active) = match &timed.central {
-            Some((_, reference)) => (of(names.len(), &reference.torque), reference.active),
+            Some((_, reference)) => (first_values(names.len(), &reference.torque), reference.active),
             None => (&[][..], 0),
         };
         window.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active });
@@ -161,7 +172,7 @@ impl Topics {
     }
 
     /// Writes the contact states of a patch's cells, and their points if the joint positions are given.
-    pub fn patch(
+    pub fn write_patch(
         &mut self,
         window: &mut ReorderWindow,
         layout: &Layout,
@@ -200,13 +211,13 @@ impl Topics {
     }
 
     /// Writes the diagnostics.
-    pub fn diagnostics(&mut self, window: &mut ReorderWindow, nanos: u64, parts: &[Diagnosis]) {
+    pub fn write_diagnostics(&mut self, window: &mut ReorderWindow, nanos: u64, parts: &[Diagnosis]) {
         window.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts });
     }
 }
 
-fn message<'a>(interface: &'a str, seen: &ReceivedFrame) -> Record<'a> {
-    let time = Timestamp::nine_digits(seen.at_nanos);
+fn frame_record<'a>(interface: &'a str, seen: &LatchedFrame) -> Record<'a> {
+    let time = Timestamp::with_nine_digits(seen.at_nanos);
     let direction = Some(if seen.from_gateway { Direction::Sent } else { Direction::Received });
     Record { time, interface, frame: seen.frame, direction }
 }

@@ -14,7 +14,7 @@ use crate::setup::names;
 
 /// Checks of the cells before a replay: the options, the survey of the capture and the routes of its buses.
 #[derive(Debug)]
-pub(super) struct Checks {
+pub(super) struct CellChecks {
     pub(super) options: ReplayOptions,
     pub(super) survey: Survey,
     pub(super) routes: Routes,
@@ -22,7 +22,7 @@ pub(super) struct Checks {
     pub(super) name: String,
 }
 
-impl Checks {
+impl CellChecks {
     /// Returns the name that a bus has in this replay.
     pub(super) fn bus_name(&self, bus_link: usize) -> &str {
         self.routes.names.get(bus_link).map_or("", |(_, name)| name)
@@ -51,7 +51,7 @@ impl Checks {
     }
 
     /// Returns true if newly started cells are already in the state in which the replay begins.
-    pub(super) fn are_fresh(&self) -> bool {
+    pub(super) fn are_cells_fresh(&self) -> bool {
         self.options.spawn.is_some() && self.named_buses().all(|(_, bus)| bus.state.is_fresh())
     }
 

@@ -11,7 +11,7 @@ use protocol::schema::Units;
 use protocol::skin::JointKind;
 use serde::Serialize;
 
-use super::comparator::OwnTerm;
+use super::comparator::OwnContribution;
 use model::decode::Decoded;
 
 /// Kind of a reply to joints.
@@ -41,14 +41,14 @@ pub enum SentValue {
     /// Words of a reply to joints.
     Words(ReplyKind, Words),
     /// A sum, with the cell's own contribution to it.
-    Sum(OwnTerm),
+    Sum(OwnContribution),
     /// An answer to `configure`, with its tag.
     Answer(u8, Answer),
 }
 
 /// Position of joints in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Position {
+pub struct JointsPosition {
     /// Number of the joints among the replayed joints of the bus, from 0.
     pub joints: u64,
     /// Epoch of the joints.
@@ -68,7 +68,7 @@ pub struct Difference {
     pub cell: u8,
     /// Position of the joints that the reply answers, if it answers any.
     #[serde(flatten)]
-    pub when: Option<Position>,
+    pub when: Option<JointsPosition>,
     /// Text for people, in several lines.
     pub text: String,
 }
@@ -80,7 +80,7 @@ impl Difference {
         how: DifferenceKind,
         (bus, units): (&str, Units),
         cell: CellId,
-        when: Option<Position>,
+        when: Option<JointsPosition>,
         recorded: Option<&SentValue>,
         now: Option<&SentValue>,
     ) -> Self {
@@ -89,7 +89,7 @@ impl Difference {
             DifferenceKind::Missing => "missing reply",
             DifferenceKind::Extra => "extra reply",
         };
-        let joints = when.map_or_else(String::new, |Position { joints, epoch, at_s }| {
+        let joints = when.map_or_else(String::new, |JointsPosition { joints, epoch, at_s }| {
             format!(", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")
         });
         let epoch = Epoch(when.map_or(0, |when| when.epoch));
@@ -143,7 +143,7 @@ impl SentValue {
 }
 
 /// Formats a sum, the children whose sums it contains, and the cell's own contribution.
-fn sum_text(cell: CellId, epoch: Epoch, own: &OwnTerm, units: Units) -> String {
+fn sum_text(cell: CellId, epoch: Epoch, own: &OwnContribution, units: Units) -> String {
     let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
     let less = match children.as_slice() {
@@ -154,7 +154,7 @@ fn sum_text(cell: CellId, epoch: Epoch, own: &OwnTerm, units: Units) -> String {
     let word = |(joint, step): (usize, &Option<i32>)| match (step, units.torque_unit(joint)) {
         (None, _) => " saturated".to_owned(),
         (Some(step), unit) => {
-            let value = f64::from(*step) * TorqueFormat::Q7_8.step();
+            let value = f64::from(*step) * TorqueFormat::Q7_8.step_size();
             if unit == JointKind::Revolute.torque_unit() {
                 format!(" {value:.3}")
             } else {
@@ -192,7 +192,8 @@ impl Display for StepDifferences {
             } else if steps != 0 {
                 let (count, way) = (steps.unsigned_abs(), if steps > 0 { "more" } else { "less" });
                 let steps = if count == 1 { "step" } else { "steps" };
-                let (value, unit) = (f64::from(count) * self.format.step(), self.units.torque_unit(index));
+                let (value, unit) =
+                    (f64::from(count) * self.format.step_size(), self.units.torque_unit(index));
                 write!(f, "{comma}joint {joint}: {count} {steps} {way} ({value:.4} {unit})")?;
             } else {
                 continue;
@@ -211,7 +212,7 @@ mod tests {
     fn a_different_torque_is_shown_word_by_word() {
         let torque = |words: [i16; 6]| SentValue::Words(ReplyKind::Torque, words.into());
         let (recorded, now) = (torque([-1075, 3195, 0, 0, 0, 0]), torque([-1074, 3193, 0, 0, 0, 0]));
-        let when = Some(Position { joints: 37, epoch: 7, at_s: 2.3842 });
+        let when = Some(JointsPosition { joints: 37, epoch: 7, at_s: 2.3842 });
         let cell = CellId::new(12).unwrap();
         let difference = Difference::new(
             DifferenceKind::Different,

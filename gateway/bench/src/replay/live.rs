@@ -11,9 +11,9 @@ use protocol::can::Frame;
 use protocol::message::{Message, State as Flags};
 use protocol::packet::Epoch;
 
-use super::player::{Pace, Stage};
-use super::replay_plan::OpenJoints;
-use super::report::Lockstep;
+use super::player::{PlayerBackend, ReplaySpeed};
+use super::replay_plan::AwaitedJoints;
+use super::report::LockstepResult;
 use super::shared_state::SharedState;
 use super::start::{ReplayBus, mode_message};
 use super::{ReplayError, ReplayOptions};
@@ -24,7 +24,7 @@ use crate::setup::names;
 const STOP_POLL_NS: u64 = 100_000_000;
 /// Pause while the queue of steps is empty.
 const STEP_PAUSE: Duration = Duration::from_micros(100);
-const DOWN_PAUSE: Duration = Duration::from_millis(50);
+const BUS_DOWN_PAUSE: Duration = Duration::from_millis(50);
 /// Time without any answer after which cells are queried again, because a frame may have been lost. After [`TIMEOUT`]
 /// they are given up.
 const RESYNC_INTERVAL: Duration = Duration::from_millis(500);
@@ -41,19 +41,19 @@ const MAX_WAIT_FACTOR: u32 = 4;
 
 /// The player's stage in a real replay.
 #[derive(Debug)]
-pub(super) struct LiveStage {
+pub(super) struct LiveBackend {
     pub(super) bus_links: Arc<Vec<ReplayBus>>,
     pub(super) shared_state: Arc<SharedState>,
     /// Messages for the user.
     pub(super) log_sender: Sender<String>,
     /// Counts of cells that did not answer, and of joints that were resent.
-    pub(super) lockstep: Lockstep,
+    pub(super) lockstep: LockstepResult,
     /// Buses on which resending did not help the last time.
     pub(super) resend_failed: BTreeSet<usize>,
     pub(super) down: BTreeSet<usize>,
 }
 
-impl Stage for LiveStage {
+impl PlayerBackend for LiveBackend {
     fn now(&self) -> u64 {
         realtime::now()
     }
@@ -83,7 +83,7 @@ impl Stage for LiveStage {
     }
 
     fn announce(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
-        self.shared_state.comparator().sent_joints(bus_index, round, epoch);
+        self.shared_state.comparator().announce_joints(bus_index, round, epoch);
     }
 
     fn send(&mut self, index: usize, frames: &[Frame]) -> Result<(), SendError> {
@@ -101,8 +101,8 @@ impl Stage for LiveStage {
             }
             // At a timed pace, waiting for answers would delay the next frames.
             let ReplayOptions { pace, lockstep, .. } = self.shared_state.checks.options;
-            if pace == Pace::Max || lockstep {
-                std::thread::sleep(DOWN_PAUSE);
+            if pace == ReplaySpeed::Max || lockstep {
+                std::thread::sleep(BUS_DOWN_PAUSE);
             }
         }
         sent
@@ -112,7 +112,7 @@ impl Stage for LiveStage {
         self.shared_state.comparator().mark_unsent(bus_index, round);
     }
 
-    fn wait_for_answers(&mut self, bus_index: usize, open: &OpenJoints) {
+    fn wait_for_answers(&mut self, bus_index: usize, open: &AwaitedJoints) {
         self.wait_until_done(bus_index);
         let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else {
             return;
@@ -138,7 +138,7 @@ impl Stage for LiveStage {
             }
             let epoch = if again % 2 == 0 { open.epoch.advanced_by(u8::MAX) } else { open.epoch };
             self.lockstep.retried += 1;
-            self.shared_state.comparator().sent_joints(bus_index, Some(round), epoch);
+            self.shared_state.comparator().announce_joints(bus_index, Some(round), epoch);
             let joints = Message::Joints { epoch, joints: open.joints };
             if self.send_messages(bus_index, &[joints]).is_err() {
                 return;
@@ -167,7 +167,7 @@ impl Stage for LiveStage {
             all.extend_from_slice(messages);
             for message in &all {
                 if let Message::Joints { epoch, .. } = *message {
-                    self.shared_state.comparator().sent_joints(*bus_link, None, epoch);
+                    self.shared_state.comparator().announce_joints(*bus_link, None, epoch);
                 }
                 self.send_messages(*bus_link, core::slice::from_ref(message))?;
             }
@@ -182,7 +182,7 @@ impl Stage for LiveStage {
     }
 }
 
-impl LiveStage {
+impl LiveBackend {
     /// Returns the messages that reset the contact state of those cells on a bus that are in test mode.
     fn contact_resets(&self, bus_index: usize) -> Vec<Message> {
         let comparator = self.shared_state.comparator();
@@ -227,7 +227,7 @@ impl LiveStage {
                 let _ = self.send_messages(bus_index, &[Message::Sync]);
             }
             if progress.elapsed() > ANSWER_TIMEOUT {
-                let late = comparator.give_up(bus_index);
+                let late = comparator.time_out_cells(bus_index);
                 let name = self.shared_state.checks.bus_name(bus_index);
                 self.lockstep.silent_cells.extend(late.iter().map(|cell| format!("{cell} on {name}")));
                 let (plural, verb) = if late.len() == 1 { ("", "does") } else { ("s", "do") };

@@ -118,7 +118,7 @@ impl Session {
                 comparator.settled_cells(bus_link).filter(|(cell, _)| cells.contains(cell)).count()
             };
             let there = required.iter().enumerate().map(there).sum();
-            Ok(there == all || timeout.is_over(there))
+            Ok(there == all || timeout.has_stalled(there))
         })
     }
 
@@ -136,7 +136,7 @@ impl Session {
             if count == 0 || session.is_interrupted() {
                 return Ok(true);
             }
-            let is_over = timeout.is_over(usize::MAX - count);
+            let is_over = timeout.has_stalled(usize::MAX - count);
             for (bus_link, cells) in without.iter().filter(|(_, cells)| is_over && !cells.is_empty()) {
                 let (name, cells) = (bus_link.bus.name(), names(cells, ""));
                 session.progress.note(&format!(

@@ -11,7 +11,7 @@
 //! ```
 //!
 //! The logic is pure: [`survey`], [`model::latched::state`], [`trace::order`], [`replay_plan`], [`player`] (its clock
-//! and buses are a [`player::Stage`]), [`comparator`] and [`difference`]. The other modules hold threads, sockets and
+//! and buses are a [`player::PlayerBackend`]), [`comparator`] and [`difference`]. The other modules hold threads, sockets and
 //! the clock.
 
 mod checks;
@@ -39,10 +39,10 @@ use protocol::id::CellId;
 use protocol::input::is_standard_input;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-use self::checks::Checks;
+use self::checks::CellChecks;
 pub use self::error::Mismatch;
 pub use self::error::ReplayError;
-use self::player::Pace;
+use self::player::ReplaySpeed;
 use self::replay_plan::SenderFilter;
 use self::report::Summary;
 use self::session::Session;
@@ -55,10 +55,10 @@ use crate::progress::Progress;
 use crate::setup::names;
 use crate::signals::catch_signals;
 use model::decode::MAX_BUSES;
-use trace::capture::{CaptureError, Entry, NoteKind, Reader, RecordingExtras, seconds_since};
+use trace::capture::{CaptureEntry, CaptureError, NoteKind, Reader, RecordingExtras, seconds_since};
 
 /// Period in ns of the wake-ups whose lateness is measured.
-const GRID_NS: u64 = 2_000_000;
+const WAKEUP_PERIOD_NS: u64 = 2_000_000;
 /// Maximum number of unreadable lines that are named.
 const MAX_NAMED_LINES: u64 = 5;
 
@@ -89,7 +89,7 @@ pub struct ReplayOptions {
     /// Number of passes over the capture, or `None` to repeat without end.
     pub passes: Option<u32>,
     /// Speed of the replay.
-    pub pace: Pace,
+    pub pace: ReplaySpeed,
     /// Time before a frame is due during which the thread polls the clock instead of sleeping.
     pub spin: Duration,
     /// True if joints are sent only after all cells have answered the joints before.
@@ -114,7 +114,7 @@ pub struct ReplayOptions {
 /// Returns [`ReplayError`] if the replay cannot start or the capture cannot be read to its end. Problems on the buses
 /// and in the comparison are in the summary.
 pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
-    let progress = Progress::lines(options.quiet);
+    let progress = Progress::notes_only(options.quiet);
     let (survey, extras, name) = survey_capture(options, &progress)?;
     let routes = Routes::new(options, &survey, &name)?;
     let skin_override = options.spawn.as_ref().map(|spawn| start::spawn_skin(spawn, &routes, &extras, &name));
@@ -122,8 +122,8 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     // Until here, a signal may end the program, because there is nothing to clean up.
     let signalled = catch_signals(&[SIGHUP, SIGINT, SIGTERM])?;
     // In lockstep, frames are sent when cells have answered, not at a time.
-    let timed = matches!(options.pace, Pace::Timed(_)) && !options.lockstep;
-    let idle = timed.then(|| idle_lateness(GRID_NS));
+    let timed = matches!(options.pace, ReplaySpeed::Timed(_)) && !options.lockstep;
+    let idle = timed.then(|| idle_lateness(WAKEUP_PERIOD_NS));
     let recorded = start::recorded_skin(&extras);
     let mut buses = start::open(options, &survey, &routes, skin_override.as_ref(), recorded.as_ref())?;
     for bus_link in buses.bus_links.iter() {
@@ -131,11 +131,11 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     }
     let sends_joints = options.only != SenderFilter::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
     let present = if sends_joints { buses.find_cells()? } else { Vec::new() };
-    let checks = Checks { options: options.clone(), survey, routes, name };
+    let checks = CellChecks { options: options.clone(), survey, routes, name };
     if let (Some(spawn), Some(skin_override)) = (&options.spawn, &skin_override) {
         buses.start_cells(spawn, skin_override, &present)?;
     } else if options.only == SenderFilter::All {
-        warn_of_doubles(&checks, &present, &progress);
+        warn_of_duplicates(&checks, &present, &progress);
     }
     let shared_state = Arc::new(SharedState::new(checks));
     let (measuring, ended) = (Vec::new(), EndedProcesses::default());
@@ -170,14 +170,14 @@ fn survey_capture(
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(ReplayError::Read)? {
         match entry {
-            Entry::Frame(record) => {
+            CaptureEntry::Frame(record) => {
                 if record.time.nanos < survey.last && backwards.is_none() {
                     backwards = Some((survey.frames + 1, survey.last - record.time.nanos));
                 }
                 survey.add_frame(&record);
                 check_bus_count(survey.buses.len())?;
             }
-            Entry::Note(note) => match note.kind {
+            CaptureEntry::Note(note) => match note.kind {
                 NoteKind::Dropped(frames) => survey.dropped = survey.dropped.saturating_add(frames),
                 NoteKind::Unreadable(why) => {
                     let line = format!("{name}:{}: {why}", note.line);
@@ -226,7 +226,7 @@ fn survey_capture(
 }
 
 /// Warns that cells which are already on the bus will receive copies of the messages that they sent in the recording.
-fn warn_of_doubles(checks: &Checks, heard: &[BTreeSet<CellId>], progress: &Progress) {
+fn warn_of_duplicates(checks: &CellChecks, heard: &[BTreeSet<CellId>], progress: &Progress) {
     for ((name, bus), heard) in checks.named_buses().zip(heard) {
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {

@@ -7,7 +7,7 @@
 //! The stage provides the clock and the buses; tests use variables for both.
 
 use hdrhistogram::Histogram;
-use protocol::bus::batch::BATCH;
+use protocol::bus::batch::MAX_BATCH_DATAGRAMS;
 use protocol::bus::{BusError, SendError};
 use protocol::can::Frame;
 use protocol::message::Message;
@@ -15,14 +15,14 @@ use protocol::packet::Epoch;
 use serde::Serialize;
 
 use super::ReplayError;
-use super::replay_plan::{DueFrame, FrameRole, OpenJoints, PlayerStep};
+use super::replay_plan::{AwaitedJoints, DueFrame, FrameRole, PlayerStep};
 use model::quantiles::histogram;
 
 /// Time in ns from the decision to start to the first frame.
 const LEAD_NS: u64 = 1_000_000;
 
 /// Interface of a player to its clock, its buses and its output.
-pub trait Stage {
+pub trait PlayerBackend {
     /// Monotonic clock in ns.
     fn now(&self) -> u64;
     /// Waits until the clock reads `at`, or the replay is stopped.
@@ -41,7 +41,7 @@ pub trait Stage {
     /// Tells the comparison that a bus refused the joints of a round.
     fn mark_unsent(&mut self, bus_index: usize, round: u64);
     /// Waits until the cells of a bus have answered.
-    fn wait_for_answers(&mut self, bus_link: usize, open: &OpenJoints);
+    fn wait_for_answers(&mut self, bus_link: usize, open: &AwaitedJoints);
     /// Restores a latched state on each bus.
     ///
     /// # Errors
@@ -53,7 +53,7 @@ pub trait Stage {
 
 /// Speed at which a capture is replayed.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Pace {
+pub enum ReplaySpeed {
     /// The capture's own times divided by this factor.
     Timed(f64),
     /// As fast as the bus accepts frames.
@@ -89,11 +89,11 @@ pub struct PlayerResult {
 /// Sends the steps of a replay.
 #[derive(Debug)]
 pub struct Player {
-    pace: Pace,
+    pace: ReplaySpeed,
     /// Frames of a sync message for each bus; `None` unless the replay is in lockstep.
     syncs: Option<Vec<Vec<Frame>>>,
     /// Joints of each bus whose answers are awaited.
-    open: Vec<Option<OpenJoints>>,
+    open: Vec<Option<AwaitedJoints>>,
     down: Vec<bool>,
     /// A time of the clock and the time of the capture that corresponds to it, both in ns.
     origin: Option<(u64, u64)>,
@@ -107,7 +107,7 @@ impl Player {
     /// Creates a player for `bus_links` buses. `syncs` holds the frames of a sync on each bus if joints must wait for
     /// all answers.
     #[must_use]
-    pub fn new(bus_links: usize, pace: Pace, syncs: Option<Vec<Vec<Frame>>>) -> Self {
+    pub fn new(bus_links: usize, pace: ReplaySpeed, syncs: Option<Vec<Vec<Frame>>>) -> Self {
         Self {
             pace,
             syncs,
@@ -120,13 +120,17 @@ impl Player {
                 was_stopped: false,
                 failure: None,
             },
-            batch: Vec::with_capacity(BATCH),
-            rounds: Vec::with_capacity(BATCH),
+            batch: Vec::with_capacity(MAX_BATCH_DATAGRAMS),
+            rounds: Vec::with_capacity(MAX_BATCH_DATAGRAMS),
         }
     }
 
     /// Sends all steps until the end, a stop, or the end of a bus.
-    pub fn play(mut self, steps: &mut rtrb::Consumer<PlayerStep>, stage: &mut impl Stage) -> PlayerResult {
+    pub fn play(
+        mut self,
+        steps: &mut rtrb::Consumer<PlayerStep>,
+        stage: &mut impl PlayerBackend,
+    ) -> PlayerResult {
         while self.played.failure.is_none() {
             if stage.is_over() {
                 self.played.was_stopped = true;
@@ -144,7 +148,7 @@ impl Player {
                         self.origin = None;
                     }
                 }
-                Ok(&PlayerStep::Frame(due)) => self.frames_from(&due, steps, stage),
+                Ok(&PlayerStep::Frame(due)) => self.send_frames_from(&due, steps, stage),
             }
         }
         if self.played.failure.is_none() && !self.played.was_stopped {
@@ -153,13 +157,13 @@ impl Player {
         self.played
     }
 
-    fn wait_for_all(&mut self, stage: &mut impl Stage) {
+    fn wait_for_all(&mut self, stage: &mut impl PlayerBackend) {
         for bus_link in 0..self.open.len() {
             self.wait_for_answers(bus_link, stage);
         }
     }
 
-    fn wait_for_answers(&mut self, bus_link: usize, stage: &mut impl Stage) {
+    fn wait_for_answers(&mut self, bus_link: usize, stage: &mut impl PlayerBackend) {
         if let Some(open) = self.open.get_mut(bus_link).and_then(Option::take) {
             stage.wait_for_answers(bus_link, &open);
         }
@@ -173,7 +177,7 @@ impl Player {
         reason = "times far below 2^53 ns"
     )]
     fn deadline(&mut self, due: &DueFrame, now: u64) -> Option<u64> {
-        let Pace::Timed(speed) = self.pace else { return None };
+        let ReplaySpeed::Timed(speed) = self.pace else { return None };
         if due.is_late {
             return None;
         }
@@ -182,11 +186,11 @@ impl Player {
     }
 
     /// Sends a frame when it is due, in one batch with the following frames of the same bus that are due by then.
-    fn frames_from(
+    fn send_frames_from(
         &mut self,
         first: &DueFrame,
         steps: &mut rtrb::Consumer<PlayerStep>,
-        stage: &mut impl Stage,
+        stage: &mut impl PlayerBackend,
     ) {
         let bus_link = first.bus_index;
         if self.syncs.is_some() && is_joints(first) {
@@ -205,7 +209,7 @@ impl Player {
         self.record_lateness(deadline, now);
         stage.show(first.at);
         // In lockstep, joints end a batch: the next frame must wait, or belongs to the next joints.
-        while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
+        while self.batch.len() < MAX_BATCH_DATAGRAMS && !(self.syncs.is_some() && open.is_some()) {
             let Ok(&PlayerStep::Frame(next)) = steps.peek() else { break };
             let waits = self.syncs.is_some()
                 && is_joints(&next)
@@ -229,7 +233,7 @@ impl Player {
         }
     }
 
-    fn add_to_batch(&mut self, due: &DueFrame, stage: &mut impl Stage) -> Option<OpenJoints> {
+    fn add_to_batch(&mut self, due: &DueFrame, stage: &mut impl PlayerBackend) -> Option<AwaitedJoints> {
         self.batch.push(due.frame);
         let FrameRole::Joints(open) = due.role else { return None };
         stage.announce(due.bus_index, open.round, open.epoch);
@@ -249,7 +253,7 @@ impl Player {
         bus_index: usize,
         frames: usize,
         sent: Result<(), SendError>,
-        stage: &mut impl Stage,
+        stage: &mut impl PlayerBackend,
     ) {
         let (Some(tally), Some(down)) =
             (self.played.bus_links.get_mut(bus_index), self.down.get_mut(bus_index))

@@ -18,7 +18,7 @@ use protocol::time::Micros;
 use super::comparator::Comparator;
 use super::survey::{Survey, is_input, is_joints};
 use model::decode::Decoded;
-use model::decode::settle::Settler;
+use model::decode::settle::OrderedDecoder;
 use trace::order::{BusMerger, ReleasedFrame};
 
 /// Time in ns after the end of the replayed part during which recorded replies are still read, because they answer
@@ -41,7 +41,7 @@ pub enum SenderFilter {
 
 /// Selection of the frames to send.
 #[derive(Clone, Debug)]
-pub struct Selection {
+pub struct FrameSelection {
     /// Selection of the frames by their sender.
     pub only: SenderFilter,
     /// Destination of each bus of the capture; `None` for a bus that is not replayed.
@@ -82,12 +82,12 @@ pub enum FrameRole {
     /// The frame is the first segment of a joint packet.
     SegmentOfJoints,
     /// The frame completes a joint packet.
-    Joints(OpenJoints),
+    Joints(AwaitedJoints),
 }
 
 /// Joints whose answers from the cells are awaited or compared.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct OpenJoints {
+pub struct AwaitedJoints {
     /// Epoch of the joints.
     pub epoch: Epoch,
     /// Positions of the joints.
@@ -109,10 +109,10 @@ pub struct PlanSummary {
 #[derive(Debug)]
 pub struct ReplayPlan<'a> {
     survey: &'a Survey,
-    selection: &'a Selection,
+    selection: &'a FrameSelection,
     /// Frames waiting to be sorted, with their buses.
     order: BusMerger<(usize, Frame)>,
-    settler: Settler<ReleasedFrame<(usize, Frame)>>,
+    settler: OrderedDecoder<ReleasedFrame<(usize, Frame)>>,
     steps: VecDeque<PlayerStep>,
     plan_summary: PlanSummary,
     /// Start of this pass in ns after the first one.
@@ -126,12 +126,12 @@ pub struct ReplayPlan<'a> {
 impl<'a> ReplayPlan<'a> {
     /// Creates the plan of a surveyed capture.
     #[must_use]
-    pub fn new(survey: &'a Survey, selection: &'a Selection) -> Self {
+    pub fn new(survey: &'a Survey, selection: &'a FrameSelection) -> Self {
         Self {
             survey,
             selection,
             order: BusMerger::default(),
-            settler: Settler::new(None),
+            settler: OrderedDecoder::new(None),
             steps: VecDeque::new(),
             plan_summary: PlanSummary::default(),
             offset: 0,
@@ -144,13 +144,13 @@ impl<'a> ReplayPlan<'a> {
     /// part.
     pub fn add_frame(&mut self, record: &Record<'_>, comparator: &mut Comparator) -> ControlFlow<()> {
         let Some(bus) = self.survey.bus_named(record.interface) else {
-            self.skip(reason::NEW);
+            self.skip(reason::NEW_BUS);
             return ControlFlow::Continue(());
         };
         self.order.push(bus, record.time.nanos, (bus, record.frame));
         while let Some(next) = self.order.pop() {
-            self.settle(next);
-            self.place_settled(comparator)?;
+            self.push_to_decoder(next);
+            self.plan_decoded_frames(comparator)?;
         }
         ControlFlow::Continue(())
     }
@@ -161,14 +161,14 @@ impl<'a> ReplayPlan<'a> {
     }
 
     /// Passes a frame to the decoder, which classifies it.
-    fn settle(&mut self, next: ReleasedFrame<(usize, Frame)>) {
+    fn push_to_decoder(&mut self, next: ReleasedFrame<(usize, Frame)>) {
         let (bus, frame) = next.item;
         let name = self.survey.buses.get(bus).map_or("", |bus| bus.name.as_str());
         self.settler.push(Micros(next.nanos / 1_000), name, &frame, next);
     }
 
     /// Plans all frames whose order and meaning are settled.
-    fn place_settled(&mut self, comparator: &mut Comparator) -> ControlFlow<()> {
+    fn plan_decoded_frames(&mut self, comparator: &mut Comparator) -> ControlFlow<()> {
         while let Some((next, decoded)) = self.settler.pop() {
             self.plan_frame(&next, &decoded, comparator)?;
         }
@@ -178,12 +178,12 @@ impl<'a> ReplayPlan<'a> {
     /// Notes the end of the capture or of the part. Another pass may follow.
     pub fn end_pass(&mut self, comparator: &mut Comparator) {
         while let Some(next) = self.order.pop_last() {
-            self.settle(next);
+            self.push_to_decoder(next);
         }
         self.settler.finish();
-        let _ = self.place_settled(comparator);
+        let _ = self.plan_decoded_frames(comparator);
         self.order = BusMerger::default();
-        self.settler = Settler::new(None);
+        self.settler = OrderedDecoder::new(None);
         if let Some((first, last)) = self.sent.take() {
             let (frames, joints) = self.counts;
             let steps = if joints > 1 { joints } else { frames }.saturating_sub(1).max(1);
@@ -230,9 +230,9 @@ impl<'a> ReplayPlan<'a> {
         }
         let (bus, frame) = next.item;
         let unwanted = if next.nanos < from {
-            Some(reason::BEFORE)
+            Some(reason::BEFORE_PART)
         } else if next.nanos >= to {
-            Some(reason::AFTER)
+            Some(reason::AFTER_PART)
         } else {
             self.skip_reason(bus, &frame, decoded)
         };
@@ -274,7 +274,7 @@ impl<'a> ReplayPlan<'a> {
             return Some(reason::ERROR);
         }
         if matches!(decoded, Decoded::Wire(..)) {
-            return Some(reason::WIRE);
+            return Some(reason::SIMULATED_WIRE);
         }
         // Damaged frames are sent too, because the cells received them in the recording.
         let id = data_id(frame).ok().filter(|_| !matches!(decoded, Decoded::Foreign(_)));
@@ -297,14 +297,14 @@ fn classify(
     comparator: &mut Comparator,
 ) -> FrameRole {
     if let Decoded::Message(Message::Joints { epoch, joints }) = *decoded {
-        return FrameRole::Joints(OpenJoints {
+        return FrameRole::Joints(AwaitedJoints {
             epoch,
             joints,
             round: comparator.expect_joints(bus_index, nanos, epoch, is_sent),
         });
     }
     if let Decoded::Message(message) = decoded {
-        comparator.expect(bus_index, message, is_in_part);
+        comparator.expect_message(bus_index, message, is_in_part);
     }
     match *decoded {
         Decoded::Segment { id } | Decoded::Damaged { id, fault: PacketError::Incomplete }
@@ -324,9 +324,9 @@ fn classify(
 /// Reasons why frames are not sent.
 pub mod reason {
     /// Frame before `--from`.
-    pub const BEFORE: &str = "before --from";
+    pub const BEFORE_PART: &str = "before --from";
     /// Frame at `--to` or after it.
-    pub const AFTER: &str = "after --to";
+    pub const AFTER_PART: &str = "after --to";
     /// Frame of a bus that is not replayed (`--bus`).
     pub const NOT_PICKED: &str = "not picked";
     /// Frame that is neither a command nor configuration nor a stimulus.
@@ -336,9 +336,9 @@ pub mod reason {
     /// Error frame: a message of a driver, never on a bus.
     pub const ERROR: &str = "error frame";
     /// Frame of a simulated wire: cells send their own wire messages now, and real buses have no wire frames.
-    pub const WIRE: &str = "simulated wire";
+    pub const SIMULATED_WIRE: &str = "simulated wire";
     /// Frame of a bus that the capture did not have when it was first read.
-    pub const NEW: &str = "bus came later";
+    pub const NEW_BUS: &str = "bus came later";
     /// Note between frames.
     pub const NOTE: &str = "note";
 }

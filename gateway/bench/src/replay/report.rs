@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::comparator::{Tally, Uncompared};
+use super::comparator::{Tally, UncomparedReplies};
 use super::difference::Difference;
 use super::player::BusTally;
 use crate::summary::{CellError, cells_in_error, count_noun};
@@ -44,9 +44,9 @@ pub struct Summary {
     /// True if the memory was locked.
     pub memory_locked: bool,
     /// Result of lockstep, if used.
-    pub lockstep: Option<Lockstep>,
+    pub lockstep: Option<LockstepResult>,
     /// Result of the comparison, if any.
-    pub expect: Option<Expect>,
+    pub expect: Option<ReplyComparison>,
     /// Errors that ended processes of cells.
     pub cell_errors: Vec<CellError>,
     /// Error that ended the replay early, if any.
@@ -71,7 +71,7 @@ pub struct BusSummary {
 
 /// Result of lockstep.
 #[derive(Clone, Debug, Default, Serialize)]
-pub struct Lockstep {
+pub struct LockstepResult {
     /// Cells that did not answer in time, as text.
     pub silent_cells: Vec<String>,
     /// Number of joints that were resent because a cell processed them too late to answer.
@@ -80,7 +80,7 @@ pub struct Lockstep {
 
 /// Result of the comparison with recorded replies.
 #[derive(Clone, Debug, Serialize)]
-pub struct Expect {
+pub struct ReplyComparison {
     /// Tolerance of torques in steps.
     pub tolerance: u16,
     /// Counts of the comparison.
@@ -96,7 +96,7 @@ pub struct Expect {
     pub first: Option<Difference>,
 }
 
-impl Uncompared {
+impl UncomparedReplies {
     /// Returns the reasons why replies lack a recorded counterpart, with their counts, without zeros.
     #[must_use]
     pub fn reasons(&self) -> Vec<(&'static str, u64)> {
@@ -134,7 +134,7 @@ impl Summary {
             return Some(failure.clone());
         }
         let mut wrong: Vec<_> = cells_in_error(&self.cell_errors, quiet).into_iter().collect();
-        if let Some(expect) = self.expect.as_ref().filter(|expect| !expect.tally.is_good()) {
+        if let Some(expect) = self.expect.as_ref().filter(|expect| !expect.tally.has_only_equal_replies()) {
             let Tally { different, missing, extra, not_requested, .. } = expect.tally;
             let counts = nonzero([
                 ("different", different),
@@ -251,7 +251,7 @@ mod tests {
             fifo: true,
             memory_locked: true,
             lockstep: None,
-            expect: Some(Expect {
+            expect: Some(ReplyComparison {
                 tolerance: 0,
                 tally: Tally { equal: 40, ..Tally::default() },
                 joints_skipped: 0,
@@ -266,7 +266,7 @@ mod tests {
 
     #[test]
     fn the_first_line_is_well_only_if_everything_was_compared() {
-        let line = |change: fn(&mut Summary, &mut Expect)| {
+        let line = |change: fn(&mut Summary, &mut ReplyComparison)| {
             let mut summary = well();
             let mut expect = summary.expect.take().unwrap();
             change(&mut summary, &mut expect);
@@ -278,7 +278,7 @@ mod tests {
         assert!(interrupted.0 && interrupted.1.starts_with("all well until it was interrupted: "));
         for (change, begin) in [
             (
-                (|_, expect| expect.tally.lacking.ended = 1) as fn(&mut Summary, &mut Expect),
+                (|_, expect| expect.tally.lacking.ended = 1) as fn(&mut Summary, &mut ReplyComparison),
                 "no difference: 100 frames sent, 40 replies as recorded, 1 reply not compared",
             ),
             (|_, expect| expect.recording_dropped = 2, "no difference: "),
@@ -303,7 +303,7 @@ mod tests {
 
     #[test]
     fn every_reason_has_a_text() {
-        let all = Uncompared {
+        let all = UncomparedReplies {
             silent: 1,
             untaken: 1,
             unrecorded: 1,
@@ -320,6 +320,6 @@ mod tests {
             tree_unknown: 1,
             sums_not_taken: 1,
         };
-        assert_eq!(all.reasons().len(), size_of::<Uncompared>() / size_of::<u64>());
+        assert_eq!(all.reasons().len(), size_of::<UncomparedReplies>() / size_of::<u64>());
     }
 }

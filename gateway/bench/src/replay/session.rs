@@ -12,16 +12,16 @@ use protocol::id::CellId;
 use protocol::message::Message;
 
 use super::ReplayError;
-use super::checks::Checks;
-use super::live::LiveStage;
+use super::checks::CellChecks;
+use super::live::LiveBackend;
 use super::player::{BusTally, Player, PlayerResult};
 use super::replay_plan::PlanSummary;
-use super::report::{BusSummary, Expect, Lockstep, Summary};
+use super::report::{BusSummary, LockstepResult, ReplyComparison, Summary};
 use super::shared_state::SharedState;
 use super::source::{self, STEP_QUEUE};
 use super::start::{Buses, SpawnSkin};
 use super::survey::SurveyedBus;
-use crate::bus::realtime::{self, Granted};
+use crate::bus::realtime::{self, GrantedPrivileges};
 use crate::error::RunError;
 use crate::processes::ended::EndedProcesses;
 use crate::progress::Progress;
@@ -93,17 +93,17 @@ impl Session {
         let bus_links = Arc::clone(&self.buses.bus_links);
         let sync = || bus_links.iter().map(|bus_link| bus_link.frames(&Message::Sync).collect()).collect();
         let player = Player::new(bus_links.len(), options.pace, options.lockstep.then(sync));
-        let mut live = LiveStage {
+        let mut live = LiveBackend {
             shared_state: Arc::clone(&self.shared_state),
             log_sender,
-            lockstep: Lockstep::default(),
+            lockstep: LockstepResult::default(),
             resend_failed: BTreeSet::new(),
             down: BTreeSet::new(),
             bus_links,
         };
         let began = Instant::now();
         let player = spawn("player", move || {
-            let granted = realtime::prepare();
+            let granted = realtime::request_realtime();
             if hears {
                 for bus_link in 0..live.bus_links.len() {
                     // Request the initial values of the counters. If the bus is down, the first frame reports it.
@@ -180,7 +180,7 @@ impl Session {
 
     /// Returns the length of the capture in ms, or `None` if the replay has no end.
     fn length_ms(&self) -> Option<u64> {
-        let Checks { survey, options, .. } = &self.shared_state.checks;
+        let CellChecks { survey, options, .. } = &self.shared_state.checks;
         let (from, to) = survey.bounds();
         let from = from.max(survey.first.unwrap_or(0));
         let one = to.min(survey.last).saturating_sub(from) / 1_000_000;
@@ -191,9 +191,9 @@ impl Session {
         &self,
         played: PlayerResult,
         plan_summary: PlanSummary,
-        live: LiveStage,
+        live: LiveBackend,
         duration_s: f64,
-        granted: Granted,
+        granted: GrantedPrivileges,
         idle: Option<&Histogram<u64>>,
     ) -> Summary {
         let checks = &self.shared_state.checks;
@@ -232,14 +232,14 @@ impl Session {
         }
     }
 
-    fn comparison_result(&self, tolerance: u16) -> Expect {
+    fn comparison_result(&self, tolerance: u16) -> ReplyComparison {
         let (comparator, checks) = (self.shared_state.comparator(), &self.shared_state.checks);
         let present = (0..self.buses.bus_links.len()).flat_map(|bus_link| comparator.present_cells(bus_link));
         let late = present.filter_map(|(_, cell)| {
             let (first, last) = cell.counters?;
             Some(u64::from(last.joints_late.wrapping_sub(first.joints_late)))
         });
-        Expect {
+        ReplyComparison {
             tolerance,
             tally: *comparator.tally(),
             joints_skipped: late.sum(),

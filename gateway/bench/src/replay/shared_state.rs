@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use protocol::time::Micros;
 
-use super::checks::Checks;
+use super::checks::CellChecks;
 use super::comparator::Comparator;
 use super::start::ReplayBus;
 use crate::bus::follow::{FollowStep, FollowedItem, Follower, OpenedOnce};
@@ -19,7 +19,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(50);
 /// State shared by all threads of a replay.
 #[derive(Debug)]
 pub(super) struct SharedState {
-    pub(super) checks: Checks,
+    pub(super) checks: CellChecks,
     comparator: Mutex<Comparator>,
     message_arrived: Condvar,
     /// Set once, to stop sending.
@@ -35,7 +35,7 @@ pub(super) struct SharedState {
 }
 
 impl SharedState {
-    pub(super) fn new(checks: Checks) -> Self {
+    pub(super) fn new(checks: CellChecks) -> Self {
         let named_cells = checks.named_buses().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
         let comparator =
             Comparator::new(named_cells, checks.survey.first.unwrap_or(0), checks.options.expect);

@@ -3,10 +3,10 @@
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use super::checks::Checks;
-use super::replay_plan::{PlanSummary, PlayerStep, ReplayPlan, Selection, reason};
+use super::checks::CellChecks;
+use super::replay_plan::{FrameSelection, PlanSummary, PlayerStep, ReplayPlan, reason};
 use super::shared_state::SharedState;
-use trace::capture::{CaptureError, Entry, Reader};
+use trace::capture::{CaptureEntry, CaptureError, Reader};
 
 /// Number of steps read ahead: some tenths of a second of traffic on a full bus.
 pub(super) const STEP_QUEUE: usize = 16_384;
@@ -25,20 +25,20 @@ pub(super) fn read_capture(
     shared_state: &SharedState,
     queue: rtrb::Producer<PlayerStep>,
 ) -> Result<PlanSummary, CaptureError> {
-    let Checks { options, survey, routes, .. } = &shared_state.checks;
+    let CellChecks { options, survey, routes, .. } = &shared_state.checks;
     let (bus_links, hears) = (routes.destinations.clone(), options.receives());
-    let selection = Selection { only: options.only, destinations: bus_links, reads: hears };
+    let selection = FrameSelection { only: options.only, destinations: bus_links, reads: hears };
     let mut source = CaptureReader { shared_state, replay_plan: ReplayPlan::new(survey, &selection), queue };
     let mut pass = 0_u32;
     while options.passes.is_none_or(|passes| pass < passes) && !source.is_over() {
-        if hears && (pass > 0 || !shared_state.checks.are_fresh()) {
+        if hears && (pass > 0 || !shared_state.checks.are_cells_fresh()) {
             source.push(source.replay_plan.restore_step());
         }
         let mut comparator = shared_state.comparator();
         comparator.expect_restart();
         for (bus, bus_link) in survey.buses.iter().zip(&routes.destinations) {
             let Some(bus_link) = *bus_link else { continue };
-            bus.latched.iter().for_each(|message| comparator.expect(bus_link, message, false));
+            bus.latched.iter().for_each(|message| comparator.expect_message(bus_link, message, false));
         }
         drop(comparator);
         source.read_pass()?;
@@ -53,7 +53,7 @@ impl CaptureReader<'_> {
     fn read_pass(&mut self) -> Result<(), CaptureError> {
         let mut reader = Reader::open_all(&self.shared_state.checks.options.files)?;
         while let Some(entry) = reader.next()? {
-            let Entry::Frame(record) = entry else {
+            let CaptureEntry::Frame(record) = entry else {
                 self.replay_plan.skip(reason::NOTE);
                 continue;
             };

@@ -16,7 +16,7 @@ use protocol::time::Micros;
 
 use model::decode::{Decoded, Decoder};
 use model::latched::LatchedState;
-use trace::capture::{BusNote, LatchedFrame, Note};
+use trace::capture::{BusNote, CaptureNote, LatchedFrame};
 
 /// Silence in ns after which a cell counts as absent.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
@@ -233,7 +233,7 @@ impl Survey {
 
     /// Handles a note: the cells of a lost bus are away until they send again. Their last answers may have been lost
     /// with the bus.
-    pub fn add_note(&mut self, note: &Note<'_>) {
+    pub fn add_note(&mut self, note: &CaptureNote<'_>) {
         let Some((name, BusNote::Lost)) = BusNote::parse(note) else { return };
         let Some(bus) = self.bus_named(name).and_then(|at| self.buses.get_mut(at)) else { return };
         // These joints may still be answered.

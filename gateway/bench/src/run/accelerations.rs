@@ -8,7 +8,7 @@ use model::accelerometer::kinematics::UPRIGHT_GRAVITY;
 use model::accelerometer::{Accelerometers, RobotState};
 use protocol::fixed::Q3_12;
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, SensorPage};
+use protocol::message::{Message, SensorPage, StimulusStart};
 use protocol::packet::Epoch;
 use protocol::skin::Cell;
 
@@ -16,14 +16,14 @@ use super::RunOptions;
 
 /// Motion of the robot in a tick.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Moved {
+pub(super) struct TickMotion {
     /// Start of the tick in s since the start of the loop.
     pub(super) at_s: f64,
     pub(super) state: RobotState,
     pub(super) is_halted: bool,
 }
 
-impl Moved {
+impl TickMotion {
     /// Returns the state of the robot `seconds` before the tick (at most 0.1 s), at constant acceleration.
     fn state_before(&self, seconds: f64) -> RobotState {
         let mut state = self.state;
@@ -58,7 +58,7 @@ impl Accelerations {
     pub(super) fn stimuli_ahead(
         &self,
         options: &RunOptions,
-        moved: Option<Moved>,
+        moved: Option<TickMotion>,
         (epoch, now): (Epoch, f64),
     ) -> Vec<(usize, Message)> {
         if moved.is_some_and(|moved| moved.is_halted) {
@@ -66,11 +66,11 @@ impl Accelerations {
         }
         match (&options.planned, options.scenario.motion) {
             (Some(planned), _) => {
-                self.stimuli(options, |seconds| planned.state_at(seconds), now, AppliesFrom::Epoch(epoch))
+                self.stimuli(options, |seconds| planned.state_at(seconds), now, StimulusStart::Epoch(epoch))
             }
             (None, motion) if motion.state_at(now).is_some() => {
                 let state = |seconds| motion.state_at(seconds).unwrap_or_default();
-                self.stimuli(options, state, now, AppliesFrom::Epoch(epoch))
+                self.stimuli(options, state, now, StimulusStart::Epoch(epoch))
             }
             (None, _) => Vec::new(),
         }
@@ -81,14 +81,14 @@ impl Accelerations {
     pub(super) fn latest_stimuli(
         &mut self,
         options: &RunOptions,
-        moved: Option<Moved>,
+        moved: Option<TickMotion>,
         (broadcasts, now): (u64, f64),
     ) -> Vec<(usize, Message)> {
         let is_known = options.planned.is_some() || options.scenario.motion.state_at(now).is_some();
         match moved {
             Some(moved) if self.broadcasts != broadcasts && (moved.is_halted || !is_known) => {
                 self.broadcasts = broadcasts;
-                self.stimuli(options, |seconds| moved.state_before(seconds), now, AppliesFrom::Next)
+                self.stimuli(options, |seconds| moved.state_before(seconds), now, StimulusStart::Next)
             }
             _ => Vec::new(),
         }
@@ -99,7 +99,7 @@ impl Accelerations {
         options: &RunOptions,
         state: impl Fn(f64) -> RobotState,
         now: f64,
-        from: AppliesFrom,
+        from: StimulusStart,
     ) -> Vec<(usize, Message)> {
         let readings = self.sensors.readings(&options.skin, state, now, |_, force| *force);
         let cells = options.skin.cells.iter().zip(readings);
@@ -121,7 +121,7 @@ mod tests {
     fn what_was_before_a_tick_follows_from_its_speeds_and_what_comes_after_it_is_unknown() {
         let mut state = RobotState::default();
         (state.position[1], state.speed[1], state.acceleration[1]) = (0.5, 1.0, -10.0);
-        let moved = Moved { at_s: 2.0, state, is_halted: false };
+        let moved = TickMotion { at_s: 2.0, state, is_halted: false };
         let before = moved.state_before(1.99);
         // q - v t + a t^2 / 2, v - a t.
         assert!((before.position[1] - (0.5 - 0.01 - 0.000_5)).abs() < 1e-12, "{before:?}");

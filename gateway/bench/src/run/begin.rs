@@ -19,7 +19,7 @@ use crate::error::RunError;
 use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, START_TIMEOUT, program_path};
 use crate::setup::{Timeout, names};
 use crate::view::BusView;
-use model::repeat::Repeats;
+use model::repeat::RepeatedRequests;
 use model::table::{Notice, Switch};
 
 /// Time within which running cells must send a heartbeat, and all cells must confirm their switches.
@@ -28,11 +28,11 @@ pub(super) const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(2);
 pub(super) const SWITCH_RETRY_INTERVAL: Span = Span::from_millis(250);
 
 /// Cells, by bus and node id, to which switches were sent, with the times.
-pub(super) type Announced = Repeats<(usize, CellId)>;
+pub(super) type SentSwitches = RepeatedRequests<(usize, CellId)>;
 
 impl Bench<'_> {
     /// Starts the cells, listens for another gateway, and waits until all cells are ready.
-    pub(super) fn begin(&mut self) -> Result<(), RunError> {
+    pub(super) fn bring_up_cells(&mut self) -> Result<(), RunError> {
         let options = self.options;
         let listened = Instant::now() + GATEWAY_DETECTION_TIME;
         if options.spawn {
@@ -56,7 +56,7 @@ impl Bench<'_> {
         self.poll_until(self.timeout(), |bench, timeout| {
             // Cells without parameters will not become ready.
             let ready = bench.count(|cell| cell.ready || cell.unconfigured);
-            let is_over = timeout.is_over(ready);
+            let is_over = timeout.has_stalled(ready);
             // After a moment without processor time, ready cells may count as dead until they send again.
             Ok(Instant::now() >= listened && (ready == cells || is_over))
         })?;
@@ -67,7 +67,7 @@ impl Bench<'_> {
         // Requests the counters, contact states and network positions of the cells.
         self.send_to_all(&Message::Report)?;
         if self.bus_links.iter().any(|bus_link| bus_link.network.is_some()) {
-            self.organise()
+            self.organise_trees()
         } else {
             Ok(())
         }
@@ -112,7 +112,7 @@ impl Bench<'_> {
         }
         // The next heartbeats show the state of the cells.
         self.send_to_all(&Message::Sync)?;
-        self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
+        self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| Ok(halted(bench) == 0 || timeout.has_stalled(0)))
     }
 
     /// Checks that a bus that existed before has neither a gateway nor cells with the same node ids. Listening disturbs
@@ -223,7 +223,7 @@ impl Bench<'_> {
 
     /// Sends all cells, before the first joints, the switches that a cell loses when it restarts.
     fn switch_cells(&mut self) -> Result<(), RunError> {
-        let mut announced = Announced::new(SWITCH_RETRY_INTERVAL);
+        let mut announced = SentSwitches::new(SWITCH_RETRY_INTERVAL);
         let lacking = self.unconfirmed_switches();
         for (bus, (bus_link, described)) in self.bus_links.iter().zip(&self.options.skin.buses).enumerate() {
             // Cells that ran before may be in any mode; newly started cells are in the default mode.
@@ -231,26 +231,26 @@ impl Bench<'_> {
                 .then(|| (Parameter::Sensing.number(), Sensing::Off.words()));
             let first = lacking.iter().find(|((of, _), _)| *of == bus).map(|(_, switches)| switches.clone());
             for switch in off.into_iter().chain(first.unwrap_or_default()) {
-                bus_link.switch(Node::Everyone, switch)?;
+                bus_link.send_switch(Node::Everyone, switch)?;
             }
         }
         announced.mark_all_sent(self.now());
         self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| {
             bench.repeat_switches(&mut announced)?;
             // Cells that have not confirmed by then get their switches again while the loop runs.
-            Ok(bench.unconfirmed_switches().is_empty() || timeout.is_over(0))
+            Ok(bench.unconfirmed_switches().is_empty() || timeout.has_stalled(0))
         })
     }
 
     /// Sends switches again to cells that have not confirmed them in time, because the cell restarted or a message was
     /// lost.
-    pub(super) fn repeat_switches(&self, announced: &mut Announced) -> Result<(), RunError> {
+    pub(super) fn repeat_switches(&self, announced: &mut SentSwitches) -> Result<(), RunError> {
         let lacking = self.unconfirmed_switches();
-        let due = announced.due(self.now(), lacking.iter().map(|(cell, _)| *cell));
+        let due = announced.due_requests(self.now(), lacking.iter().map(|(cell, _)| *cell));
         for ((bus, cell), switches) in lacking.into_iter().filter(|(cell, _)| due.contains(cell)) {
             let Some(bus_link) = self.bus_links.get(bus) else { continue };
             for switch in switches {
-                bus_link.switch(Node::Cell(cell), switch)?;
+                bus_link.send_switch(Node::Cell(cell), switch)?;
             }
         }
         Ok(())
@@ -260,7 +260,7 @@ impl Bench<'_> {
     fn unconfirmed_switches(&self) -> Vec<((usize, CellId), Vec<Switch>)> {
         let mut lacking = Vec::new();
         for (bus, bus_link) in
-            self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())
+            self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_working())
         {
             let Ok(view) = bus_link.view.lock() else { continue };
             // Check the flag first: cells rarely lack a switch, and this would visit thousands of cells a hundred times

@@ -30,7 +30,7 @@ use crate::record::Recorder;
 use crate::setup::names;
 use crate::view::{BusView, CellView};
 use control::cycle::Cycle;
-use control::cycle::turn::{BusPort, Shared, TimedRecord};
+use control::cycle::turn::{BusPort, SharedRunState, TimedRecord};
 use model::table::Switch;
 
 /// Interval between polls until the loop starts.
@@ -54,7 +54,7 @@ pub(super) struct RunBus {
     pub(super) hosts: Hosts,
     /// Network of its cells, if they answer with sums.
     pub(super) network: Option<Network>,
-    pub(super) shared: Arc<Shared>,
+    pub(super) shared: Arc<SharedRunState>,
 }
 
 impl RunBus {
@@ -71,7 +71,7 @@ impl RunBus {
     }
 
     /// Sends a switch to one cell or to all cells. The caller repeats it for cells that do not confirm.
-    pub(super) fn switch(&self, to: Node, (number, words): Switch) -> Result<bool, BusError> {
+    pub(super) fn send_switch(&self, to: Node, (number, words): Switch) -> Result<bool, BusError> {
         self.send(&Message::Configure { to, tag: SWITCH_TAG, request: Request::Write { number, words } })
     }
 }
@@ -84,7 +84,7 @@ pub(super) struct Bench<'a> {
     pub(super) idle: Histogram<u64>,
     /// Number of packets that the kernel's backlog had dropped before the first bus was opened.
     pub(super) backlog_dropped: Option<u64>,
-    pub(super) shared: Arc<Shared>,
+    pub(super) shared: Arc<SharedRunState>,
     pub(super) bus_links: Vec<RunBus>,
     pub(super) events: Inlet<(usize, BusEvent)>,
     pub(super) signalled: Arc<AtomicBool>,

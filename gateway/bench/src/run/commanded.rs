@@ -33,7 +33,7 @@ impl Bench<'_> {
         });
         let Some(mut remote) = self.remote.take() else { return };
         if remote.lines.has_ended() {
-            self.commanded.release(|bus| commands_sent(links, bus));
+            self.commanded.release_down_buses(|bus| commands_sent(links, bus));
             // At the end of the run the other side may end first.
             if !self.signalled.load(Ordering::Relaxed) {
                 progress.error(
@@ -89,7 +89,7 @@ impl Bench<'_> {
             BenchCommand::Process { action, bus, node } => self.control_process(action, bus, node),
             BenchCommand::Link { down, bus, nodes } => self.command_link(down, bus, nodes),
             BenchCommand::Bus { down, bus } => {
-                self.commanded.check(down, bus)?;
+                self.commanded.check_switch(down, bus)?;
                 self.switch_bus(down, bus)?;
                 self.commanded.note_switched(down, bus, commands_sent(&self.bus_links, bus));
                 Ok(())
@@ -134,7 +134,7 @@ impl Bench<'_> {
         if link.kind.is_interface() {
             return switch_interface(&link.name, down);
         }
-        let name = link.kind.served_as(&link.name);
+        let name = link.kind.served_name(&link.name);
         let served = self.served.iter_mut().find(|served| served.bus() == name);
         let served = served.ok_or(CommandError::NotServed)?;
         if down {
@@ -153,7 +153,7 @@ impl Bench<'_> {
             pairs.map(move |[one, other]| LinkDown { bus, nodes: [one.get(), other.get()] })
         });
         let buses = self.bus_links.iter().enumerate().map(|(bus, bus_link)| BusStatus {
-            down: self.commanded.is_expected(bus),
+            down: self.commanded.is_loss_expected(bus),
             links: bus_link.network.is_some(),
         });
         BenchState {

@@ -25,11 +25,11 @@ pub(super) struct RemoteControl {
 /// Buses that commands have taken down. They outlive the remote control, because only a bus itself shows that it works
 /// again.
 #[derive(Debug, Default)]
-pub(super) struct SwitchedBuses(BTreeMap<usize, Switched>);
+pub(super) struct SwitchedBuses(BTreeMap<usize, SwitchState>);
 
 /// State of a bus that a command has taken down.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Switched {
+enum SwitchState {
     /// The bus was taken down and must stay down.
     Down,
     /// The bus was brought up, or released, after it had accepted `commands` commands of this run.
@@ -39,12 +39,12 @@ enum Switched {
 impl SwitchedBuses {
     /// Returns true if a bus is to stay down.
     pub(super) fn is_down(&self, bus: usize) -> bool {
-        self.0.get(&bus) == Some(&Switched::Down)
+        self.0.get(&bus) == Some(&SwitchState::Down)
     }
 
     /// Returns true if a command caused the loss of a bus: the bus is down, or has not worked since it was brought up.
     /// Such a loss does not end the run.
-    pub(super) fn is_expected(&self, bus: usize) -> bool {
+    pub(super) fn is_loss_expected(&self, bus: usize) -> bool {
         self.0.contains_key(&bus)
     }
 
@@ -53,25 +53,25 @@ impl SwitchedBuses {
     /// # Errors
     /// Returns [`Refused`] if the bus is in the requested state already, or will be as soon as its receiver has noticed
     /// the last change.
-    pub(super) fn check(&self, down: bool, bus: usize) -> Result<(), CommandError> {
+    pub(super) fn check_switch(&self, down: bool, bus: usize) -> Result<(), CommandError> {
         match (down, self.0.get(&bus)) {
-            (true, Some(Switched::Down)) => Err(CommandError::Already("up")),
-            (false, Some(Switched::Up { .. })) => Err(CommandError::ComesUp),
+            (true, Some(SwitchState::Down)) => Err(CommandError::Already("up")),
+            (false, Some(SwitchState::Up { .. })) => Err(CommandError::ComesUp),
             (false, None) => Err(CommandError::Already("down")),
-            (true, Some(Switched::Up { .. }) | None) | (false, Some(Switched::Down)) => Ok(()),
+            (true, Some(SwitchState::Up { .. }) | None) | (false, Some(SwitchState::Down)) => Ok(()),
         }
     }
 
     /// Notes that a bus was taken down or brought up after it had accepted this number of commands.
     pub(super) fn note_switched(&mut self, down: bool, bus: usize, commands: u64) {
-        self.0.insert(bus, if down { Switched::Down } else { Switched::Up { commands } });
+        self.0.insert(bus, if down { SwitchState::Down } else { SwitchState::Up { commands } });
     }
 
     /// Releases the buses that are down, because no later command will bring them up. `commands` returns the number of
     /// commands that a bus has accepted.
-    pub(super) fn release(&mut self, commands: impl Fn(usize) -> u64) {
-        for (bus, switched) in self.0.iter_mut().filter(|(_, switched)| **switched == Switched::Down) {
-            *switched = Switched::Up { commands: commands(*bus) };
+    pub(super) fn release_down_buses(&mut self, commands: impl Fn(usize) -> u64) {
+        for (bus, switched) in self.0.iter_mut().filter(|(_, switched)| **switched == SwitchState::Down) {
+            *switched = SwitchState::Up { commands: commands(*bus) };
         }
     }
 
@@ -80,8 +80,8 @@ impl SwitchedBuses {
     /// `None` for a bus that is lost.
     pub(super) fn forget_working(&mut self, taken: impl Fn(usize) -> Option<u64>) {
         self.0.retain(|bus, switched| match switched {
-            Switched::Down => true,
-            Switched::Up { commands } => taken(*bus).is_none_or(|taken| taken <= *commands),
+            SwitchState::Down => true,
+            SwitchState::Up { commands } => taken(*bus).is_none_or(|taken| taken <= *commands),
         });
     }
 }
@@ -150,28 +150,28 @@ mod tests {
     #[test]
     fn a_bus_that_was_taken_up_is_expected_until_it_has_worked() {
         let mut buses = SwitchedBuses::default();
-        assert!(matches!(buses.check(false, 0), Err(CommandError::Already("down"))));
-        buses.check(true, 0).unwrap();
+        assert!(matches!(buses.check_switch(false, 0), Err(CommandError::Already("down"))));
+        buses.check_switch(true, 0).unwrap();
         buses.note_switched(true, 0, 100);
-        assert!(matches!(buses.check(true, 0), Err(CommandError::Already("up"))));
+        assert!(matches!(buses.check_switch(true, 0), Err(CommandError::Already("up"))));
         buses.forget_working(|_| Some(105));
-        assert!(buses.is_down(0) && buses.is_expected(0), "what works there is of before");
+        assert!(buses.is_down(0) && buses.is_loss_expected(0), "what works there is of before");
         // The bus was taken down and up at once, so that its receiver has not noticed the change.
-        buses.check(false, 0).unwrap();
+        buses.check_switch(false, 0).unwrap();
         buses.note_switched(false, 0, 105);
         buses.forget_working(|_| Some(105));
-        assert!(!buses.is_down(0) && buses.is_expected(0));
-        assert!(matches!(buses.check(false, 0), Err(CommandError::ComesUp)));
+        assert!(!buses.is_down(0) && buses.is_loss_expected(0));
+        assert!(matches!(buses.check_switch(false, 0), Err(CommandError::ComesUp)));
         buses.forget_working(|_| None);
-        assert!(buses.is_expected(0), "the receiver has noticed it");
+        assert!(buses.is_loss_expected(0), "the receiver has noticed it");
         // The bus was taken down again before it worked.
-        buses.check(true, 0).unwrap();
+        buses.check_switch(true, 0).unwrap();
         buses.note_switched(true, 0, 105);
         buses.note_switched(false, 0, 105);
         buses.forget_working(|_| Some(105));
-        assert!(buses.is_expected(0) && !buses.is_expected(1));
+        assert!(buses.is_loss_expected(0) && !buses.is_loss_expected(1));
         buses.forget_working(|_| Some(106));
-        assert!(!buses.is_expected(0), "it works: its next loss is one");
+        assert!(!buses.is_loss_expected(0), "it works: its next loss is one");
     }
 
     #[test]
@@ -179,11 +179,11 @@ mod tests {
         let mut buses = SwitchedBuses::default();
         buses.note_switched(true, 0, 7);
         buses.note_switched(false, 1, 7);
-        buses.release(|_| 9);
-        assert!(!buses.is_down(0) && buses.is_expected(0) && buses.is_expected(1));
+        buses.release_down_buses(|_| 9);
+        assert!(!buses.is_down(0) && buses.is_loss_expected(0) && buses.is_loss_expected(1));
         buses.forget_working(|_| Some(9));
-        assert!(buses.is_expected(0) && !buses.is_expected(1));
+        assert!(buses.is_loss_expected(0) && !buses.is_loss_expected(1));
         buses.forget_working(|_| Some(10));
-        assert!(!buses.is_expected(0));
+        assert!(!buses.is_loss_expected(0));
     }
 }

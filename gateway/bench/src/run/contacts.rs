@@ -24,12 +24,12 @@ impl Bench<'_> {
     pub(super) fn settle_contacts(&mut self, script: &mut Script) -> Result<(), RunError> {
         let unreported = |cell: &CellView| cell.unclear && !cell.responded.counters;
         self.poll_until(REPORT_TIMEOUT, |bench, timeout| {
-            Ok(bench.count(unreported) == 0 || timeout.is_over(0))
+            Ok(bench.count(unreported) == 0 || timeout.has_stalled(0))
         })?;
         if script.touches.cells().next().is_some() {
             self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| {
                 bench.clear_contacts(script)?;
-                Ok(bench.count(|cell| cell.unclear) == 0 || timeout.is_over(0))
+                Ok(bench.count(|cell| cell.unclear) == 0 || timeout.has_stalled(0))
             })?;
         }
         let unclear = self.names(|cell| cell.unclear);
@@ -49,11 +49,11 @@ impl Bench<'_> {
             return Ok(());
         }
         let unclear = self.unclear_cells();
-        let due = script.cleared.due(self.now(), unclear);
+        let due = script.cleared.due_requests(self.now(), unclear);
         for &(bus, cell) in &due {
             let Some(bus_link) = self.bus_links.get(bus) else { continue };
             let mode = core::array::from_fn(|place| if place == 0 { TEST_MODE } else { 0 });
-            bus_link.switch(Node::Cell(cell), (Parameter::Mode.number(), mode))?;
+            bus_link.send_switch(Node::Cell(cell), (Parameter::Mode.number(), mode))?;
         }
         if due.is_empty() || script.has_not_begun() {
             return Ok(());
@@ -65,7 +65,7 @@ impl Bench<'_> {
     fn unclear_cells(&self) -> Vec<(usize, CellId)> {
         let mut unclear = Vec::new();
         for (bus, bus_link) in
-            self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())
+            self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_working())
         {
             let Ok(view) = bus_link.view.lock() else { continue };
             // Check the flag first: cells are rarely unclear, and this would visit thousands of cells a hundred times a

@@ -14,12 +14,12 @@ use super::measured::LoopTotals;
 use super::receiver::ReceiverResult;
 use super::watch::ROUND_PAUSE;
 use crate::error::RunError;
-use crate::record::feed::Unrecorded;
+use crate::record::feed::UnrecordedCounts;
 use crate::record::{Recorder, backlog};
 use crate::summary::{BusSummary, CellSummary, LoopSummary, NetworkSummary, OutagesSummary, Summary};
 use crate::view::BusView;
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, Responded};
+use model::table::{Accuracy, ResponseFlags};
 use trace::recording::account::RecordingAccount;
 
 /// Time that cells have to send their final reports; an overloaded machine needs it.
@@ -40,7 +40,7 @@ impl Bench<'_> {
     }
 
     /// Ends a bench whose loop never started.
-    pub(super) fn give_up(mut self, error: RunError) -> Result<Summary, RunError> {
+    pub(super) fn end_without_loop(mut self, error: RunError) -> Result<Summary, RunError> {
         let mut summary = Summary::empty(&self.options.skin);
         let received = self.stop_receivers();
         summary.recording = self.recorder.take().map(Recorder::discard);
@@ -67,13 +67,13 @@ impl Bench<'_> {
         thread::sleep(two_periods.unwrap_or_default());
         self.wait_until(Self::has_caught_up);
         self.send_to_all(&Message::Report)?;
-        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.counters));
+        self.wait_until(|bench| bench.has_caught_up() && bench.all_cells_reported(|said| said.counters));
         if interrupted {
             self.send_to_all(&Message::Halt)?;
         }
         // Send the sync last, so that the count in each cell's heartbeat covers all other packets of the cell.
         self.send_to_all(&Message::Sync)?;
-        self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat));
+        self.wait_until(|bench| bench.has_caught_up() && bench.all_cells_reported(|said| said.heartbeat));
         Ok(())
     }
 
@@ -82,13 +82,13 @@ impl Bench<'_> {
     fn has_caught_up(&self) -> bool {
         self.bus_links.iter().all(|bus_link| {
             let read = bus_link.view.lock().map_or(u64::MAX, |view| view.commands);
-            !bus_link.link.state.is_there() || read >= bus_link.link.state.commands.load(Ordering::Relaxed)
+            !bus_link.link.state.is_working() || read >= bus_link.link.state.commands.load(Ordering::Relaxed)
         })
     }
 
     /// Returns true if all ready cells on working buses have sent a report for which `said` is true.
-    fn all_have(&self, said: impl Fn(&Responded) -> bool) -> bool {
-        self.bus_links.iter().filter(|bus_link| bus_link.link.state.is_there()).all(|bus_link| {
+    fn all_cells_reported(&self, said: impl Fn(&ResponseFlags) -> bool) -> bool {
+        self.bus_links.iter().filter(|bus_link| bus_link.link.state.is_working()).all(|bus_link| {
             let all = |view: &BusView| view.cells.iter().all(|cell| !cell.ready || said(&cell.responded));
             bus_link.view.lock().map_or(true, |view| all(&view))
         })
@@ -112,11 +112,11 @@ impl Bench<'_> {
 
     /// Ends the recording after all threads have stopped queuing.
     fn finish_recording(&mut self, received: &[Option<ReceiverResult>]) -> Option<RecordingAccount> {
-        let add = |all: Unrecorded, one: &ReceiverResult| Unrecorded {
+        let add = |all: UnrecordedCounts, one: &ReceiverResult| UnrecordedCounts {
             frames: all.frames + one.unrecorded.frames,
             epochs: all.epochs + one.unrecorded.epochs,
         };
-        let unrecorded = received.iter().flatten().fold(Unrecorded::default(), add);
+        let unrecorded = received.iter().flatten().fold(UnrecordedCounts::default(), add);
         let ticks = self.shared.records_unrecorded.load(Ordering::Relaxed);
         self.recorder.take().map(|recorder| recorder.finish(unrecorded, ticks))
     }
@@ -128,8 +128,9 @@ impl Bench<'_> {
         measured: &LoopTotals,
         received: &[Option<ReceiverResult>],
     ) -> Summary {
-        let backlog_dropped =
-            backlog::dropped().zip(self.backlog_dropped).map(|(now, before)| now.saturating_sub(before));
+        let backlog_dropped = backlog::dropped_packets()
+            .zip(self.backlog_dropped)
+            .map(|(now, before)| now.saturating_sub(before));
         let all = received.iter().flatten().map(|received| received.table.accuracy());
         Summary {
             cells: self.cell_summaries(received),
@@ -140,7 +141,7 @@ impl Bench<'_> {
             before_halt: measured.halts.history(&self.options.skin),
             first_broadcast_s: measured.first_broadcast_s.unwrap_or(f64::NAN),
             control: self.loop_summary(measured, summary.control),
-            accuracy: all.fold(Accuracy::default(), Accuracy::with),
+            accuracy: all.fold(Accuracy::default(), Accuracy::merged),
             backlog_dropped,
             buses: self.bus_summaries(received, backlog_dropped, measured),
             ..summary
@@ -186,7 +187,7 @@ impl Bench<'_> {
             let link = &bus_link.link;
             let network = bus_link.network.as_ref().map(|network| NetworkSummary {
                 tree_ready_s: network.tree_ready.map(protocol::time::Span::seconds),
-                deepest: network.deepest(),
+                deepest: network.max_slot_depth(),
                 differences: network.differences.iter().map(ToString::to_string).collect(),
                 unreachable: network.unreachable().collect(),
                 longest_unreachable_s: network.longest_unreachable.seconds(),
@@ -201,7 +202,7 @@ impl Bench<'_> {
             let kind = link.kind.to_string();
             let summary = BusSummary::new(&link.name, &kind, link.receive_buffer, table, dropped, ended);
             let mut summary = BusSummary { outages, network, hosts: bus_link.hosts.summary(), ..summary };
-            summary.uplink.explain_by_hosts(bus_link.hosts.lost());
+            summary.uplink.attribute_to_hosts(bus_link.hosts.lost_frames());
             Some(summary)
         };
         let mut summaries: Vec<_> =
@@ -209,7 +210,7 @@ impl Bench<'_> {
         // The buses of the dropped packets are unknown.
         let mut backlog = backlog_dropped.unwrap_or(0);
         for summary in summaries.iter_mut().filter(|summary| summary.kind == BusKind::SocketCan.name()) {
-            backlog -= summary.uplink.explain_by_backlog(backlog);
+            backlog -= summary.uplink.attribute_to_backlog(backlog);
         }
         summaries
     }

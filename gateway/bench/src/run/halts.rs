@@ -125,7 +125,7 @@ fn seconds(time: Micros) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use control::controller::{BadCycle, Controller, ControllerOutput, Input};
+    use control::controller::{BadCycle, Controller, ControllerInput, ControllerOutput};
     use control::cycle::carried::BusInput;
     use control::cycle::{Cycle, Tick};
     use control::robot::SimulatedArm;
@@ -137,7 +137,7 @@ mod tests {
     struct Until(u64);
 
     impl Controller for Until {
-        fn step(&mut self, input: &Input) -> ControllerOutput {
+        fn step(&mut self, input: &ControllerInput) -> ControllerOutput {
             if input.tick < self.0 {
                 ControllerOutput::Move(padded(&[0.25; 6]))
             } else {

@@ -62,7 +62,7 @@ impl Hosts {
             self.reconnect_at = now + RECONNECT_INTERVAL;
             self.reports = link.connect_reports().ok();
         }
-        match self.reports.as_mut().map(ReportReader::take) {
+        match self.reports.as_mut().map(ReportReader::read_reports) {
             Some(Ok(reports)) => {
                 for report in reports {
                     self.known.add_report(&link.name, report, now, &mut changes);
@@ -85,7 +85,7 @@ impl Hosts {
     }
 
     /// Number of frames lost between the hosts.
-    pub(super) fn lost(&self) -> u64 {
+    pub(super) fn lost_frames(&self) -> u64 {
         self.known.hosts.values().flat_map(|of| of.lost).fold(0, u64::saturating_add)
     }
 
@@ -203,10 +203,10 @@ mod tests {
         let mut of = Fixture::new();
         let (notes, in_doubt, _) = of.take(&[("b", true, 1, 50, 60)]);
         assert_eq!((notes, in_doubt), (vec!["host 'b' of vcan0 is linked (cells 7, 9)".to_owned()], 0));
-        assert_eq!(of.0.lost(), 0);
+        assert_eq!(of.0.lost_frames(), 0);
         assert_eq!(of.take(&[("b", true, 1, 53, 60)]), (vec![], 0, 0), "their own counts show it");
         assert_eq!(of.take(&[("b", true, 1, 53, 64)]), (vec![], 2, 2), "stimuli may be among them");
-        assert_eq!((of.0.lost(), of.0.summary()[0].lost_from, of.0.summary()[0].lost_to), (7, 3, 4));
+        assert_eq!((of.0.lost_frames(), of.0.summary()[0].lost_from, of.0.summary()[0].lost_to), (7, 3, 4));
     }
 
     #[test]
@@ -241,6 +241,6 @@ mod tests {
         assert!(of.0.is_away(CellId::new(9).unwrap()), "its heartbeats may still be on their way");
         let (notes, _, reached) = of.take(&[("b", true, 1, 2, 0)]);
         assert_eq!((notes.len(), reached), (1, 2));
-        assert_eq!(of.0.lost(), 7);
+        assert_eq!(of.0.lost_frames(), 7);
     }
 }

@@ -7,7 +7,7 @@ use hdrhistogram::Histogram;
 use protocol::skin::Skin;
 use protocol::time::Span;
 
-use super::accelerations::Moved;
+use super::accelerations::TickMotion;
 use super::halts::Halts;
 use super::status_line::StatusLine;
 use crate::remote::Lateness;
@@ -92,7 +92,7 @@ impl LoopTotals {
     }
 
     /// Returns the motion of the robot in the last tick.
-    pub(super) fn last_motion(&self) -> Option<Moved> {
+    pub(super) fn last_motion(&self) -> Option<TickMotion> {
         let [before, last] = [self.before?, self.last?].map(|timed| timed.record);
         let [began, at_s] = [before, last].map(|record| Span(record.tick.time.0).seconds());
         let mut state = RobotState { position: last.q, speed: last.qdot, ..RobotState::default() };
@@ -100,7 +100,7 @@ impl LoopTotals {
         for (acceleration, (now, before)) in state.acceleration.iter_mut().zip(speeds) {
             *acceleration = (now - before) / (at_s - began);
         }
-        Some(Moved { at_s, state, is_halted: last.halted.is_some() })
+        Some(TickMotion { at_s, state, is_halted: last.halted.is_some() })
     }
 
     /// Returns the text of the progress line for `width` columns.

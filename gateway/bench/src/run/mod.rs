@@ -36,8 +36,8 @@ use protocol::bus::KindChoices;
 use protocol::skin::Skin;
 
 use self::commander::RemoteControl;
-pub use self::network::TooDeep;
-use crate::emulate::Emulated;
+pub use self::network::TreeTooDeep;
+use crate::emulate::EmulatedCells;
 pub use crate::error::RunError;
 use crate::remote::JsonPipe;
 use crate::summary::Summary;
@@ -59,7 +59,7 @@ pub struct RunOptions {
     /// True if the run starts the cells; otherwise they must be on the bus already.
     pub spawn: bool,
     /// Cells to emulate and their firmware; the other cells are processes.
-    pub emulated: Option<Emulated>,
+    pub emulated: Option<EmulatedCells>,
     /// Maximum number of cells per process.
     pub cells_per_process: usize,
     /// Directory for the cells' parameters, if they keep them.
@@ -86,16 +86,16 @@ pub fn run(options: &RunOptions, remote: Option<JsonPipe>) -> Result<Summary, Ru
     let mut bench = match start::start(options) {
         Ok(bench) => bench,
         Err(error) if error.exit_code() == 1 => {
-            return Ok(Summary::of_no_run(&options.skin, error.to_string()));
+            return Ok(Summary::for_failed_start(&options.skin, error.to_string()));
         }
         Err(error) => return Err(error),
     };
     bench.remote = remote.map(RemoteControl::new);
-    match bench.begin() {
+    match bench.bring_up_cells() {
         Ok(()) => {
             bench.print_announcements();
             Ok(bench.run_loop())
         }
-        Err(error) => bench.give_up(error),
+        Err(error) => bench.end_without_loop(error),
     }
 }

@@ -6,15 +6,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use protocol::id::{CellId, Node};
 use protocol::message::{Message, Request};
 use protocol::packet::WORDS;
-use protocol::parameters::{LinksDown, Parameter, Reply as Words, Slots};
+use protocol::parameters::{LinksDown, Parameter, Reply as Words, SumSchedule};
 use protocol::port::PORTS;
 use protocol::skin::{Skin, SkinReply, Wires};
 use protocol::time::{Micros, Span};
 use thiserror::Error;
 
 use model::network::check::{self, Difference};
-use model::network::tree::{TreePlaces, tree_places};
-use model::repeat::Repeats;
+use model::network::tree::{ReportedTree, tree_places};
+use model::repeat::RepeatedRequests;
 
 use crate::view::BusView;
 
@@ -28,13 +28,13 @@ const REROUTE_TIMEOUT: Span = Span::from_millis(300);
 pub(super) struct Network {
     name: String,
     wires: Wires,
-    slots: Slots,
+    slots: SumSchedule,
     period_us: u16,
     /// Cells to which their slots were sent, with the times.
-    announced: Repeats<CellId>,
+    announced: RepeatedRequests<CellId>,
     /// Ports of each cell whose links must be down, one bit per port.
     ports_down: BTreeMap<CellId, u8>,
-    reported_links_down: Repeats<CellId>,
+    reported_links_down: RepeatedRequests<CellId>,
     /// Cells that send but have no route to a root, with the time at which this began.
     without_route: BTreeMap<CellId, Micros>,
     /// Cells that were reported as unreachable and still have no route, with the time at which this began.
@@ -57,7 +57,7 @@ pub(super) struct Network {
     .period_us.checked_div(*.slot_us).unwrap_or(0).saturating_sub(1),
     slots = .slots
 )]
-pub struct TooDeep {
+pub struct TreeTooDeep {
     /// Name of the bus.
     pub bus: String,
     /// Depth of the deepest cell of the tree, in wires from its root.
@@ -87,11 +87,11 @@ impl Network {
         Some(Self {
             name: described.name.clone(),
             wires: skin.wires(bus),
-            slots: Slots { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
+            slots: SumSchedule { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
             period_us: skin.period_us().unwrap_or(u16::MAX),
-            announced: Repeats::new(RETRY_INTERVAL),
+            announced: RepeatedRequests::new(RETRY_INTERVAL),
             ports_down: BTreeMap::new(),
-            reported_links_down: Repeats::new(RETRY_INTERVAL),
+            reported_links_down: RepeatedRequests::new(RETRY_INTERVAL),
             without_route: BTreeMap::new(),
             reported: BTreeMap::new(),
             reported_too_deep: false,
@@ -102,7 +102,7 @@ impl Network {
     }
 
     /// Returns the largest depth that has a slot.
-    pub(super) const fn deepest(&self) -> u8 {
+    pub(super) const fn max_slot_depth(&self) -> u8 {
         self.slots.deepest
     }
 
@@ -116,7 +116,7 @@ impl Network {
         self.without_route.keys().map(|cell| cell.get())
     }
 
-    fn places(view: &BusView) -> TreePlaces {
+    fn places(view: &BusView) -> ReportedTree {
         tree_places(
             view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)),
         )
@@ -124,7 +124,7 @@ impl Network {
 
     /// Returns the number of cells with a route to a root, and true if all cells that send have one and their pages
     /// agree.
-    pub(super) fn progress(view: &BusView) -> (usize, bool) {
+    pub(super) fn tree_progress(view: &BusView) -> (usize, bool) {
         let places = Self::places(view);
         (places.depths.len(), places.unreachable.is_empty() && places.agree)
     }
@@ -138,12 +138,12 @@ impl Network {
     ///
     /// # Errors
     /// Returns [`TooDeep`] if the slots do not fit between two joint broadcasts. The error names values that would fit.
-    pub(super) fn fit_slots(&mut self, view: &BusView) -> Result<(), TooDeep> {
+    pub(super) fn fit_slots(&mut self, view: &BusView) -> Result<(), TreeTooDeep> {
         let deepest = Self::places(view).max_depth().unwrap_or(0);
         let slots = u32::from(deepest) + 1;
         let (slot_us, period_us) = (u32::from(self.slots.slot_us), u32::from(self.period_us));
         if slots * slot_us > period_us {
-            return Err(TooDeep { bus: self.name.clone(), deepest, slots, slot_us, period_us });
+            return Err(TreeTooDeep { bus: self.name.clone(), deepest, slots, slot_us, period_us });
         }
         self.slots.deepest = deepest;
         Ok(())
@@ -173,7 +173,7 @@ impl Network {
 
     /// Returns the messages for cells that have not answered in time.
     pub(super) fn repeat_messages(&mut self, now: Micros, view: &BusView) -> Vec<Message> {
-        let due = self.announced.due(now, self.unconfirmed(view));
+        let due = self.announced.due_requests(now, self.unconfirmed(view));
         due.into_iter().map(|cell| self.reply_message(Node::Cell(cell))).collect()
     }
 
@@ -203,7 +203,7 @@ impl Network {
         let ready = view.cells.iter().filter(|cell| cell.ready);
         let open =
             ready.filter(|cell| requested_ports(&cell.node).is_some_and(|deaf| deaf != cell.ports_down));
-        let due = self.reported_links_down.due(now, open.map(|cell| cell.node));
+        let due = self.reported_links_down.due_requests(now, open.map(|cell| cell.node));
         let message = |cell: CellId| {
             let deaf = requested_ports(&cell)?;
             let request = Request::Write {
@@ -282,8 +282,8 @@ mod tests {
     use super::*;
     use crate::view::CellView;
     use model::network::check::ObservedCell;
-    use model::table::{Responded, SWITCHES};
-    use protocol::message::Tree;
+    use model::table::{ResponseFlags, SWITCHES};
+    use protocol::message::TreePage;
     use protocol::packet::Epoch;
 
     fn network() -> Network {
@@ -310,7 +310,7 @@ mod tests {
             measures: false,
             other_configuration: false,
             last_joints: Epoch(0),
-            responded: Responded::default(),
+            responded: ResponseFlags::default(),
             reply,
             ports_down: 0,
             unconfirmed_switches: [None; SWITCHES],
@@ -324,7 +324,7 @@ mod tests {
             alive: tree.is_some(),
             tree: tree.map(|(parent, depth)| {
                 let up = if parent == Some(0) { 4 } else { 0 };
-                Tree { parent, parent_port: up, depth, ..Tree::default() }
+                TreePage { parent, parent_port: up, depth, ..TreePage::default() }
             }),
             ports: None,
         });
@@ -344,7 +344,7 @@ mod tests {
         let look = network.check_running(now, &view(&deep, words));
         let everyone = |message: &Message| matches!(message, Message::Configure { to: Node::Everyone, .. });
         assert!(look.messages.iter().all(everyone) && look.messages.len() == 1, "{look:?}");
-        assert_eq!(network.deepest(), 2);
+        assert_eq!(network.max_slot_depth(), 2);
         // A cell that has not answered gets its own message, after an interval.
         assert_eq!(network.check_running(now, &view(&deep, words)), NetworkCheck::default());
         let look = network.check_running(at(2), &view(&deep, words));

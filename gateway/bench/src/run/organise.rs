@@ -19,19 +19,19 @@ const SETTLING_TIME: Duration = Duration::from_millis(1_500);
 
 impl Bench<'_> {
     /// Waits until the cells that answer with sums form a tree, and sends them their slots.
-    pub(super) fn organise(&mut self) -> Result<(), RunError> {
+    pub(super) fn organise_trees(&mut self) -> Result<(), RunError> {
         self.shared.sends_to_roots.store(true, Ordering::Relaxed);
         let began = self.now();
         self.poll_until(self.timeout(), |bench, timeout| {
             let (mut have_ways, mut whole, now) = (0, true, bench.now());
             for (network, view) in bench.networks() {
-                let (count, all) = Network::progress(&view);
+                let (count, all) = Network::tree_progress(&view);
                 have_ways += count;
                 whole &= all;
                 network.tree_ready =
                     all.then(|| network.tree_ready.unwrap_or_else(|| now.elapsed_since(began)));
             }
-            Ok(whole || timeout.is_over(have_ways))
+            Ok(whole || timeout.has_stalled(have_ways))
         })?;
         self.check_networks()?;
         for (network, view) in self.networks() {
@@ -44,7 +44,7 @@ impl Bench<'_> {
             .filter_map(|bus_link| bus_link.network.as_ref())
             .filter(|_| !self.options.quiet)
         {
-            let (name, deepest) = (network.name(), network.deepest());
+            let (name, deepest) = (network.name(), network.max_slot_depth());
             let tree_ready = network.tree_ready.unwrap_or_default().seconds();
             eprint_line(&format!(
                 "the cells of {name} are a tree of depth {deepest} after {tree_ready:.2} s"
@@ -66,7 +66,7 @@ impl Bench<'_> {
                 changes += usize::from(differences != network.differences);
                 network.differences = differences;
             }
-            Ok(none || timeout.is_over(changes))
+            Ok(none || timeout.has_stalled(changes))
         })?;
         let mut broken = None;
         for network in self.bus_links.iter().filter_map(|bus_link| bus_link.network.as_ref()) {
@@ -94,7 +94,7 @@ impl Bench<'_> {
                     network.unconfirmed(&view).iter().map(|cell| format!("{cell} on {}", network.name())),
                 );
             }
-            let is_last = unconfirmed.is_empty() || timeout.is_over(0);
+            let is_last = unconfirmed.is_empty() || timeout.has_stalled(0);
             if !is_last {
                 bench.send_to_networks(Network::repeat_messages)?;
             }

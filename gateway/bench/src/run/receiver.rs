@@ -7,7 +7,7 @@ use std::sync::mpsc::{self, Sender};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use protocol::bus::{BusError, Received};
+use protocol::bus::{BusError, ReceivedFrame};
 use protocol::id::{CellId, Kind};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
@@ -15,13 +15,13 @@ use protocol::time::Micros;
 
 use crate::bus::follow::{FollowStep, FollowedItem, Follower};
 use crate::bus::link::{Outages, ReceiveEnd};
-use crate::bus::realtime::wall;
+use crate::bus::realtime::wall_clock_ns;
 use crate::bus::roots::RootWires;
-use crate::record::feed::{EpochContacts, Outlet, Unrecorded};
+use crate::record::feed::{EpochContacts, RecorderSender, UnrecordedCounts};
 use crate::view::{BusView, CellView};
-use control::cycle::turn::Shared;
-use model::latched::ReceivedFrame;
-use model::table::{Notice, Snapshot, Table};
+use control::cycle::turn::SharedRunState;
+use model::latched::LatchedFrame;
+use model::table::{BusTable, Notice, Snapshot};
 use trace::capture::BusNote;
 
 /// Interval between checks of timeouts and updates of the view, if no frame arrives.
@@ -67,15 +67,15 @@ pub struct Receiver {
     /// Interval between checks of timeouts and updates of the view while the loop runs.
     pub check_interval: Duration,
     /// State of the bus and its cells.
-    pub table: Table,
+    pub table: BusTable,
     /// Snapshots for the control loop.
     pub snapshots: triple_buffer::Input<Snapshot>,
     /// Joint positions of each broadcast before they are rounded to words.
     pub positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
     /// Queues to the recorder, if the run is recorded.
-    pub outlet: Option<Outlet>,
+    pub outlet: Option<RecorderSender>,
     /// State shared by all threads.
-    pub shared: Arc<Shared>,
+    pub shared: Arc<SharedRunState>,
     /// State shown to the main thread.
     pub view: Arc<Mutex<BusView>>,
     /// Events for the main thread.
@@ -89,11 +89,11 @@ pub struct Receiver {
 #[derive(Debug)]
 pub struct ReceiverResult {
     /// Final state of the bus and its cells.
-    pub table: Table,
+    pub table: BusTable,
     /// Number of frames that the bus dropped because they were not read in time.
     pub dropped: u64,
     /// Number of items that did not fit into the recorder's queues.
-    pub unrecorded: Unrecorded,
+    pub unrecorded: UnrecordedCounts,
     /// Number and total duration of the bus's losses.
     pub outages: Outages,
     /// Time at which the receiver ended, for which the states of the cells hold, however long the recorder takes to
@@ -125,22 +125,22 @@ impl Receiver {
             let step = self.follower.step(&mut self.receive_end, wait);
             self.handle_step(step, &mut account);
             for cells in self.possibly_missed.try_iter() {
-                self.table.interrupt_cells(|cell| cells.contains(&cell));
+                self.table.handle_unreachable_cells(|cell| cells.contains(&cell));
             }
             self.handle_frames();
             if self.shared.sends_to_roots.load(Ordering::Relaxed) {
                 self.follower.roots.iter_mut().for_each(RootWires::start_sending);
             }
-            self.record(&mut account);
+            self.forward_to_recorder(&mut account);
             if looked.elapsed() >= self.present_interval() {
                 looked = Instant::now();
                 self.refresh_view(&mut account);
             }
             self.publish();
         }
-        let ended = Micros(wall() / 1_000);
+        let ended = Micros(wall_clock_ns() / 1_000);
         self.table.finish();
-        let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, report_remaining);
+        let unrecorded = self.outlet.as_mut().map_or_else(UnrecordedCounts::default, report_remaining);
         let dropped = self.follower.dropped();
         ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages, ended }
     }
@@ -163,10 +163,10 @@ impl Receiver {
             }
             FollowStep::Nothing | FollowStep::Leftover(_) => {}
             FollowStep::Down(error) => self.report_loss(false, BusEvent::Down(error), account),
-            FollowStep::Drained => self.table.interrupt(),
+            FollowStep::Drained => self.table.handle_bus_loss(),
             FollowStep::Gone(error) => {
                 self.report_loss(true, BusEvent::Lost(error), account);
-                self.table.interrupt();
+                self.table.handle_bus_loss();
             }
             FollowStep::Refused(error) => self.send_event(BusEvent::Refused(error)),
         }
@@ -183,7 +183,7 @@ impl Receiver {
     /// Notes a state of the bus in the recording.
     fn note(&mut self, what: BusNote) {
         if let Some(outlet) = &mut self.outlet {
-            outlet.bus(wall(), what);
+            outlet.push_bus_note(wall_clock_ns(), what);
         }
     }
 
@@ -192,25 +192,25 @@ impl Receiver {
         self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
         let Self { follower, table, positions: queue, outlet, .. } = self;
         follower.for_each_item(|part| match part {
-            FollowedItem::Feeds(root, feeds) => table.set_feeds(root, feeds),
+            FollowedItem::Feeds(root, feeds) => table.set_root_feeds_gateway(root, feeds),
             FollowedItem::Frame(received) => {
                 let at = Micros(received.at_nanos / 1_000);
                 let mut positions = |epoch| take_positions(queue, epoch);
                 table.handle_frame(at, received.own, &received.frame, &mut positions);
                 if let Some(outlet) = outlet {
-                    let Received { frame, at_nanos, own } = received;
-                    outlet.frame(ReceivedFrame { at_nanos, from_gateway: own, frame });
+                    let ReceivedFrame { frame, at_nanos, own } = received;
+                    outlet.push_frame(LatchedFrame { at_nanos, from_gateway: own, frame });
                 }
             }
         });
     }
 
     /// Forwards drop counts and, once per epoch, contact states to the recorder.
-    fn record(&mut self, account: &mut ReportedState) {
+    fn forward_to_recorder(&mut self, account: &mut ReportedState) {
         let Some(outlet) = &mut self.outlet else { return };
         let dropped = self.follower.dropped();
         if dropped > account.announced {
-            outlet.dropped(wall(), dropped - account.announced);
+            outlet.push_dropped(wall_clock_ns(), dropped - account.announced);
             account.announced = dropped;
         }
         let Some((number, epoch, at)) = self.table.newest_joints() else { return };
@@ -228,7 +228,7 @@ impl Receiver {
 
     /// Checks timeouts, and updates the main thread's view.
     fn refresh_view(&mut self, account: &mut ReportedState) {
-        let now = Micros(wall() / 1_000);
+        let now = Micros(wall_clock_ns() / 1_000);
         self.table.handle_time(now);
         let notices: Vec<_> = self.table.notices().collect();
         for notice in notices {
@@ -236,7 +236,7 @@ impl Receiver {
         }
         let cells = self.table.statuses(now).map(|(cell, status)| CellView::new(cell, status));
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
-        if !self.receive_end.link.state.is_there() {
+        if !self.receive_end.link.state.is_working() {
             // The lost bus will not deliver the commands that it has accepted.
             account.unread =
                 self.receive_end.link.state.commands.load(Ordering::Relaxed).saturating_sub(read);
@@ -256,9 +256,9 @@ impl Receiver {
 }
 
 /// Reports the items that did not fit into the queues, waiting up to 1 s until the queue has room for the report.
-fn report_remaining(outlet: &mut Outlet) -> Unrecorded {
+fn report_remaining(outlet: &mut RecorderSender) -> UnrecordedCounts {
     let give_up = Instant::now() + Duration::from_secs(1);
-    while !outlet.report_unrecorded(wall()) && Instant::now() < give_up {
+    while !outlet.report_unrecorded(wall_clock_ns()) && Instant::now() < give_up {
         std::thread::sleep(Duration::from_millis(1));
     }
     outlet.unrecorded()

@@ -30,18 +30,18 @@ use crate::emulate::{self, Emulation, Emulator};
 use crate::error::RunError;
 use crate::processes::ended::EndedProcesses;
 use crate::processes::{Processes, allow_files, program_path};
-use crate::record::feed::{self, Feed, Outlet};
+use crate::record::feed::{self, RecorderFeed, RecorderSender};
 use crate::record::{Mcap, Outputs, Recorder, backlog, facts};
 use crate::signals::{SignalError, catch_signals};
 use crate::threads::spawn;
 use crate::view::BusView;
-use control::controller::{Controller, Planned};
+use control::controller::{Controller, PlannedController};
 use control::cycle::Cycle;
-use control::cycle::turn::{BusPort, Shared, TimedRecord};
+use control::cycle::turn::{BusPort, SharedRunState, TimedRecord};
 use control::motion::controller_of;
 use control::robot::SimulatedArm;
 use model::quantiles::Quantiles;
-use model::table::Table;
+use model::table::BusTable;
 use trace::recording::layout::Layout;
 use trace::recording::series::FileHead;
 
@@ -62,7 +62,7 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     // Ignore the signal, so that a file at its size limit is an ordinary write error.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|source| SignalError { signal: SIGXFSZ, source })?;
-    let outputs = Outputs::claim(&options.record, &signalled, eprint_line).map_err(|refused| {
+    let outputs = Outputs::open_outputs(&options.record, &signalled, eprint_line).map_err(|refused| {
         if signalled.load(Ordering::Relaxed) { RunError::Interrupted } else { refused.into() }
     })?;
     let numbered = options.record.candump.as_ref().is_some_and(|candump| candump.numbered);
@@ -71,14 +71,14 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let controller: Box<dyn Controller> = match &options.planned {
         Some(motion) => {
             let motion = motion.clone();
-            Box::new(Planned::new(skin, move |seconds| motion.state_at(seconds).position))
+            Box::new(PlannedController::new(skin, move |seconds| motion.state_at(seconds).position))
         }
         None => controller_of(skin, &options.scenario.motion)?,
     };
     let arm = SimulatedArm::new(skin, options.scenario.motion.start);
     let cycle = Some(Cycle::new(skin, controller, Box::new(arm)));
     let idle = realtime::idle_lateness(skin.timing.tick_nanos());
-    let backlog_dropped = backlog::dropped();
+    let backlog_dropped = backlog::dropped_packets();
     let (mut served, mut processes) = (Vec::new(), Processes::new()?);
     // Commission the cells before this run opens its buses, because the run would take the commissioning for another
     // gateway.
@@ -95,7 +95,7 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let opened = skin.buses.iter().zip(targets).zip(opened);
     let opened = opened.map(|((bus, (.., target)), opened)| create_link(options, bus, target, opened));
     let opened = opened.collect::<Result<Vec<_>, _>>()?;
-    let shared = Arc::new(Shared::default());
+    let shared = Arc::new(SharedRunState::default());
     let (tell, bus_event) = mpsc::channel();
     let (mut bus_links, mut feeds) = (Vec::new(), Vec::new());
     for (index, (receive_end, slot)) in opened.into_iter().enumerate() {
@@ -120,7 +120,7 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
             tell.clone(),
         )?);
     }
-    let (recorder, recorded) = record(options, outputs, feeds, &bus_links, &idle)?;
+    let (recorder, recorded) = start_recorder(options, outputs, feeds, &bus_links, &idle)?;
     Ok(Bench {
         options,
         began,
@@ -235,7 +235,7 @@ fn create_link(
 }
 
 /// Starts the recorder, if anything is to be recorded. Returns it with the queue for the loop's records.
-fn record(
+fn start_recorder(
     options: &RunOptions,
     outputs: Outputs,
     bus_feeds: Vec<feed::BusFeed>,
@@ -248,7 +248,7 @@ fn record(
     let (recorded, ticks) = outputs.records_all().then(|| rtrb::RingBuffer::new(feed::TICK_QUEUE)).unzip();
     let head =
         options.record.mcap.as_ref().map(|mcap| head(options, mcap, bus_links, idle)).unwrap_or_default();
-    let feed = Feed { bus_feeds, ticks };
+    let feed = RecorderFeed { bus_feeds, ticks };
     let mut layout = Layout::new(&options.skin);
     if let Some(robot) = options.record.mcap.as_ref().and_then(|mcap| mcap.robot.clone()) {
         layout = layout.with_robot(robot);
@@ -258,7 +258,7 @@ fn record(
 
 /// Returns the head that each file of a recording begins with.
 fn head(options: &RunOptions, mcap: &Mcap, bus_links: &[RunBus], idle: &Histogram<u64>) -> FileHead {
-    let nanos = realtime::wall();
+    let nanos = realtime::wall_clock_ns();
     let mut run = vec![
         ("duration_s".to_owned(), options.scenario.duration.seconds().to_string()),
         ("spawn".to_owned(), options.spawn.to_string()),
@@ -270,8 +270,8 @@ fn head(options: &RunOptions, mcap: &Mcap, bus_links: &[RunBus], idle: &Histogra
         (format!("bus/{}", link.name), how)
     }));
     let metadata = vec![
-        ("program", facts::program(&mcap.command_line, nanos)),
-        ("machine", facts::machine(&Quantiles::from_histogram(idle, 1e-3))),
+        ("program", facts::program_metadata(&mcap.command_line, nanos)),
+        ("machine", facts::machine_metadata(&Quantiles::from_histogram(idle, 1e-3))),
         ("configuration", facts::configuration(&options.skin, run)),
         ("configuration_hashes", facts::hashes(&options.skin)),
     ];
@@ -284,13 +284,13 @@ fn start_receiver(
     index: usize,
     (receive_end, slot): (ReceiveEnd, BusSlot),
     view: Arc<Mutex<BusView>>,
-    outlet: Option<Outlet>,
-    shared: &Arc<Shared>,
+    outlet: Option<RecorderSender>,
+    shared: &Arc<SharedRunState>,
     bus_event: mpsc::Sender<(usize, BusEvent)>,
 ) -> Result<RunBus, RunError> {
     let skin = &options.skin;
     let (link, shared) = (Arc::clone(&receive_end.link), Arc::clone(shared));
-    let mut table = Table::new(skin, index);
+    let mut table = BusTable::new(skin, index);
     if !ReceiveFilter::for_bus(skin, index, outlet.is_some()).all_sums {
         table.receive_root_sums_only();
     }

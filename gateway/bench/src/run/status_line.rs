@@ -34,7 +34,7 @@ pub(super) struct StatusLine<'a> {
 
 /// Level of detail of each part of a progress line: 0 omits the part or selects its shortest form.
 #[derive(Clone, Copy)]
-struct Detail {
+struct DetailLevels {
     time: u8,
     alarm: u8,
     contact: u8,
@@ -44,19 +44,19 @@ struct Detail {
 }
 
 /// Details of the lines, longest first. Less important parts are dropped first.
-const DETAILS: [Detail; 12] = [
-    Detail { time: 1, alarm: 1, contact: 3, late: 1, mode: 1, torque: 2 },
-    Detail { time: 1, alarm: 1, contact: 3, late: 1, mode: 0, torque: 2 },
-    Detail { time: 1, alarm: 1, contact: 3, late: 0, mode: 0, torque: 2 },
-    Detail { time: 1, alarm: 1, contact: 2, late: 0, mode: 0, torque: 2 },
-    Detail { time: 1, alarm: 1, contact: 1, late: 0, mode: 0, torque: 2 },
-    Detail { time: 1, alarm: 1, contact: 1, late: 0, mode: 0, torque: 1 },
-    Detail { time: 1, alarm: 0, contact: 1, late: 0, mode: 0, torque: 1 },
-    Detail { time: 1, alarm: 0, contact: 0, late: 0, mode: 0, torque: 1 },
-    Detail { time: 0, alarm: 0, contact: 0, late: 0, mode: 0, torque: 1 },
-    Detail { time: 1, alarm: 0, contact: 1, late: 0, mode: 0, torque: 0 },
-    Detail { time: 1, alarm: 0, contact: 0, late: 0, mode: 0, torque: 0 },
-    Detail { time: 0, alarm: 0, contact: 0, late: 0, mode: 0, torque: 0 },
+const DETAIL_CHOICES: [DetailLevels; 12] = [
+    DetailLevels { time: 1, alarm: 1, contact: 3, late: 1, mode: 1, torque: 2 },
+    DetailLevels { time: 1, alarm: 1, contact: 3, late: 1, mode: 0, torque: 2 },
+    DetailLevels { time: 1, alarm: 1, contact: 3, late: 0, mode: 0, torque: 2 },
+    DetailLevels { time: 1, alarm: 1, contact: 2, late: 0, mode: 0, torque: 2 },
+    DetailLevels { time: 1, alarm: 1, contact: 1, late: 0, mode: 0, torque: 2 },
+    DetailLevels { time: 1, alarm: 1, contact: 1, late: 0, mode: 0, torque: 1 },
+    DetailLevels { time: 1, alarm: 0, contact: 1, late: 0, mode: 0, torque: 1 },
+    DetailLevels { time: 1, alarm: 0, contact: 0, late: 0, mode: 0, torque: 1 },
+    DetailLevels { time: 0, alarm: 0, contact: 0, late: 0, mode: 0, torque: 1 },
+    DetailLevels { time: 1, alarm: 0, contact: 1, late: 0, mode: 0, torque: 0 },
+    DetailLevels { time: 1, alarm: 0, contact: 0, late: 0, mode: 0, torque: 0 },
+    DetailLevels { time: 0, alarm: 0, contact: 0, late: 0, mode: 0, torque: 0 },
 ];
 
 impl StatusLine<'_> {
@@ -64,33 +64,35 @@ impl StatusLine<'_> {
     /// without a width, the full text. All texts contain the torque.
     pub(super) fn text(&self, width: Option<usize>) -> String {
         let fits = |text: &String| width.is_none_or(|width| text.chars().count() <= width);
-        let mut texts = DETAILS.into_iter().map(|detail| self.detailed(detail));
+        let mut texts = DETAIL_CHOICES.into_iter().map(|detail| self.text_with_details(detail));
         let first = texts.find(fits);
-        first.unwrap_or_else(|| DETAILS.last().map_or_else(String::new, |detail| self.detailed(*detail)))
+        first.unwrap_or_else(|| {
+            DETAIL_CHOICES.last().map_or_else(String::new, |detail| self.text_with_details(*detail))
+        })
     }
 
-    fn detailed(&self, detail: Detail) -> String {
+    fn text_with_details(&self, detail: DetailLevels) -> String {
         let late = (detail.late > 0).then(|| format!("ticks late 99 % {:.0} µs", self.late_us));
         let mode = (detail.mode > 0).then(|| format!("{:11}", self.mode));
         let parts = [
-            Some(self.time(detail.time)),
-            self.lost(detail.alarm),
-            self.halted(detail.alarm),
-            self.contact(detail.contact),
+            Some(self.time_text(detail.time)),
+            self.lost_buses_text(detail.alarm),
+            self.halt_text(detail.alarm),
+            self.contact_text(detail.contact),
             late,
             mode,
-            Some(self.torque(detail.torque)),
+            Some(self.torque_text(detail.torque)),
         ];
         parts.into_iter().flatten().collect::<Vec<_>>().join("  ")
     }
 
-    fn time(&self, detail: u8) -> String {
+    fn time_text(&self, detail: u8) -> String {
         let (elapsed, duration) = (self.elapsed_s, self.duration_s);
         let has_end = detail > 0 && duration < ENDLESS_S;
         if has_end { format!("{elapsed:5.1} of {duration:.1} s") } else { format!("{elapsed:5.1} s") }
     }
 
-    fn lost(&self, detail: u8) -> Option<String> {
+    fn lost_buses_text(&self, detail: u8) -> Option<String> {
         match (self.lost, detail) {
             ([], _) => None,
             (lost, 0) => Some(format!("LOST: {}", lost.len())),
@@ -98,13 +100,13 @@ impl StatusLine<'_> {
         }
     }
 
-    fn halted(&self, detail: u8) -> Option<String> {
+    fn halt_text(&self, detail: u8) -> Option<String> {
         let why = self.halted?;
         Some(if detail > 0 { format!("HALTED: {}", printable(why)) } else { "HALTED".to_owned() })
     }
 
     /// Formats the number of cells in contact. Stale and dead cells appear at full detail, or if their number is not 0.
-    fn contact(&self, detail: u8) -> Option<String> {
+    fn contact_text(&self, detail: u8) -> Option<String> {
         let (contributing, cells) = (self.contributing, self.cells);
         let width = cells.to_string().len();
         let mut text = match detail {
@@ -120,7 +122,7 @@ impl StatusLine<'_> {
         Some(text)
     }
 
-    fn torque(&self, detail: u8) -> String {
+    fn torque_text(&self, detail: u8) -> String {
         let each =
             |one: &dyn Fn(&f64) -> String| self.torque_nm.iter().map(one).collect::<Vec<_>>().join(" ");
         match detail {

@@ -10,7 +10,7 @@ use crate::processes::Processes;
 use crate::summary::ProcessorUse;
 
 /// Processor time of this process so far in s.
-fn own_seconds() -> f64 {
+fn own_processor_seconds() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     std::time::Duration::try_from(time).map_or(0.0, |time| time.as_secs_f64())
 }
@@ -31,14 +31,14 @@ fn processor_seconds(pid: u32) -> Option<f64> {
 
 /// Private memory of a process in KiB.
 #[must_use]
-pub(super) fn private_kib(pid: u32) -> Option<u64> {
+pub(super) fn private_memory_kib(pid: u32) -> Option<u64> {
     let map = fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).ok()?;
     let kib = |line: &str| line.split_whitespace().nth(1)?.parse::<u64>().ok();
     Some(map.lines().filter(|line| line.starts_with("Private_")).filter_map(kib).sum())
 }
 
 /// Processor times so far in s: of this program, of the cell processes and of the bus servers.
-pub(super) struct Spent {
+pub(super) struct ProcessorTimes {
     gateway: f64,
     /// Time of each cell process.
     cells: HashMap<u32, f64>,
@@ -46,12 +46,12 @@ pub(super) struct Spent {
     buses: HashMap<u32, f64>,
 }
 
-impl Spent {
+impl ProcessorTimes {
     /// Reads the times of this program, of cells and of bus servers.
     pub(super) fn measure(cells: &Processes, buses: &[ServedBus]) -> Self {
         let of = |pid: u32| Some((pid, processor_seconds(pid)?));
         Self {
-            gateway: own_seconds(),
+            gateway: own_processor_seconds(),
             cells: cells.pids().filter_map(of).collect(),
             buses: buses.iter().filter_map(|bus| of(bus.pid())).collect(),
         }

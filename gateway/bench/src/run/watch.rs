@@ -10,26 +10,26 @@ use std::time::{Duration, Instant};
 use protocol::bus::BusKind;
 use protocol::can::Frame;
 use protocol::id::{CellId, Node};
-use protocol::message::{AppliesFrom, Message, SensorPage};
+use protocol::message::{Message, SensorPage, StimulusStart};
 use protocol::skin::Cell;
 use protocol::time::Span;
 
-use super::accelerations::{Accelerations, Moved};
-use super::begin::{Announced, SWITCH_RETRY_INTERVAL};
+use super::accelerations::{Accelerations, TickMotion};
+use super::begin::{SWITCH_RETRY_INTERVAL, SentSwitches};
 use super::bench::Bench;
 use super::commanded::serve;
 use super::measured::LoopTotals;
 use super::receiver::BusEvent;
-use super::usage::{Spent, private_kib};
+use super::usage::{ProcessorTimes, private_memory_kib};
 use crate::bus::link::BusSlot;
-use crate::bus::realtime::{self, Granted};
+use crate::bus::realtime::{self, GrantedPrivileges};
 use crate::error::RunError;
 use crate::progress::Progress;
 use crate::record::Recorder;
 use crate::summary::{PrivateMemory, Summary};
 use crate::threads::{ThreadError, spawn};
 use control::cycle::turn::{TickDriver, TimedRecord};
-use control::external::Absence;
+use control::external::ControllerAbsence;
 use model::scenario::{FaultKind, Touches};
 use model::table::Notice;
 
@@ -41,13 +41,13 @@ pub(super) const ROUND_PAUSE: Duration = Duration::from_millis(10);
 const RECORD_QUEUE: usize = 1_024;
 
 /// Result of the thread that runs the control loop.
-struct LoopEnd {
+struct LoopResult {
     /// Privileges that the machine granted to the thread.
-    granted: Granted,
+    granted: GrantedPrivileges,
     /// Counts of the controller by name.
     counts: BTreeMap<String, u64>,
     /// Reason why the controller counts as absent, if it does.
-    absence: Option<Absence>,
+    absence: Option<ControllerAbsence>,
 }
 
 /// Progress of the main thread through the faults and touches of the scenario.
@@ -59,9 +59,9 @@ pub(super) struct Script {
     /// Index of the scenario's next fault.
     fault: usize,
     /// Cells to which switches were sent again, with the times.
-    announced: Announced,
+    announced: SentSwitches,
     /// Cells whose contact state was cleared, with the times.
-    pub(super) cleared: Announced,
+    pub(super) cleared: SentSwitches,
     /// Time at which the loop started.
     started: Instant,
 }
@@ -88,14 +88,14 @@ impl Bench<'_> {
         let turn = TickDriver::new(cycle, lines, scenario, Arc::clone(&self.shared), records);
         let turn = turn.with_recorder(self.recorded.take());
         let touches = Touches::new(&options.scenario, &options.skin);
-        let (announced, started) = (Announced::new(SWITCH_RETRY_INTERVAL), Instant::now());
+        let (announced, started) = (SentSwitches::new(SWITCH_RETRY_INTERVAL), Instant::now());
         let accelerations = Accelerations::new(options);
-        let cleared = Announced::new(SWITCH_RETRY_INTERVAL);
+        let cleared = SentSwitches::new(SWITCH_RETRY_INTERVAL);
         let mut script = Script { touches, accelerations, epoch: 0, fault: 0, announced, cleared, started };
         self.settle_contacts(&mut script)?;
         self.send_stimuli(&mut script, None)?;
 
-        let before = Spent::measure(&self.processes, &self.served);
+        let before = ProcessorTimes::measure(&self.processes, &self.served);
         script.started = Instant::now();
         let control = self.start_loop(turn, slots)?;
         let mut progress = Progress::new(options.quiet);
@@ -116,18 +116,19 @@ impl Bench<'_> {
         progress.clear();
         measured.add_records(&mut inlet, self.began);
         summary.processor =
-            Spent::measure(&self.processes, &self.served).cores_since(&before, summary.duration_s);
-        let of_buses = self.served.iter().filter_map(|bus| private_kib(bus.pid()));
+            ProcessorTimes::measure(&self.processes, &self.served).cores_since(&before, summary.duration_s);
+        let of_buses = self.served.iter().filter_map(|bus| private_memory_kib(bus.pid()));
         summary.memory = PrivateMemory {
-            cell_private_kib: self.processes.pids().filter_map(private_kib).max(),
-            gateway_private_kib: private_kib(std::process::id()),
+            cell_private_kib: self.processes.pids().filter_map(private_memory_kib).max(),
+            gateway_private_kib: private_memory_kib(std::process::id()),
             buses_private_kib: of_buses.reduce(|all, one| all + one),
         };
         if failure.is_some() || ended.is_err() {
             // The halt is the last command that the cells get.
             let _ = self.send_to_all(&Message::Halt);
         }
-        let LoopEnd { granted, counts, absence } = ended.map_err(|_| RunError::Panicked("control loop"))?;
+        let LoopResult { granted, counts, absence } =
+            ended.map_err(|_| RunError::Panicked("control loop"))?;
         let control = &mut summary.control;
         (control.fifo, control.memory_locked, control.controller) = (granted.fifo, granted.locked, counts);
         let ended = match failure {
@@ -146,18 +147,18 @@ impl Bench<'_> {
         &self,
         mut turn: TickDriver,
         mut slots: Vec<BusSlot>,
-    ) -> Result<JoinHandle<LoopEnd>, ThreadError> {
+    ) -> Result<JoinHandle<LoopResult>, ThreadError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
         let shared = Arc::clone(&self.shared);
         spawn("control", move || {
-            let granted = realtime::prepare();
+            let granted = realtime::request_realtime();
             let send = |bus: usize, frames: &[Frame]| {
                 slots.get_mut(bus).is_some_and(|slot| slot.read().try_send_all(frames))
             };
             realtime::run(&mut turn, &shared, period_ns, ticks, send);
             let counts = turn.counts().into_iter().filter(|(_, count)| *count > 0).collect();
-            LoopEnd { granted, counts, absence: turn.absence() }
+            LoopResult { granted, counts, absence: turn.absence() }
         })
     }
 
@@ -183,7 +184,7 @@ impl Bench<'_> {
         self.handle_remote(measured, progress);
         self.handle_events(script, progress)?;
         self.note_ended_processes(progress, false);
-        self.serve_again(progress);
+        self.restart_bus_servers(progress);
         self.handle_hosts(script, progress)?;
         for note in self.watch_networks()? {
             progress.note(&note);
@@ -198,7 +199,7 @@ impl Bench<'_> {
                 let bus_link = self
                     .bus_links
                     .iter()
-                    .find(|bus_link| bus_link.link.state.is_there())
+                    .find(|bus_link| bus_link.link.state.is_working())
                     .or_else(|| self.bus_links.first());
                 let (bus, kind) = bus_link.map_or(("BUS", BusKind::SocketCan), |bus_link| {
                     (bus_link.link.name.as_str(), bus_link.link.kind)
@@ -212,7 +213,7 @@ impl Bench<'_> {
         for line in self.recorder.iter().flat_map(Recorder::messages) {
             progress.note(&line);
         }
-        let lost = self.bus_links.iter().filter(|bus_link| !bus_link.link.state.is_there());
+        let lost = self.bus_links.iter().filter(|bus_link| !bus_link.link.state.is_working());
         progress.show(|width| {
             let lost: Vec<_> = lost.map(|bus_link| bus_link.link.name.as_str()).collect();
             let comparing = self.shared.comparing.load(Ordering::Relaxed);
@@ -223,7 +224,7 @@ impl Bench<'_> {
     }
 
     /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
-    fn send_stimuli(&self, script: &mut Script, moved: Option<Moved>) -> Result<(), RunError> {
+    fn send_stimuli(&self, script: &mut Script, moved: Option<TickMotion>) -> Result<(), RunError> {
         let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
         // Skipped broadcasts have no epoch, but the scenario's time continues.
         let skipped = self.shared.broadcasts_skipped.load(Ordering::Relaxed);
@@ -236,7 +237,7 @@ impl Bench<'_> {
                 self.stimulate(
                     (stimulus.bus, stimulus.node),
                     stimulus.pages(),
-                    AppliesFrom::Epoch(numbered),
+                    StimulusStart::Epoch(numbered),
                 )?;
             }
             if let Some(accelerations) = &script.accelerations {
@@ -270,7 +271,7 @@ impl Bench<'_> {
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
         for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| selects(cell)) {
             let pages = script.touches.pages(cell, script.epoch.saturating_sub(1));
-            self.stimulate((bus, node), pages, AppliesFrom::Next)?;
+            self.stimulate((bus, node), pages, StimulusStart::Next)?;
         }
         Ok(())
     }
@@ -279,7 +280,7 @@ impl Bench<'_> {
         &self,
         (bus, node): (usize, CellId),
         pages: impl Iterator<Item = SensorPage>,
-        from: AppliesFrom,
+        from: StimulusStart,
     ) -> Result<(), RunError> {
         let to = Node::Cell(node);
         let messages: Vec<_> = pages.map(|page| (bus, Message::Stimulus { to, from, page })).collect();
@@ -335,7 +336,7 @@ impl Bench<'_> {
     /// Returns true if all buses are gone, and no command has taken one down or is bringing one up.
     fn has_no_bus(&self) -> bool {
         let mut buses = self.bus_links.iter().enumerate();
-        buses.all(|(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_expected(bus))
+        buses.all(|(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_loss_expected(bus))
     }
 
     /// Handles the events of the receivers.
@@ -436,7 +437,7 @@ impl Bench<'_> {
 
     /// Starts new servers for this run's embedded buses whose servers have ended, unless a command has taken the bus
     /// down.
-    fn serve_again(&mut self, progress: &Progress) {
+    fn restart_bus_servers(&mut self, progress: &Progress) {
         let gone = self.bus_links.iter().enumerate();
         let gone = gone.filter(|&(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_down(bus));
         let gone: Vec<_> = gone.map(|(_, bus_link)| bus_link.link.name.clone()).collect();

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use model::table::{CellState, Errors, Replies};
+use model::table::{CellState, Replies, TorqueErrors};
 use protocol::skin::{self, Skin};
 use serde::Serialize;
 
@@ -96,7 +96,7 @@ pub struct CellSummary {
     /// Number of torques that were not due, because the cell's contact state was unknown.
     pub contact_unknown: u64,
     /// Errors of the cell's torques against the central ones, in the joints that move the cell.
-    pub error: Errors,
+    pub error: TorqueErrors,
     /// Largest number of equal words in succession, by kind, while the cell should have sent changing ones. Kinds
     /// without such a succession are absent.
     pub stuck: BTreeMap<&'static str, u64>,
@@ -112,7 +112,7 @@ impl CellSummary {
         let mut replies = RepliesSummary::default();
         known.into_iter().for_each(|cell| replies.add(cell));
         let mode =
-            known.and_then(CellState::measures).map(|measures| if measures { "measure" } else { "test" });
+            known.and_then(CellState::is_measuring).map(|measures| if measures { "measure" } else { "test" });
         Self {
             node: described.node.get(),
             bus: skin.buses.get(described.bus).map_or_else(String::new, |bus| bus.name.clone()),
@@ -130,7 +130,7 @@ impl CellSummary {
 
     /// Returns true if the cell measures, so that stimuli do not touch it.
     #[must_use]
-    pub fn measures(&self) -> bool {
+    pub fn is_measuring(&self) -> bool {
         self.mode == Some("measure")
     }
 }

@@ -36,20 +36,20 @@ impl Verdict {
     #[must_use]
     pub fn new(summary: &Summary) -> Self {
         let mut look_at = Vec::new();
-        ending(&mut look_at, summary);
+        add_ending_findings(&mut look_at, summary);
         let buses = || summary.buses.iter();
         absent_cells(&mut look_at, summary);
         buses().for_each(|bus| unexplained_losses(&mut look_at, bus));
-        buses().for_each(|bus| network(&mut look_at, bus));
-        wrong_torques(&mut look_at, summary);
-        restarts(&mut look_at, summary);
-        recording(&mut look_at, summary);
+        buses().for_each(|bus| add_network_findings(&mut look_at, bus));
+        add_torque_findings(&mut look_at, summary);
+        add_restart_findings(&mut look_at, summary);
+        add_recording_findings(&mut look_at, summary);
         buses().for_each(|bus| explained_losses(&mut look_at, bus));
-        unchecked(&mut look_at, summary);
-        control(&mut look_at, summary);
+        add_unchecked_findings(&mut look_at, summary);
+        add_control_findings(&mut look_at, summary);
         buses().for_each(|bus| late_replies(&mut look_at, bus));
-        buses().for_each(|bus| incomplete(&mut look_at, bus));
-        ticks(&mut look_at, summary);
+        buses().for_each(|bus| add_incomplete_epochs(&mut look_at, bus));
+        add_tick_findings(&mut look_at, summary);
         buses().for_each(|bus| irregular_frames(&mut look_at, bus));
         let ended_well = matches!(summary.outcome, Outcome::Done | Outcome::Interrupted);
         if look_at.is_empty() && !ended_well {
@@ -95,7 +95,7 @@ pub(crate) fn count_noun(count: impl TryInto<u64>, one: &str, more: &str) -> Str
 }
 
 /// Formats the number of times that an event happened: `once`, `3 times`.
-fn times(count: u64) -> String {
+fn times_text(count: u64) -> String {
     if count == 1 { "once".to_owned() } else { format!("{count} times") }
 }
 
@@ -133,7 +133,7 @@ fn is_above(value: f64, limit: f64) -> bool {
 }
 
 /// Adds findings on a run that ended early or badly.
-fn ending(look_at: &mut Vec<String>, summary: &Summary) {
+fn add_ending_findings(look_at: &mut Vec<String>, summary: &Summary) {
     look_at.extend(summary.failure.as_ref().map(|failure| format!("the run failed: {failure}")));
     if let Some(why) = &summary.halted {
         let at = summary.halts.last().map_or_else(String::new, |halt| format!(" at {:.3} s", halt.at_s));
@@ -152,7 +152,7 @@ fn absent_cells(look_at: &mut Vec<String>, summary: &Summary) {
         look_at.push(format!(
             "{} was lost {} for {:.1} s in all{end}: its cells' torques decayed to zero",
             bus.name,
-            times(bus.outages.times),
+            times_text(bus.outages.times),
             bus.outages.lost_s
         ));
     }
@@ -171,8 +171,8 @@ fn absent_cells(look_at: &mut Vec<String>, summary: &Summary) {
     }
     for host in summary.buses.iter().flat_map(|bus| &bus.hosts) {
         let lost = host.lost_from + host.lost_to;
-        let gone =
-            (host.gone > 0).then(|| format!("gone {} for {:.1} s in all", times(host.gone), host.gone_s));
+        let gone = (host.gone > 0)
+            .then(|| format!("gone {} for {:.1} s in all", times_text(host.gone), host.gone_s));
         let end = (!host.at_end).then(|| "not reached at the end".to_owned());
         let lost = (lost > 0).then(|| format!("{} lost", count_noun(lost, "frame", "frames")));
         let parts: Vec<_> = [gone, end, lost].into_iter().flatten().collect();
@@ -211,7 +211,7 @@ fn unexplained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
 }
 
 /// Adds findings on trees that differ from the description.
-fn network(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn add_network_findings(look_at: &mut Vec<String>, bus: &BusSummary) {
     let Some(network) = &bus.network else { return };
     if !network.unreachable.is_empty() {
         look_at.push(format!(
@@ -227,7 +227,7 @@ fn network(look_at: &mut Vec<String>, bus: &BusSummary) {
 }
 
 /// Adds findings on wrong torques.
-fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
+fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
     let accuracy = &summary.accuracy;
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| is_above(mean, CELL_ERROR_NM));
     for cells in cells_that(summary, is_off) {
@@ -271,7 +271,7 @@ fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
 }
 
 /// Adds findings on restarts of cells, and on halts that have ended.
-fn restarts(look_at: &mut Vec<String>, summary: &Summary) {
+fn add_restart_findings(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_that(summary, |cell| cell.restarts > 0) {
         look_at.push(format!("{cells}: restarted; what was due then is in doubt"));
     }
@@ -290,11 +290,12 @@ fn restarts(look_at: &mut Vec<String>, summary: &Summary) {
     let ended = halts.saturating_sub(summary.halted.is_some().into());
     if ended > 0 {
         let why = summary.halts.first().map_or("", |halt| &halt.reason);
-        look_at.push(format!("the robot was halted {} and resumed, at first because {why}", times(ended)));
+        look_at
+            .push(format!("the robot was halted {} and resumed, at first because {why}", times_text(ended)));
     }
 }
 
-fn recording(look_at: &mut Vec<String>, summary: &Summary) {
+fn add_recording_findings(look_at: &mut Vec<String>, summary: &Summary) {
     let Some(recording) = &summary.recording else { return };
     let messages = recording.messages_lost.values().sum::<u64>();
     // If the run failed, its error already names the file that could not be written.
@@ -340,7 +341,7 @@ fn explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-fn control(look_at: &mut Vec<String>, summary: &Summary) {
+fn add_control_findings(look_at: &mut Vec<String>, summary: &Summary) {
     let control = &summary.control;
     let bad = control.bad_cycles.values().sum::<u64>();
     if bad > 0 {
@@ -360,7 +361,7 @@ fn control(look_at: &mut Vec<String>, summary: &Summary) {
 }
 
 /// Adds a finding on skipped ticks.
-fn ticks(look_at: &mut Vec<String>, summary: &Summary) {
+fn add_tick_findings(look_at: &mut Vec<String>, summary: &Summary) {
     let control = &summary.control;
     if control.ticks_skipped > 0 {
         let fifo = if control.fifo { "" } else { " (SCHED_FIFO was refused)" };
@@ -400,7 +401,7 @@ fn late_replies(look_at: &mut Vec<String>, bus: &BusSummary) {
 }
 
 /// Adds a finding on incomplete epochs that late or missing replies do not explain.
-fn incomplete(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn add_incomplete_epochs(look_at: &mut Vec<String>, bus: &BusSummary) {
     let parts = bus.sums.map(|sums| sums.contributions);
     let explained =
         bus.replies.due > bus.replies.in_time || parts.is_some_and(|parts| parts.due > parts.in_time);
@@ -429,13 +430,13 @@ fn irregular_frames(look_at: &mut Vec<String>, bus: &BusSummary) {
 }
 
 /// Adds findings on everything that the run could not check.
-fn unchecked(look_at: &mut Vec<String>, summary: &Summary) {
-    for cells in cells_that(summary, |cell| cell.contact_unknown > 0 && !cell.measures()) {
+fn add_unchecked_findings(look_at: &mut Vec<String>, summary: &Summary) {
+    for cells in cells_that(summary, |cell| cell.contact_unknown > 0 && !cell.is_measuring()) {
         look_at.push(format!(
             "{cells}: contact not known, torques not compared; stimuli from before this run, or a baseline"
         ));
     }
-    for cells in cells_that(summary, CellSummary::measures) {
+    for cells in cells_that(summary, CellSummary::is_measuring) {
         look_at
             .push(format!("{cells}: in mode \"measure\", not pressed by the scenario, torques not compared"));
     }

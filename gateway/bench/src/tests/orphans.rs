@@ -27,7 +27,7 @@ fn begun(mut writer: FileWriter<Vec<u8>>) -> Vec<u8> {
 fn left(folder: &TempDir, name: &str) {
     let (_, mut file) = PartFile::create(folder.path().join(name)).unwrap();
     let there = usize::try_from(file.metadata().unwrap().len()).unwrap();
-    let bytes = begun(FileWriter::in_file(Vec::new(), &file.metadata().unwrap()).unwrap());
+    let bytes = begun(FileWriter::with_file_identity(Vec::new(), &file.metadata().unwrap()).unwrap());
     file.write_all(&bytes[there..]).unwrap();
 }
 
@@ -42,7 +42,7 @@ fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
     };
     let options = RecordOptions { mcap: Some(mcap), ..RecordOptions::default() };
     let mut said = Vec::new();
-    let claimed = Outputs::claim(&options, &AtomicBool::new(false), |line| {
+    let claimed = Outputs::open_outputs(&options, &AtomicBool::new(false), |line| {
         said.push(line.replace(&format!("{}/", folder.display()), ""));
     });
     (claimed.map_err(|error| error.to_string()), said)

@@ -9,12 +9,12 @@ use crate::summary::{
     TickSummary, Verdict, WrittenFile,
 };
 use model::quantiles::{Quantiles, histogram};
-use model::table::{Accuracy, CellStatus, Event, Table};
+use model::table::{Accuracy, BusTable, CellStatus, Event};
 use protocol::can::Format;
 use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{
-    Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+    Answer, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart,
 };
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::Parameter;
@@ -173,7 +173,7 @@ fn maps() -> BTreeSet<String> {
 }
 
 /// Returns the summaries of all cells of a skin.
-fn of_each(skin: &Skin, table: &Table) -> Vec<CellSummary> {
+fn of_each(skin: &Skin, table: &BusTable) -> Vec<CellSummary> {
     let both = skin.cells.iter().zip(table.cells());
     both.map(|(described, cell)| CellSummary::new(skin, described, Some(cell))).collect()
 }
@@ -184,7 +184,7 @@ fn serialised(summary: &Summary) -> Value {
 
 #[test]
 fn every_key_is_documented_with_its_type_and_no_other() {
-    let (skin, table) = (skin(), Table::new(&skin(), 0));
+    let (skin, table) = (skin(), BusTable::new(&skin(), 0));
     let mut cells = of_each(&skin, &table);
     cells.iter_mut().for_each(|cell| cell.mode = Some("test"));
     let bus = BusSummary::new("vcan0", "embedded", 0, &table, 0, Micros(0));
@@ -248,10 +248,10 @@ fn every_outcome_is_documented_with_its_exit_code() {
 /// A bus with two pressed cells: one answers in time; the other's replies are lost, refused, late and repeated.
 fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
     let skin = skin();
-    let mut table = Table::new(&skin, 0);
+    let mut table = BusTable::new(&skin, 0);
     let mut broadcasts = 0;
     let mut at = 0;
-    let mut say = |table: &mut Table, own: bool, message: &Message, spoil: bool| {
+    let mut say = |table: &mut BusTable, own: bool, message: &Message, spoil: bool| {
         at += 100;
         for frame in message.encode().frames(Format::Fd) {
             let mut bytes = frame.data().to_vec();
@@ -262,7 +262,7 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
         }
     };
     let cells = [1, 2].map(|node| CellId::new(node).unwrap());
-    let heartbeat = |table: &Table, place: usize, sent| {
+    let heartbeat = |table: &BusTable, place: usize, sent| {
         let state = State::CONFIGURED.with(State::TEST_MODE, true);
         let configuration = table.cells()[place].configuration;
         let page = Heartbeat { serial: 1, configuration, sent, rejected: 0, state };
@@ -289,8 +289,11 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
         let answer = Answer::Value { number, written: true, words };
         say(&mut table, false, &Message::Configured { from, tag: 0, answer }, false);
     }
-    let press =
-        Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page: SensorPage::Skin(skin_page) };
+    let press = Message::Stimulus {
+        to: Node::Everyone,
+        from: StimulusStart::Next,
+        page: SensorPage::Skin(skin_page),
+    };
     say(&mut table, true, &press, false);
     for epoch in 0..8 {
         say(&mut table, true, &Message::Joints { epoch: Epoch(epoch), joints }, false);
@@ -366,12 +369,12 @@ fn what_the_document_says_adds_up_does() {
 #[test]
 fn a_cell_that_measures_is_said_to_and_one_that_was_never_heard_is_in_no_mode() {
     let skin = skin();
-    let mut table = Table::new(&skin, 0);
+    let mut table = BusTable::new(&skin, 0);
     let page = NetworkPage::Heartbeat(Heartbeat { state: State::CONFIGURED, ..Heartbeat::default() });
     let beat = Message::Network { from: Node::Cell(skin.cells[0].node), epoch: Epoch(0), page };
     for frame in beat.encode().frames(Format::Fd) {
         table.handle_frame(Micros(0), false, &frame, &mut |_| None);
     }
-    let modes: Vec<_> = of_each(&skin, &table).iter().map(|cell| (cell.mode, cell.measures())).collect();
+    let modes: Vec<_> = of_each(&skin, &table).iter().map(|cell| (cell.mode, cell.is_measuring())).collect();
     assert_eq!(modes, [(Some("measure"), true), (None, false)]);
 }

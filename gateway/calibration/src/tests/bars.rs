@@ -26,7 +26,7 @@ use crate::{Calibration, Refusal, Settings, calibrate};
 use model::accelerometer::Accelerometers;
 use model::accelerometer::kinematics::STANDARD_GRAVITY;
 use model::accelerometer::sensor::{DataSheet, rotation};
-use model::central::Central;
+use model::central::CentralComputation;
 use model::testing;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use protocol::skin::Skin;
@@ -114,7 +114,7 @@ impl Errors {
 
 /// Returns the mean error of torques relative to their mean size, for forces on every cell in a few poses.
 fn torque_error(truth: &Skin, found: &Skin) -> f64 {
-    let [truth_central, found_central] = [truth, found].map(Central::unquantised);
+    let [truth_central, found_central] = [truth, found].map(CentralComputation::unquantised);
     let (mut off, mut size) = (0.0, 0.0);
     for step in 0..10 {
         let mut q = [0.0; 14];
@@ -276,7 +276,7 @@ fn a_joint_that_does_not_move_is_named_as_what_would_help() {
     for (cell, result) in skin.cells.iter().zip(&calibration.cells) {
         let unsure = result.troubles.iter().any(|trouble| matches!(trouble, Diagnosis::Joint { .. }));
         assert_eq!(unsure, cell.joint >= 5, "node {}: {:?}", cell.node, result.troubles);
-        assert!(!unsure || !result.is_written());
+        assert!(!unsure || !result.is_pose_written());
     }
 }
 

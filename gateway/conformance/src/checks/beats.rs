@@ -17,25 +17,25 @@ const MAX_LATENESS_US: u64 = 20_000;
 const CLOCK_TOLERANCE_US: u64 = 3_000;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::fast_parameters(2))?;
+    session.prepare_cell(&arm::fast_parameters(2))?;
     session.settle()?;
-    let first = regular(session, 1_300)?;
-    shifted(session)?;
+    let first = check_regular(session, 1_300)?;
+    check_not_shifted(session)?;
     if session.about.test_mode && session.about.committed {
-        early(session)?;
+        check_early(session)?;
     } else {
         session.findings.not_tested("BEAT-2", "without test mode nothing presses the cell");
     }
-    let last = held(session)?;
+    let last = check_held_state(session)?;
     if let (Some(first), Some(last)) = (first, last) {
-        clock(session, first, last);
+        check_clock(session, first, last);
     }
     Ok(())
 }
 
 /// The regular heartbeats of an interval.
 #[derive(Clone, Copy, Debug)]
-struct Grid {
+struct HeartbeatGrid {
     /// The latest time at which the first heartbeat was due, in us.
     due: u64,
     /// The mean interval between two heartbeats, in us.
@@ -53,15 +53,15 @@ fn times(session: &Session<'_>) -> Vec<u64> {
 }
 
 /// Checks that a halt and a latched stimulus last longer than 2 s, and that heartbeats continue meanwhile.
-fn held(session: &mut Session<'_>) -> Result<Option<Grid>, StopReason> {
+fn check_held_state(session: &mut Session<'_>) -> Result<Option<HeartbeatGrid>, StopReason> {
     let presses = session.about.test_mode && session.about.committed;
     if presses {
-        session.press_and_step(&[0; MAX_JOINTS], arm::press(4_096))?;
+        session.press_and_step(&[0; MAX_JOINTS], arm::press_with_sum(4_096))?;
     }
     session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
     let first = session.packets.len();
-    let grid = regular(session, 2_300)?;
+    let grid = check_regular(session, 2_300)?;
     let beats = session.packets.get(first..).unwrap_or_default().iter().filter_map(CellPacket::beat);
     let is_halted = beats.clone().all(|(beat, _)| beat.state.has(State::HALTED));
     session.check("CMD-1", is_halted, || {
@@ -76,21 +76,21 @@ fn held(session: &mut Session<'_>) -> Result<Option<Grid>, StopReason> {
         session.check("STIM-7", is_there, || {
             "a latched stimulus must hold for more than 2 s, but no torque came after that time".to_owned()
         });
-        session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
+        session.press_and_step(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
     }
     Ok(grid)
 }
 
 /// Checks that without any request a heartbeat comes every 250 ms, at most 20 ms late. Returns the measured times if
 /// that is so.
-fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, StopReason> {
+fn check_regular(session: &mut Session<'_>, ms: u64) -> Result<Option<HeartbeatGrid>, StopReason> {
     let due = usize::try_from(ms * 1_000 / HEARTBEAT_INTERVAL_US).unwrap_or_default();
     for attempt in 0..3 {
         session.begin_exchange();
         session.idle(Span::from_millis(ms))?;
         let late = session.lateness();
         let times = times(session);
-        session.consume();
+        session.mark_expected();
         let apart: Vec<_> = times.windows(2).filter_map(|pair| Some(pair.get(1)? - pair.first()?)).collect();
         let (from, to) = (
             HEARTBEAT_INTERVAL_US - MAX_LATENESS_US - CLOCK_TOLERANCE_US,
@@ -108,7 +108,7 @@ fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, StopReaso
                 .map(|(at, place)| at.saturating_sub(place * HEARTBEAT_INTERVAL_US))
                 .min();
             let each = apart.iter().sum::<u64>().checked_div(apart.len() as u64);
-            let grid = due.zip(each).map(|(due, each)| Grid { due, each });
+            let grid = due.zip(each).map(|(due, each)| HeartbeatGrid { due, each });
             return Ok(grid.filter(|_| is_so));
         }
     }
@@ -116,7 +116,7 @@ fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, StopReaso
 }
 
 /// Checks that heartbeats that answer a sync or a claimant do not shift the regular ones.
-fn shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_not_shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claim = twin_heartbeat(session, 1, true);
     for (what, message, offset) in
         [("a sync", Message::Sync, 100), ("a claim", claim, 170), ("a sync", Message::Sync, 60)]
@@ -130,7 +130,7 @@ fn shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
                 .idle(Span((grid.0 + 2 * HEARTBEAT_INTERVAL_US + 60_000).saturating_sub(session.now().0)))?;
             let late = session.lateness();
             let times = times(session);
-            session.consume();
+            session.mark_expected();
             // The answer, and two regular heartbeats.
             let is_so = match times.as_slice() {
                 [answer, first, second] => {
@@ -164,20 +164,20 @@ fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, StopReason> {
     let came = session.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
     session.check("BEAT-1", came, || "a heartbeat is due every 250 ms, but none came for 320 ms".to_owned());
     let at = session.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
-    session.consume();
+    session.mark_expected();
     Ok(at)
 }
 
 /// Checks the heartbeats while joints come every 16 ms: each may be early by at most that period.
-fn early(session: &mut Session<'_>) -> Result<(), StopReason> {
-    const PERIOD: u64 = 16_000;
+fn check_early(session: &mut Session<'_>) -> Result<(), StopReason> {
+    const JOINTS_PERIOD_US: u64 = 16_000;
     for press in [4_096, 0] {
         for attempt in 0..3 {
             let Some(grid) = next_beat(session)? else { return Ok(()) };
             session.begin_exchange();
-            session.press(arm::press(press))?;
+            session.press(arm::press_with_sum(press))?;
             for step in 1..=64 {
-                let due = grid + Span(5_000 + step * PERIOD);
+                let due = grid + Span(5_000 + step * JOINTS_PERIOD_US);
                 session.wait(due, |_| false)?;
                 let epoch = session.next_epoch();
                 let joints = session.joints(epoch, &[0; MAX_JOINTS]);
@@ -190,20 +190,20 @@ fn early(session: &mut Session<'_>) -> Result<(), StopReason> {
             if press > 0 {
                 check_order(session);
             }
-            session.consume();
+            session.mark_expected();
             session.known.pending = None;
-            session.known.skin = Some(arm::press(press));
+            session.known.skin = Some(arm::press_with_sum(press));
             session.known.active = Some(press > 0);
             // 1024 ms: each heartbeat is at most a period and a bit early, and each 250 ms have one.
             let slots: Vec<_> = times
                 .iter()
                 .map(|at| {
-                    let since = at.saturating_sub(grid.0) + PERIOD + CLOCK_TOLERANCE_US;
+                    let since = at.saturating_sub(grid.0) + JOINTS_PERIOD_US + CLOCK_TOLERANCE_US;
                     (since / HEARTBEAT_INTERVAL_US, since % HEARTBEAT_INTERVAL_US)
                 })
                 .collect();
             let is_early = |(place, (slot, rest)): (u64, &(u64, u64))| {
-                *slot == place && *rest <= PERIOD + MAX_LATENESS_US + 2 * CLOCK_TOLERANCE_US
+                *slot == place && *rest <= JOINTS_PERIOD_US + MAX_LATENESS_US + 2 * CLOCK_TOLERANCE_US
             };
             let is_so = (4..=5).contains(&slots.len()) && (1..).zip(&slots).all(is_early);
             if is_so || attempt == 2 || late.0 < 1_000 {
@@ -238,7 +238,7 @@ fn check_order(session: &mut Session<'_>) {
 }
 
 /// Checks the cell's clock by two groups of regular heartbeats, which are several seconds apart.
-fn clock(session: &mut Session<'_>, first: Grid, last: Grid) {
+fn check_clock(session: &mut Session<'_>, first: HeartbeatGrid, last: HeartbeatGrid) {
     let span = last.due.saturating_sub(first.due);
     let each = ((first.each + last.each) / 2).max(1);
     let beats = (span + each / 2) / each;

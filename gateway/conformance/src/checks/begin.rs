@@ -19,10 +19,10 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.idle(Span::from_millis(20))?;
     session.begin_exchange();
     session.known.senses = false;
-    session.measure()?;
-    identity(session)?;
+    session.measure_round_trip()?;
+    check_identity(session)?;
     session.about.ports = session.has_ports()?;
-    options(session)?;
+    check_options(session)?;
     if session.known.hash == Some(0) {
         unconfigured::run(session)?;
     } else {
@@ -33,10 +33,10 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.about.committed = session.commit(&document)?;
     session.known.halted = Some(false);
     // Before the commit the hash may have been 0.
-    if session.about.committed { identity(session) } else { Ok(()) }
+    if session.about.committed { check_identity(session) } else { Ok(()) }
 }
 
-fn identity(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_identity(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read(Parameter::Identity.number())?;
     let Reply::Value([.., version, hash, state, _]) = reply else {
         session.check("CONF-1", false, || {
@@ -65,7 +65,7 @@ fn identity(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn options(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_options(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.write_first_words(Parameter::Mode.number(), [1])?;
     let words = reply.words().map(|[first, ..]| first);
     session.about.test_mode = words == Some(1);
@@ -73,7 +73,7 @@ fn options(session: &mut Session<'_>) -> Result<(), StopReason> {
     let is_known = words == Some(1) || reply == Reply::Refused(19);
     session.check("OPT-1", is_known, || format!("a write of 1 to parameter 5 must be accepted, or refused with reason 19, but the answer was {reply}"));
     if session.about.test_mode {
-        session.test_mode(true)?;
+        session.switch_test_mode(true)?;
     }
     session.known.senses = true;
     let reply = session.write_first_words(Parameter::Sensing.number(), [2])?;
@@ -82,7 +82,7 @@ fn options(session: &mut Session<'_>) -> Result<(), StopReason> {
         format!("a write of 2 to parameter 7 must be accepted, or refused with reason 19, but the answer was {reply}")
     });
     session.write_first_words(Parameter::Sensing.number(), [0])?;
-    let reply = session.write(Parameter::Baseline.number(), baseline::HOLD)?;
+    let reply = session.write(Parameter::Baseline.number(), baseline::HOLD_RULE)?;
     session.about.baseline = reply.words().is_some();
     // A cell that implements the protocol without baselines refuses with 18.
     let is_known = session.about.baseline || matches!(reply, Reply::Refused(18 | 19));

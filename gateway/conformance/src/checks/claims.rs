@@ -2,7 +2,7 @@
 
 use protocol::id::Node;
 use protocol::message::{
-    Heartbeat, Message, NetworkPage, Ports, ReceivedCounts as HeardPage, RejectedCounts, State, Tree,
+    Heartbeat, Message, NetworkPage, PortsPage, ReceivedCounts as HeardPage, RejectedCounts, State, TreePage,
 };
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
@@ -23,17 +23,17 @@ pub(super) fn twin_heartbeat(session: &Session<'_>, serial: u32, claiming: bool)
 }
 
 /// Returns a network page, other than a heartbeat, of another cell with the node id of the cell under test.
-pub(super) fn page(session: &Session<'_>, page: NetworkPage) -> Message {
+pub(super) fn twin_page(session: &Session<'_>, page: NetworkPage) -> Message {
     Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page }
 }
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::example_parameters(2))?;
+    session.prepare_cell(&arm::example_parameters(2))?;
     let own = session.about.serial.unwrap_or_default();
     for serial in [own.wrapping_sub(1), own.wrapping_add(1), 0, u32::MAX, own] {
-        defended(session, serial)?;
+        check_defence(session, serial)?;
     }
-    twice(session, own)?;
+    check_simultaneous_claims(session, own)?;
     // The words of a heartbeat's serial number and CLAIMING have other meanings in these pages.
     let state = State::CLAIMING.0 | 1 << 12;
     let pages = [
@@ -41,20 +41,20 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         NetworkPage::Rejected(RejectedCounts::default()),
         NetworkPage::Received(HeardPage { joints: 1, torques: state, ..HeardPage::default() }),
         NetworkPage::Rejected(RejectedCounts { length: 1, stimuli: state, ..RejectedCounts::default() }),
-        NetworkPage::Tree(Tree::default()),
-        NetworkPage::Ports(Ports::default()),
+        NetworkPage::Tree(TreePage::default()),
+        NetworkPage::Ports(PortsPage::default()),
     ];
-    let mut others: Vec<_> = pages.into_iter().map(|it| page(session, it)).collect();
+    let mut others: Vec<_> = pages.into_iter().map(|it| twin_page(session, it)).collect();
     others.push(twin_heartbeat(session, own.wrapping_sub(1), false));
     others.push(twin_heartbeat(session, own, false));
     for other in others {
-        not_answered(session, &other)?;
+        check_not_answered(session, &other)?;
     }
     // A claim is answered regardless of the packets before it.
     session.wait_for_quiet(Span::from_millis(120))?;
-    let other = page(session, NetworkPage::Received(HeardPage::default()));
+    let other = twin_page(session, NetworkPage::Received(HeardPage::default()));
     session.send_messages(&[other])?;
-    defended(session, own.wrapping_sub(1))?;
+    check_defence(session, own.wrapping_sub(1))?;
     session.exchange_all(&[])?;
     Ok(())
 }
@@ -65,7 +65,7 @@ fn beats(session: &Session<'_>) -> Vec<(Micros, State)> {
 }
 
 /// Checks that a claim is answered at once with DUPLICATE, and that DUPLICATE is clear in the next heartbeat.
-fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
+fn check_defence(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
     // The time of the answer is a matter of TIME-2.
     session.wait_for_quiet(Span::from_millis(160))?;
     session.begin_exchange();
@@ -88,7 +88,7 @@ fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
     session.check("CLAIM-6", count <= 1, || {
         format!("a claim must be answered with one heartbeat, but {count} came")
     });
-    session.consume();
+    session.mark_expected();
     // The heartbeat that answers the sync is checked as usual.
     session.exchange_all(&[])?;
     session.idle(DEFENCE_INTERVAL)
@@ -96,7 +96,7 @@ fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
 
 /// Checks that of three claims within 10 ms only one is answered, and that DUPLICATE in the next heartbeat shows the
 /// others.
-fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
+fn check_simultaneous_claims(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
     if session.is_slow() {
         session.findings.not_tested("CLAIM-6", "claims within 10 ms: the connection to the cell is too slow");
         return Ok(());
@@ -115,7 +115,7 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
             .elapsed_since(times.first().copied().unwrap_or_default());
         session.idle(Span::from_millis(25))?;
         let count = beats(session).len();
-        session.consume();
+        session.mark_expected();
         if apart > Span::from_millis(7) {
             continue;
         }
@@ -134,7 +134,7 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
             "DUPLICATE must be set in the heartbeat after a claim that was not answered, but is clear"
                 .to_owned()
         });
-        session.consume();
+        session.mark_expected();
         session.exchange_all(&[])?;
         return Ok(());
     }
@@ -143,7 +143,7 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
 }
 
 /// Checks that a `4nn` that is not a claim gets no answer, and sets DUPLICATE in one heartbeat.
-fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), StopReason> {
+fn check_not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), StopReason> {
     session.wait_for_quiet(Span::from_millis(80))?;
     session.begin_exchange();
     session.send_messages(&[*other])?;
@@ -152,7 +152,7 @@ fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), StopRe
     session.check("CLAIM-6", count == 0, || {
         "a 4nn that is not a claim must not be answered, but a heartbeat came".to_owned()
     });
-    session.consume();
+    session.mark_expected();
     // A read of the identity shows DUPLICATE, and does not clear it.
     let reply = session.read(Parameter::Identity.number())?;
     let shown = reply.words().map(|[.., state, _]| State(state.cast_unsigned())).unwrap_or_default();
@@ -173,7 +173,7 @@ fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), StopRe
             state.0
         )
     });
-    session.consume();
+    session.mark_expected();
     session.exchange_all(&[])?;
     Ok(())
 }

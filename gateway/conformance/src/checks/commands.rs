@@ -1,9 +1,9 @@
 //! The commands halt, resume, sync and report.
 
-use model::central::Central;
+use model::central::CentralComputation;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, Readings, SensorPage, SkinSensors, State};
+use protocol::message::{Message, SensorPage, SensorReadings, SkinSensors, State, StimulusStart};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Span;
 
@@ -11,20 +11,26 @@ use crate::arm;
 use crate::bus::StopReason;
 use crate::session::{ANSWER_TIMEOUT, Exchange, Session};
 
-const HERE: [i16; MAX_JOINTS] = [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
-const THERE: [i16; MAX_JOINTS] = [-0x1400, 0x1100, -0x0700, 0x2300, -0x1900, 0x0800, 0, 0, 0, 0, 0, 0, 0, 0];
+const FIRST_POSITIONS: [i16; MAX_JOINTS] =
+    [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
+const SECOND_POSITIONS: [i16; MAX_JOINTS] =
+    [-0x1400, 0x1100, -0x0700, 0x2300, -0x1900, 0x0800, 0, 0, 0, 0, 0, 0, 0, 0];
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    if !session.ready(&arm::example_parameters(6))? {
+    if !session.prepare_cell(&arm::example_parameters(6))? {
         return Ok(());
     }
-    alone(session)?;
-    halt(session)?;
-    syncs(session)?;
-    report(session)
+    check_answer_counts(session)?;
+    check_halt(session)?;
+    check_syncs(session)?;
+    check_report(session)
 }
 
-fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Result<Exchange, StopReason> {
+fn check_command(
+    session: &mut Session<'_>,
+    command: Message,
+    id: &'static str,
+) -> Result<Exchange, StopReason> {
     let is_halt = command == Message::Halt;
     session.known.halted = Some(is_halt);
     if is_halt {
@@ -47,7 +53,7 @@ fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Res
 
 /// Checks that a halt or a resume is not answered, and that a halted cell answers a sync with one heartbeat. Commands
 /// are sent at times when no regular heartbeat is due.
-fn alone(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_answer_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
     const ATTEMPTS: usize = 3;
     let cases = [
         ("a halt", Message::Halt, "CMD-1"),
@@ -64,7 +70,7 @@ fn alone(session: &mut Session<'_>) -> Result<(), StopReason> {
                 expected > 0 && heard.iter().any(|it| it.beat().is_some())
             })?;
             let came = session.answers().len();
-            session.consume();
+            session.mark_expected();
             if came == expected || attempt == ATTEMPTS {
                 session.check(id, came == expected, || {
                     let halted = if expected > 0 { " to a halted cell" } else { "" };
@@ -80,17 +86,17 @@ fn alone(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
-    let unit = arm::press(arm::unit_press(protocol::fixed::TorqueFormat::Q3_12));
-    let central = Central::for_single_cell(&arm::example_parameters(6));
+fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let unit = arm::press_with_sum(arm::unit_press_sum(protocol::fixed::TorqueFormat::Q3_12));
+    let central = CentralComputation::for_single_cell(&arm::example_parameters(6));
     for round in 0..2 {
-        session.press_and_step(&HERE, unit)?;
-        let exchange = command(session, Message::Halt, "CMD-1")?;
+        session.press_and_step(&FIRST_POSITIONS, unit)?;
+        let exchange = check_command(session, Message::Halt, "CMD-1")?;
         session.check("STATE-1", !exchange.state().has(State::ACTIVE), || {
             "ACTIVE must be clear after a halt, but is set".to_owned()
         });
         if round == 1 {
-            command(session, Message::Halt, "CMD-1")?;
+            check_command(session, Message::Halt, "CMD-1")?;
         } else {
             // Only a resume ends a halt: neither a commit nor an exchange does.
             session.commit(&protocol::parameters::Parameters {
@@ -101,7 +107,9 @@ fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
             session.exchange_all(&[])?;
         }
         let before = session.counters()?.heard;
-        for positions in [HERE, HERE, HERE, HERE, THERE] {
+        for positions in
+            [FIRST_POSITIONS, FIRST_POSITIONS, FIRST_POSITIONS, FIRST_POSITIONS, SECOND_POSITIONS]
+        {
             let epoch = session.next_epoch();
             session.step_at(epoch, &positions)?;
         }
@@ -114,14 +122,14 @@ fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.check("CMD-1", after.torques == before.torques, || {
             "a halted cell must not count torques, but its count changed".to_owned()
         });
-        command(session, Message::Resume, "CMD-2")?;
-        let step = session.step(&THERE)?;
-        let exact = arm::exact_jacobian(&central, &THERE);
+        check_command(session, Message::Resume, "CMD-2")?;
+        let step = session.step(&SECOND_POSITIONS)?;
+        let exact = arm::exact_jacobian(&central, &SECOND_POSITIONS);
         let off = step
             .words()
             .iter()
             .zip(exact)
-            .map(|(word, exact)| arm::steps_off(*word, exact))
+            .map(|(word, exact)| arm::steps_from_exact(*word, exact))
             .max()
             .unwrap_or(0);
         session.check("CMD-2", off <= 8, || {
@@ -131,24 +139,24 @@ fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
             )
         });
         // A release while halted clears ACTIVE, so no torque of zeros is due.
-        command(session, Message::Halt, "CMD-1")?;
-        session.press_and_step(&HERE, arm::press(0))?;
-        command(session, Message::Resume, "CMD-2")?;
-        let step = session.step(&THERE)?;
+        check_command(session, Message::Halt, "CMD-1")?;
+        session.press_and_step(&FIRST_POSITIONS, arm::press_with_sum(0))?;
+        check_command(session, Message::Resume, "CMD-2")?;
+        let step = session.step(&SECOND_POSITIONS)?;
         session.check("CMD-1", step.torque.is_none(), || {
             "after a release while halted no torque must come, but one came".to_owned()
         });
     }
     // A resume does not change a cell that is not halted.
-    session.press_and_step(&HERE, unit)?;
-    command(session, Message::Resume, "CMD-2")?;
-    session.press_and_step(&HERE, arm::press(0))?;
-    session.step(&HERE)?;
+    session.press_and_step(&FIRST_POSITIONS, unit)?;
+    check_command(session, Message::Resume, "CMD-2")?;
+    session.press_and_step(&FIRST_POSITIONS, arm::press_with_sum(0))?;
+    session.step(&FIRST_POSITIONS)?;
     Ok(())
 }
 
 /// Checks that each sync is answered with one heartbeat.
-fn syncs(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_syncs(session: &mut Session<'_>) -> Result<(), StopReason> {
     const SYNCS: usize = 8;
     session.begin_exchange();
     let mut beats = 0;
@@ -170,7 +178,7 @@ fn syncs(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn report(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_report(session: &mut Session<'_>) -> Result<(), StopReason> {
     let skin = SkinSensors {
         contact: [100, -200, 300].map(Q5_10::from_bits),
         proximity: Q1_14::from_bits(0x1234),
@@ -179,14 +187,14 @@ fn report(session: &mut Session<'_>) -> Result<(), StopReason> {
     let acceleration = [11, -22, 4_096].map(Q3_12::from_bits);
     let to = Node::Cell(session.cell);
     let page = SensorPage::Acceleration(acceleration);
-    session.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Next, page }])?;
-    session.press_and_step(&HERE, skin)?;
+    session.send_messages(&[Message::Stimulus { to, from: StimulusStart::Next, page }])?;
+    session.press_and_step(&FIRST_POSITIONS, skin)?;
     // Pending values are not reported yet.
-    session.press(arm::press(77))?;
+    session.press(arm::press_with_sum(77))?;
     for _ in 0..3 {
         session.begin_exchange();
         let asked = session.send_messages(&[Message::Report])?;
-        let answers = session.pages(asked)?;
+        let answers = session.report_pages(asked)?;
         session.idle(Span::from_millis(5))?;
         if let Some(last) = answers.last() {
             session.note_time("report", asked, last.at);
@@ -199,7 +207,7 @@ fn report(session: &mut Session<'_>) -> Result<(), StopReason> {
         });
         let sent: Vec<_> =
             answers.iter().filter_map(|heard| heard.sensors().map(|(_, page)| *page)).collect();
-        let mut latched = Readings::default();
+        let mut latched = SensorReadings::default();
         [SensorPage::Skin(skin), page].iter().for_each(|page| latched.set(page));
         let latched = latched.pages();
         session.check("SENSE-1", sent.len() == latched.len(), || {
@@ -216,7 +224,7 @@ fn report(session: &mut Session<'_>) -> Result<(), StopReason> {
             )
         });
     }
-    session.press_and_step(&HERE, arm::press(0))?;
-    session.step(&HERE)?;
+    session.press_and_step(&FIRST_POSITIONS, arm::press_with_sum(0))?;
+    session.step(&FIRST_POSITIONS)?;
     Ok(())
 }

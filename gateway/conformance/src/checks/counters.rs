@@ -12,7 +12,7 @@ use crate::session::Session;
 
 /// The counter of network page 2 that must count an unusable packet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Reason {
+enum RejectCounter {
     Length,
     Crc,
     /// Counted only if the cell's controller delivers the frame.
@@ -22,7 +22,7 @@ enum Reason {
     None,
 }
 
-impl Reason {
+impl RejectCounter {
     const fn text(self) -> &'static str {
         match self {
             Self::Length => "only as length",
@@ -39,7 +39,7 @@ impl Reason {
 const ATTEMPTS: usize = 3;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::example_parameters(2))?;
+    session.prepare_cell(&arm::example_parameters(2))?;
     let mut before = session.counters()?;
     for (what, frames, reason) in cases(session) {
         let mut beats = usize::MAX;
@@ -77,18 +77,18 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn is_counted(before: RejectedCounts, after: RejectedCounts, reason: Reason) -> bool {
+fn is_counted(before: RejectedCounts, after: RejectedCounts, reason: RejectCounter) -> bool {
     let mut expected = before;
     let field = match reason {
-        Reason::Length => &mut expected.length,
-        Reason::Crc => &mut expected.crc,
-        Reason::MaybeForeign => &mut expected.foreign,
-        Reason::Meaning => &mut expected.meaning,
-        Reason::Incomplete => &mut expected.incomplete,
-        Reason::None => return before == after,
+        RejectCounter::Length => &mut expected.length,
+        RejectCounter::Crc => &mut expected.crc,
+        RejectCounter::MaybeForeign => &mut expected.foreign,
+        RejectCounter::Meaning => &mut expected.meaning,
+        RejectCounter::Incomplete => &mut expected.incomplete,
+        RejectCounter::None => return before == after,
     };
     *field = field.wrapping_add(1);
-    after == expected || reason == Reason::MaybeForeign && after == before
+    after == expected || reason == RejectCounter::MaybeForeign && after == before
 }
 
 /// Returns packets that would have an effect if the cell accepted them.
@@ -113,14 +113,14 @@ fn packets(session: &Session<'_>) -> Vec<(&'static str, Packet)> {
     ]
 }
 
-fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, Reason)> {
+fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, RejectCounter)> {
     let mut cases = Vec::new();
     let (format, own) = (session.format, session.cell);
     for (name, packet) in packets(session) {
         let id = u32::from(packet.id.to_bits());
         let bytes = packet.encode();
         let framed = |bytes: &[u8]| frames(format, id, bytes);
-        let wrong = if format == Format::Fd { Reason::Crc } else { Reason::Incomplete };
+        let wrong = if format == Format::Fd { RejectCounter::Crc } else { RejectCounter::Incomplete };
         for (what, place, flip) in
             [("first", 0, 1), ("tenth", 9, 0x40), ("next to last", 14, 0x80), ("last", 15, 1)]
         {
@@ -151,23 +151,27 @@ fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, Reason)> {
             cases.push((format!("{name} with its CRC's bytes swapped"), framed(&swapped), wrong));
         }
         if format == Format::Fd {
-            fd_lengths(&mut cases, name, &packet);
+            add_fd_lengths(&mut cases, name, &packet);
         } else {
             let lengths: &[usize] =
                 if packet.id == Id::command(Command::Joints) { &[0, 5, 7] } else { &[0, 4, 7] };
             for length in lengths {
                 let short = bytes.get(..*length).unwrap_or_default();
                 let frame = Frame::classic(id, short).into_iter().collect();
-                cases.push((format!("{length} bytes under the identifier of {name}"), frame, Reason::Length));
+                cases.push((
+                    format!("{length} bytes under the identifier of {name}"),
+                    frame,
+                    RejectCounter::Length,
+                ));
             }
         }
-        foreign(&mut cases, name, format, id, &bytes);
+        add_foreign_frames(&mut cases, name, format, id, &bytes);
     }
     for byte in [0, 0xFF] {
-        let wrong = if format == Format::Fd { Reason::Crc } else { Reason::Incomplete };
+        let wrong = if format == Format::Fd { RejectCounter::Crc } else { RejectCounter::Incomplete };
         cases.push((format!("a halt of 16 bytes {byte:02X}"), frames(format, 0, &[byte; 16]), wrong));
     }
-    pages(session, &mut cases);
+    add_bad_pages(session, &mut cases);
     cases
 }
 
@@ -180,7 +184,7 @@ fn frames(format: Format, id: u32, bytes: &[u8]) -> Vec<Frame> {
 }
 
 /// Adds FD frames with lengths that this kind of packet cannot have, with a correct CRC if there is room for one.
-fn fd_lengths(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, packet: &Packet) {
+fn add_fd_lengths(cases: &mut Vec<(String, Vec<Frame>, RejectCounter)>, name: &str, packet: &Packet) {
     let id = u32::from(packet.id.to_bits());
     let has_long = packet.id == Id::command(Command::Joints);
     for length in [0, 1, 8, 12, 20, 24, 32, 48, 64] {
@@ -202,29 +206,35 @@ fn fd_lengths(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, packet:
             bytes.extend(crc);
         }
         let frame = Frame::fd(id, BIT_RATE_SWITCH, &bytes).into_iter().collect();
-        cases.push((format!("{name} in {length} bytes"), frame, Reason::Length));
+        cases.push((format!("{name} in {length} bytes"), frame, RejectCounter::Length));
     }
     let classic = Frame::classic(id, packet.encode().get(..8).unwrap_or_default());
-    cases.push((format!("{name} in a classic frame"), classic.into_iter().collect(), Reason::Length));
+    cases.push((format!("{name} in a classic frame"), classic.into_iter().collect(), RejectCounter::Length));
 }
 
 /// Adds frames that resemble a packet, but have an identifier of 29 bits or are remote frames.
-fn foreign(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, format: Format, id: u32, bytes: &[u8]) {
+fn add_foreign_frames(
+    cases: &mut Vec<(String, Vec<Frame>, RejectCounter)>,
+    name: &str,
+    format: Format,
+    id: u32,
+    bytes: &[u8],
+) {
     // On a classic bus, only the first segment.
     let whole = frames(format, id | EXTENDED, bytes).into_iter().take(1).collect();
-    cases.push((format!("{name} under an identifier of 29 bits"), whole, Reason::MaybeForeign));
+    cases.push((format!("{name} under an identifier of 29 bits"), whole, RejectCounter::MaybeForeign));
     // The upper 11 of 29 bits; the frames of a wire have the uppermost bit set.
     if id < 0x400 {
         let upper = frames(format, id << 18 | EXTENDED, bytes).into_iter().take(1).collect();
-        cases.push((format!("{name} in the upper bits of 29"), upper, Reason::MaybeForeign));
+        cases.push((format!("{name} in the upper bits of 29"), upper, RejectCounter::MaybeForeign));
     }
     let remote = Frame::remote(id, 8).into_iter().collect();
-    cases.push((format!("a remote frame of {name}"), remote, Reason::MaybeForeign));
+    cases.push((format!("a remote frame of {name}"), remote, RejectCounter::MaybeForeign));
 }
 
 /// Adds packets with pages and counts that do not exist, and with identifiers that are undefined or belong to other
 /// nodes.
-fn pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Reason)>) {
+fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, RejectCounter)>) {
     let own = Node::Cell(session.cell);
     let packet =
         |id, words: [i16; 6], epoch, count| Packet { id, words: words.into(), epoch: Epoch(epoch), count };
@@ -237,18 +247,18 @@ fn pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Reason)>) {
         add(
             format!("its own 4nn of page {page}"),
             packet(Id::new(Kind::Network, own), claim, 0, page),
-            Reason::Meaning,
+            RejectCounter::Meaning,
         );
     }
     for count in [2, 3, 0x7F, 0x82, 0xFF] {
         for to in [own, Node::Everyone] {
             let stimulus = packet(Id::new(Kind::Stimulus, to), [999, 0, 0, 0, 0, 0], 0, count);
-            add(format!("a stimulus of count {count:02X} to {to}"), stimulus, Reason::Meaning);
+            add(format!("a stimulus of count {count:02X} to {to}"), stimulus, RejectCounter::Meaning);
         }
     }
     for command in [5, 6, 0x55, 0xFF] {
         let id = Id { kind: Kind::Command, node: command };
-        add(format!("command {command}"), packet(id, [0; 6], 0, 0), Reason::None);
+        add(format!("command {command}"), packet(id, [0; 6], 0, 0), RejectCounter::None);
     }
     let own = session.cell.get();
     let near = [own.wrapping_add(1), own.wrapping_sub(1), own ^ 3, own ^ 0x80, 0xFE, 1];
@@ -261,21 +271,21 @@ fn pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Reason)>) {
             let packet = packet(id, [1; 6], 0, count);
             let length = if session.format == Format::Fd { 12 } else { 5 };
             let bytes: Vec<_> = packet.encode().iter().copied().take(length).collect();
-            add(format!("a {} packet of node {node}", kind.name()), packet, Reason::None);
+            add(format!("a {} packet of node {node}", kind.name()), packet, RejectCounter::None);
             others.push((
                 format!("{length} bytes under the identifier of a {} packet of node {node}", kind.name()),
                 frames(session.format, id.to_bits().into(), &bytes),
-                Reason::None,
+                RejectCounter::None,
             ));
         }
     }
     let everyone = Id { kind: Kind::Network, node: 0 };
-    add("a gateway's heartbeat".to_owned(), packet(everyone, [0; 6], 0, 0), Reason::None);
+    add("a gateway's heartbeat".to_owned(), packet(everyone, [0; 6], 0, 0), RejectCounter::None);
     let joints = Id::command(Command::Joints);
     for count in [0, 7, 14, 200] {
         let words = Words::new(Length::Six, [3; MAX_JOINTS]);
         let packet = Packet { id: joints, words, epoch: Epoch(251), count };
-        add(format!("joints of count {count}"), packet, Reason::Meaning);
+        add(format!("joints of count {count}"), packet, RejectCounter::Meaning);
     }
     cases.extend(others);
 }

@@ -16,7 +16,7 @@ const RANDOM_FORCES: usize = 40;
 const ROUNDING_FORCES: usize = 12;
 
 /// The sensor words of a press: three of contact, and one of proximity.
-type Sensed = ([i16; 3], i16);
+type SensorWords = ([i16; 3], i16);
 
 /// Joint positions, and the words of J that were measured at them.
 struct MeasuredPose {
@@ -27,33 +27,37 @@ struct MeasuredPose {
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut dice = TestRandom::new(2);
     let parameters = arm::example_parameters(6);
-    if !session.ready(&parameters)? {
+    if !session.prepare_cell(&parameters)? {
         return Ok(());
     }
     let mut known = Vec::new();
     for _ in 0..4 {
         let positions = arm::positions(&mut dice, &parameters);
-        let j = session.press_and_step(&positions, arm::press(arm::unit_press(TorqueFormat::Q3_12)))?.words();
+        let j = session
+            .press_and_step(&positions, arm::press_with_sum(arm::unit_press_sum(TorqueFormat::Q3_12)))?
+            .words();
         known.push(MeasuredPose { positions, j });
     }
-    ties(session, &parameters, &known)?;
+    check_ties(session, &parameters, &known)?;
     for (contact, crafted) in rules() {
         let parameters = Parameters { contact, ..parameters };
-        if session.ready(&parameters)? {
-            rule(session, &mut dice, &parameters, &known, &crafted)?;
+        if session.prepare_cell(&parameters)? {
+            check_rule(session, &mut dice, &parameters, &known, &crafted)?;
         }
     }
     for format in [TorqueFormat::Q5_10, TorqueFormat::Q7_8] {
-        let parameters = Parameters { torque_format: format, contact: arm::PLAIN, ..parameters };
-        if session.about.abilities.first_missing(&parameters).is_none() && session.ready(&parameters)? {
-            ties(session, &parameters, &known)?;
+        let parameters = Parameters { torque_format: format, contact: arm::PLAIN_CONTACT, ..parameters };
+        if session.about.abilities.first_missing(&parameters).is_none()
+            && session.prepare_cell(&parameters)?
+        {
+            check_ties(session, &parameters, &known)?;
         }
     }
     Ok(())
 }
 
 /// Checks one press at joint positions with a known J.
-fn press(
+fn check_press(
     session: &mut Session<'_>,
     parameters: &Parameters,
     known: &MeasuredPose,
@@ -81,13 +85,13 @@ fn press(
 }
 
 /// Checks products that end in exactly half a step, and words at the limits of their range.
-fn ties(
+fn check_ties(
     session: &mut Session<'_>,
     parameters: &Parameters,
     known: &[MeasuredPose],
 ) -> Result<(), StopReason> {
     let format = parameters.torque_format;
-    let bits = 30 - i64::from(format.fraction());
+    let bits = 30 - i64::from(format.fraction_bits());
     let product = |j: i16, sum: i32| i64::from(j) * i64::from(sum) * 64;
     for known in known {
         let words: Vec<_> = known.j.iter().copied().filter(|j| *j != 0).collect();
@@ -104,14 +108,14 @@ fn ties(
         sums.extend((1..most).filter(|sum| is_end(*sum)).take(2));
         sums.extend([most, 1, 2, 9_000, 40_000]);
         for sum in sums {
-            press(session, parameters, known, arm::press(sum), "TORQUE-1")?;
+            check_press(session, parameters, known, arm::press_with_sum(sum), "TORQUE-1")?;
         }
     }
     Ok(())
 }
 
 /// Returns gains and thresholds, each with sensor words at their corner cases.
-fn rules() -> Vec<(Contact, Vec<Sensed>)> {
+fn rules() -> Vec<(Contact, Vec<SensorWords>)> {
     let rule = |words: [i16; 5]| {
         let [alpha_c, alpha_p, contact, proximity, force] = words;
         Contact {
@@ -189,31 +193,31 @@ fn rules() -> Vec<(Contact, Vec<Sensed>)> {
     ]
 }
 
-fn rule(
+fn check_rule(
     session: &mut Session<'_>,
     dice: &mut TestRandom,
     parameters: &Parameters,
     known: &[MeasuredPose],
-    crafted: &[Sensed],
+    crafted: &[SensorWords],
 ) -> Result<(), StopReason> {
-    let skin = |(contact, proximity): Sensed| SkinSensors {
+    let skin = |(contact, proximity): SensorWords| SkinSensors {
         contact: contact.map(Q5_10::from_bits),
         proximity: Q1_14::from_bits(proximity),
         ..SkinSensors::default()
     };
     for (place, words) in crafted.iter().enumerate() {
         if let Some(known) = known.get(place % known.len().max(1)) {
-            press(session, parameters, known, skin(*words), "FORCE-1")?;
+            check_press(session, parameters, known, skin(*words), "FORCE-1")?;
         }
     }
     let mut random = |shift: u32| {
         let contact = [0; 3].map(|_| dice.word() >> shift);
         (contact, (dice.word() >> shift) & i16::MAX)
     };
-    for place in 0..session.attempts(RANDOM_FORCES) {
+    for place in 0..session.reduced_attempts(RANDOM_FORCES) {
         let shift = [0, 2, 4, 7];
         let (Some(known), Some(shift)) = (known.get(place % 4), shift.get(place / 2 % 4)) else { continue };
-        press(session, parameters, known, skin(random(*shift)), "FORCE-1")?;
+        check_press(session, parameters, known, skin(random(*shift)), "FORCE-1")?;
     }
     // Forces for which truncating F_z instead of rounding it gives another word.
     let mut shown = 0;
@@ -225,9 +229,9 @@ fn rule(
             word(force) != word(force - 1) && !protocol::fixed::is_saturated(word(force))
         };
         if force > 1 && is_rounded_up(&parameters.contact, &skin) && known.j.iter().any(shows) {
-            press(session, parameters, known, skin, "FORCE-1")?;
+            check_press(session, parameters, known, skin, "FORCE-1")?;
             shown += 1;
-            if shown >= session.attempts(ROUNDING_FORCES) {
+            if shown >= session.reduced_attempts(ROUNDING_FORCES) {
                 break;
             }
         }

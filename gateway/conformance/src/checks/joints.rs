@@ -13,19 +13,19 @@ const POSITIONS: [i16; MAX_JOINTS] =
     [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    if !session.ready(&arm::example_parameters(6))? {
+    if !session.prepare_cell(&arm::example_parameters(6))? {
         return Ok(());
     }
-    session.press_and_step(&POSITIONS, arm::press(4_096))?;
-    epochs(session)?;
-    repeats(session)?;
-    counts(session)?;
-    contacts(session)
+    session.press_and_step(&POSITIONS, arm::press_with_sum(4_096))?;
+    check_epochs(session)?;
+    check_repeats(session)?;
+    check_counts(session)?;
+    check_contacts(session)
 }
 
 /// Checks that joints of any epoch other than the last one are accepted, at any distance from it, and more than 256 in
 /// a row.
-fn epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?.heard;
     let mut torque: Option<Words> = None;
     let mut epoch = session.known.last_epoch;
@@ -61,9 +61,9 @@ fn epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that the epoch of the last joints is dropped when it is repeated; epoch 0 is not special.
-fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
     for is_zero in [false, true] {
-        session.press_and_step(&POSITIONS, arm::press(4_096))?;
+        session.press_and_step(&POSITIONS, arm::press_with_sum(4_096))?;
         let before = session.counters()?.heard;
         let first = if is_zero { 0 } else { session.next_epoch() };
         session.step_at(first, &POSITIONS)?;
@@ -75,11 +75,11 @@ fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
             });
         }
         // A pending stimulus must not be latched by repeated joints.
-        session.press(arm::press(2_000))?;
+        session.press(arm::press_with_sum(2_000))?;
         let joints = session.joints(first, &POSITIONS);
         session.exchange_all(&[joints])?;
-        let skin = session.latched()?;
-        session.check("JOINTS-1", skin == Some(arm::press(4_096)), || {
+        let skin = session.read_latched_skin()?;
+        session.check("JOINTS-1", skin == Some(arm::press_with_sum(4_096)), || {
             format!("repeated joints must not latch a stimulus, but {} is latched", arm::format_skin(skin))
         });
         let second = session.next_epoch();
@@ -97,19 +97,19 @@ fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that joints are dropped if their count is not that of the chain, or is impossible.
-fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.press_and_step(&POSITIONS, arm::press(4_096))?;
+fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.press_and_step(&POSITIONS, arm::press_with_sum(4_096))?;
     let mut before = session.counters()?;
     for count in [5, 1, 4, 0, 7, 15, 255] {
         let epoch = session.next_epoch();
         // The stimulus is latched by the next valid joints, whatever their epoch.
         let sum = 4_096 + i32::from(count) * 8;
-        let before_press = session.latched()?;
-        session.press(arm::press(sum))?;
+        let before_press = session.read_latched_skin()?;
+        session.press(arm::press_with_sum(sum))?;
         before = session.counters()?;
-        let frames = raw(session, epoch, count, Length::Six);
+        let frames = joints_frames(session, epoch, count, Length::Six);
         let exchange = session.exchange(&frames)?;
-        let skin = session.latched()?;
+        let skin = session.read_latched_skin()?;
         session.check("JOINTS-2", skin == before_press, || {
             format!(
                 "joints with count {count} must not latch a stimulus, but {} is latched",
@@ -136,7 +136,7 @@ fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
     // The order of a cell's checks: impossible counts, then repetitions, then the count of the chain.
     let last = session.known.last_epoch;
     for (count, is_repeated) in [(5, true), (0, false)] {
-        let frames = raw(session, last, count, Length::Six);
+        let frames = joints_frames(session, last, count, Length::Six);
         session.exchange(&frames)?;
         let after = session.counters()?;
         let repeated = after.heard.joints_repeated.wrapping_sub(before.heard.joints_repeated);
@@ -152,7 +152,7 @@ fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     if session.format == protocol::can::Format::Fd {
         let epoch = session.next_epoch();
-        let frames = raw(session, epoch, 7, Length::Eight);
+        let frames = joints_frames(session, epoch, 7, Length::Eight);
         session.exchange(&frames)?;
         let after = session.counters()?;
         let is_so = after.refused.meaning == before.refused.meaning.wrapping_add(1)
@@ -165,7 +165,7 @@ fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Returns the frames of joints with this count, which need not match the chain.
-fn raw(session: &Session<'_>, epoch: u8, count: u8, length: Length) -> Vec<Frame> {
+fn joints_frames(session: &Session<'_>, epoch: u8, count: u8, length: Length) -> Vec<Frame> {
     let id = session.joints(epoch, &POSITIONS).id();
     let packet = Packet { id, words: Words::new(length, POSITIONS), epoch: Epoch(epoch), count };
     packet.frames(session.format).collect()
@@ -173,37 +173,37 @@ fn raw(session: &Session<'_>, epoch: u8, count: u8, length: Length) -> Vec<Frame
 
 /// Checks touches and releases: in contact each joints message is answered with a torque, a release with one torque of
 /// zeros, and later joints with nothing.
-fn contacts(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_contacts(session: &mut Session<'_>) -> Result<(), StopReason> {
     for round in 0..4 {
         for sum in [3_000, 3_000, 0, 0, 0, 9_000, 0, 0] {
             let positions = POSITIONS.map(|word| word.wrapping_add(round * 0x0111));
-            session.press_and_step(&positions, arm::press(sum))?;
+            session.press_and_step(&positions, arm::press_with_sum(sum))?;
         }
-        session.press(arm::press(500))?;
+        session.press(arm::press_with_sum(500))?;
         for _ in 0..3 {
             session.step(&POSITIONS)?;
         }
-        session.press_and_step(&POSITIONS, arm::press(0))?;
+        session.press_and_step(&POSITIONS, arm::press_with_sum(0))?;
         session.step(&POSITIONS)?;
     }
     Ok(())
 }
 
 /// Checks joints that are older than a period of 1 us when the cell processes them.
-pub(super) fn old(session: &mut Session<'_>) -> Result<(), StopReason> {
-    if !session.ready(&arm::example_parameters(6))? {
+pub(super) fn check_old_joints(session: &mut Session<'_>) -> Result<(), StopReason> {
+    if !session.prepare_cell(&arm::example_parameters(6))? {
         return Ok(());
     }
     let mut shown = BurstResults::default();
     for press in [4_096, 1_024, 2_048, 512] {
-        burst(session, press, &mut shown)?;
+        send_burst(session, press, &mut shown)?;
     }
     if !shown.any {
         session.findings.not_tested("JOINTS-4", "the cell processed all joints at once, and skipped none");
     }
     session.known.active = None;
-    none_is_lost(session)?;
-    session.ready(&arm::example_parameters(6))?;
+    check_none_lost(session)?;
+    session.prepare_cell(&arm::example_parameters(6))?;
     Ok(())
 }
 
@@ -218,30 +218,30 @@ struct BurstResults {
 /// The number of bursts of joints; JOINTS-4 fails if old joints are answered in all of them.
 const BURSTS: usize = 4;
 
-fn burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -> Result<(), StopReason> {
-    const BURST: u8 = 24;
+fn send_burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -> Result<(), StopReason> {
+    const BURST_JOINTS: u8 = 24;
     // In contact: skipped joints change the contact as little as the commit does.
     session.commit(&arm::example_parameters(6))?;
-    session.press_and_step(&POSITIONS, arm::press(press + 1))?;
+    session.press_and_step(&POSITIONS, arm::press_with_sum(press + 1))?;
     session.commit(&Parameters { period_us: 1, ..arm::example_parameters(6) })?;
     session.exchange_all(&[])?;
     let before = session.counters()?;
-    session.press(arm::press(press))?;
+    session.press(arm::press_with_sum(press))?;
     session.begin_exchange();
     let mut sent: Vec<(u8, Micros)> = Vec::new();
     let mut frames = Vec::new();
-    for _ in 0..BURST {
+    for _ in 0..BURST_JOINTS {
         let epoch = session.next_epoch();
         sent.push((epoch, Micros(0)));
         frames.extend(session.frames(&session.joints(epoch, &POSITIONS)));
     }
     let times = session.send_all(&frames)?;
-    let each = frames.len() / usize::from(BURST);
+    let each = frames.len() / usize::from(BURST_JOINTS);
     for (sent, at) in sent.iter_mut().zip(times.chunks(each)) {
         sent.1 = at.last().copied().unwrap_or_default();
     }
     session.idle(Span::from_millis(60))?;
-    session.consume();
+    session.mark_expected();
     let answers: Vec<_> = session.answers().iter().filter_map(|it| Some((it.at, it.torque()?.0.0))).collect();
     if let Some(text) = find_old_answer(&sent, &answers) {
         (shown.any, shown.answered) = (true, shown.answered + 1);
@@ -258,18 +258,19 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -> Res
         after.heard.torques.wrapping_sub(before.heard.torques),
     ];
     let taken = joints.wrapping_add(skipped);
-    let is_so = taken <= u16::from(BURST) && usize::from(torques) == answers.len() && joints >= torques;
+    let is_so =
+        taken <= u16::from(BURST_JOINTS) && usize::from(torques) == answers.len() && joints >= torques;
     session.check("JOINTS-4", is_so, || {
         format!(
-            "the counters must match the {BURST} joints sent and the torques that came, but {joints} were counted as joints, {skipped} as skipped and {torques} as torques, and {} were answered",
+            "the counters must match the {BURST_JOINTS} joints sent and the torques that came, but {joints} were counted as joints, {skipped} as skipped and {torques} as torques, and {} were answered",
             answers.len()
         )
     });
     shown.any |= skipped > 0;
-    if skipped > 0 && taken == u16::from(BURST) {
+    if skipped > 0 && taken == u16::from(BURST_JOINTS) {
         // Skipped joints still count as the last ones, latch stimuli and leave ACTIVE unchanged.
-        let page = session.latched()?;
-        session.check("STIM-8", page == Some(arm::press(press)), || {
+        let page = session.read_latched_skin()?;
+        session.check("STIM-8", page == Some(arm::press_with_sum(press)), || {
             format!("skipped joints must latch a stimulus, but {} is latched", arm::format_skin(page))
         });
         session.known.epoch = Some(session.known.last_epoch);
@@ -288,10 +289,10 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -> Res
 /// Returns a description of joints that were answered although they were too old, if there are any. A cell that answers
 /// one joints message after the next one has come is too late for that next one, and must not answer it.
 fn find_old_answer(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String> {
-    const MARGIN: Span = Span(100);
+    const TIME_MARGIN: Span = Span(100);
     let late = answers.windows(2).find(|pair| match pair {
         [(before, _), (_, epoch)] => {
-            sent.iter().any(|(of, at)| of == epoch && before.elapsed_since(*at) > MARGIN)
+            sent.iter().any(|(of, at)| of == epoch && before.elapsed_since(*at) > TIME_MARGIN)
         }
         _ => false,
     });
@@ -303,14 +304,14 @@ fn find_old_answer(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<St
 }
 
 /// Checks that joints that wait in the cell's receive queue are accepted too: the counters add up to the number sent.
-fn none_is_lost(session: &mut Session<'_>) -> Result<(), StopReason> {
-    const WAIT: usize = 3;
+fn check_none_lost(session: &mut Session<'_>) -> Result<(), StopReason> {
+    const WAITING_JOINTS: usize = 3;
     session.commit(&arm::example_parameters(6))?;
-    session.press_and_step(&POSITIONS, arm::press(4_096))?;
+    session.press_and_step(&POSITIONS, arm::press_with_sum(4_096))?;
     session.counters()?;
     for _ in 0..8 {
         session.begin_exchange();
-        let all: Vec<_> = (0..WAIT)
+        let all: Vec<_> = (0..WAITING_JOINTS)
             .map(|_| {
                 let epoch = session.next_epoch();
                 session.joints(epoch, &POSITIONS)
@@ -320,7 +321,7 @@ fn none_is_lost(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.send(&frames)?;
         session.known.epoch = Some(session.known.last_epoch);
         session.idle(Span::from_millis(4))?;
-        session.consume();
+        session.mark_expected();
     }
     session.known.active = None;
     session.counters()?;

@@ -1,6 +1,6 @@
 //! Checks of J for arms of many shapes, and of torque words bit for bit.
 
-use model::central::Central;
+use model::central::CentralComputation;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::parameters::{Abilities, MAX_JOINTS, Parameters, Pose, Row, RowKind};
 
@@ -9,19 +9,19 @@ use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The number of joint positions per arm.
-const POSES: usize = 20;
+const POSES_PER_ARM: usize = 20;
 /// The number of joint positions per arm, for arms that differ only in their number of joints.
 const POSES_PER_LENGTH: usize = 4;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut dice = TestRandom::new(1);
     for parameters in arms(&mut dice, session.about.abilities) {
-        check_arm(session, &mut dice, &parameters, POSES)?;
+        check_arm(session, &mut dice, &parameters, POSES_PER_ARM)?;
     }
-    for parameters in lengths(&mut dice, session.about.abilities) {
+    for parameters in arms_by_length(&mut dice, session.about.abilities) {
         check_arm(session, &mut dice, &parameters, POSES_PER_LENGTH)?;
     }
-    out_of_reach(session)
+    check_saturation(session)
 }
 
 /// Returns arms that the cell can compute: a UR5, six revolute joints of any shape, and the further shapes that its
@@ -31,7 +31,7 @@ fn arms(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
     arms.extend(half_turns());
     let six = |prismatic, rows| ChainShape { joints: 6, rows, prismatic };
     arms.extend((0..4).map(|_| arm::random_parameters(dice, six(false, 6))));
-    let (joints, rows) = (abilities.joints(), abilities.rows());
+    let (joints, rows) = (abilities.max_joints(), abilities.max_rows());
     // Few joints, many joints, and other kinds of rows.
     let more = [
         ChainShape { joints: 1, rows: 1, prismatic: false },
@@ -71,8 +71,8 @@ fn half_turns() -> [Parameters; 2] {
 }
 
 /// Returns arms of each number of joints above six, with a row for each joint and the cell at the tip.
-fn lengths(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
-    let most = abilities.joints().min(abilities.rows());
+fn arms_by_length(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
+    let most = abilities.max_joints().min(abilities.max_rows());
     let of = |joints| {
         let arm = arm::random_parameters(dice, ChainShape { joints, rows: joints, prismatic: false });
         Parameters { joint: arm.joints, ..arm }
@@ -87,21 +87,21 @@ fn check_arm(
     parameters: &Parameters,
     poses: usize,
 ) -> Result<(), StopReason> {
-    if !session.ready(parameters)? {
+    if !session.prepare_cell(parameters)? {
         return Ok(());
     }
-    let central = Central::for_single_cell(parameters);
+    let central = CentralComputation::for_single_cell(parameters);
     let format = parameters.torque_format;
     let mut positions = [0; MAX_JOINTS];
-    for pose in 0..session.attempts(poses) {
+    for pose in 0..session.reduced_attempts(poses) {
         let next = arm::positions(dice, parameters);
         // Every third time only joints beyond the sixth move.
         let stays = if pose % 3 == 2 && parameters.joints > 6 { 6 } else { 0 };
         positions.iter_mut().zip(next).skip(stays).for_each(|(position, next)| *position = next);
-        let j = session.press_and_step(&positions, arm::press(arm::unit_press(format)))?.words();
+        let j = session.press_and_step(&positions, arm::press_with_sum(arm::unit_press_sum(format)))?.words();
         check_jacobian(session, parameters, &central, &positions, &j);
         // The same joints again, with any force: J is known now.
-        let press = arm::press(i32::from(dice.word()).abs() * 3);
+        let press = arm::press_with_sum(i32::from(dice.word()).abs() * 3);
         let words = session.press_and_step(&positions, press)?.words();
         check_torque_words(
             session,
@@ -118,12 +118,12 @@ fn check_arm(
 fn check_jacobian(
     session: &mut Session<'_>,
     parameters: &Parameters,
-    central: &Central,
+    central: &CentralComputation,
     positions: &[i16; MAX_JOINTS],
     j: &[i16; MAX_JOINTS],
 ) {
     let exact = arm::exact_jacobian(central, positions);
-    let off = j.iter().zip(exact).map(|(&word, exact)| arm::steps_off(word, exact)).max().unwrap_or(0);
+    let off = j.iter().zip(exact).map(|(&word, exact)| arm::steps_from_exact(word, exact)).max().unwrap_or(0);
     let most = arm::tolerance(parameters);
     let joints = usize::from(parameters.joints);
     session.check("J-3", off <= most, || {
@@ -159,7 +159,7 @@ pub(super) fn check_torque_words(
 
 /// Checks that J saturates with levers of 3.8 m: one of a link, and one of a prismatic joint that slides beyond the
 /// range of a word.
-fn out_of_reach(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_saturation(session: &mut Session<'_>) -> Result<(), StopReason> {
     let far = Q1_14::from_bits(31_000);
     let mut long = Parameters { joint: 1, joints: 1, ..arm::example_parameters(1) };
     long.rows = [Row { a: far, ..Row::default() }; protocol::parameters::MAX_ROWS];
@@ -192,10 +192,10 @@ fn check_saturated_jacobian(
     for sign in [1, -1] {
         let pose = Pose { normal: normal.map(|word| Q1_14::from_bits(word * sign)), ..arm.pose };
         let parameters = Parameters { pose, ..*arm };
-        if !session.ready(&parameters)? {
+        if !session.prepare_cell(&parameters)? {
             return Ok(());
         }
-        let press = arm::press(arm::unit_press(parameters.torque_format));
+        let press = arm::press_with_sum(arm::unit_press_sum(parameters.torque_format));
         let [first, ..] = session.press_and_step(positions, press)?.words();
         let is_held = if sign > 0 { first <= i16::MIN + 8 } else { first >= i16::MAX - 8 };
         session.check("J-2", is_held, || {

@@ -1,7 +1,7 @@
 //! Checks that a commit, a resume and a write of the mode leave the rest of the cell's state unchanged.
 
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, SensorPage};
+use protocol::message::{Message, SensorPage, StimulusStart};
 use protocol::packet::{Epoch, padded_words};
 use protocol::parameters::{MAX_JOINTS, Parameter, Parameters};
 
@@ -11,47 +11,52 @@ use crate::session::{Reply, Session};
 
 const POSITIONS: [i16; MAX_JOINTS] =
     [0x0200, -0x1100, 0x0700, -0x0300, 0x1900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
-const HELD: i32 = 4_444;
-const LATER: i32 = 5_555;
+const LATCHED_SUM: i32 = 4_444;
+const PENDING_SUM: i32 = 5_555;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    if !session.ready(&arm::example_parameters(6))? {
+    if !session.prepare_cell(&arm::example_parameters(6))? {
         return Ok(());
     }
-    commit(session)?;
-    resume(session)?;
-    mode(session)?;
-    session.ready(&arm::example_parameters(6))?;
+    check_commit(session)?;
+    check_resume(session)?;
+    check_mode_write(session)?;
+    session.prepare_cell(&arm::example_parameters(6))?;
     Ok(())
 }
 
 /// Puts the cell in contact with a pending stimulus, and returns the epoch of that stimulus.
-fn touched(session: &mut Session<'_>) -> Result<u8, StopReason> {
-    session.press_and_step(&POSITIONS, arm::press(HELD))?;
+fn touch_cell(session: &mut Session<'_>) -> Result<u8, StopReason> {
+    session.press_and_step(&POSITIONS, arm::press_with_sum(LATCHED_SUM))?;
     let later = session.known.last_epoch.wrapping_add(20);
     let to = Node::Cell(session.cell);
-    let page = SensorPage::Skin(arm::press(LATER));
-    session.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Epoch(Epoch(later)), page }])?;
+    let page = SensorPage::Skin(arm::press_with_sum(PENDING_SUM));
+    session.send_messages(&[Message::Stimulus { to, from: StimulusStart::Epoch(Epoch(later)), page }])?;
     Ok(later)
 }
 
 /// Checks that the latched stimulus and the one pending for epoch `later` still exist.
-fn is_touched(session: &mut Session<'_>, later: u8, id: &'static str, what: &str) -> Result<(), StopReason> {
+fn check_stimuli_kept(
+    session: &mut Session<'_>,
+    later: u8,
+    id: &'static str,
+    what: &str,
+) -> Result<(), StopReason> {
     let is_there = session.step(&POSITIONS)?.torque.is_some();
     session.check(id, is_there, || {
         format!("{what} must keep the latched stimulus, but no torque came after it")
     });
-    session.known.skin = Some(arm::press(LATER));
+    session.known.skin = Some(arm::press_with_sum(PENDING_SUM));
     session.step_at(later, &POSITIONS)?;
-    let skin = session.latched()?;
-    session.check(id, skin == Some(arm::press(LATER)), || {
+    let skin = session.read_latched_skin()?;
+    session.check(id, skin == Some(arm::press_with_sum(PENDING_SUM)), || {
         format!("{what} must keep a pending stimulus, but at its epoch {} is latched", arm::format_skin(skin))
     });
     Ok(())
 }
 
-fn commit(session: &mut Session<'_>) -> Result<(), StopReason> {
-    let later = touched(session)?;
+fn check_commit(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let later = touch_cell(session)?;
     let events = [101, 102, 103, 104, 105, 0];
     let (sensing, thresholds) = (Parameter::Sensing.number(), Parameter::Events.number());
     if session.about.sensing {
@@ -87,7 +92,7 @@ fn commit(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("CONF-7", again.is_silent(), || {
         "joints repeated after a commit must not be answered, but were".to_owned()
     });
-    is_touched(session, later, "CONF-7", "a commit")?;
+    check_stimuli_kept(session, later, "CONF-7", "a commit")?;
     // A halted cell stays halted.
     session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
@@ -98,24 +103,24 @@ fn commit(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn resume(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_resume(session: &mut Session<'_>) -> Result<(), StopReason> {
     for is_halted in [true, false] {
-        let later = touched(session)?;
+        let later = touch_cell(session)?;
         if is_halted {
             session.send_messages(&[Message::Halt])?;
             session.known.active = Some(false);
         }
         session.send_messages(&[Message::Resume])?;
         session.exchange_all(&[])?;
-        is_touched(session, later, "CMD-2", "a resume")?;
+        check_stimuli_kept(session, later, "CMD-2", "a resume")?;
     }
     Ok(())
 }
 
 /// Checks that a write of parameter 5 clears stimuli and changes nothing else, also if it is sent to everyone.
-fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_mode_write(session: &mut Session<'_>) -> Result<(), StopReason> {
     for to in [Node::Cell(session.cell), Node::Everyone] {
-        touched(session)?;
+        touch_cell(session)?;
         session.send_messages(&[Message::Halt])?;
         (session.known.halted, session.known.active) = (Some(true), Some(false));
         for on in [0, 1] {

@@ -9,18 +9,18 @@ use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The number of joints messages that are sent.
-const JOINTS: i16 = 12;
+const JOINTS_MESSAGES: i16 = 12;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    if !session.ready(&arm::example_parameters(2))? {
+    if !session.prepare_cell(&arm::example_parameters(2))? {
         return Ok(());
     }
     if session.about.test_mode {
-        session.test_mode(false)?;
+        session.switch_test_mode(false)?;
     }
     session.known.active = None;
     let mut before = None;
-    for number in 0..JOINTS {
+    for number in 0..JOINTS_MESSAGES {
         let skips = session.skips;
         let step = session.step(&[number << 9; MAX_JOINTS])?;
         let Some((beat, _)) = step.exchange.beat.filter(|_| skips == session.skips) else {
@@ -47,6 +47,6 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         });
         before = Some(is_active);
     }
-    session.ready(&arm::example_parameters(2))?;
+    session.prepare_cell(&arm::example_parameters(2))?;
     Ok(())
 }

@@ -47,66 +47,78 @@ enum Precondition {
 }
 
 /// A group of checks that are run, and repeated, together.
-struct Group {
+struct CheckGroup {
     /// The ids of the requirements that the group covers.
     about: &'static [&'static str],
     needs: Precondition,
     run: fn(&mut Session<'_>) -> Result<(), StopReason>,
 }
 
-const fn group(
+const fn check_group(
     about: &'static [&'static str],
     needs: Precondition,
     run: fn(&mut Session<'_>) -> Result<(), StopReason>,
-) -> Group {
-    Group { about, needs, run }
+) -> CheckGroup {
+    CheckGroup { about, needs, run }
 }
 
-const GROUPS: &[Group] = &[
-    group(
+const GROUPS: &[CheckGroup] = &[
+    check_group(
         &["CONF-1", "CONF-2", "CONF-3", "CONF-4", "CONF-7", "CONF-12"],
         Precondition::Nothing,
         parameters::run,
     ),
-    group(&["CONF-11", "CONF-13", "ID-2", "OPT-1"], Precondition::Nothing, parameters::others),
-    group(&["CONF-7", "CONF-9", "CMD-2", "STATE-1"], Precondition::Press, leaves::run),
-    group(&["CONF-5", "CONF-6", "COUNT-2"], Precondition::Nothing, refusals::run),
-    group(&["CONF-9", "CONF-10", "SENSE-3", "OPT-1", "LINK-1"], Precondition::Nothing, options::switches),
-    group(&["OPT-2"], Precondition::Nothing, options::ignored),
-    group(&["J-1", "J-2", "J-3", "TORQUE-1"], Precondition::Press, kinematics::run),
-    group(&["FORCE-1", "TORQUE-1", "TORQUE-2", "STATE-1"], Precondition::Press, force::run),
-    group(&["JOINTS-1", "JOINTS-2", "JOINTS-3", "JOINTS-5", "JOINTS-6"], Precondition::Press, joints::run),
-    group(&["JOINTS-4", "STIM-8"], Precondition::Press, joints::old),
-    group(&["JOINTS-6"], Precondition::Nothing, measuring::run),
-    group(
+    check_group(
+        &["CONF-11", "CONF-13", "ID-2", "OPT-1"],
+        Precondition::Nothing,
+        parameters::check_addressing,
+    ),
+    check_group(&["CONF-7", "CONF-9", "CMD-2", "STATE-1"], Precondition::Press, leaves::run),
+    check_group(&["CONF-5", "CONF-6", "COUNT-2"], Precondition::Nothing, refusals::run),
+    check_group(
+        &["CONF-9", "CONF-10", "SENSE-3", "OPT-1", "LINK-1"],
+        Precondition::Nothing,
+        options::check_switches,
+    ),
+    check_group(&["OPT-2"], Precondition::Nothing, options::check_ignored),
+    check_group(&["J-1", "J-2", "J-3", "TORQUE-1"], Precondition::Press, kinematics::run),
+    check_group(&["FORCE-1", "TORQUE-1", "TORQUE-2", "STATE-1"], Precondition::Press, force::run),
+    check_group(
+        &["JOINTS-1", "JOINTS-2", "JOINTS-3", "JOINTS-5", "JOINTS-6"],
+        Precondition::Press,
+        joints::run,
+    ),
+    check_group(&["JOINTS-4", "STIM-8"], Precondition::Press, joints::check_old_joints),
+    check_group(&["JOINTS-6"], Precondition::Nothing, measuring::run),
+    check_group(
         &["STIM-1", "STIM-2", "STIM-3", "STIM-4", "STIM-5", "STIM-6", "STIM-7", "STIM-8"],
         Precondition::Press,
         stimuli::run,
     ),
-    group(
+    check_group(
         &["CMD-1", "CMD-2", "CMD-3", "CMD-4", "STATE-1", "SENSE-1", "SENSE-2"],
         Precondition::Press,
         commands::run,
     ),
-    group(
+    check_group(
         &["BASE-1", "BASE-2", "BASE-3", "BASE-4", "BASE-5", "BASE-6", "BASE-7", "BASE-8"],
         Precondition::Baseline,
         baseline::run,
     ),
-    group(&["COUNT-1", "SEND-1"], Precondition::Nothing, counters::run),
-    group(&["COUNT-3"], Precondition::Classic, segments::run),
-    group(&["CLAIM-6", "CLAIM-7", "STATE-2"], Precondition::Nothing, claims::run),
-    group(
+    check_group(&["COUNT-1", "SEND-1"], Precondition::Nothing, counters::run),
+    check_group(&["COUNT-3"], Precondition::Classic, segments::run),
+    check_group(&["CLAIM-6", "CLAIM-7", "STATE-2"], Precondition::Nothing, claims::run),
+    check_group(
         &["BEAT-1", "BEAT-2", "BEAT-3", "CMD-1", "STIM-7", "TIME-1", "TIME-3"],
         Precondition::Nothing,
         beats::run,
     ),
-    group(
+    check_group(
         &["SENSE-4", "SENSE-5", "SENSE-6", "SENSE-7", "SENSE-8", "SENSE-9", "SENSE-10", "SENSE-11", "TIME-3"],
         Precondition::Sensing,
         sensing::run,
     ),
-    group(
+    check_group(
         &[
             "CLAIM-1", "CLAIM-2", "CLAIM-3", "CLAIM-4", "CLAIM-5", "CLAIM-7", "CONF-2", "CONF-8", "CONF-9",
             "ID-3",
@@ -117,7 +129,7 @@ const GROUPS: &[Group] = &[
 ];
 
 /// The time to leave for the other groups when a group is repeated.
-const RESERVE: Span = Span::from_millis(20_000);
+const TIME_RESERVE: Span = Span::from_millis(20_000);
 
 /// The parts of requirements that cannot be tested from the bus of any cell, with the reason.
 const UNTESTABLE: &[(&str, &str)] = &[
@@ -135,7 +147,7 @@ const UNTESTABLE: &[(&str, &str)] = &[
 /// # Errors
 /// Returns the reason why the test could not continue.
 pub fn run(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), StopReason> {
-    let done = groups(session, only);
+    let done = run_groups(session, only);
     if done.is_ok() {
         for (id, why) in UNTESTABLE {
             session.findings.not_tested(id, *why);
@@ -145,7 +157,7 @@ pub fn run(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), St
     done
 }
 
-fn groups(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), StopReason> {
+fn run_groups(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), StopReason> {
     begin::run(session)?;
     mark_tree_requirements(session);
     for group in GROUPS {
@@ -171,19 +183,19 @@ fn groups(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), Sto
 
 /// Runs a group, and repeats it if something failed while this computer was late: a cell that is a process may have
 /// waited for a processor as well. The cell then has to meet each requirement in one of a few attempts.
-fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), StopReason> {
+fn run_group(session: &mut Session<'_>, group: &CheckGroup) -> Result<(), StopReason> {
     const ATTEMPTS: usize = 4;
-    const LATE: Span = Span::from_millis(4);
+    const MAX_LATENESS: Span = Span::from_millis(4);
     let before = session.findings.clone();
     let mut failed: Option<BTreeSet<&'static str>> = None;
     for attempt in 1..=ATTEMPTS {
         session.worst_lateness();
         let began = session.now();
-        session.regular_beat()?;
+        session.check_regular_beat()?;
         (group.run)(session)?;
         session.settle()?;
         if group.needs != Precondition::Restart {
-            session.regular_beat()?;
+            session.check_regular_beat()?;
         }
         let now: BTreeSet<_> = session.findings.failed_since(&before).collect();
         let each: BTreeSet<_> =
@@ -192,8 +204,8 @@ fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), StopReason>
             session.findings.retract(forgiven, &before);
         }
         let took = session.now().elapsed_since(began);
-        let is_over = attempt == ATTEMPTS || session.remaining_time().0 < took.0 + RESERVE.0;
-        if each.is_empty() || is_over || session.worst_lateness() < LATE {
+        let is_over = attempt == ATTEMPTS || session.remaining_time().0 < took.0 + TIME_RESERVE.0;
+        if each.is_empty() || is_over || session.worst_lateness() < MAX_LATENESS {
             break;
         }
         session.findings = before.clone();

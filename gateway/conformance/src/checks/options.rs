@@ -10,30 +10,30 @@ use crate::arm;
 use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
-const REPLY: u8 = 6;
-const SENSING: u8 = 7;
-const EVENTS: u8 = 8;
-const LINKS: u8 = 9;
-const BASELINE: u8 = 11;
-const TARE: u8 = 12;
+const REPLY_PARAMETER: u8 = 6;
+const SENSING_PARAMETER: u8 = 7;
+const EVENTS_PARAMETER: u8 = 8;
+const LINKS_PARAMETER: u8 = 9;
+const BASELINE_PARAMETER: u8 = 11;
+const TARE_PARAMETER: u8 = 12;
 
-pub(super) fn switches(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::example_parameters(2))?;
+pub(super) fn check_switches(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.prepare_cell(&arm::example_parameters(2))?;
     session.known.senses = true;
-    mode(session)?;
-    reply_mode(session)?;
-    sensing(session)?;
-    no_baseline(session)?;
-    links(session)?;
-    rows(session)?;
-    session.write_first_words(SENSING, [0])?;
+    check_test_mode(session)?;
+    check_reply_mode(session)?;
+    check_sensing(session)?;
+    check_no_baseline(session)?;
+    check_links(session)?;
+    check_impossible_row(session)?;
+    session.write_first_words(SENSING_PARAMETER, [0])?;
     session.settle()?;
     session.known.senses = false;
     Ok(())
 }
 
 /// Writes a parameter, and checks the reply.
-fn expect(
+fn expect_reply(
     session: &mut Session<'_>,
     id: &'static str,
     number: u8,
@@ -48,14 +48,14 @@ fn expect(
 }
 
 /// Writes an impossible value, and checks that it is refused and changes nothing.
-fn refuse(
+fn expect_refusal(
     session: &mut Session<'_>,
     id: &'static str,
     number: u8,
     written: [i16; WORDS],
 ) -> Result<(), StopReason> {
     let before = session.read(number)?;
-    expect(session, id, number, written, Reply::Refused(19))?;
+    expect_reply(session, id, number, written, Reply::Refused(19))?;
     let after = session.read(number)?;
     session.check("CONF-5", before == after, || {
         format!("a refused write must not change parameter {number}, but changed it from {before} to {after}")
@@ -64,16 +64,16 @@ fn refuse(
 }
 
 /// Checks that a write of 1 to parameter 5 switches test mode on at once, and that every other value switches it off.
-fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_test_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.about.test_mode {
-        expect(session, "OPT-1", 5, [0; WORDS], Reply::Value([0; WORDS]))?;
-        return refuse(session, "OPT-1", 5, padded_words([1]));
+        expect_reply(session, "OPT-1", 5, [0; WORDS], Reply::Value([0; WORDS]))?;
+        return expect_refusal(session, "OPT-1", 5, padded_words([1]));
     }
     for (written, on) in
         [(2, false), (1, true), (-1, false), (1, true), (0x0101, false), (0, false), (1, true)]
     {
         let junk = [written, 7, -7, 9, 0x7FFF, 1];
-        expect(session, "CONF-3", 5, junk, Reply::Value(padded_words([on.into()])))?;
+        expect_reply(session, "CONF-3", 5, junk, Reply::Value(padded_words([on.into()])))?;
         session.known.test_mode = Some(on);
         session.known.skin = on.then(Default::default);
         let reply = session.read(5)?;
@@ -88,61 +88,67 @@ fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn reply_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_reply_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     for bad in [[2, 0, 0, 0, 0, 0], [-1, 0, 0, 0, 0, 0], [1, 0, 3, 0, 0, 0], [1, 500, 254, 0, 0, 0]] {
-        refuse(session, "CONF-10", REPLY, bad)?;
+        expect_refusal(session, "CONF-10", REPLY_PARAMETER, bad)?;
     }
     for bad in [[1, 500, -1, 0, 0, 0], [1, 500, 3, 2, 0, 0], [1, 500, 3, -1, 0, 0]] {
-        refuse(session, "CONF-10", REPLY, bad)?;
+        expect_refusal(session, "CONF-10", REPLY_PARAMETER, bad)?;
     }
     if session.about.ports {
         let sum = padded_words([1, 500, 3, 1]);
-        expect(session, "CONF-10", REPLY, sum, Reply::Value(sum))?;
+        expect_reply(session, "CONF-10", REPLY_PARAMETER, sum, Reply::Value(sum))?;
     } else {
-        refuse(session, "OPT-1", REPLY, padded_words([1, 500, 3, 1]))?;
+        expect_refusal(session, "OPT-1", REPLY_PARAMETER, padded_words([1, 500, 3, 1]))?;
     }
-    expect(session, "CONF-3", REPLY, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
-    let reply = session.read(REPLY)?;
+    expect_reply(session, "CONF-3", REPLY_PARAMETER, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
+    let reply = session.read(REPLY_PARAMETER)?;
     session.check("CONF-9", reply == Reply::Value([0; WORDS]), || {
         format!("parameter 6 must be read as 0 after a write of 0, but is read as {reply}")
     });
     Ok(())
 }
 
-fn sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.about.sensing {
-        for number in [SENSING, EVENTS] {
-            expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
+        for number in [SENSING_PARAMETER, EVENTS_PARAMETER] {
+            expect_reply(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
             let reply = session.read(number)?;
             session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
                 format!("parameter {number} of an option that the cell lacks must be read as 0, but is read as {reply}")
             });
-            refuse(session, "OPT-1", number, padded_words([1, 50]))?;
+            expect_refusal(session, "OPT-1", number, padded_words([1, 50]))?;
         }
         session.findings.not_applicable("SENSE-3", "it sends no sensor values without a request");
         return Ok(());
     }
     for bad in [[3, 50], [-1, 50], [1, 0], [i16::MAX, 1]] {
-        refuse(session, "SENSE-3", SENSING, padded_words(bad))?;
+        expect_refusal(session, "SENSE-3", SENSING_PARAMETER, padded_words(bad))?;
     }
-    expect(session, "CONF-3", SENSING, [2, 50, 3, 4, 5, 6], Reply::Value(padded_words([2])))?;
-    expect(session, "CONF-3", SENSING, [0, 50, 3, 4, 5, 6], Reply::Value([0; WORDS]))?;
+    expect_reply(session, "CONF-3", SENSING_PARAMETER, [2, 50, 3, 4, 5, 6], Reply::Value(padded_words([2])))?;
+    expect_reply(session, "CONF-3", SENSING_PARAMETER, [0, 50, 3, 4, 5, 6], Reply::Value([0; WORDS]))?;
     // 65 535 ms.
-    expect(session, "SENSE-3", SENSING, [1, -1, 3, 4, 5, 6], Reply::Value(padded_words([1, -1])))?;
-    refuse(session, "SENSE-3", SENSING, padded_words([1, 0]))?;
-    expect(session, "SENSE-3", SENSING, [0; WORDS], Reply::Value([0; WORDS]))?;
+    expect_reply(
+        session,
+        "SENSE-3",
+        SENSING_PARAMETER,
+        [1, -1, 3, 4, 5, 6],
+        Reply::Value(padded_words([1, -1])),
+    )?;
+    expect_refusal(session, "SENSE-3", SENSING_PARAMETER, padded_words([1, 0]))?;
+    expect_reply(session, "SENSE-3", SENSING_PARAMETER, [0; WORDS], Reply::Value([0; WORDS]))?;
     let usual = Events::default().words();
     for place in 0..5 {
         let mut bad = usual;
         bad.iter_mut().skip(place).take(1).for_each(|word| *word = -1);
-        refuse(session, "SENSE-3", EVENTS, bad)?;
+        expect_refusal(session, "SENSE-3", EVENTS_PARAMETER, bad)?;
     }
     let [a, b, c, d, ..] = usual;
-    refuse(session, "SENSE-3", EVENTS, [a, b, c, d, 0x4001, 0])?;
+    expect_refusal(session, "SENSE-3", EVENTS_PARAMETER, [a, b, c, d, 0x4001, 0])?;
     for good in [[0, 0, 0, 0, 0x4000, 0], [i16::MAX, i16::MAX, i16::MAX, i16::MAX, 0, 0], usual] {
         let [a, b, c, d, e, _] = good;
-        expect(session, "SENSE-3", EVENTS, [a, b, c, d, e, 77], Reply::Value(good))?;
-        let reply = session.read(EVENTS)?;
+        expect_reply(session, "SENSE-3", EVENTS_PARAMETER, [a, b, c, d, e, 77], Reply::Value(good))?;
+        let reply = session.read(EVENTS_PARAMETER)?;
         session.check("CONF-9", reply == Reply::Value(good), || {
             format!("parameter 8 must be read as it was written, but is read as {reply}")
         });
@@ -151,41 +157,47 @@ fn sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that a cell without a baseline accepts only zeros in parameters 11 and 12.
-fn no_baseline(session: &mut Session<'_>) -> Result<(), StopReason> {
-    let reply = session.read(BASELINE)?;
+fn check_no_baseline(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let reply = session.read(BASELINE_PARAMETER)?;
     if session.about.baseline || reply == Reply::Refused(18) {
         return Ok(());
     }
-    for number in [BASELINE, TARE] {
-        expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
-        refuse(session, "OPT-1", number, padded_words([1, 102]))?;
+    for number in [BASELINE_PARAMETER, TARE_PARAMETER] {
+        expect_reply(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
+        expect_refusal(session, "OPT-1", number, padded_words([1, 102]))?;
     }
     Ok(())
 }
 
-fn links(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_links(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.about.test_mode {
         if session.about.ports {
-            expect(session, "LINK-1", LINKS, padded_words([0x1F]), Reply::Value(padded_words([0x1F])))?;
+            expect_reply(
+                session,
+                "LINK-1",
+                LINKS_PARAMETER,
+                padded_words([0x1F]),
+                Reply::Value(padded_words([0x1F])),
+            )?;
         } else {
-            refuse(session, "OPT-1", LINKS, padded_words([1]))?;
+            expect_refusal(session, "OPT-1", LINKS_PARAMETER, padded_words([1]))?;
         }
         // Bits 5 to 15 are not used.
-        expect(session, "CONF-3", LINKS, [-32, 9, 9, 9, 9, 9], Reply::Value([0; WORDS]))?;
-        session.test_mode(false)?;
+        expect_reply(session, "CONF-3", LINKS_PARAMETER, [-32, 9, 9, 9, 9, 9], Reply::Value([0; WORDS]))?;
+        session.switch_test_mode(false)?;
     }
     for written in [padded_words([0]), padded_words([1])] {
-        refuse(session, "LINK-1", LINKS, written)?;
+        expect_refusal(session, "LINK-1", LINKS_PARAMETER, written)?;
     }
     if session.about.test_mode {
-        session.test_mode(true)?;
+        session.switch_test_mode(true)?;
     }
     Ok(())
 }
 
 /// Checks the first row that the cell cannot have: it reads as 0, and accepts only 0.
-fn rows(session: &mut Session<'_>) -> Result<(), StopReason> {
-    let most = session.about.abilities.rows();
+fn check_impossible_row(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let most = session.about.abilities.max_rows();
     let Some(number) = u8::try_from(most).ok().filter(|most| *most < 32).map(|most| 16 + most) else {
         return Ok(());
     };
@@ -196,13 +208,13 @@ fn rows(session: &mut Session<'_>) -> Result<(), StopReason> {
             most + 1
         )
     });
-    expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
-    refuse(session, "OPT-1", number, padded_words([1, 2, 3, 4]))
+    expect_reply(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
+    expect_refusal(session, "OPT-1", number, padded_words([1, 2, 3, 4]))
 }
 
 /// Checks that the cell ignores words, bytes and bits that a packet does not use.
-pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::example_parameters(2))?;
+pub(super) fn check_ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.prepare_cell(&arm::example_parameters(2))?;
     let junk = |command| Packet {
         id: Id::command(command),
         words: [1, -1, 0x7FFF, 3, 4, 5].into(),
@@ -223,7 +235,7 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
     });
     session.begin_exchange();
     let asked = session.send(&frames(session, junk(Command::Report)))?;
-    let pages = session.pages(asked)?;
+    let pages = session.report_pages(asked)?;
     session.check("OPT-2", !pages.is_empty(), || {
         "unused words of a report must be ignored, but it was not answered".to_owned()
     });
@@ -235,7 +247,7 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("OPT-2", is_there, || {
         "unused words of a sync must be ignored, but it was not answered".to_owned()
     });
-    read_with_words(session)?;
+    check_read_with_words(session)?;
     if session.format == Format::Fd {
         // A frame without the bit-rate switch.
         let sync = Message::Sync.encode();
@@ -250,13 +262,13 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
         });
     }
     if session.about.test_mode && session.about.committed {
-        words_beyond(session)?;
+        check_extra_words(session)?;
     }
     Ok(())
 }
 
 /// Checks that the words of a read are ignored.
-fn read_with_words(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_read_with_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let id = Id::new(Kind::Configure, Node::Cell(session.cell));
     let packet = Packet { id, words: [9, 8, 7, 6, 5, 4].into(), epoch: Epoch(3), count: 2 };
     let frames: Vec<_> = packet.frames(session.format).collect();
@@ -273,13 +285,13 @@ fn read_with_words(session: &mut Session<'_>) -> Result<(), StopReason> {
 
 /// Checks that further words do not change the torque: after the joints of a shorter chain, and in a stimulus whose
 /// page has fewer words.
-fn words_beyond(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_extra_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let short = protocol::parameters::Parameters { joints: 3, ..arm::example_parameters(2) };
-    if !session.ready(&short)? {
+    if !session.prepare_cell(&short)? {
         return Ok(());
     }
     let positions = [0x0123, -0x2345, 0x0456, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
-    let expected = session.press_and_step(&positions, arm::press(4_096))?.words();
+    let expected = session.press_and_step(&positions, arm::press_with_sum(4_096))?.words();
     let epoch = session.next_epoch();
     let id = Id::command(Command::Joints);
     let words = [0x0123, -0x2345, 0x0456, 0x7777, -1, 0x1111].into();
@@ -305,6 +317,6 @@ fn words_beyond(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("OPT-2", after == expected, || {
         "unused words of a stimulus of the acceleration must be ignored, but changed the torque".to_owned()
     });
-    session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
+    session.press_and_step(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
     Ok(())
 }

@@ -11,7 +11,7 @@ use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
 /// Returns a configuration that differs from `arm::document` in each parameter.
-fn other() -> Parameters {
+fn other_parameters() -> Parameters {
     let mut other = Parameters { joint: 6, period_us: 50_000, ..arm::example_parameters(6) };
     other.contact.alpha_c = Q3_12::from_bits(5_000);
     other.pose.position = [0x0777, -0x0333, 0x0123].map(Q1_14::from_bits);
@@ -22,25 +22,25 @@ fn other() -> Parameters {
 }
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    let (one, other) = (arm::example_parameters(2), other());
-    if !session.ready(&one)? {
+    let (one, other) = (arm::example_parameters(2), other_parameters());
+    if !session.prepare_cell(&one)? {
         return Ok(());
     }
-    reads(session, &one, "CONF-1")?;
+    check_reads(session, &one, "CONF-1")?;
     session.stage(&other)?;
     // Staged values are neither read, hashed nor used for computing.
-    reads(session, &one, "CONF-2")?;
+    check_reads(session, &one, "CONF-2")?;
     session.exchange_all(&[])?;
-    computes(session, &one, &other, "CONF-2")?;
+    check_computes_with(session, &one, &other, "CONF-2")?;
     if session.about.test_mode {
         // The joints of the chain are those in use, too.
         session.stage(&Parameters { joints: 3, joint: 3, ..other })?;
-        let step = session.press_and_step(&[0x0222; MAX_JOINTS], arm::press(4_096))?;
+        let step = session.press_and_step(&[0x0222; MAX_JOINTS], arm::press_with_sum(4_096))?;
         session.check("JOINTS-2", step.torque.is_some(), || {
             "joints of the chain in use must be answered while a shorter chain is staged, but were not"
                 .to_owned()
         });
-        session.press_and_step(&[0x0222; MAX_JOINTS], arm::press(0))?;
+        session.press_and_step(&[0x0222; MAX_JOINTS], arm::press_with_sum(0))?;
         session.stage(&other)?;
     }
     for wrong in [0x0001, 0x0080, 0x0100, 0x8000, 0xFFFF, one.hash() ^ other.hash(), other.hash()] {
@@ -50,23 +50,23 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
             format!("a commit with hash {hash:04X} while {:04X} is staged must be refused with reason 16, but the answer was {reply}", other.hash())
         });
     }
-    reads(session, &one, "CONF-5")?;
+    check_reads(session, &one, "CONF-5")?;
     session.known.active = None;
     session.commit(&other)?;
-    reads(session, &other, "CONF-7")?;
+    check_reads(session, &other, "CONF-7")?;
     session.exchange_all(&[])?;
-    computes(session, &other, &one, "CONF-7")?;
+    check_computes_with(session, &other, &one, "CONF-7")?;
     let reply = session.read(Parameter::Commit.number())?;
     session.check("CONF-1", reply == Reply::Value([0; WORDS]), || {
         format!("the commit parameter must be read as 0, but is read as {reply}")
     });
-    unused(session)?;
-    tags(session)
+    check_unused_words(session)?;
+    check_tags(session)
 }
 
 /// Checks that each stored parameter reads as the value in use.
-fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> Result<(), StopReason> {
-    for parameter in Parameter::stored(6) {
+fn check_reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> Result<(), StopReason> {
+    for parameter in Parameter::stored_for_rows(6) {
         let reply = session.read(parameter.number())?;
         let words = expected.words(parameter);
         session.check(id, reply == Reply::Value(words), || {
@@ -81,7 +81,7 @@ fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> 
 }
 
 /// Checks that the torque follows from the parameters `expected`, and not from `not`.
-fn computes(
+fn check_computes_with(
     session: &mut Session<'_>,
     expected: &Parameters,
     not: &Parameters,
@@ -92,10 +92,10 @@ fn computes(
     }
     let positions = [0x0111, -0x1222, 0x2333, 0x0444, -0x0555, 0x0666, 0, 0, 0, 0, 0, 0, 0, 0];
     debug_assert_eq!(positions.len(), MAX_JOINTS);
-    let press = arm::press(4_096);
+    let press = arm::press_with_sum(4_096);
     let step = session.press_and_step(&positions, press)?;
     let near = |parameters: &Parameters| {
-        let central = model::central::Central::for_single_cell(parameters);
+        let central = model::central::CentralComputation::for_single_cell(parameters);
         let exact = arm::exact_jacobian(&central, &positions);
         let force = arm::force(&parameters.contact, &press);
         let word = |x: f64| {
@@ -110,16 +110,16 @@ fn computes(
             arm::format_words(&step.words())
         )
     });
-    session.press_and_step(&positions, arm::press(0))?;
+    session.press_and_step(&positions, arm::press_with_sum(0))?;
     Ok(())
 }
 
 /// Checks that words which a parameter does not use become 0, in the answer to a write and in the hash.
-fn unused(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_unused_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let expected = Parameters { period_us: 57_001, ..arm::example_parameters(3) };
     session.stage(&expected)?;
     session.known.staged = None;
-    for parameter in Parameter::stored(6).filter(|it| *it != Parameter::Pose) {
+    for parameter in Parameter::stored_for_rows(6).filter(|it| *it != Parameter::Pose) {
         let clean = expected.words(parameter);
         let used = if parameter == Parameter::Timing { 1 } else { 5 };
         let mut dirty = clean;
@@ -147,7 +147,7 @@ fn unused(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.staged = Some(expected);
         session.known.hash = Some(hash);
         session.known.active = None;
-        reads(session, &expected, "CONF-3")?;
+        check_reads(session, &expected, "CONF-3")?;
     } else {
         session.known.parameters = None;
         session.known.hash = None;
@@ -155,7 +155,7 @@ fn unused(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn tags(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_tags(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = Node::Cell(session.cell);
     let (number, on) = (Parameter::Mode.number(), i16::from(session.about.test_mode));
     for tag in [0, 1, 0x7E, 0x7F, 0x80, 0xFE, 0xFF, 0xFF, 0] {
@@ -190,15 +190,15 @@ fn tags(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks the answers to requests to everyone and to other cells, and to requests for parameters that do not exist.
-pub(super) fn others(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::example_parameters(2))?;
+pub(super) fn check_addressing(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.prepare_cell(&arm::example_parameters(2))?;
     let reply = session.request(Node::Everyone, Request::Read { number: 2 })?;
     let expected = arm::example_parameters(2).words(Parameter::Pose);
     session.check("CONF-11", reply == Reply::Value(expected), || {
         format!("a read sent to everyone must return the value in use, but the answer was {reply}")
     });
     let number = Parameter::Pose.number();
-    let pose = other().words(Parameter::Pose);
+    let pose = other_parameters().words(Parameter::Pose);
     let reply = session.request(Node::Everyone, Request::Write { number, words: pose })?;
     session.check("CONF-11", reply == Reply::Value(pose), || {
         format!("a write sent to everyone must be answered with its words, but the answer was {reply}")
@@ -211,7 +211,7 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), StopReason> {
             "a write of the mode sent to everyone must be answered with its words, but the answer was {reply}"
         )
     });
-    let staged = Parameters { pose: other().pose, ..arm::example_parameters(2) };
+    let staged = Parameters { pose: other_parameters().pose, ..arm::example_parameters(2) };
     session.known.staged = Some(staged);
     // A commit to everyone is a commit of this cell.
     let hash = padded_words([staged.hash().cast_signed()]);
@@ -226,11 +226,11 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), StopReason> {
         if done { (Some(staged), Some(staged.hash())) } else { (None, None) };
     session.exchange_all(&[])?;
     session.commit(&staged)?;
-    unknown(session)?;
-    not_its_own(session)
+    check_unknown(session)?;
+    check_other_cells(session)
 }
 
-fn unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
     for number in (10..=10).chain(13..16).chain(48..127) {
         // Reads and writes alternate.
         let reply = if number % 2 == 0 {
@@ -253,7 +253,7 @@ fn unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that a packet for another cell gets no answer and has no effect.
-fn not_its_own(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_other_cells(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?;
     let own = session.cell.get();
     let near = [own ^ 1, own ^ 0x80, own.wrapping_add(1), own.wrapping_sub(1)];
@@ -261,8 +261,8 @@ fn not_its_own(session: &mut Session<'_>) -> Result<(), StopReason> {
     for cell in cells.filter_map(|node| CellId::new(node.into()).ok()) {
         let to = Node::Cell(cell);
         let read = Message::Configure { to, tag: 9, request: Request::Read { number: 0 } };
-        let press = protocol::message::SensorPage::Skin(arm::press(4_096));
-        let press = Message::Stimulus { to, from: protocol::message::AppliesFrom::Next, page: press };
+        let press = protocol::message::SensorPage::Skin(arm::press_with_sum(4_096));
+        let press = Message::Stimulus { to, from: protocol::message::StimulusStart::Next, page: press };
         let exchange = session.exchange_all(&[read, press])?;
         session.check("ID-2", exchange.is_silent(), || {
             format!("a request to cell {cell} must not be answered by this cell, but was")

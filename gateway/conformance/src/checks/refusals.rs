@@ -9,13 +9,13 @@ use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    if !session.ready(&arm::example_parameters(2))? {
+    if !session.prepare_cell(&arm::example_parameters(2))? {
         return Ok(());
     }
     let before = session.counters()?;
     let staged = Parameters { period_us: 45_000, ..arm::example_parameters(5) };
     session.stage(&staged)?;
-    writes(session, &staged)?;
+    check_writes(session, &staged)?;
     // A refused write does not change the staged copy.
     let hash = staged.hash().cast_signed();
     let reply = session.write_first_words(Parameter::Commit.number(), [hash])?;
@@ -30,7 +30,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     } else {
         (session.known.parameters, session.known.hash, session.known.staged) = (None, None, None);
     }
-    commits(session)?;
+    check_commits(session)?;
     // The values in use are unchanged, and so is the rest of the staged copy.
     session.stage(&staged)?;
     let reply = session.read(Parameter::Timing.number())?;
@@ -46,7 +46,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks writes that are refused at once. If several words are bad, the refusal gives the lowest of their reasons.
-fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), StopReason> {
+fn check_writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), StopReason> {
     let mount = |words: [i16; 5], reason| (Parameter::Mount, words, reason);
     let row = |kind: i16| (Parameter::Row(1), [1, 2, 3, 4, kind], 9);
     let large = session.about.abilities.word() != 0;
@@ -125,7 +125,7 @@ const COMMIT_FLAWS: &[Flaw] = &[
 ];
 
 /// Defects of a configuration's table of rows.
-const ROWS: &[Flaw] = &[
+const ROW_TABLE_FLAWS: &[Flaw] = &[
     (7, |it| (it.table_rows, it.row) = (5, 2)),
     (7, |it| it.table_rows = 255),
     (8, |it| (it.table_rows, it.row) = (6, 0)),
@@ -140,18 +140,19 @@ const ROWS: &[Flaw] = &[
 ];
 
 /// Checks defects that are refused at the commit. The hash is wrong too, so that a faulty cell commits nothing.
-fn commits(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_commits(session: &mut Session<'_>) -> Result<(), StopReason> {
     let can_rows = session.about.abilities.word() != 0;
     let is_apt = |flaw: &&Flaw| can_rows || !matches!(flaw.0, 7 | 8);
     let base = arm::example_parameters(2);
-    if session.about.abilities.rows() == MAX_ROWS {
-        one_row_more(session, &base)?;
+    if session.about.abilities.max_rows() == MAX_ROWS {
+        check_one_row_more(session, &base)?;
     }
-    let all = FLAWS.iter().chain(COMMIT_FLAWS).chain(if can_rows { ROWS } else { &[] }).filter(is_apt);
+    let all =
+        FLAWS.iter().chain(COMMIT_FLAWS).chain(if can_rows { ROW_TABLE_FLAWS } else { &[] }).filter(is_apt);
     for (reason, flaw) in all {
         let mut parameters = base;
         flaw(&mut parameters);
-        refused(session, &parameters, *reason)?;
+        check_refused(session, &parameters, *reason)?;
     }
     let apt: Vec<_> = FLAWS.iter().filter(is_apt).collect();
     for (place, (reason, first)) in apt.iter().enumerate() {
@@ -159,22 +160,22 @@ fn commits(session: &mut Session<'_>) -> Result<(), StopReason> {
             let mut parameters = base;
             first(&mut parameters);
             second(&mut parameters);
-            refused(session, &parameters, *reason)?;
+            check_refused(session, &parameters, *reason)?;
         }
     }
     let mut all = base;
     apt.iter().for_each(|(_, flaw)| flaw(&mut all));
-    refused(session, &all, 2)
+    check_refused(session, &all, 2)
 }
 
 /// Checks that a table of 33 rows, one more than possible, is refused with reason 7, whatever the number of joints.
-fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), StopReason> {
+fn check_one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), StopReason> {
     let mut full = Parameters { table_rows: 32, row: 6, joint: 6, ..*base };
     for (place, row) in full.rows.iter_mut().enumerate().skip(6) {
         let a = Q1_14::from_bits(i16::try_from(place).unwrap_or_default());
         *row = Row { kind: RowKind::Fixed, a, ..Row::default() };
     }
-    refused(session, &full, 16)?;
+    check_refused(session, &full, 16)?;
     for joints in [6, 7] {
         let over = Parameters { table_rows: 33, joints, ..full };
         session.write(Parameter::Mount.number(), over.words(Parameter::Mount))?;
@@ -187,7 +188,7 @@ fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), Stop
     Ok(())
 }
 
-fn refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> Result<(), StopReason> {
+fn check_refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> Result<(), StopReason> {
     session.stage(parameters)?;
     let hash = !parameters.hash();
     let reply = session.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;

@@ -10,21 +10,21 @@ use protocol::packet::{WORDS, Words, padded_words};
 use protocol::parameters::{Events, MAX_JOINTS, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
-use super::claims::{page, twin_heartbeat};
+use super::claims::{twin_heartbeat, twin_page};
 use crate::arm;
 use crate::bus::StopReason;
 use crate::session::{ANSWER_TIMEOUT, CellPacket, Reply, Session, TrackedState};
-use claiming::{gives_way, invalid, stays, while_claiming};
+use claiming::{check_gives_way, check_invalid_page, check_stays, check_while_claiming};
 
 /// The time limit from switching the cell off to its first packet.
 const BOOT_TIMEOUT: Span = Span::from_millis(8_000);
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::example_parameters(2))?;
+    session.prepare_cell(&arm::example_parameters(2))?;
     let after_test_mode = survives(session)?;
-    while_claiming(session, after_test_mode)?;
-    stays(session)?;
-    invalid(session)?;
+    check_while_claiming(session, after_test_mode)?;
+    check_stays(session)?;
+    check_invalid_page(session)?;
     let own = session.about.serial.unwrap_or_default();
     // CLAIMING and a higher serial number have these meanings in a heartbeat only.
     let state = State::CLAIMING.0 | 1 << 12;
@@ -41,12 +41,12 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
             "a claim with a lower serial number, whose low word is higher",
             twin_heartbeat(session, lower, true),
         ),
-        ("network page 2", page(session, NetworkPage::Rejected(other))),
+        ("network page 2", twin_page(session, NetworkPage::Rejected(other))),
         ("a claim with its own serial number", twin_heartbeat(session, own, true)),
         ("a heartbeat without CLAIMING", twin_heartbeat(session, own.wrapping_add(1), false)),
         (
             "network page 1",
-            page(session, NetworkPage::Received(protocol::message::ReceivedCounts::default())),
+            twin_page(session, NetworkPage::Received(protocol::message::ReceivedCounts::default())),
         ),
     ];
     let has_lower = |what: &str| match what.contains("low word") {
@@ -54,7 +54,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         false => own > 0 || !what.contains("lower"),
     };
     for (what, other) in others.into_iter().filter(|(what, _)| has_lower(what)) {
-        gives_way(session, what, &other)?;
+        check_gives_way(session, what, &other)?;
     }
     in_the_middle(session)
 }
@@ -87,7 +87,7 @@ fn restart_with(
         ..TrackedState::default()
     };
     let (parameters, senses) = (session.known.parameters, session.known.senses);
-    session.consume();
+    session.mark_expected();
     session.begin_restart()?;
     session.known = TrackedState { may_be_silent: true, ..keep };
     session.begin_expected_exchange();
@@ -152,7 +152,7 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
         session.wait(until, |heard| heard.iter().any(is_settled))?;
     }
     let at = first(session);
-    session.consume();
+    session.mark_expected();
     let expected = claim(session);
     session.check("CLAIM-5", at.is_some(), || {
         format!(
@@ -161,7 +161,7 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
         )
     });
     session.known.may_be_silent = false;
-    session.extend_life();
+    session.excuse_silence();
     Ok(at)
 }
 
@@ -169,9 +169,9 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
 /// heartbeat.
 fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let kept = arm::distinct_parameters(session.about.abilities);
-    session.ready(&kept)?;
+    session.prepare_cell(&kept)?;
     let before = touched(session)?;
-    session.press(arm::press(0))?;
+    session.press(arm::press_with_sum(0))?;
     session.step(&[0; MAX_JOINTS])?;
     let staged = Parameters { period_us: 44_000, ..arm::example_parameters(4) };
     session.stage(&staged)?;
@@ -230,7 +230,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     session.known.hash = Some(kept.hash());
     (session.known.halted, session.known.epoch) = (Some(false), Some(0));
     session.exchange_all(&[])?;
-    for parameter in Parameter::stored(kept.all_rows().len()) {
+    for parameter in Parameter::stored_for_rows(kept.all_rows().len()) {
         let reply = session.read(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
             format!(
@@ -251,7 +251,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let next = Parameters { period_us: 45_250, ..kept };
     session.known.active = None;
     let done = session.commit(&next)?;
-    session.test_mode(session.about.test_mode)?;
+    session.switch_test_mode(session.about.test_mode)?;
     session.check("CONF-2", done, || {
         "after a restart the staged copy must equal the values in use, but a commit on top of it failed"
             .to_owned()
@@ -296,7 +296,7 @@ fn touched(session: &mut Session<'_>) -> Result<Option<Words>, StopReason> {
     session.known.active = None;
     let positions =
         core::array::from_fn(|place| [0x0777, -0x0555, 0x0333].get(place % 3).copied().unwrap_or(0));
-    Ok(session.press_and_step(&positions, arm::press(9_000))?.torque)
+    Ok(session.press_and_step(&positions, arm::press_with_sum(9_000))?.torque)
 }
 
 /// Checks a reset just after a commit was requested: the cell uses the old or the new configuration, or reports that
@@ -307,14 +307,14 @@ fn in_the_middle(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.known.hash = None;
     let (old, new) =
         (arm::example_parameters(2), Parameters { period_us: 44_000, ..arm::example_parameters(4) });
-    session.ready(&old)?;
+    session.prepare_cell(&old)?;
     session.stage(&new)?;
     let request = Request::Write {
         number: Parameter::Commit.number(),
         words: padded_words([new.hash().cast_signed()]),
     };
     session.send_messages(&[Message::Configure { to: Node::Cell(session.cell), tag: 1, request }])?;
-    session.consume();
+    session.mark_expected();
     let claimed = restart(session)?;
     settled(session, claimed)?;
     session.begin_expected_exchange();
@@ -322,7 +322,7 @@ fn in_the_middle(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.wait(sync + ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
     let beat =
         session.answers().iter().rev().find_map(|it| it.beat().map(|(beat, _)| *beat)).unwrap_or_default();
-    session.consume();
+    session.mark_expected();
     let is_whole =
         beat.state.has(State::CONFIGURED) && [old.hash(), new.hash()].contains(&beat.configuration);
     let is_noticed = !beat.state.has(State::CONFIGURED) && beat.state.has(State::FLASH_DAMAGED);

@@ -2,7 +2,7 @@
 
 use protocol::can::{Format, Frame, FrameError};
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, Request, SensorPage};
+use protocol::message::{Message, Request, SensorPage, StimulusStart};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
@@ -15,56 +15,56 @@ type SegmentPair = [Frame; 2];
 
 /// A step of a series: a segment, or a pause in ms.
 #[derive(Clone, Copy, Debug)]
-enum Act {
+enum SeriesStep {
     Send(Frame),
     Wait(u64),
 }
 
-use Act::{Send, Wait};
+use SeriesStep::{Send, Wait};
 
 /// A series of segments, and the expected result.
-struct Series {
+struct SegmentSeries {
     what: &'static str,
-    acts: Vec<Act>,
+    acts: Vec<SeriesStep>,
     /// The expected number of answers.
     packets: usize,
     incomplete: u16,
 }
 
-fn two(session: &Session<'_>, message: &Message) -> SegmentPair {
+fn two_segments(session: &Session<'_>, message: &Message) -> SegmentPair {
     let mut frames = session.frames(message).into_iter();
     core::array::from_fn(|_| frames.next().unwrap_or(Frame::EMPTY))
 }
 
-fn read(session: &Session<'_>, number: u8, tag: u8) -> SegmentPair {
+fn read_segments(session: &Session<'_>, number: u8, tag: u8) -> SegmentPair {
     let to = Node::Cell(session.cell);
-    two(session, &Message::Configure { to, tag, request: Request::Read { number } })
+    two_segments(session, &Message::Configure { to, tag, request: Request::Read { number } })
 }
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::example_parameters(6))?;
+    session.prepare_cell(&arm::example_parameters(6))?;
     for series in series(session) {
         run_series(session, &series)?;
     }
-    seven(session)?;
+    check_seven_segments(session)?;
     if session.about.test_mode && session.about.committed {
-        joints(session)?;
-        if session.about.abilities.joints() > 6 {
-            three(session)?;
+        check_joints_segments(session)?;
+        if session.about.abilities.max_joints() > 6 {
+            check_three_segments(session)?;
         }
     }
     Ok(())
 }
 
 /// Checks joints of three segments: each comes in time after the one before, but the first is too old for the last.
-fn three(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_three_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut dice = arm::TestRandom::new(7);
     let parameters =
         arm::random_parameters(&mut dice, arm::ChainShape { joints: 8, rows: 8, prismatic: false });
-    if session.about.abilities.first_missing(&parameters).is_some() || !session.ready(&parameters)? {
+    if session.about.abilities.first_missing(&parameters).is_some() || !session.prepare_cell(&parameters)? {
         return Ok(());
     }
-    session.press_and_step(&[0x0111; MAX_JOINTS], arm::press(4_096))?;
+    session.press_and_step(&[0x0111; MAX_JOINTS], arm::press_with_sum(4_096))?;
     let epoch = session.next_epoch();
     let frames = session.frames(&session.joints(epoch, &[0x0111; MAX_JOINTS]));
     session.begin_exchange();
@@ -73,32 +73,33 @@ fn three(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.idle(Span::from_millis(9))?;
     }
     session.idle(Span::from_millis(10))?;
-    session.consume();
+    session.mark_expected();
     let came = session.answers().iter().any(|it| it.torque().is_some());
     session.check("COUNT-3", !came, || {
         "joints of three segments 9 ms apart must not be answered, because the first is too old for the last, but were".to_owned()
     });
     session.step(&[0x0111; MAX_JOINTS])?;
     session.forget_counters();
-    session.ready(&arm::example_parameters(6))?;
+    session.prepare_cell(&arm::example_parameters(6))?;
     Ok(())
 }
 
-fn series(session: &Session<'_>) -> Vec<Series> {
-    let [a1, a2] = read(session, 0, 0x11);
-    let [b1, b2] = read(session, 2, 0x22);
+fn series(session: &Session<'_>) -> Vec<SegmentSeries> {
+    let [a1, a2] = read_segments(session, 0, 0x11);
+    let [b1, b2] = read_segments(session, 2, 0x22);
     let stimulus = Message::Stimulus {
         to: Node::Cell(session.cell),
-        from: AppliesFrom::Next,
-        page: SensorPage::Skin(arm::press(0)),
+        from: StimulusStart::Next,
+        page: SensorPage::Skin(arm::press_with_sum(0)),
     };
-    let [s1, s2] = two(session, &stimulus);
-    let [e1, e2] = two(
+    let [s1, s2] = two_segments(session, &stimulus);
+    let [e1, e2] = two_segments(
         session,
         &Message::Configure { to: Node::Everyone, tag: 0x33, request: Request::Read { number: 3 } },
     );
     let bad = flipped(&a2);
-    let of = |what, acts: Vec<Act>, packets, incomplete| Series { what, acts, packets, incomplete };
+    let of =
+        |what, acts: Vec<SeriesStep>, packets, incomplete| SegmentSeries { what, acts, packets, incomplete };
     vec![
         of("two segments", vec![Send(a1), Send(a2)], 1, 0),
         of(
@@ -146,7 +147,7 @@ fn flipped(frame: &Frame) -> Frame {
 }
 
 /// Checks a series, and repeats it up to three times if the bench was late.
-fn run_series(session: &mut Session<'_>, series: &Series) -> Result<(), StopReason> {
+fn run_series(session: &mut Session<'_>, series: &SegmentSeries) -> Result<(), StopReason> {
     for _ in 0..3 {
         let before = session.counters()?.refused;
         session.begin_exchange();
@@ -171,7 +172,7 @@ fn run_series(session: &mut Session<'_>, series: &Series) -> Result<(), StopReas
         }
         session.idle(Span::from_millis(30))?;
         let answers = session.answers().iter().filter(|heard| heard.beat().is_none()).count();
-        session.consume();
+        session.mark_expected();
         // The next packet under this identifier counts the remaining segments.
         session.read(1)?;
         let after = session.counters()?.refused;
@@ -195,20 +196,20 @@ fn run_series(session: &mut Session<'_>, series: &Series) -> Result<(), StopReas
 }
 
 /// Checks the document's example: seven segments, no two of which form a packet, and a packet.
-fn seven(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_seven_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     let firsts: Vec<_> = (0..7)
         .map(|index| {
             let to = Node::Cell(session.cell);
             let request = Request::Write { number: 2, words: [index; 6] };
-            let [first, _] = two(session, &Message::Configure { to, tag: 1, request });
+            let [first, _] = two_segments(session, &Message::Configure { to, tag: 1, request });
             Send(first)
         })
         .collect();
-    let [a1, a2] = read(session, 0, 0x44);
+    let [a1, a2] = read_segments(session, 0, 0x44);
     let acts = firsts.into_iter().chain([Send(a1), Send(a2)]).collect();
     run_series(
         session,
-        &Series {
+        &SegmentSeries {
             what: "seven segments of which no two form a packet, and a packet",
             acts,
             packets: 1,
@@ -216,17 +217,17 @@ fn seven(session: &mut Session<'_>) -> Result<(), StopReason> {
         },
     )?;
     // A frame of a wrong length or format between two segments does not affect them.
-    let [b1, b2] = read(session, 2, 0x55);
+    let [b1, b2] = read_segments(session, 2, 0x55);
     let short = Frame::classic(a1.raw_id(), &[1, 2, 3, 4, 5, 6, 7]);
-    between(session, "a frame of 7 bytes", [b1, b2], short)?;
-    if session.carries(Format::Fd) {
-        between(session, "an FD frame", [b1, b2], Frame::fd(a1.raw_id(), 0, &[0; 16]))?;
+    check_frame_between(session, "a frame of 7 bytes", [b1, b2], short)?;
+    if session.supports_format(Format::Fd) {
+        check_frame_between(session, "an FD frame", [b1, b2], Frame::fd(a1.raw_id(), 0, &[0; 16]))?;
     }
     Ok(())
 }
 
 /// Checks a frame between two segments of a packet.
-fn between(
+fn check_frame_between(
     session: &mut Session<'_>,
     what: &str,
     [first, last]: SegmentPair,
@@ -251,20 +252,20 @@ fn between(
 }
 
 /// Checks that segments of joints wait for 15 ms.
-fn joints(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_joints_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     let positions = [0x0111; MAX_JOINTS];
-    session.press_and_step(&positions, arm::press(4_096))?;
+    session.press_and_step(&positions, arm::press_with_sum(4_096))?;
     for (ms, arrives) in [(5, true), (13, true), (40, false)] {
         for _ in 0..3 {
             let before = session.counters()?;
             let epoch = session.next_epoch();
-            let [first, second] = two(session, &session.joints(epoch, &positions));
+            let [first, second] = two_segments(session, &session.joints(epoch, &positions));
             session.begin_exchange();
             let began = session.send(&[first])?;
             session.idle(Span::from_millis(ms))?;
             let ended = session.send(&[second])?;
             session.idle(Span::from_millis(10))?;
-            session.consume();
+            session.mark_expected();
             let came = session.answers().iter().any(|heard| heard.torque().is_some());
             let apart = ended.elapsed_since(began);
             if arrives {

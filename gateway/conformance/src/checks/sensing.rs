@@ -3,7 +3,7 @@
 
 use protocol::fixed::{Q, Q1_14, Q3_12};
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, Readings, SensorPage, SkinSensors};
+use protocol::message::{Message, SensorPage, SensorReadings, SkinSensors, StimulusStart};
 use protocol::packet::{Epoch, padded_words};
 use protocol::parameters::{Events, MAX_JOINTS};
 use protocol::time::Span;
@@ -14,24 +14,24 @@ use crate::arm::{self, TestRandom};
 use crate::bus::StopReason;
 use crate::session::{CellPacket, Session};
 
-const SENSING: u8 = 7;
-const EVENTS: u8 = 8;
-const STEPS: usize = 160;
+const SENSING_PARAMETER: u8 = 7;
+const EVENTS_PARAMETER: u8 = 8;
+const EVENT_STEPS: usize = 160;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.ready(&arm::fast_parameters(6))?;
+    session.prepare_cell(&arm::fast_parameters(6))?;
     session.known.senses = true;
-    session.write(EVENTS, Events::default().words())?;
-    let done = switches(session)
-        .and_then(|()| order(session))
-        .and_then(|()| events(session, Events::default(), 3))
-        .and_then(|()| events(session, fine(), 4))
-        .and_then(|()| after_beats(session))
-        .and_then(|()| halted(session))
-        .and_then(|()| continuous(session));
+    session.write(EVENTS_PARAMETER, Events::default().words())?;
+    let done = check_switches(session)
+        .and_then(|()| check_order(session))
+        .and_then(|()| check_events(session, Events::default(), 3))
+        .and_then(|()| check_events(session, fine_thresholds(), 4))
+        .and_then(|()| check_pages_after_beats(session))
+        .and_then(|()| check_halted(session))
+        .and_then(|()| check_continuous(session));
     done?;
-    session.write_first_words(SENSING, [0])?;
-    session.write(EVENTS, Events::default().words())?;
+    session.write_first_words(SENSING_PARAMETER, [0])?;
+    session.write(EVENTS_PARAMETER, Events::default().words())?;
     session.settle()?;
     session.known.senses = false;
     session.idle(Span::from_millis(300))?;
@@ -40,7 +40,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Returns thresholds for which every change except that of proximity is an event, without hysteresis.
-fn fine() -> Events {
+fn fine_thresholds() -> Events {
     let [contact, proximity, temperature, acceleration, hysteresis] = [0, 700, 0, 0, 0];
     Events {
         contact: Q::from_bits(contact),
@@ -56,7 +56,7 @@ fn pages(heard: &[CellPacket]) -> Vec<u8> {
     heard.iter().filter_map(|it| Some(it.sensors()?.1.number())).collect()
 }
 
-fn list(pages: &[u8]) -> String {
+fn format_pages(pages: &[u8]) -> String {
     if pages.is_empty() {
         return "none".to_owned();
     }
@@ -64,7 +64,7 @@ fn list(pages: &[u8]) -> String {
 }
 
 /// Writes parameter 7, and checks the pages that follow at once.
-fn switched(
+fn check_switch(
     session: &mut Session<'_>,
     mode: [i16; 2],
     expected: &[u8],
@@ -72,33 +72,37 @@ fn switched(
 ) -> Result<(), StopReason> {
     session.wait_for_quiet(Span::from_millis(60))?;
     session.begin_exchange();
-    session.write(SENSING, padded_words(mode))?;
+    session.write(SENSING_PARAMETER, padded_words(mode))?;
     session.idle(Span::from_millis(8))?;
     let pages = pages(session.answers());
     session.check("SENSE-4", pages == expected, || {
-        format!("after {what} sensors pages {} came, but must be {}", list(&pages), list(expected))
+        format!(
+            "after {what} sensors pages {} came, but must be {}",
+            format_pages(&pages),
+            format_pages(expected)
+        )
     });
-    session.consume();
+    session.mark_expected();
     Ok(())
 }
 
-fn switches(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.write_first_words(SENSING, [0])?;
+fn check_switches(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.write_first_words(SENSING_PARAMETER, [0])?;
     session.settle()?;
-    switched(session, [2, 0], &[0, 1], "a switch to event mode")?;
-    switched(session, [2, 0], &[], "the same mode again")?;
-    switched(session, [1, 1_000], &[0, 1], "a switch to continuous mode")?;
-    switched(session, [1, 1_000], &[], "the same period again")?;
-    switched(session, [1, 1_001], &[0, 1], "another period")?;
-    switched(session, [0, 0], &[], "a switch off")?;
-    switched(session, [2, 0], &[0, 1], "a switch to event mode")
+    check_switch(session, [2, 0], &[0, 1], "a switch to event mode")?;
+    check_switch(session, [2, 0], &[], "the same mode again")?;
+    check_switch(session, [1, 1_000], &[0, 1], "a switch to continuous mode")?;
+    check_switch(session, [1, 1_000], &[], "the same period again")?;
+    check_switch(session, [1, 1_001], &[0, 1], "another period")?;
+    check_switch(session, [0, 0], &[], "a switch off")?;
+    check_switch(session, [2, 0], &[0, 1], "a switch to event mode")
 }
 
 /// Checks that the torque of a touch is sent before its sensors page.
-fn order(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_order(session: &mut Session<'_>) -> Result<(), StopReason> {
     for sum in [4_096, 0] {
         session.wait_for_quiet(Span::from_millis(60))?;
-        session.press(arm::press(sum))?;
+        session.press(arm::press_with_sum(sum))?;
         let step = session.step(&[0x0321; MAX_JOINTS])?;
         let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
         session.check("TIME-3", kinds == ["torque", "sensors"], || {
@@ -110,40 +114,40 @@ fn order(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks random values around the thresholds: a page comes exactly when the model requires it.
-fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), StopReason> {
+fn check_events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), StopReason> {
     let mut dice = TestRandom::new(seed);
-    session.write_first_words(SENSING, [0])?;
-    session.write(EVENTS, events.words())?;
-    session.test_mode(true)?;
+    session.write_first_words(SENSING_PARAMETER, [0])?;
+    session.write(EVENTS_PARAMETER, events.words())?;
+    session.switch_test_mode(true)?;
     session.known.active = None;
     session.step(&[0; MAX_JOINTS])?;
     session.known.active = Some(false);
-    session.write_first_words(SENSING, [2])?;
+    session.write_first_words(SENSING_PARAMETER, [2])?;
     session.idle(Span::from_millis(10))?;
     session.begin_exchange();
     let mut model = EventModel::new(events);
-    for step in 0..session.attempts(STEPS) {
+    for step in 0..session.reduced_attempts(EVENT_STEPS) {
         let (skin, acceleration) = match crafted(&events).get(step) {
             Some(skin) => (*skin, None),
-            None => values(&mut dice, &events, &model, step),
+            None => random_readings(&mut dice, &events, &model, step),
         };
-        if step == CRAFTED - 1 {
+        if step == CRAFTED_READINGS - 1 {
             // Writing the same thresholds again changes nothing.
-            session.write(EVENTS, events.words())?;
+            session.write(EVENTS_PARAMETER, events.words())?;
         }
         session.press(skin)?;
         if let Some(acceleration) = acceleration {
             let to = Node::Cell(session.cell);
             let page = SensorPage::Acceleration(acceleration);
-            session.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Next, page }])?;
+            session.send_messages(&[Message::Stimulus { to, from: StimulusStart::Next, page }])?;
         }
         // Pages that came with a regular heartbeat count as sent, too.
-        for heard in session.unmarked() {
+        for heard in session.packets_since_exchange() {
             if let Some((_, page)) = heard.sensors() {
-                model.sends(page);
+                model.mark_sent(page);
             }
         }
-        let turned = model.turned();
+        let turned = model.state_text();
         let (expected, ids) = model.latch(skin, acceleration);
         let before = Epoch(session.known.last_epoch);
         let (from, skips) = (session.packets.len(), session.skips);
@@ -153,7 +157,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
             came.exchange.answers.iter().filter_map(|it| it.sensors().map(|(_, page)| *page)).collect();
         let numbers = pages(&came.exchange.answers);
         let all = session.packets.get(from..).unwrap_or_default().iter().filter_map(CellPacket::sensors);
-        all.for_each(|(_, page)| model.sends(page));
+        all.for_each(|(_, page)| model.mark_sent(page));
         // Skipped joints make no event, and a page with a heartbeat may replace the one that the next joints would have
         // sent.
         if beats == 1 && skips == session.skips {
@@ -164,8 +168,8 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
                     "{} {moved} is latched at step {} (before: {turned}): pages {} came, but must be {}",
                     arm::format_skin(Some(skin)),
                     step + 1,
-                    list(&numbers),
-                    list(&expected)
+                    format_pages(&numbers),
+                    format_pages(&expected)
                 )
             });
         }
@@ -183,21 +187,21 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
         if step % 40 == 39 {
             // The pages of a report count as sent, too.
             for page in session.report()?.iter().filter_map(CellPacket::sensors) {
-                model.sends(page.1);
+                model.mark_sent(page.1);
             }
         }
     }
-    session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
+    session.press_and_step(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
     session.step(&[0; MAX_JOINTS])?;
     Ok(())
 }
 
 /// The number of crafted values, for cases that random values may miss.
-const CRAFTED: usize = 6;
+const CRAFTED_READINGS: usize = 6;
 
 /// Returns a touch whose sum exceeds a word, and one that fades. Each ends so softly that only the end of the contact
 /// is an event.
-fn crafted(events: &Events) -> [SkinSensors; CRAFTED] {
+fn crafted(events: &Events) -> [SkinSensors; CRAFTED_READINGS] {
     let touch = events.contact.to_bits().max(1);
     let soft = (touch / 8).max(1);
     [[i16::MAX, i16::MAX, 0], [soft, 0, 0], [0; 3], [touch, 0, 0], [soft, 0, 0], [0; 3]]
@@ -205,7 +209,7 @@ fn crafted(events: &Events) -> [SkinSensors; CRAFTED] {
 }
 
 /// Returns sensor values near the last sent ones, and near the thresholds.
-fn values(
+fn random_readings(
     dice: &mut TestRandom,
     events: &Events,
     model: &EventModel,
@@ -248,11 +252,11 @@ fn values(
 }
 
 /// Checks that in event mode page 0 follows each regular heartbeat, and page 1 every fourth one since the switch.
-fn after_beats(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.write_first_words(SENSING, [0])?;
+fn check_pages_after_beats(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.write_first_words(SENSING_PARAMETER, [0])?;
     session.wait_for_quiet(Span::from_millis(60))?;
     session.begin_exchange();
-    session.write_first_words(SENSING, [2])?;
+    session.write_first_words(SENSING_PARAMETER, [2])?;
     session.idle(Span::from_millis(10))?;
     session.begin_expected_exchange();
     session.idle(Span::from_millis(2_050))?;
@@ -266,15 +270,15 @@ fn after_beats(session: &mut Session<'_>) -> Result<(), StopReason> {
             _ => {}
         }
     }
-    session.consume();
-    let all = Readings::default().pages().map(|page| page.number());
+    session.mark_expected();
+    let all = SensorReadings::default().pages().map(|page| page.number());
     let is_so = beats.len() >= 7
         && beats.iter().enumerate().all(|(place, pages)| {
             let expected: &[u8] = if place % 4 == 3 { &all } else { &[0] };
             pages == expected
         });
     session.check("SENSE-10", is_so, || {
-        let all: Vec<_> = beats.iter().map(|pages| list(pages)).collect();
+        let all: Vec<_> = beats.iter().map(|pages| format_pages(pages)).collect();
         let count = beats.len();
         format!("pages after each of {count} heartbeats in event mode: {}; expected are page 0, and the others after each fourth", all.join(", "))
     });
@@ -287,55 +291,55 @@ fn after_beats(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn halted(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_halted(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.begin_exchange();
     session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
     session.wait_for_quiet(Span::from_millis(60))?;
     for sum in [5_000, 0] {
-        session.press(arm::press(sum))?;
+        session.press(arm::press_with_sum(sum))?;
         let step = session.step(&[0; MAX_JOINTS])?;
         let pages = pages(&step.exchange.answers);
         session.check("SENSE-11", pages == [0], || {
-            let pages = list(&pages);
+            let pages = format_pages(&pages);
             format!("a halted cell in event mode must send page 0 at a touch or its end, but sent {pages}")
         });
     }
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
-    session.write_first_words(SENSING, [0])?;
+    session.write_first_words(SENSING_PARAMETER, [0])?;
     session.settle()
 }
 
-fn continuous(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_continuous(session: &mut Session<'_>) -> Result<(), StopReason> {
     for period in [50, 120] {
-        grid(session, period, false)?;
+        check_page_times(session, period, false)?;
     }
     // As short as the period of the joints: no page is early.
-    grid(session, 16, true)?;
+    check_page_times(session, 16, true)?;
     if session.about.committed {
-        grid(session, 40, true)?;
+        check_page_times(session, 40, true)?;
     }
     Ok(())
 }
 
 /// Checks that page 0 comes at the times `t + P + P n / 255 + i P`, with the switch at t, the period P, the node id n
 /// and i = 0, 1, ... If joints come and P is longer than their period, a page may be earlier by up to that period.
-fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(), StopReason> {
-    const JOINTS: u64 = 16_000;
-    const LATE: u64 = 20_000;
-    const SLACK: u64 = 2_000;
+fn check_page_times(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(), StopReason> {
+    const JOINTS_PERIOD_US: u64 = 16_000;
+    const MAX_LATENESS_US: u64 = 20_000;
+    const SLACK_US: u64 = 2_000;
     let (id, early) = match with_joints {
-        true if period * 1_000 > JOINTS => ("SENSE-6", JOINTS),
+        true if period * 1_000 > JOINTS_PERIOD_US => ("SENSE-6", JOINTS_PERIOD_US),
         true => ("SENSE-6", 0),
         false => ("SENSE-5", 0),
     };
     for attempt in 0..3 {
-        session.write_first_words(SENSING, [0])?;
+        session.write_first_words(SENSING_PARAMETER, [0])?;
         session.settle()?;
         session.begin_exchange();
         let period_ms = i16::try_from(period).unwrap_or_default();
-        session.write_first_words(SENSING, [1, period_ms])?;
+        session.write_first_words(SENSING_PARAMETER, [1, period_ms])?;
         let Some(began) = session.answers().first().map(|it| it.at) else { return Ok(()) };
         let span = Span::from_millis(12 * period);
         let mut due = began + Span(7_000);
@@ -345,19 +349,19 @@ fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(),
             let joints = session.joints(epoch, &[0; MAX_JOINTS]);
             session.send_messages(&[joints])?;
             session.known.epoch = Some(epoch);
-            due = due + Span(JOINTS);
+            due = due + Span(JOINTS_PERIOD_US);
         }
         session.wait(began + span, |_| false)?;
         let late = session.lateness();
         let all: Vec<_> = session.answers().iter().filter_map(|it| Some((it.at, *it.sensors()?.1))).collect();
-        session.consume();
+        session.mark_expected();
         let skin = all.iter().filter(|(_, page)| matches!(page, SensorPage::Skin(_))).skip(1);
         let times: Vec<_> = skin.map(|(at, _)| at.elapsed_since(began).0).collect();
         let first = period * 1_000 + period * 1_000 * u64::from(session.cell.get()) / 255;
         let is_in_time = |(place, at): (usize, &u64)| {
             let due = first + place as u64 * period * 1_000;
-            let slack = SLACK + at / 100;
-            (due.saturating_sub(early + slack)..=due + LATE + slack).contains(at)
+            let slack = SLACK_US + at / 100;
+            (due.saturating_sub(early + slack)..=due + MAX_LATENESS_US + slack).contains(at)
         };
         let is_so = (10..=12).contains(&times.len()) && times.iter().enumerate().all(is_in_time);
         if is_so || attempt == 2 || late.0 < 1_000 {

@@ -1,7 +1,7 @@
 //! A model of event mode (SENSE-7, SENSE-8 and SENSE-9), which predicts the sensors pages that a cell must send.
 
 use protocol::fixed::{Q, Q3_12};
-use protocol::message::{Readings, SensorPage, SkinSensors};
+use protocol::message::{SensorPage, SensorReadings, SkinSensors};
 use protocol::parameters::Events;
 
 /// The state of contact or of proximity in event mode.
@@ -39,8 +39,8 @@ impl Touch {
 #[derive(Clone, Debug)]
 pub(super) struct EventModel {
     events: Events,
-    latched: Readings,
-    sent: Readings,
+    latched: SensorReadings,
+    sent: SensorReadings,
     contact: Touch,
     proximity: Touch,
 }
@@ -48,10 +48,10 @@ pub(super) struct EventModel {
 impl EventModel {
     /// Creates the state at a switch to event mode, if all latched values are 0.
     pub(super) fn new(events: Events) -> Self {
-        let nothing = Readings::default();
+        let nothing = SensorReadings::default();
         let mut model =
             Self { events, latched: nothing, sent: nothing, contact: Touch::Free, proximity: Touch::Free };
-        model.follow();
+        model.update_states();
         model
     }
 
@@ -64,7 +64,7 @@ impl EventModel {
     }
 
     /// Returns a description of the states of contact and proximity, for a message.
-    pub(super) fn turned(&self) -> String {
+    pub(super) fn state_text(&self) -> String {
         let name = |touch| match touch {
             Touch::Free => "free",
             Touch::Touched => "touched",
@@ -74,7 +74,7 @@ impl EventModel {
     }
 
     /// Takes the values of a page that the cell sent as its last sent ones.
-    pub(super) const fn sends(&mut self, page: &SensorPage) {
+    pub(super) const fn mark_sent(&mut self, page: &SensorPage) {
         self.sent.set(page);
     }
 
@@ -85,7 +85,7 @@ impl EventModel {
     }
 
     /// Updates the states of contact and proximity from the latched values, and returns true if one has changed.
-    fn follow(&mut self) -> bool {
+    fn update_states(&mut self) -> bool {
         let before = (self.contact, self.proximity);
         let hysteresis = i64::from(self.events.hysteresis.to_bits());
         let skin = self.latched.skin;
@@ -105,7 +105,7 @@ impl EventModel {
         let before = self.latched;
         self.latched.skin = skin;
         self.latched.acceleration = acceleration.unwrap_or(self.latched.acceleration);
-        let turned = self.follow();
+        let turned = self.update_states();
         let (now, sent, events) = (self.latched.skin, self.sent.skin, self.events);
         let has_moved = |from: &SkinSensors| {
             is_far(&now.contact, &from.contact, events.contact)

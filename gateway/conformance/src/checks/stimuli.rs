@@ -1,7 +1,7 @@
 //! Checks of stimuli: the joints that latch them, the number that can be pending, and the events that clear them.
 
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, SensorPage};
+use protocol::message::{Message, SensorPage, StimulusStart};
 use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 
@@ -21,18 +21,19 @@ struct PressedCell {
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let parameters = arm::example_parameters(6);
-    if !session.ready(&parameters)? {
+    if !session.prepare_cell(&parameters)? {
         return Ok(());
     }
-    let j =
-        session.press_and_step(&POSITIONS, arm::press(arm::unit_press(parameters.torque_format)))?.words();
+    let j = session
+        .press_and_step(&POSITIONS, arm::press_with_sum(arm::unit_press_sum(parameters.torque_format)))?
+        .words();
     let cell = PressedCell { parameters, j };
     let before = session.counters()?;
-    let mut count = next(session, &cell)?;
-    count += first_epoch(session, &cell)?;
-    let late = too_late(session, &cell)?;
+    let mut count = check_next_joints(session, &cell)?;
+    count += check_first_epoch(session, &cell)?;
+    let late = check_too_late(session, &cell)?;
     count += late;
-    count += order(session, &cell)?;
+    count += check_order(session, &cell)?;
     let after = session.counters()?;
     let counted = after.heard.stimuli.wrapping_sub(before.heard.stimuli);
     session.check("STIM-3", counted == count, || {
@@ -46,21 +47,21 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("STIM-6", is_same, || {
         format!("stimuli must not be refused while fewer than 8 are pending, but the counters are {after}")
     });
-    pending(session, &cell)?;
-    forgotten(session, &cell)?;
-    measuring(session)?;
-    halted(session, &cell)
+    check_pending(session, &cell)?;
+    check_cleared(session, &cell)?;
+    check_measuring(session)?;
+    check_halted(session, &cell)
 }
 
 /// Sends joints of an epoch, and checks by the torque that a press with this sum of contact words is latched.
-fn latched(
+fn check_latched(
     session: &mut Session<'_>,
     cell: &PressedCell,
     epoch: u8,
     sum: i32,
     id: &'static str,
 ) -> Result<(), StopReason> {
-    let skin = arm::press(sum);
+    let skin = arm::press_with_sum(sum);
     session.known.skin = Some(skin);
     session.known.pending = None;
     let step = session.step_at(epoch, &POSITIONS)?;
@@ -80,14 +81,14 @@ fn latched(
 }
 
 /// Checks stimuli for the next joints, and returns the number of stimuli sent.
-fn next(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
+fn check_next_joints(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     let start = session.known.last_epoch;
     for (jump, sum) in [(1, 1_000), (200, 1_500), (3, 0), (128, 2_000), (255, 2_500)] {
         let epoch = session.known.last_epoch.wrapping_add(jump);
-        session.press(arm::press(sum))?;
-        latched(session, cell, epoch, sum, "STIM-4")?;
-        latched(session, cell, epoch.wrapping_add(1), sum, "STIM-7")?;
+        session.press(arm::press_with_sum(sum))?;
+        check_latched(session, cell, epoch, sum, "STIM-4")?;
+        check_latched(session, cell, epoch.wrapping_add(1), sum, "STIM-7")?;
         count += 1;
     }
     // The epoch byte is then ignored, and a stimulus to everyone counts too.
@@ -96,107 +97,107 @@ fn next(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason
         [(start, Node::Cell(session.cell)), (ahead, Node::Everyone), (ahead, Node::Cell(session.cell))]
     {
         let sum = 3_000 + i32::from(epoch);
-        let page = SensorPage::Skin(arm::press(sum));
-        let mut packet = Message::Stimulus { to, from: AppliesFrom::Next, page }.encode();
+        let page = SensorPage::Skin(arm::press_with_sum(sum));
+        let mut packet = Message::Stimulus { to, from: StimulusStart::Next, page }.encode();
         packet.epoch = Epoch(epoch);
         let frames: Vec<_> = packet.frames(session.format).collect();
         session.send(&frames)?;
         let epoch = session.next_epoch();
-        latched(session, cell, epoch, sum, "STIM-4")?;
+        check_latched(session, cell, epoch, sum, "STIM-4")?;
         count += 1;
     }
     Ok(count)
 }
 
 /// Checks stimuli whose first epoch is near, far, or past the wrap-around, and returns the number of stimuli sent.
-fn first_epoch(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
+fn check_first_epoch(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut held = 4_000;
     let mut count = 1;
-    session.press(arm::press(held))?;
+    session.press(arm::press_with_sum(held))?;
     let epoch = session.next_epoch();
-    latched(session, cell, epoch, held, "STIM-3")?;
+    check_latched(session, cell, epoch, held, "STIM-3")?;
     for (last, ahead) in [(10, 3), (250, 8), (250, 6), (100, 1), (20, 127), (200, 100)] {
-        latched(session, cell, last, held, "STIM-3")?;
+        check_latched(session, cell, last, held, "STIM-3")?;
         let (first, sum) = (u8::wrapping_add(last, ahead), held + 111);
-        session.press_at(first, arm::press(sum))?;
+        session.press_at(first, arm::press_with_sum(sum))?;
         count += 1;
         for step in [1, 2, ahead / 2, ahead - 1].into_iter().filter(|step| (1..ahead).contains(step)) {
             let epoch = last.wrapping_add(step);
             if epoch != session.known.last_epoch {
-                latched(session, cell, epoch, held, "STIM-3")?;
+                check_latched(session, cell, epoch, held, "STIM-3")?;
             }
         }
         // The first epoch itself, or one or two after it.
         let epoch = first.wrapping_add(ahead % 3);
-        latched(session, cell, epoch, sum, "STIM-3")?;
+        check_latched(session, cell, epoch, sum, "STIM-3")?;
         held = sum;
     }
     // Two stimuli at once, each for its own epoch; joints with an earlier epoch do not latch later stimuli.
     let last = session.known.last_epoch;
-    session.press_at(last.wrapping_add(2), arm::press(held + 300))?;
-    session.press_at(last.wrapping_add(3), arm::press(held + 600))?;
+    session.press_at(last.wrapping_add(2), arm::press_with_sum(held + 300))?;
+    session.press_at(last.wrapping_add(3), arm::press_with_sum(held + 600))?;
     count += 2;
-    latched(session, cell, last.wrapping_add(1), held, "STIM-3")?;
-    latched(session, cell, last.wrapping_sub(20), held, "STIM-3")?;
-    latched(session, cell, last.wrapping_add(2), held + 300, "STIM-3")?;
-    latched(session, cell, last.wrapping_add(3), held + 600, "STIM-3")?;
+    check_latched(session, cell, last.wrapping_add(1), held, "STIM-3")?;
+    check_latched(session, cell, last.wrapping_sub(20), held, "STIM-3")?;
+    check_latched(session, cell, last.wrapping_add(2), held + 300, "STIM-3")?;
+    check_latched(session, cell, last.wrapping_add(3), held + 600, "STIM-3")?;
     // The first epoch is exactly 128 ahead of the joints.
     let first = session.known.last_epoch.wrapping_add(100);
-    session.press_at(first, arm::press(held + 900))?;
-    latched(session, cell, first.wrapping_sub(128), held + 600, "STIM-3")?;
-    latched(session, cell, first, held + 900, "STIM-3")?;
+    session.press_at(first, arm::press_with_sum(held + 900))?;
+    check_latched(session, cell, first.wrapping_sub(128), held + 600, "STIM-3")?;
+    check_latched(session, cell, first, held + 900, "STIM-3")?;
     Ok(count + 1)
 }
 
 /// Checks stimuli for epochs that are over, and returns the number of stimuli sent.
-fn too_late(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
+fn check_too_late(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     for (behind, jump) in [(0, 1), (5, 1), (2, 250), (127, 1)] {
         let last = session.known.last_epoch;
         let sum = 5_000 + 100 * i32::from(behind) + i32::from(jump);
-        session.press_at(last.wrapping_sub(behind), arm::press(sum))?;
+        session.press_at(last.wrapping_sub(behind), arm::press_with_sum(sum))?;
         count += 1;
-        latched(session, cell, last.wrapping_add(jump), sum, "STIM-5")?;
+        check_latched(session, cell, last.wrapping_add(jump), sum, "STIM-5")?;
     }
     // Late for the joints of epoch 0.
     session.step_at(0, &POSITIONS)?;
-    session.press_at(0, arm::press(5_777))?;
-    latched(session, cell, 1, 5_777, "STIM-5")?;
+    session.press_at(0, arm::press_with_sum(5_777))?;
+    check_latched(session, cell, 1, 5_777, "STIM-5")?;
     Ok(count + 1)
 }
 
 /// Checks several stimuli for the same joints, and returns the number of stimuli sent.
-fn order(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
+fn check_order(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     for (first, second, jump) in [(1, 1, 1), (2, 1, 2), (1, 2, 2), (3, 0, 3)] {
         let last = session.known.last_epoch;
         for (ahead, sum) in [(first, 6_000), (second, 7_000)] {
             if ahead > 0 {
-                session.press_at(last.wrapping_add(ahead), arm::press(sum))?;
+                session.press_at(last.wrapping_add(ahead), arm::press_with_sum(sum))?;
             } else {
-                session.press(arm::press(sum))?;
+                session.press(arm::press_with_sum(sum))?;
             }
             count += 1;
         }
         // The acceleration is another page.
         let to = Node::Cell(session.cell);
         let page = SensorPage::Acceleration([1, 2, 3].map(protocol::fixed::Q3_12::from_bits));
-        session.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Next, page }])?;
+        session.send_messages(&[Message::Stimulus { to, from: StimulusStart::Next, page }])?;
         count += 1;
-        latched(session, cell, last.wrapping_add(jump), 7_000, "STIM-7")?;
+        check_latched(session, cell, last.wrapping_add(jump), 7_000, "STIM-7")?;
         // A stimulus stays latched, whatever else comes.
         session.counters()?;
         session.read(1)?;
         for _ in 0..2 {
             let epoch = session.next_epoch();
-            latched(session, cell, epoch, 7_000, "STIM-7")?;
+            check_latched(session, cell, epoch, 7_000, "STIM-7")?;
         }
     }
     Ok(count)
 }
 
 /// Checks that eight stimuli can be pending, and the ninth is refused.
-fn pending(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
+fn check_pending(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     let before = session.counters()?;
     let last = session.known.last_epoch;
     let to = Node::Cell(session.cell);
@@ -204,9 +205,9 @@ fn pending(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReas
         let page = if ahead % 4 == 0 {
             SensorPage::Acceleration([protocol::fixed::Q3_12::from_bits(9); 3])
         } else {
-            SensorPage::Skin(arm::press(1_000 * i32::from(ahead)))
+            SensorPage::Skin(arm::press_with_sum(1_000 * i32::from(ahead)))
         };
-        let first = AppliesFrom::Epoch(Epoch(last.wrapping_add(20 + ahead)));
+        let first = StimulusStart::Epoch(Epoch(last.wrapping_add(20 + ahead)));
         session.send_messages(&[Message::Stimulus { to, from: first, page }])?;
     }
     let after = session.counters()?;
@@ -222,45 +223,45 @@ fn pending(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReas
     });
     for ahead in [1, 2, 3, 5, 6, 7, 8, 9, 10, 11] {
         let expected = if ahead < 8 { 1_000 * i32::from(ahead) } else { 7_000 };
-        latched(session, cell, last.wrapping_add(20 + ahead), expected, "STIM-6")?;
+        check_latched(session, cell, last.wrapping_add(20 + ahead), expected, "STIM-6")?;
     }
     // There is room again.
-    session.press(arm::press(1_234))?;
+    session.press(arm::press_with_sum(1_234))?;
     let epoch = session.next_epoch();
-    latched(session, cell, epoch, 1_234, "STIM-6")
+    check_latched(session, cell, epoch, 1_234, "STIM-6")
 }
 
 /// Checks that a write of parameter 5 clears the latched and the pending stimuli.
-fn forgotten(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
+fn check_cleared(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     for on_between in [true, false] {
-        session.press(arm::press(3_333))?;
+        session.press(arm::press_with_sum(3_333))?;
         let epoch = session.next_epoch();
-        latched(session, cell, epoch, 3_333, "STIM-2")?;
-        session.press_at(epoch.wrapping_add(2), arm::press(4_444))?;
+        check_latched(session, cell, epoch, 3_333, "STIM-2")?;
+        session.press_at(epoch.wrapping_add(2), arm::press_with_sum(4_444))?;
         if !on_between {
-            session.test_mode(false)?;
+            session.switch_test_mode(false)?;
         }
-        session.test_mode(true)?;
-        latched(session, cell, epoch.wrapping_add(1), 0, "STIM-2")?;
-        latched(session, cell, epoch.wrapping_add(2), 0, "STIM-2")?;
+        session.switch_test_mode(true)?;
+        check_latched(session, cell, epoch.wrapping_add(1), 0, "STIM-2")?;
+        check_latched(session, cell, epoch.wrapping_add(2), 0, "STIM-2")?;
     }
     Ok(())
 }
 
 /// Checks that a cell that measures accepts no stimuli.
-fn measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.test_mode(false)?;
+fn check_measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.switch_test_mode(false)?;
     let before = session.counters()?;
-    session.press(arm::press(5_555))?;
+    session.press(arm::press_with_sum(5_555))?;
     session.known.pending = None;
     let last = session.known.last_epoch;
-    session.press_at(last.wrapping_add(1), arm::press(6_666))?;
+    session.press_at(last.wrapping_add(1), arm::press_with_sum(6_666))?;
     let after = session.counters()?;
     let counted = after.refused.stimuli.wrapping_sub(before.refused.stimuli);
     session.check("STIM-1", counted == 2 && after.heard.stimuli == before.heard.stimuli, || {
         format!("outside test mode 2 stimuli must be counted as refused, but {counted} were: {after}")
     });
-    session.test_mode(true)?;
+    session.switch_test_mode(true)?;
     session.known.active = None;
     session.step(&POSITIONS)?;
     let step = session.step(&POSITIONS)?;
@@ -271,22 +272,22 @@ fn measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that a halted cell accepts and latches stimuli.
-fn halted(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
+fn check_halted(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     let epoch = session.next_epoch();
     session.begin_exchange();
     session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
-    session.press_at(epoch.wrapping_add(1), arm::press(2_222))?;
+    session.press_at(epoch.wrapping_add(1), arm::press_with_sum(2_222))?;
     session.step_at(epoch, &POSITIONS)?;
-    session.known.skin = Some(arm::press(2_222));
+    session.known.skin = Some(arm::press_with_sum(2_222));
     session.step_at(epoch.wrapping_add(1), &POSITIONS)?;
-    let skin = session.latched()?;
-    session.check("STIM-8", skin == Some(arm::press(2_222)), || {
+    let skin = session.read_latched_skin()?;
+    session.check("STIM-8", skin == Some(arm::press_with_sum(2_222)), || {
         format!("a halted cell must latch a stimulus, but {} is latched", arm::format_skin(skin))
     });
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
-    latched(session, cell, epoch.wrapping_add(2), 2_222, "STIM-8")?;
-    session.press_and_step(&POSITIONS, arm::press(0))?;
+    check_latched(session, cell, epoch.wrapping_add(2), 2_222, "STIM-8")?;
+    session.press_and_step(&POSITIONS, arm::press_with_sum(0))?;
     Ok(())
 }

@@ -13,15 +13,15 @@ const POSITIONS: [i16; MAX_JOINTS] = [0x0111; MAX_JOINTS];
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.begin_exchange();
     session.known.halted = Some(false);
-    staged(session)?;
-    let skin = arm::press(4_096);
+    check_staged_reads(session)?;
+    let skin = arm::press_with_sum(4_096);
     if session.about.test_mode {
         session.press(skin)?;
         session.known.pending = None;
     }
-    joints(session)?;
+    check_joints(session)?;
     if session.about.test_mode {
-        let latched = session.latched()?;
+        let latched = session.read_latched_skin()?;
         session.check("JOINTS-3", latched == Some(skin), || {
             format!(
                 "a cell without a configuration latched {}, but must latch {}",
@@ -29,14 +29,14 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
                 arm::format_skin(Some(skin))
             )
         });
-        session.test_mode(true)?;
+        session.switch_test_mode(true)?;
     }
     session.known.epoch = None;
     Ok(())
 }
 
 /// Checks that a read returns the staged value while no configuration is in use.
-fn staged(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_staged_reads(session: &mut Session<'_>) -> Result<(), StopReason> {
     let pose = arm::example_parameters(2).words(Parameter::Pose);
     let number = Parameter::Pose.number();
     let before = session.read(number)?;
@@ -58,10 +58,10 @@ fn staged(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that the cell accepts joints of any chain, if their count matches their length, and does not answer them.
-fn joints(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_joints(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?;
     // The cell need not accept more joints than it can compute.
-    let most = u8::try_from(session.about.abilities.joints()).unwrap_or(u8::MAX);
+    let most = u8::try_from(session.about.abilities.max_joints()).unwrap_or(u8::MAX);
     for count in 1..=most {
         let epoch = session.next_epoch();
         let joints = session.joints_of(epoch, &POSITIONS, count);

@@ -14,7 +14,7 @@ use protocol::time::Span;
 const SLEEP_TIME: Duration = Duration::from_millis(1);
 
 #[derive(Debug, Default)]
-struct Shared {
+struct ProbeState {
     /// The time at which the thread should be woken, in us.
     due: AtomicU64,
     /// The maximum lateness, in us.
@@ -24,11 +24,11 @@ struct Shared {
 
 /// A handle of the thread, which ends when this handle is dropped.
 #[derive(Debug)]
-pub(super) struct Probe(Arc<Shared>);
+pub(super) struct LatenessProbe(Arc<ProbeState>);
 
-impl Probe {
+impl LatenessProbe {
     pub(super) fn new() -> io::Result<Self> {
-        let shared = Arc::new(Shared::default());
+        let shared = Arc::new(ProbeState::default());
         shared.due.store(u64::MAX, Ordering::Relaxed);
         let own = Arc::clone(&shared);
         thread::Builder::new().spawn(move || {
@@ -51,7 +51,7 @@ impl Probe {
     }
 }
 
-impl Drop for Probe {
+impl Drop for LatenessProbe {
     fn drop(&mut self) {
         self.0.over.store(true, Ordering::Relaxed);
     }

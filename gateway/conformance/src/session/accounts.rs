@@ -27,7 +27,7 @@ pub(super) struct PacketCounts {
 
 /// The numbers of heartbeats up to some time.
 #[derive(Clone, Copy, Debug, Default)]
-struct Beats {
+struct HeartbeatCounts {
     came: u64,
     /// The minimum and maximum number of heartbeats that syncs and claims requested.
     asked: (u64, u64),
@@ -35,7 +35,7 @@ struct Beats {
 
 /// The counts of packets from one start of the cell to the next.
 #[derive(Debug, Default)]
-pub(super) struct Accounts {
+pub(super) struct PacketAccounts {
     /// Segments of the test's own packets.
     segments: Vec<(Id, Reassembler)>,
     /// The epoch of the last accepted joints.
@@ -43,10 +43,10 @@ pub(super) struct Accounts {
     counts: PacketCounts,
     /// The last counters that the cell reported, with the bench's counts at that time.
     compared: Option<(HeardPage, RejectedCounts, PacketCounts)>,
-    beats: Beats,
+    beats: HeartbeatCounts,
     defended: Option<Micros>,
     /// The time of the last regular heartbeat, and the numbers of heartbeats until then.
-    anchor: Option<(Micros, Beats)>,
+    anchor: Option<(Micros, HeartbeatCounts)>,
     /// The minimum and maximum number of surplus heartbeats, over all intervals between regular heartbeats.
     surplus: (i64, i64),
     /// The number of missing heartbeats, since the last regular one, that are not awaited any more.
@@ -56,7 +56,7 @@ pub(super) struct Accounts {
 /// A discrepancy: the requirement, and a description.
 pub(super) type Discrepancy = (&'static str, String);
 
-impl Accounts {
+impl PacketAccounts {
     /// Counts the packet that a frame of the bench completes; `joints` is the number of joints of the chain, if the
     /// cell has a configuration.
     pub(super) fn count_own_frame(
@@ -180,7 +180,7 @@ impl Accounts {
     }
 
     /// Returns true if fewer heartbeats came than were requested or regularly due, apart from those given up.
-    pub(super) fn is_one_missing(&self, now: Micros) -> bool {
+    pub(super) fn is_heartbeat_missing(&self, now: Micros) -> bool {
         self.missing(now) > self.given_up
     }
 
@@ -192,17 +192,17 @@ impl Accounts {
     }
 
     /// Stops waiting for the missing heartbeats.
-    pub(super) fn give_up(&mut self, now: Micros) {
+    pub(super) fn excuse_missing(&mut self, now: Micros) {
         self.given_up = self.missing(now);
     }
 
     /// Notes a regular heartbeat. Returns the number of heartbeats since the last regular one, and the minimum and
     /// maximum number that were due.
-    pub(super) fn regular(&mut self, at: Micros) -> Option<(u64, u64, u64)> {
+    pub(super) fn note_regular_heartbeat(&mut self, at: Micros) -> Option<(u64, u64, u64)> {
         self.given_up = 0;
         let (before_at, before) = self.anchor.replace((at, self.beats))?;
         let regular = (at.elapsed_since(before_at).0 + HEARTBEAT_INTERVAL.0 / 2) / HEARTBEAT_INTERVAL.0;
-        let asked = |of: fn(&Beats) -> u64| regular + of(&self.beats) - of(&before);
+        let asked = |of: fn(&HeartbeatCounts) -> u64| regular + of(&self.beats) - of(&before);
         let (came, min, max) =
             (self.beats.came - before.came, asked(|it| it.asked.0), asked(|it| it.asked.1));
         self.surplus.0 += came.cast_signed() - max.cast_signed();

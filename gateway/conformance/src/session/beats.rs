@@ -12,7 +12,7 @@ const QUIET_MARGIN: Span = Span::from_millis(25);
 impl Session<'_> {
     /// Waits for a regular heartbeat, and checks the number of heartbeats since the last one: one every 250 ms, and one
     /// for each sync and claim.
-    pub(crate) fn regular_beat(&mut self) -> Result<(), StopReason> {
+    pub(crate) fn check_regular_beat(&mut self) -> Result<(), StopReason> {
         // Lets the answers to earlier requests arrive.
         self.settle()?;
         let until = self.now() + HEARTBEAT_INTERVAL + QUIET_MARGIN + QUIET_MARGIN;
@@ -20,14 +20,14 @@ impl Session<'_> {
         let at = self.answers().iter().find(|it| it.beat().is_some()).map(|it| it.at);
         self.check("BEAT-1", came, || "a heartbeat is due every 250 ms, but none came for 300 ms".to_owned());
         self.life.regular = at;
-        if let Some((came, min, max)) = at.and_then(|at| self.life.accounts.regular(at)) {
+        if let Some((came, min, max)) = at.and_then(|at| self.life.accounts.note_regular_heartbeat(at)) {
             self.check("BEAT-1", (min..=max).contains(&came), || {
                 let due = if min == max { min.to_string() } else { format!("{min} to {max}") };
                 format!("{came} heartbeats came, but {due} were due: one every 250 ms, and one to each sync and claim")
             });
         }
         self.idle(QUIET_MARGIN)?;
-        self.consume();
+        self.mark_expected();
         Ok(())
     }
 
@@ -51,6 +51,6 @@ impl Session<'_> {
             let since = now.elapsed_since(at);
             since > QUIET_MARGIN && since.0 + span.0 + QUIET_MARGIN.0 < HEARTBEAT_INTERVAL.0
         });
-        if is_free { Ok(()) } else { self.regular_beat() }
+        if is_free { Ok(()) } else { self.check_regular_beat() }
     }
 }

@@ -79,7 +79,7 @@ impl Session<'_> {
             self.answers().iter().rev().find_map(|heard| heard.beat().map(|(beat, epoch)| (*beat, epoch)));
         let came = beats(self);
         let answers = self.answers().iter().filter(|heard| heard.beat().is_none()).copied().collect();
-        self.consume();
+        self.mark_expected();
         let exchange = Exchange { at, answers, beats: came, beat };
         self.check_state(&exchange);
         Ok(exchange)
@@ -97,12 +97,12 @@ impl Session<'_> {
                 // A heartbeat that was due before the cell processed the joints has the previous epoch.
                 (any, right) = (true, right || epoch.is_none_or(|epoch| of.0 == epoch));
             }
-            if right && !self.life.accounts.is_one_missing(self.bus.now()) {
+            if right && !self.life.accounts.is_heartbeat_missing(self.bus.now()) {
                 return Ok(true);
             }
             if self.bus.now() >= until {
                 // Missing heartbeats are not awaited again.
-                self.life.accounts.give_up(self.bus.now());
+                self.life.accounts.excuse_missing(self.bus.now());
                 self.clock.other_epochs |= any && !right;
                 return Ok(any);
             }

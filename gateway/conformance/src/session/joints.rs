@@ -1,7 +1,7 @@
 //! Sends joints and stimuli, and checks the answers of the cell.
 
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Message, Request, SensorPage, SkinSensors, State};
+use protocol::message::{Message, Request, SensorPage, SkinSensors, State, StimulusStart};
 use protocol::packet::{Epoch, Length, Words, padded_words};
 use protocol::parameters::{MAX_JOINTS, Parameter};
 
@@ -45,7 +45,7 @@ impl Session<'_> {
         let to = Node::Cell(self.cell);
         self.send_messages(&[Message::Stimulus {
             to,
-            from: AppliesFrom::Next,
+            from: StimulusStart::Next,
             page: SensorPage::Skin(skin),
         }])?;
         Ok(())
@@ -56,7 +56,7 @@ impl Session<'_> {
         let to = Node::Cell(self.cell);
         self.send_messages(&[Message::Stimulus {
             to,
-            from: AppliesFrom::Epoch(Epoch(first)),
+            from: StimulusStart::Epoch(Epoch(first)),
             page: SensorPage::Skin(skin),
         }])?;
         Ok(())
@@ -149,7 +149,7 @@ impl Session<'_> {
             format!("joints {epoch} must be answered with at most one torque, but {count} came")
         });
         for other in exchange.answers.iter().filter(|heard| heard.torque().is_none()) {
-            if let Some(id) = self.known.unexpected(&other.message) {
+            if let Some(id) = self.known.violated_requirement(&other.message) {
                 let kind = other.message.id().kind.name();
                 self.check(id, false, || {
                     format!("joints must not be answered with a {kind} packet, but one came")
@@ -157,7 +157,7 @@ impl Session<'_> {
             }
         }
         let first = torques.first().and_then(|heard| Some((heard.at, heard.torque()?.0, *heard.torque()?.1)));
-        self.clock.skipped = first.is_none() && self.came_late(&exchange);
+        self.clock.skipped = first.is_none() && self.were_joints_late(&exchange);
         self.skips = self.skips.wrapping_add(u16::from(self.clock.skipped));
         let expected = match due {
             Some(ExpectedAnswer::Torque) => Some(true),
@@ -201,7 +201,7 @@ impl Session<'_> {
 
     /// Returns true if the cell processed the joints when they were older than a period, as the answer to the sync
     /// shows. It then skipped them, and their consequences cannot be expected.
-    fn came_late(&self, exchange: &Exchange) -> bool {
+    fn were_joints_late(&self, exchange: &Exchange) -> bool {
         let period = self.known.parameters.map_or(u64::MAX, |it| it.period_us.into());
         let beat = self.answers().iter().rev().find(|heard| heard.beat().is_some());
         beat.is_some_and(|heard| heard.at.elapsed_since(exchange.at).0 > period && period > 1_000)
@@ -248,7 +248,7 @@ impl Session<'_> {
     }
 
     /// Requests a report, and returns its skin page, which has the latched values.
-    pub(crate) fn latched(&mut self) -> Result<Option<SkinSensors>, StopReason> {
+    pub(crate) fn read_latched_skin(&mut self) -> Result<Option<SkinSensors>, StopReason> {
         let pages = self.report()?;
         Ok(pages.iter().find_map(|heard| match heard.sensors() {
             Some((_, SensorPage::Skin(skin))) => Some(*skin),
@@ -257,7 +257,7 @@ impl Session<'_> {
     }
 
     /// Switches test mode on or off, which clears all stimuli.
-    pub(crate) fn test_mode(&mut self, on: bool) -> Result<(), StopReason> {
+    pub(crate) fn switch_test_mode(&mut self, on: bool) -> Result<(), StopReason> {
         self.set_test_mode(Node::Cell(self.cell), on)
     }
 
@@ -272,7 +272,7 @@ impl Session<'_> {
 
     /// Commits parameters, and puts the cell in test mode, not in contact and not halted. Returns true if the commit
     /// succeeded.
-    pub(crate) fn ready(
+    pub(crate) fn prepare_cell(
         &mut self,
         parameters: &protocol::parameters::Parameters,
     ) -> Result<bool, StopReason> {
@@ -281,7 +281,7 @@ impl Session<'_> {
         self.known.halted = Some(false);
         let done = self.commit(parameters)?;
         if self.about.test_mode {
-            self.test_mode(true)?;
+            self.switch_test_mode(true)?;
         } else {
             (self.known.skin, self.known.pending) = (None, None);
         }

@@ -52,7 +52,7 @@ pub(crate) struct TrackedState {
 
 impl TrackedState {
     /// Returns the requirement that forbids the cell to send this packet unrequested.
-    pub(crate) fn unexpected(&self, message: &Message) -> Option<&'static str> {
+    pub(crate) fn violated_requirement(&self, message: &Message) -> Option<&'static str> {
         match message {
             Message::Network { page: NetworkPage::Received(_) | NetworkPage::Rejected(_), .. } => {
                 Some("CMD-4")

@@ -11,7 +11,7 @@ use protocol::packet::{Length, Lengths, Packet, Reassembler, Reassembly};
 use protocol::time::Micros;
 
 use super::Session;
-use super::accounts::Accounts;
+use super::accounts::PacketAccounts;
 use crate::bus::{ObservedFrame, StopReason};
 
 /// The state of the test from one start of the cell to the next.
@@ -25,7 +25,7 @@ pub(super) struct CellLife {
     /// first one.
     pub(super) joined: [bool; 8],
     /// The bench's counts of packets.
-    pub(super) accounts: Accounts,
+    pub(super) accounts: PacketAccounts,
     /// The field *sent* of the last heartbeat, and the number of packets since that heartbeat.
     pub(super) sent: Option<(u16, u16)>,
     /// True if CLAIMING is set in the last heartbeat.
@@ -39,13 +39,13 @@ pub(super) struct CellLife {
 impl CellLife {
     /// Returns the state for a life that begins with a heartbeat at this time. Waiting segments of the bench's own
     /// packets are kept, because they were on the bus.
-    fn after(former: Self, claimed: Micros) -> Self {
+    fn after_restart(former: Self, claimed: Micros) -> Self {
         let accounts = former.accounts.restarted();
         Self { claimed: Some(claimed), joined: [true; 8], accounts, ..Self::default() }
     }
 
     /// Notes that a complete packet of a kind has come. Returns true if one had come before.
-    pub(super) fn join_kind(&mut self, place: usize) -> bool {
+    pub(super) fn note_packet_kind(&mut self, place: usize) -> bool {
         self.joined.get_mut(place).is_none_or(|joined| core::mem::replace(joined, true))
     }
 
@@ -85,7 +85,7 @@ impl Session<'_> {
     pub(super) fn receive(&mut self, seen: ObservedFrame, id: Id) {
         let Some(held) = &mut self.held else { return self.handle_cell_frame(seen, id) };
         held.push((seen, id));
-        let Some((beat, places)) = claim(held, self.format) else { return };
+        let Some((beat, places)) = completed_claim(held, self.format) else { return };
         // A contact that bounces starts the cell more than once; an answer to another claim is not a start.
         if self.life.claimed.is_some() && beat.sent != 0 {
             return;
@@ -97,7 +97,7 @@ impl Session<'_> {
         for (seen, id) in before {
             self.handle_cell_frame(seen, id);
         }
-        self.life = CellLife::after(core::mem::take(&mut self.life), seen.at);
+        self.life = CellLife::after_restart(core::mem::take(&mut self.life), seen.at);
         for (seen, id) in of_claim {
             self.handle_cell_frame(seen, id);
         }
@@ -105,7 +105,7 @@ impl Session<'_> {
 }
 
 /// Returns the heartbeat with CLAIMING that the last frame completes, if there is one, and the indices of its frames.
-fn claim(held: &[(ObservedFrame, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)> {
+fn completed_claim(held: &[(ObservedFrame, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)> {
     let (last, id) = held.last()?;
     if id.kind != Kind::Network || last.frame.format() != format {
         return None;

@@ -57,7 +57,7 @@ impl Session<'_> {
             if segments.is_waiting() && now.elapsed_since(last.at) > ANSWER_TIMEOUT {
                 *segments = Reassembler::NONE;
                 let frame = last.frame;
-                if !self.life.join_kind(place) {
+                if !self.life.note_packet_kind(place) {
                     continue;
                 }
                 self.check("SEND-1", false, || {
@@ -95,11 +95,11 @@ impl Session<'_> {
                 match segments.push(Micros(0), id, Lengths::for_id(id), frame.data()) {
                     Ok(Reassembly::Waiting) => return,
                     Ok(Reassembly::Complete(packet)) => {
-                        self.life.join_kind(id.kind as usize);
+                        self.life.note_packet_kind(id.kind as usize);
                         Ok(packet)
                     }
                     // The previous segment is the end of a packet that began before the test.
-                    Ok(Reassembly::Incomplete) if !self.life.join_kind(id.kind as usize) => return,
+                    Ok(Reassembly::Incomplete) if !self.life.note_packet_kind(id.kind as usize) => return,
                     Ok(Reassembly::Incomplete) => Err(PacketError::Incomplete),
                     Ok(Reassembly::Ambiguous) => Err(PacketError::Ambiguous),
                     Err(error) => Err(error),

@@ -3,7 +3,7 @@
 use model::decode::Decoded;
 use protocol::id::Node;
 use protocol::message::{
-    Answer, Message, NetworkPage, Readings, ReceivedCounts as HeardPage, RejectedCounts, Request,
+    Answer, Message, NetworkPage, ReceivedCounts as HeardPage, RejectedCounts, Request, SensorReadings,
 };
 use protocol::packet::{Epoch, WORDS, padded_words};
 use protocol::parameters::{Parameter, Parameters};
@@ -58,9 +58,9 @@ const REPORT_PAGES: [u8; 2] = [1, 2];
 const REPORT_OF_PORTS: [u8; 2] = [3, 4];
 
 /// Returns the names of the pages that answer a report, in order.
-fn report_of(has_ports: bool) -> Vec<String> {
+fn report_page_names(has_ports: bool) -> Vec<String> {
     let network = |pages: &[u8]| pages.iter().map(|page| format!("network {page}")).collect::<Vec<_>>();
-    let sensors = Readings::default().pages().map(|page| format!("sensors {}", page.number()));
+    let sensors = SensorReadings::default().pages().map(|page| format!("sensors {}", page.number()));
     let of_ports = if has_ports { network(&REPORT_OF_PORTS) } else { Vec::new() };
     network(&REPORT_PAGES).into_iter().chain(sensors).chain(of_ports).collect()
 }
@@ -95,7 +95,7 @@ impl core::fmt::Display for Reply {
 }
 
 /// Returns the time, the tag and the content of an answer to a request.
-const fn configured(heard: &CellPacket) -> Option<(Micros, u8, Answer)> {
+const fn configured_answer(heard: &CellPacket) -> Option<(Micros, u8, Answer)> {
     if let Message::Configured { tag, answer, .. } = heard.message {
         Some((heard.at, tag, answer))
     } else {
@@ -148,13 +148,15 @@ impl Session<'_> {
             heard.iter().any(|it| matches!(it.message, Message::Configured { .. }))
         })?;
         // The answer to an earlier, interrupted request may come first.
-        let is_its = |heard: &CellPacket| heard.message.tag() == Some(tag) && configured(heard).is_some();
+        let is_its =
+            |heard: &CellPacket| heard.message.tag() == Some(tag) && configured_answer(heard).is_some();
         self.wait(self.now() + LATE_ANSWER_TIMEOUT, |heard| {
-            heard.iter().any(is_its) || !heard.iter().any(|it| configured(it).is_some())
+            heard.iter().any(is_its) || !heard.iter().any(|it| configured_answer(it).is_some())
         })?;
         let place = self.answers().iter().position(is_its);
-        let place = place.or_else(|| self.answers().iter().position(|heard| configured(heard).is_some()));
-        let found = place.and_then(|place| configured(self.answers().get(place)?));
+        let place =
+            place.or_else(|| self.answers().iter().position(|heard| configured_answer(heard).is_some()));
+        let found = place.and_then(|place| configured_answer(self.answers().get(place)?));
         let Some((answered, came, answer)) = found else {
             self.check(id, false, || {
                 format!(
@@ -197,7 +199,7 @@ impl Session<'_> {
     /// Stages parameters: writes all stored ones that differ from the staged ones.
     pub(crate) fn stage(&mut self, parameters: &Parameters) -> Result<(), StopReason> {
         let before = self.known.staged.take();
-        for parameter in Parameter::stored(parameters.all_rows().len()) {
+        for parameter in Parameter::stored_for_rows(parameters.all_rows().len()) {
             let words = parameters.words(parameter);
             if before.is_none_or(|before| before.words(parameter) != words) {
                 let reply = self.write(parameter.number(), words)?;
@@ -245,14 +247,14 @@ impl Session<'_> {
     pub(crate) fn report(&mut self) -> Result<Vec<CellPacket>, StopReason> {
         self.begin_exchange();
         let asked = self.send_messages(&[Message::Report])?;
-        self.pages(asked)
+        self.report_pages(asked)
     }
 
     /// Returns true if the cell sends the pages of a cell with ports.
     pub(crate) fn has_ports(&mut self) -> Result<bool, StopReason> {
         self.begin_exchange();
         let asked = self.send_messages(&[Message::Report])?;
-        let pages = self.collect(asked, report_of(true).len())?;
+        let pages = self.collect(asked, report_page_names(true).len())?;
         let is_of_ports = |page: &NetworkPage| matches!(page, NetworkPage::Tree(_) | NetworkPage::Ports(_));
         Ok(pages.iter().any(|it| matches!(&it.message, Message::Network { page, .. } if is_of_ports(page))))
     }
@@ -262,13 +264,13 @@ impl Session<'_> {
         let pages = |heard: &[CellPacket]| heard.iter().filter(|it| it.beat().is_none()).count();
         self.wait(asked + REPORT_TIMEOUT, |heard| pages(heard) >= expected)?;
         let pages = self.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
-        self.consume();
+        self.mark_expected();
         Ok(pages)
     }
 
     /// Returns the pages of a report that was requested at a time.
-    pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<CellPacket>, StopReason> {
-        let order = report_of(self.about.ports);
+    pub(crate) fn report_pages(&mut self, asked: Micros) -> Result<Vec<CellPacket>, StopReason> {
+        let order = report_page_names(self.about.ports);
         let pages = self.collect(asked, order.len() + usize::from(self.known.adapts))?;
         if !self.known.senses {
             let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();

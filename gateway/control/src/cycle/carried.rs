@@ -5,7 +5,7 @@
 //! then decays to zero.
 
 use protocol::packet::Epoch;
-use protocol::skin::Safety;
+use protocol::skin::SafetyLimits;
 
 use model::table::BusTotals;
 
@@ -48,7 +48,7 @@ impl CarriedBroadcasts {
 }
 
 /// Returns the fraction of the last torque, 0 to 1, that counts after this many broadcasts were not read back.
-pub(super) fn remaining_fraction(unanswered: u64, safety: &Safety) -> f64 {
+pub(super) fn remaining_fraction(unanswered: u64, safety: &SafetyLimits) -> f64 {
     let hold = u64::from(safety.hold_epochs);
     if unanswered <= hold {
         return 1.0;
@@ -59,6 +59,6 @@ pub(super) fn remaining_fraction(unanswered: u64, safety: &Safety) -> f64 {
 }
 
 /// Returns true if a bus that has missed this many broadcasts contributes no torque any more.
-pub(super) fn is_lost(unanswered: u64, safety: &Safety) -> bool {
+pub(super) fn is_lost(unanswered: u64, safety: &SafetyLimits) -> bool {
     unanswered > u64::from(safety.hold_epochs) + u64::from(safety.decay_epochs)
 }

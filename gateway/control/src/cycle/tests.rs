@@ -1,5 +1,5 @@
 use super::*;
-use crate::controller::Kinesthetic;
+use crate::controller::KinestheticController;
 use crate::robot::SimulatedArm;
 use model::table::BusTotals;
 use model::testing;
@@ -8,7 +8,7 @@ use protocol::time::Span;
 struct Dead;
 
 impl Controller for Dead {
-    fn step(&mut self, _: &Input) -> ControllerOutput {
+    fn step(&mut self, _: &ControllerInput) -> ControllerOutput {
         ControllerOutput::Bad(BadCycle::NoAnswer)
     }
 }
@@ -29,7 +29,7 @@ fn cycle(controller: Box<dyn Controller>) -> (Cycle, BusTotals) {
 
 #[test]
 fn joints_go_out_every_eighth_tick_also_after_skipped_ones() {
-    let (mut cycle, bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
+    let (mut cycle, bus) = cycle(Box::new(KinestheticController::new(&testing::skin()).unwrap()));
     let mut sent = vec![];
     for number in [0, 1, 7, 8, 9, 17, 18, 40, 41] {
         let outcome = cycle.tick(tick(number), 0, [works(&bus)]);
@@ -64,7 +64,7 @@ struct FailingController {
 }
 
 impl Controller for FailingController {
-    fn step(&mut self, _: &Input) -> ControllerOutput {
+    fn step(&mut self, _: &ControllerInput) -> ControllerOutput {
         self.ticks += 1;
         let moves = [0.5; MAX_ROBOT_JOINTS];
         if self.misses.contains(&self.ticks) {
@@ -109,7 +109,7 @@ fn another_program_may_take_its_time_to_begin() {
 fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
     let skin = testing::skin();
     let limit = u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1);
-    let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&skin).unwrap()));
+    let (mut cycle, mut bus) = cycle(Box::new(KinestheticController::new(&skin).unwrap()));
     let bad =
         |cycle: &mut Cycle, bus: &BusTotals, number| cycle.tick(tick(number), 0, [works(bus)]).record.bad;
     for number in 0..=limit * 8 {
@@ -129,11 +129,11 @@ struct TwoBuses {
 }
 
 impl TwoBuses {
-    fn new(lost_bus: LostBus) -> Self {
+    fn new(lost_bus: LostBusReaction) -> Self {
         let mut skin = testing::two_buses();
         skin.safety.lost_bus = lost_bus;
         let robot = SimulatedArm::new(&skin, [0.0; MAX_ROBOT_JOINTS]);
-        let controller = Box::new(Kinesthetic::new(&skin).unwrap());
+        let controller = Box::new(KinestheticController::new(&skin).unwrap());
         let reference_torque =
             BusTotals { torque: [1.0; MAX_JOINTS], contributing: 1, ..BusTotals::default() };
         let cycle = Cycle::new(&skin, controller, Box::new(robot));
@@ -160,7 +160,7 @@ impl TwoBuses {
 
 #[test]
 fn a_lost_bus_decays_by_the_rule_for_cells_and_the_others_go_on() {
-    let mut two = TwoBuses::new(LostBus::Continue);
+    let mut two = TwoBuses::new(LostBusReaction::Continue);
     for _ in 0..5 {
         let record = two.epoch([true, true]);
         assert_eq!((record.torque[0], record.contributing, record.missing), (2.0, 2, 0));
@@ -187,7 +187,7 @@ fn a_lost_bus_decays_by_the_rule_for_cells_and_the_others_go_on() {
 
 #[test]
 fn a_bus_that_carries_nothing_is_lost_also_without_a_report() {
-    let mut two = TwoBuses::new(LostBus::Continue);
+    let mut two = TwoBuses::new(LostBusReaction::Continue);
     two.epoch([true, true]);
     let missing: Vec<_> = (0..300).map(|_| two.epoch([true, false]).missing).collect();
     assert_eq!(missing[..7], [0; 7]);
@@ -196,7 +196,7 @@ fn a_bus_that_carries_nothing_is_lost_also_without_a_report() {
 
 #[test]
 fn without_any_bus_the_torque_is_not_valid() {
-    let mut two = TwoBuses::new(LostBus::Continue);
+    let mut two = TwoBuses::new(LostBusReaction::Continue);
     two.epoch([true, true]);
     two.works = [false, false];
     assert_eq!(two.epoch([false, false]).bad, Some(BadCycle::Torque));
@@ -206,7 +206,7 @@ fn without_any_bus_the_torque_is_not_valid() {
 
 #[test]
 fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
-    let mut two = TwoBuses::new(LostBus::Halt);
+    let mut two = TwoBuses::new(LostBusReaction::Halt);
     assert_eq!(two.epoch([true, true]).bad, None);
     two.works[0] = false;
     assert_eq!(two.epoch([true, true]).bad, Some(BadCycle::Torque));
@@ -220,7 +220,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
 
 #[test]
 fn a_halted_robot_stands_whatever_is_commanded() {
-    let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
+    let (mut cycle, mut bus) = cycle(Box::new(KinestheticController::new(&testing::skin()).unwrap()));
     bus.torque = [5.0; MAX_JOINTS];
     for number in 0..50 {
         cycle.tick(tick(number), 0, [works(&bus)]);
@@ -238,7 +238,7 @@ fn a_halted_robot_stands_whatever_is_commanded() {
 struct Present(std::ops::Range<u64>);
 
 impl Controller for Present {
-    fn step(&mut self, input: &Input) -> ControllerOutput {
+    fn step(&mut self, input: &ControllerInput) -> ControllerOutput {
         let answers = self.0.contains(&input.tick);
         if answers {
             ControllerOutput::Move([0.0; MAX_ROBOT_JOINTS])
@@ -247,15 +247,15 @@ impl Controller for Present {
         }
     }
 
-    fn absence(&self, silent: Option<u32>) -> Option<Absence> {
+    fn absence(&self, silent: Option<u32>) -> Option<ControllerAbsence> {
         let (socket, answers) = (std::path::PathBuf::new(), self.0.end - self.0.start);
-        silent.map(|ticks| Absence::Gone { socket, answers, ticks })
+        silent.map(|ticks| ControllerAbsence::Gone { socket, answers, ticks })
     }
 }
 
 /// Runs a loop whose controller has one second to start. Returns the reason for its absence at the end, and that of the
 /// halt.
-fn absence_after(ticks: u64, present: std::ops::Range<u64>) -> (Option<Absence>, Option<Halt>) {
+fn absence_after(ticks: u64, present: std::ops::Range<u64>) -> (Option<ControllerAbsence>, Option<Halt>) {
     let (mut cycle, bus) = cycle(Box::new(Present(present)));
     cycle.start_deadline = Some(Micros(1_000_000));
     let mut halted = None;

@@ -12,7 +12,7 @@ use protocol::parameters::MAX_JOINTS;
 
 use crate::cycle::carried::BusInput;
 use crate::cycle::{CentralTorque, Cycle, Tick, TickRecord};
-use crate::external::Absence;
+use crate::external::ControllerAbsence;
 use model::scenario::{Scenario, TorqueSource};
 use model::table::Snapshot;
 
@@ -21,7 +21,7 @@ const HALT_REPEAT_EPOCHS: u8 = 8;
 
 /// The state that all threads of a run share.
 #[derive(Debug, Default)]
-pub struct Shared {
+pub struct SharedRunState {
     /// True once the control loop is to end.
     pub stop_loop: AtomicBool,
     /// True once the receivers are to end, after the loop.
@@ -77,7 +77,7 @@ impl Default for BusState {
 impl BusState {
     /// Returns true if the bus works at present.
     #[must_use]
-    pub fn is_there(&self) -> bool {
+    pub fn is_working(&self) -> bool {
         self.works.load(Ordering::Relaxed)
     }
 }
@@ -102,7 +102,7 @@ pub struct TickDriver {
     cycle: Cycle,
     lines: Vec<BusPort>,
     scenario: Arc<Scenario>,
-    shared: Arc<Shared>,
+    shared: Arc<SharedRunState>,
     records: rtrb::Producer<TimedRecord>,
     /// Queue of records to the recorder; `None` if the run is not recorded.
     recorded: Option<rtrb::Producer<TimedRecord>>,
@@ -119,7 +119,7 @@ impl TickDriver {
         cycle: Cycle,
         lines: Vec<BusPort>,
         scenario: Arc<Scenario>,
-        shared: Arc<Shared>,
+        shared: Arc<SharedRunState>,
         records: rtrb::Producer<TimedRecord>,
     ) -> Self {
         let (owed, worked) = (vec![None; lines.len()], vec![true; lines.len()]);
@@ -141,7 +141,7 @@ impl TickDriver {
 
     /// Returns the reason for which the controller counts as absent; `None` if it does not.
     #[must_use]
-    pub fn absence(&self) -> Option<Absence> {
+    pub fn absence(&self) -> Option<ControllerAbsence> {
         self.cycle.absence()
     }
 
@@ -162,14 +162,14 @@ impl TickDriver {
             line.snapshot.update();
         }
         let snapshots = || self.lines.iter().map(|line| line.snapshot.output_buffer());
-        let heard = self
-            .lines
-            .iter()
-            .map(|line| BusInput { sums: &line.snapshot.output_buffer().sums, works: line.state.is_there() });
+        let heard = self.lines.iter().map(|line| BusInput {
+            sums: &line.snapshot.output_buffer().sums,
+            works: line.state.is_working(),
+        });
         let outcome = self.cycle.tick(tick, skipped, heard);
         let central = (mode == TorqueSource::Compare).then(|| {
             let before = now();
-            let reference_torque = self.cycle.central(snapshots());
+            let reference_torque = self.cycle.central_torque(snapshots());
             // Without `black_box` the compiler could drop this work if the result is unused.
             (now().saturating_sub(before), std::hint::black_box(reference_torque))
         });
@@ -181,14 +181,14 @@ impl TickDriver {
             }
             self.send_pending(&mut send);
             // Many buses have the same joints: encode them once.
-            let mut encoded_joints: Option<(usize, Format, Encoded, [f64; MAX_JOINTS])> = None;
+            let mut encoded_joints: Option<(usize, Format, EncodedFrames, [f64; MAX_JOINTS])> = None;
             for (bus, line) in self.lines.iter_mut().enumerate() {
                 let chain = self.cycle.chain_of(bus);
                 let same =
                     encoded_joints.as_ref().filter(|(of, format, ..)| (*of, *format) == (chain, line.format));
                 if same.is_none() {
                     let joints = Message::Joints { epoch, joints: self.cycle.joints(chain) };
-                    let encoded = Encoded::new(&joints.encode(), line.format);
+                    let encoded = EncodedFrames::new(&joints.encode(), line.format);
                     encoded_joints = Some((chain, line.format, encoded, self.cycle.chain_positions(chain)));
                 }
                 let Some((_, _, encoded, positions)) = &encoded_joints else { continue };
@@ -226,7 +226,7 @@ impl TickDriver {
     fn requeue_for_returned_buses(&mut self, halted: bool) {
         for ((line, owed), worked) in self.lines.iter().zip(&mut self.pending_commands).zip(&mut self.worked)
         {
-            let works = line.state.is_there();
+            let works = line.state.is_working();
             // Load before swap: a swap in every tick is costly, and the flag is rarely set.
             let returned = &line.state.returned;
             let returned = returned.load(Ordering::Relaxed) && returned.swap(false, Ordering::Relaxed);
@@ -257,18 +257,18 @@ impl BusPort {
         &self,
         bus: usize,
         message: &Message,
-        shared: &Shared,
+        shared: &SharedRunState,
         send: &mut impl FnMut(usize, &[Frame]) -> bool,
     ) -> bool {
-        self.send_frames(bus, &Encoded::new(&message.encode(), self.format), shared, send)
+        self.send_frames(bus, &EncodedFrames::new(&message.encode(), self.format), shared, send)
     }
 
     /// Sends the frames of a command on the bus. If the bus accepts them, counts the command and returns true.
     fn send_frames(
         &self,
         bus: usize,
-        encoded: &Encoded,
-        shared: &Shared,
+        encoded: &EncodedFrames,
+        shared: &SharedRunState,
         send: &mut impl FnMut(usize, &[Frame]) -> bool,
     ) -> bool {
         let frames = encoded.frames();
@@ -284,12 +284,12 @@ impl BusPort {
 
 /// The frames of an encoded packet in an array, with their number.
 #[derive(Clone, Copy, Debug)]
-struct Encoded {
+struct EncodedFrames {
     all: [Frame; Length::MAX_SEGMENTS],
     count: usize,
 }
 
-impl Encoded {
+impl EncodedFrames {
     fn new(packet: &Packet, format: Format) -> Self {
         let mut encoded = Self { all: [Frame::EMPTY; Length::MAX_SEGMENTS], count: 0 };
         for (place, frame) in encoded.all.iter_mut().zip(packet.frames(format)) {

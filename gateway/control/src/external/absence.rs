@@ -8,7 +8,7 @@ use thiserror::Error;
 /// The reason for which an external controller counts as absent. The message also says what to do.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
-pub enum Absence {
+pub enum ControllerAbsence {
     /// No program sent a hello.
     #[error(
         "no external controller sent a hello on {}{}: start it before the run or within [controller] start_s; \

@@ -14,38 +14,38 @@
 use protocol::skin::MAX_ROBOT_JOINTS;
 use thiserror::Error;
 
-use crate::controller::Input;
+use crate::controller::ControllerInput;
 
 const MAGIC: [u8; 4] = *b"SKBC";
 const VERSION: u16 = 1;
-const STATE: u16 = 1;
-const ANSWER: u16 = 2;
-const HELLO: u16 = 3;
+const STATE_KIND: u16 = 1;
+const ANSWER_KIND: u16 = 2;
+const HELLO_KIND: u16 = 3;
 
 const HEAD_BYTES: usize = 8;
 /// Size of the longest answer in bytes.
 pub(super) const MAX_ANSWER_BYTES: usize = answer_bytes(MAX_ROBOT_JOINTS);
 
 /// Number of values of each kind in a datagram for a robot with `joints` joints.
-const fn values(joints: usize) -> usize {
+const fn value_count(joints: usize) -> usize {
     if joints < 6 { 6 } else { joints }
 }
 
 /// Size in bytes of a state for a robot with `joints` joints.
 const fn state_bytes(joints: usize) -> usize {
-    40 + 24 * values(joints)
+    40 + 24 * value_count(joints)
 }
 
 /// Size in bytes of an answer for a robot with `joints` joints.
 const fn answer_bytes(joints: usize) -> usize {
-    24 + 8 * values(joints)
+    24 + 8 * value_count(joints)
 }
 
 /// The state that the gateway sends in each tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StateDatagram {
     /// The input of a controller in this tick.
-    pub input: Input,
+    pub input: ControllerInput,
     /// Number of the robot's joints.
     pub joints: u32,
 }
@@ -121,14 +121,14 @@ impl Writer<'_> {
         }
     }
 
-    fn head(&mut self, kind: u16) {
+    fn write_header(&mut self, kind: u16) {
         self.put(MAGIC);
         self.put(VERSION.to_le_bytes());
         self.put(kind.to_le_bytes());
     }
 
-    fn joints(&mut self, all: [f64; MAX_ROBOT_JOINTS], joints: usize) {
-        for value in all.into_iter().take(values(joints)) {
+    fn write_joints(&mut self, all: [f64; MAX_ROBOT_JOINTS], joints: usize) {
+        for value in all.into_iter().take(value_count(joints)) {
             self.put(value.to_le_bytes());
         }
     }
@@ -145,16 +145,16 @@ impl Reader<'_> {
     }
 
     /// Reads the values of all joints. Joints that the robot does not have get 0.
-    fn joints(&mut self, joints: usize) -> [f64; MAX_ROBOT_JOINTS] {
+    fn read_joints(&mut self, joints: usize) -> [f64; MAX_ROBOT_JOINTS] {
         let mut all = [0.0; MAX_ROBOT_JOINTS];
-        for value in all.iter_mut().take(values(joints)) {
+        for value in all.iter_mut().take(value_count(joints)) {
             *value = f64::from_le_bytes(self.take());
         }
         all
     }
 
     /// Reads the header and returns the kind of the datagram.
-    fn head(&mut self) -> Result<u16, InvalidDatagram> {
+    fn read_header(&mut self) -> Result<u16, InvalidDatagram> {
         if self.0.len() < HEAD_BYTES {
             return Err(InvalidDatagram::Length);
         }
@@ -169,11 +169,11 @@ impl Reader<'_> {
 }
 
 impl StateDatagram {
-    const VALID: u32 = 1;
-    const HALTED: u32 = 1 << 1;
+    const VALID_FLAG: u32 = 1;
+    const HALTED_FLAG: u32 = 1 << 1;
     /// The lowest bit of the mask of lost buses in the flags, for the first bus. Bit 31 stands for the 16th bus and all
     /// after it.
-    const MISSING: u32 = 16;
+    const MISSING_BUSES_SHIFT: u32 = 16;
 
     /// Encodes the state as a datagram.
     #[must_use]
@@ -182,26 +182,26 @@ impl StateDatagram {
         let mut bytes = [0; state_bytes(MAX_ROBOT_JOINTS)];
         let mut out = Writer(&mut bytes);
         let input = &self.input;
-        out.head(STATE);
+        out.write_header(STATE_KIND);
         out.put(input.tick.to_le_bytes());
         out.put(input.time.0.to_le_bytes());
         out.put(input.age.to_le_bytes());
         out.put(input.contributing.to_le_bytes());
         let flag = |bit, set| if set { bit } else { 0 };
         let missing = input.missing | flag(1 << 15, input.missing >> 16 != 0);
-        let flags = flag(Self::VALID, input.valid) | flag(Self::HALTED, input.halted);
-        out.put((flags | missing << Self::MISSING).to_le_bytes());
+        let flags = flag(Self::VALID_FLAG, input.valid) | flag(Self::HALTED_FLAG, input.halted);
+        out.put((flags | missing << Self::MISSING_BUSES_SHIFT).to_le_bytes());
         out.put(self.joints.to_le_bytes());
-        out.joints(input.q, joints);
-        out.joints(input.qdot, joints);
-        out.joints(input.torque, joints);
+        out.write_joints(input.q, joints);
+        out.write_joints(input.qdot, joints);
+        out.write_joints(input.torque, joints);
         bytes.into_iter().take(state_bytes(joints)).collect()
     }
 }
 
 impl AnswerDatagram {
-    const VELOCITY: u32 = 1;
-    const POSITION: u32 = 2;
+    const VELOCITY_COMMAND: u32 = 1;
+    const POSITION_COMMAND: u32 = 2;
 }
 
 impl ReceivedDatagram {
@@ -211,9 +211,9 @@ impl ReceivedDatagram {
     /// Returns [`Nonsense`] if the datagram is neither an answer nor a hello.
     pub(super) fn decode(bytes: &[u8], joints: usize) -> Result<Self, InvalidDatagram> {
         let mut from = Reader(bytes);
-        let expected = match from.head()? {
-            HELLO => HEAD_BYTES,
-            ANSWER => answer_bytes(joints),
+        let expected = match from.read_header()? {
+            HELLO_KIND => HEAD_BYTES,
+            ANSWER_KIND => answer_bytes(joints),
             _ => return Err(InvalidDatagram::Kind),
         };
         if bytes.len() != expected {
@@ -225,13 +225,13 @@ impl ReceivedDatagram {
         let tick = u64::from_le_bytes(from.take());
         let command = u32::from_le_bytes(from.take());
         let _zero: [u8; 4] = from.take();
-        let values = from.joints(joints);
+        let values = from.read_joints(joints);
         if !values.iter().all(|value| value.is_finite()) {
             return Err(InvalidDatagram::NotFinite);
         }
         let command = match command {
-            AnswerDatagram::VELOCITY => JointCommand::Velocity(values),
-            AnswerDatagram::POSITION => JointCommand::Position(values),
+            AnswerDatagram::VELOCITY_COMMAND => JointCommand::Velocity(values),
+            AnswerDatagram::POSITION_COMMAND => JointCommand::Position(values),
             _ => return Err(InvalidDatagram::Command),
         };
         Ok(Self::Answer(AnswerDatagram { tick, command }))
@@ -247,28 +247,28 @@ mod peer {
         /// Decodes a state. Never panics.
         pub(crate) fn decode(bytes: &[u8]) -> Result<Self, InvalidDatagram> {
             let mut from = Reader(bytes);
-            if from.head()? != STATE {
+            if from.read_header()? != STATE_KIND {
                 return Err(InvalidDatagram::Kind);
             }
-            let mut input = Input {
+            let mut input = ControllerInput {
                 tick: u64::from_le_bytes(from.take()),
                 time: protocol::time::Micros(u64::from_le_bytes(from.take())),
                 age: u32::from_le_bytes(from.take()),
                 contributing: u32::from_le_bytes(from.take()),
-                ..Input::default()
+                ..ControllerInput::default()
             };
             let flags = u32::from_le_bytes(from.take());
-            input.valid = flags & Self::VALID != 0;
-            input.halted = flags & Self::HALTED != 0;
-            input.missing = flags >> Self::MISSING;
+            input.valid = flags & Self::VALID_FLAG != 0;
+            input.halted = flags & Self::HALTED_FLAG != 0;
+            input.missing = flags >> Self::MISSING_BUSES_SHIFT;
             let joints = u32::from_le_bytes(from.take());
             let count = usize::try_from(joints).unwrap();
             if bytes.len() != state_bytes(count) {
                 return Err(InvalidDatagram::Length);
             }
-            input.q = from.joints(count);
-            input.qdot = from.joints(count);
-            input.torque = from.joints(count);
+            input.q = from.read_joints(count);
+            input.qdot = from.read_joints(count);
+            input.torque = from.read_joints(count);
             Ok(Self { input, joints })
         }
     }
@@ -278,15 +278,15 @@ mod peer {
         pub(crate) fn encode(&self, joints: usize) -> Vec<u8> {
             let mut bytes = vec![0; answer_bytes(joints)];
             let mut out = Writer(&mut bytes);
-            out.head(ANSWER);
+            out.write_header(ANSWER_KIND);
             out.put(self.tick.to_le_bytes());
             let (command, values) = match self.command {
-                JointCommand::Velocity(values) => (Self::VELOCITY, values),
-                JointCommand::Position(values) => (Self::POSITION, values),
+                JointCommand::Velocity(values) => (Self::VELOCITY_COMMAND, values),
+                JointCommand::Position(values) => (Self::POSITION_COMMAND, values),
             };
             out.put(command.to_le_bytes());
             out.put([0; 4]);
-            out.joints(values, joints);
+            out.write_joints(values, joints);
             bytes
         }
     }

@@ -3,9 +3,9 @@
 
 use std::path::PathBuf;
 
-use super::absence::{Absence, OtherDatagrams};
+use super::absence::{ControllerAbsence, OtherDatagrams};
 use super::datagram::{InvalidDatagram, JointCommand, ReceivedDatagram};
-use crate::controller::{BadCycle, ControllerOutput, Input, SpeedLimits};
+use crate::controller::{BadCycle, ControllerInput, ControllerOutput, SpeedLimits};
 
 /// Numbers of events since the start of the exchange.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
@@ -55,18 +55,18 @@ impl ExchangeCounts {
     /// Returns the reason for which the controller counts as absent; `None` if it does not. It is absent if it never
     /// answered, or not in the last `silent` ticks, which are enough to halt the robot of a controller that had
     /// started.
-    pub(super) fn absence(&self, socket: PathBuf, silent: Option<u32>) -> Option<Absence> {
+    pub(super) fn absence(&self, socket: PathBuf, silent: Option<u32>) -> Option<ControllerAbsence> {
         let &Self { hellos, answers, missing, late, other_senders, failed, .. } = self;
         match (hellos, answers, silent) {
             (0, ..) => {
                 let others = OtherDatagrams { named: other_senders, unnamed: failed };
-                Some(Absence::NoHello { socket, others })
+                Some(ControllerAbsence::NoHello { socket, others })
             }
             (_, 0, _) => {
                 let nonsense = self.nonsense.iter().sum();
-                Some(Absence::NoAnswer { socket, missing, late, nonsense })
+                Some(ControllerAbsence::NoAnswer { socket, missing, late, nonsense })
             }
-            (.., Some(ticks)) => Some(Absence::Gone { socket, answers, ticks }),
+            (.., Some(ticks)) => Some(ControllerAbsence::Gone { socket, answers, ticks }),
             (.., None) => None,
         }
     }
@@ -96,7 +96,7 @@ pub(super) enum SendResult {
 
 /// The exchange of datagrams with the peer.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Exchange {
+pub(super) struct DatagramExchange {
     connected: bool,
     /// Number of the tick whose answer is awaited.
     due: Option<u64>,
@@ -107,7 +107,7 @@ pub(super) struct Exchange {
     joints: usize,
 }
 
-impl Exchange {
+impl DatagramExchange {
     /// Creates an exchange for a robot with `joints` joints.
     pub(super) fn new(joints: usize) -> Self {
         Self { joints, ..Self::default() }
@@ -155,7 +155,7 @@ impl Exchange {
     }
 
     /// Returns the command of the peer for this tick. To be called after all received datagrams have been handled.
-    pub(super) fn step(&mut self, input: &Input, pace: &SpeedLimits) -> ControllerOutput {
+    pub(super) fn step(&mut self, input: &ControllerInput, pace: &SpeedLimits) -> ControllerOutput {
         let (due, answer) = (self.due.take(), self.answer.take());
         let nonsense = core::mem::take(&mut self.nonsense);
         if answer.is_some() {
@@ -166,9 +166,11 @@ impl Exchange {
         match (answer, due) {
             _ if nonsense => ControllerOutput::Bad(BadCycle::Nonsense),
             (Some(JointCommand::Velocity(velocity)), _) => {
-                ControllerOutput::Move(pace.limited(velocity, input))
+                ControllerOutput::Move(pace.limit_velocities(velocity, input))
             }
-            (Some(JointCommand::Position(goal)), _) => ControllerOutput::Move(pace.towards(&goal, input)),
+            (Some(JointCommand::Position(goal)), _) => {
+                ControllerOutput::Move(pace.velocities_towards(&goal, input))
+            }
             (None, Some(_)) => ControllerOutput::Bad(BadCycle::NoAnswer),
             (None, None) => ControllerOutput::Bad(BadCycle::NoPeer),
         }

@@ -14,9 +14,9 @@ mod datagram;
 mod exchange;
 mod socket;
 
-pub use absence::{Absence, OtherDatagrams};
+pub use absence::{ControllerAbsence, OtherDatagrams};
 pub use datagram::{AnswerDatagram, InvalidDatagram, JointCommand, StateDatagram};
-pub use socket::{External, SocketError};
+pub use socket::{ExternalController, SocketError};
 
 #[cfg(test)]
 mod tests;

@@ -12,10 +12,10 @@ use rustix::io::Errno;
 use rustix::net::SocketAddrUnix;
 use thiserror::Error;
 
-use super::absence::Absence;
+use super::absence::ControllerAbsence;
 use super::datagram::{MAX_ANSWER_BYTES, StateDatagram};
-use super::exchange::{Exchange, SendResult, Sender};
-use crate::controller::{Controller, ControllerOutput, Input, SpeedLimits};
+use super::exchange::{DatagramExchange, SendResult, Sender};
+use crate::controller::{Controller, ControllerInput, ControllerOutput, SpeedLimits};
 
 /// Maximum number of datagrams that are received per tick. Others remain in the socket's queue, so that no sender can
 /// delay the tick.
@@ -23,13 +23,13 @@ const MAX_DATAGRAMS_PER_TICK: usize = 16;
 
 /// A controller in another program.
 #[derive(Debug)]
-pub struct External {
+pub struct ExternalController {
     socket: UnixDatagram,
     path: PathBuf,
     /// Device and inode of the socket's file. At the end the file is removed only if it is still this one.
     file: Option<(u64, u64)>,
     peer: Option<SocketAddr>,
-    exchange: Exchange,
+    exchange: DatagramExchange,
     pace: SpeedLimits,
     joints: u32,
 }
@@ -68,7 +68,7 @@ pub enum SocketError {
     },
 }
 
-impl External {
+impl ExternalController {
     /// Listens on a socket at a path. A socket file that no program listens on is replaced.
     ///
     /// # Errors
@@ -79,7 +79,7 @@ impl External {
             file: file_identity(path),
             path: path.to_owned(),
             peer: None,
-            exchange: Exchange::new(skin.robot.joints.len()),
+            exchange: DatagramExchange::new(skin.robot.joints.len()),
             pace: SpeedLimits::from_skin(skin),
             joints: u32::try_from(skin.robot.joints.len()).unwrap_or_default(),
         })
@@ -109,7 +109,7 @@ impl External {
         }
     }
 
-    fn send(&mut self, input: &Input) {
+    fn send(&mut self, input: &ControllerInput) {
         let Some(peer) = &self.peer else { return };
         let state = StateDatagram { input: *input, joints: self.joints }.encode();
         let sent = match self.socket.send_to_addr(&state, peer) {
@@ -125,8 +125,8 @@ impl External {
     }
 }
 
-impl Controller for External {
-    fn step(&mut self, input: &Input) -> ControllerOutput {
+impl Controller for ExternalController {
+    fn step(&mut self, input: &ControllerInput) -> ControllerOutput {
         self.receive();
         let step = self.exchange.step(input, &self.pace);
         self.send(input);
@@ -137,12 +137,12 @@ impl Controller for External {
         self.exchange.counts.named().collect()
     }
 
-    fn absence(&self, silent: Option<u32>) -> Option<Absence> {
+    fn absence(&self, silent: Option<u32>) -> Option<ControllerAbsence> {
         self.exchange.counts.absence(self.path.clone(), silent)
     }
 }
 
-impl Drop for External {
+impl Drop for ExternalController {
     fn drop(&mut self) {
         if self.file.is_some() && file_identity(&self.path) == self.file {
             // Ignore the error: the next gateway replaces a dead socket.

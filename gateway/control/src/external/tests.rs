@@ -8,18 +8,18 @@ use tempfile::TempDir;
 
 use super::datagram::ReceivedDatagram;
 use super::*;
-use crate::controller::{BadCycle, Controller, ControllerOutput, Input};
+use crate::controller::{BadCycle, Controller, ControllerInput, ControllerOutput};
 use model::testing::skin;
 use protocol::packet::padded;
 
 const HELLO: &[u8] = b"SKBC\x01\x00\x03\x00";
 
-fn listen(path: &Path) -> Result<External, SocketError> {
-    External::listen(path, &skin())
+fn listen(path: &Path) -> Result<ExternalController, SocketError> {
+    ExternalController::listen(path, &skin())
 }
 
 /// Creates a directory, and a gateway that listens on a socket in it. Returns both, and the path of the socket.
-fn gateway() -> (TempDir, PathBuf, External) {
+fn gateway() -> (TempDir, PathBuf, ExternalController) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("controller.sock");
     let gateway = listen(&path).unwrap();
@@ -34,8 +34,8 @@ fn program(folder: &TempDir, name: &str) -> UnixDatagram {
     socket
 }
 
-fn input(tick: u64) -> Input {
-    Input { tick, valid: true, ..Input::default() }
+fn input(tick: u64) -> ControllerInput {
+    ControllerInput { tick, valid: true, ..ControllerInput::default() }
 }
 
 fn velocity(tick: u64, first: f64) -> Vec<u8> {
@@ -49,13 +49,13 @@ fn state(socket: &UnixDatagram) -> StateDatagram {
     StateDatagram::decode(&bytes[..length]).unwrap()
 }
 
-fn count(gateway: &External, name: &str) -> u64 {
+fn count(gateway: &ExternalController, name: &str) -> u64 {
     gateway.counts().into_iter().find(|(known, _)| known == name).unwrap().1
 }
 
 #[test]
 fn a_state_is_the_bytes_of_the_documented_table() {
-    let input = Input {
+    let input = ControllerInput {
         tick: 0x0102,
         time: protocol::time::Micros(516_000),
         q: padded(&[1.0, 0.0, 0.0, 0.0, 0.0, -2.0]),
@@ -78,7 +78,7 @@ fn a_state_is_the_bytes_of_the_documented_table() {
 
 #[test]
 fn a_robot_of_more_joints_has_longer_datagrams() {
-    let mut input = Input::default();
+    let mut input = ControllerInput::default();
     (input.q[0], input.qdot[0], input.torque[12]) = (1.0, 0.5, 0.25);
     let bytes = StateDatagram { input, joints: 13 }.encode();
     assert_eq!(bytes.len(), 40 + 3 * 13 * 8);
@@ -94,7 +94,9 @@ fn a_robot_of_more_joints_has_longer_datagrams() {
 #[test]
 fn buses_beyond_the_16th_share_its_bit() {
     let said = |missing| {
-        let bytes = StateDatagram { input: Input { missing, ..Input::default() }, joints: 6 }.encode();
+        let bytes =
+            StateDatagram { input: ControllerInput { missing, ..ControllerInput::default() }, joints: 6 }
+                .encode();
         StateDatagram::decode(&bytes).unwrap().input.missing
     };
     assert_eq!([1, 1 << 15, 1 << 16, 1 << 31].map(said), [1, 1 << 15, 1 << 15, 1 << 15]);
@@ -137,7 +139,7 @@ fn an_answer_is_executed_in_the_next_tick() {
     program.send(&velocity(3, 99.0)).unwrap();
     assert_eq!(gateway.step(&input(4)), ControllerOutput::Move(padded(&[2.0, 0.0, 0.0, 0.0, 0.0, 0.0])));
     program.send(&velocity(4, 1.0)).unwrap();
-    let halted = Input { halted: true, ..input(5) };
+    let halted = ControllerInput { halted: true, ..input(5) };
     assert_eq!(gateway.step(&halted), ControllerOutput::Move(padded(&[0.0; 6])), "a halted robot stays");
     assert_eq!((count(&gateway, "answers"), count(&gateway, "missing")), (4, 0));
 }
@@ -342,7 +344,7 @@ proptest! {
 
 /// Checks the reason for which a gateway counts its controller as absent, with `silent` bad cycles at the end. Also
 /// checks that the message names the path of the socket.
-fn absent(gateway: &External, path: &Path, silent: Option<u32>, words: &str) {
+fn absent(gateway: &ExternalController, path: &Path, silent: Option<u32>, words: &str) {
     let absence = gateway.absence(silent).unwrap_or_else(|| panic!("not absent: {words}")).to_string();
     assert!(absence.contains(words) && absence.contains(&path.display().to_string()), "{absence}");
     assert!(!absence.contains('\n'), "{absence:?}");

@@ -6,8 +6,8 @@ use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::controller::{Controller, ControllerOutput, Input};
-use crate::external::External;
+use crate::controller::{Controller, ControllerInput, ControllerOutput};
+use crate::external::ExternalController;
 use protocol::packet::padded;
 use protocol::skin::Skin;
 use protocol::time::Micros;
@@ -27,7 +27,7 @@ fn the_example_in_python_makes_the_arm_give_way() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("controller.sock");
     let skin = Skin::parse("ur5-253.toml", include_str!("../../../examples/ur5-253.toml")).unwrap();
-    let mut gateway = External::listen(&path, &skin).unwrap();
+    let mut gateway = ExternalController::listen(&path, &skin).unwrap();
     let example = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/external_controller.py");
     let python = Command::new("python3").arg(example).arg(&path).stdout(Stdio::piped()).spawn();
     let mut python = Running(python.expect("python3 is needed: apt install python3"));
@@ -43,8 +43,14 @@ fn the_example_in_python_makes_the_arm_give_way() {
     while answers < 100 || !report.is_finished() {
         assert!(start.elapsed() < Duration::from_secs(60), "{answers} answers, and no report from python3");
         let time = Micros(u64::try_from(start.elapsed().as_micros()).unwrap());
-        let input =
-            Input { tick, time, torque: padded(&torque), contributing: 3, valid: true, ..Input::default() };
+        let input = ControllerInput {
+            tick,
+            time,
+            torque: padded(&torque),
+            contributing: 3,
+            valid: true,
+            ..ControllerInput::default()
+        };
         tick += 1;
         if let ControllerOutput::Move(velocity) = gateway.step(&input) {
             assert_eq!(ControllerOutput::Move(velocity), target);

@@ -2,10 +2,10 @@
 //! skin are computed centrally.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
-use crate::controller::{ControllerOutput, Input};
+use crate::controller::{ControllerInput, ControllerOutput};
 use crate::motion::controller_of;
 use crate::robot::{Robot, SimulatedArm};
-use model::central::Central;
+use model::central::CentralComputation;
 use model::scenario::{Scenario, Touches};
 use protocol::fixed::Q1_14;
 use protocol::message::SkinSensors;
@@ -34,7 +34,7 @@ fn play(scenario: &str) -> Maxima {
     let scenario = Scenario::parse("scenario", scenario, &skin).unwrap();
     let start = scenario.motion.start;
     let mut controller = controller_of(&skin, &scenario.motion).unwrap();
-    let central = Central::new(&skin);
+    let central = CentralComputation::new(&skin);
     let mut arm = SimulatedArm::new(&skin, start);
     let mut touches = Touches::new(&scenario, &skin);
     let mut sensors = vec![SkinSensors::default(); skin.cells.len()];
@@ -48,7 +48,7 @@ fn play(scenario: &str) -> Maxima {
             }
             let joints: Vec<_> = arm.positions().map(|angle| Q1_14::from_radians(angle).unwrap()).to_vec();
             let frames = central.frames(&joints);
-            let total = central.total(&frames, &sensors);
+            let total = central.total_torque(&frames, &sensors);
             torque = total.torque;
             most.active.push(total.active);
             for (cell, sensors) in sensors.iter().enumerate() {
@@ -59,7 +59,15 @@ fn play(scenario: &str) -> Maxima {
         }
         let (q, qdot) = (arm.positions(), arm.velocities());
         let time = Micros(tick * 2_000);
-        let input = Input { tick, time, q, qdot, torque: padded(&torque), valid: true, ..Input::default() };
+        let input = ControllerInput {
+            tick,
+            time,
+            q,
+            qdot,
+            torque: padded(&torque),
+            valid: true,
+            ..ControllerInput::default()
+        };
         let ControllerOutput::Move(velocity) = controller.step(&input) else {
             unreachable!("the input is valid")
         };

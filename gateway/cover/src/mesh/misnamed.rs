@@ -1,31 +1,31 @@
 //! Recognises files whose contents have another format than their extension says.
 
-use protocol::xml::kind_of_root;
+use protocol::xml::format_of_root_element;
 use roxmltree::Document;
 
 use super::MeshError;
 
 /// The advice for a file of an unsupported format.
-const CONVERT: &str = "convert it to stl, dae or obj, and name that in the URDF";
+const CONVERT_ADVICE: &str = "convert it to stl, dae or obj, and name that in the URDF";
 
 /// The first bytes, the name of the format, and the advice for each known format.
 const MAGIC: &[(&[u8], &str, &str)] = &[
-    (b"glTF", "a binary glTF file", CONVERT),
-    (b"ply\n", "a PLY mesh", CONVERT),
-    (b"ply\r", "a PLY mesh", CONVERT),
-    (b"ISO-10303-21", "a STEP file", CONVERT),
-    (b"#VRML", "a VRML file", CONVERT),
-    (b"Kaydara FBX", "an FBX file", CONVERT),
+    (b"glTF", "a binary glTF file", CONVERT_ADVICE),
+    (b"ply\n", "a PLY mesh", CONVERT_ADVICE),
+    (b"ply\r", "a PLY mesh", CONVERT_ADVICE),
+    (b"ISO-10303-21", "a STEP file", CONVERT_ADVICE),
+    (b"#VRML", "a VRML file", CONVERT_ADVICE),
+    (b"Kaydara FBX", "an FBX file", CONVERT_ADVICE),
 ];
 
 /// Returns an error that names the actual format of a file; `None` if no other format is recognised. `extension` is in
 /// lower case.
 pub(super) fn error(file: &str, extension: &str, bytes: &[u8]) -> Option<MeshError> {
-    let (what, hint) = kind(extension, bytes)?;
+    let (what, hint) = detect_format(extension, bytes)?;
     Some(MeshError::Foreign { file: file.to_owned(), line: None, what, hint })
 }
 
-fn kind(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
+fn detect_format(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).trim_ascii_start();
     if let Some((_, what, hint)) = MAGIC.iter().find(|(magic, ..)| bytes.starts_with(magic)) {
         return Some(((*what).to_owned(), hint));
@@ -34,7 +34,7 @@ fn kind(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
         return Some(("an ASCII STL".to_owned(), "rename it to .stl, in the URDF too"));
     }
     if text.starts_with(b"<") {
-        return xml(extension, bytes);
+        return detect_xml_format(extension, bytes);
     }
     let begins = |line: &[u8], word: &[u8]| line.trim_ascii_start().starts_with(word);
     let mut lines = bytes.split(|byte| *byte == b'\n');
@@ -44,13 +44,13 @@ fn kind(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
 
 /// Recognises XML that is not COLLADA, and COLLADA whose extension is another. Returns the name of the format and
 /// advice.
-fn xml(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
+fn detect_xml_format(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
     let text = protocol::xml::decode(bytes).ok()?;
     let prepared = protocol::xml::prepare(&text).ok()?;
     let document = Document::parse(&prepared.text).ok()?;
     let name = document.root_element().tag_name().name();
-    let what =
-        kind_of_root(name).map_or_else(|| format!("XML with the outermost element {name}"), str::to_owned);
+    let what = format_of_root_element(name)
+        .map_or_else(|| format!("XML with the outermost element {name}"), str::to_owned);
     match (name, extension) {
         ("COLLADA", "dae") => None,
         ("COLLADA", _) => Some((what, "rename it to .dae, in the URDF too")),

@@ -11,14 +11,14 @@ const AREA_TOLERANCE: f64 = 1e-6;
 
 /// The maximum total area of the triangles of a polygon that is not planar, relative to the polygon's area in
 /// projection. At 2.0 the triangles are tilted by 60 degrees.
-const MAX_BENT_AREA: f64 = 2.0;
+const MAX_BENT_AREA_RATIO: f64 = 2.0;
 
 /// The maximum share of a mesh's area in polygons that intersect themselves or are bent. Meshes of real robots have a
 /// few such polygons, each of about a square millimetre.
-const MAX_FAULTY_SHARE: f64 = 1e-3;
+const MAX_FAULTY_AREA_SHARE: f64 = 1e-3;
 
 /// The width of a polygon, relative to its length, below which it counts as having no area.
-const MAX_THIN_WIDTH: f64 = 1e-6;
+const MAX_THIN_WIDTH_RATIO: f64 = 1e-6;
 
 /// The triangles of all polygons of a mesh, and the errors of dividing them.
 #[derive(Debug, Default)]
@@ -43,17 +43,17 @@ impl Triangulation {
             Outline::Flat(plane) => plane,
             Outline::Thin => return,
             Outline::Opposite { area } => {
-                self.fault(area, &format!("a polygon with {corners} corners crosses itself"));
+                self.record_fault(area, &format!("a polygon with {corners} corners crosses itself"));
                 return;
             }
         };
         let flat = plane.points(outline);
         let from = self.triangles.len();
         let (expected, got) = if holes.is_empty() && is_fan(&flat) {
-            fan(outline, &mut self.triangles);
+            add_fan(outline, &mut self.triangles);
             (area(&flat), area(&flat))
         } else {
-            self.ears(&plane, flat, outline, holes)
+            self.cut_ears(&plane, flat, outline, holes)
         };
         let scale = plane.extent * plane.extent;
         let off = (got - expected).abs();
@@ -62,23 +62,23 @@ impl Triangulation {
             let why = format!(
                 "a polygon with {corners} corners crosses itself, as triangles it has {share:.4} times its area"
             );
-            self.fault(off * scale, &why);
+            self.record_fault(off * scale, &why);
             return;
         }
         let added = self.triangles.get(from..).unwrap_or_default();
         let bent = added.iter().map(surface::area).sum::<f64>() / scale;
-        if bent > MAX_BENT_AREA * expected {
+        if bent > MAX_BENT_AREA_RATIO * expected {
             let share = bent / expected;
             let why = format!(
                 "a polygon with {corners} corners is bent, as triangles it has {share:.4} times its area"
             );
-            self.fault((bent - expected) * scale, &why);
+            self.record_fault((bent - expected) * scale, &why);
         }
     }
 
     /// Adds the triangles of a polygon, which are found by cutting off its ears. Returns the area of the polygon in its
     /// plane, and that of the triangles.
-    fn ears(
+    fn cut_ears(
         &mut self,
         plane: &Plane,
         mut flat: Vec<[f64; 2]>,
@@ -110,7 +110,7 @@ impl Triangulation {
         (expected, got)
     }
 
-    fn fault(&mut self, off: f64, why: &str) {
+    fn record_fault(&mut self, off: f64, why: &str) {
         self.off += off;
         if self.worst.as_ref().is_none_or(|(worst, _)| off > *worst) {
             self.worst = Some((off, why.to_owned()));
@@ -122,7 +122,7 @@ impl Triangulation {
     pub(super) fn finish(self) -> Result<Vec<Triangle>, String> {
         let whole: f64 = self.triangles.iter().map(surface::area).sum();
         match self.worst {
-            Some((_, why)) if self.off.is_nan() || self.off > MAX_FAULTY_SHARE * whole => {
+            Some((_, why)) if self.off.is_nan() || self.off > MAX_FAULTY_AREA_SHARE * whole => {
                 Err(format!("{why}: make triangles of it where it was drawn"))
             }
             _ => Ok(self.triangles),
@@ -131,7 +131,7 @@ impl Triangulation {
 }
 
 /// Adds a triangle for each edge of a convex polygon: the edge and the first corner.
-pub(super) fn fan(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
+pub(super) fn add_fan(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
     if let [first, rest @ ..] = corners {
         triangles.extend(rest.windows(2).filter_map(|edge| match *edge {
             [a, b] => Some([*first, a, b]),
@@ -168,12 +168,12 @@ impl Plane {
         let from = |point: &Point3<f64>| (point - origin) / extent;
         let along = from(farthest);
         let width = outline.iter().map(|point| from(point).cross(&along).norm()).fold(0.0, f64::max);
-        if width < MAX_THIN_WIDTH || !along.norm().is_finite() {
+        if width < MAX_THIN_WIDTH_RATIO || !along.norm().is_finite() {
             return Outline::Thin;
         }
         let next = outline.iter().cycle().skip(1);
         let normal: Vector3<f64> = outline.iter().zip(next).map(|(a, b)| from(a).cross(&from(b))).sum();
-        match Unit::try_new(normal, MAX_THIN_WIDTH * width) {
+        match Unit::try_new(normal, MAX_THIN_WIDTH_RATIO * width) {
             Some(normal) => Outline::Flat(Self { origin, axes: tangents(&normal), extent }),
             None => Outline::Opposite { area: width * extent * extent },
         }
@@ -191,14 +191,16 @@ impl Plane {
 }
 
 /// Returns the signed area of the triangle from one point to two others.
-fn between([x, y]: [f64; 2], [ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
+fn signed_triangle_area([x, y]: [f64; 2], [ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
     ((ax - x) * (by - y) - (bx - x) * (ay - y)) / 2.0
 }
 
 /// Returns the area of a polygon: positive if it is counterclockwise, negative if it is clockwise.
 fn area(polygon: &[[f64; 2]]) -> f64 {
     let [first, rest @ ..] = polygon else { return 0.0 };
-    rest.windows(2).map(|edge| if let &[a, b] = edge { between(*first, a, b) } else { 0.0 }).sum()
+    rest.windows(2)
+        .map(|edge| if let &[a, b] = edge { signed_triangle_area(*first, a, b) } else { 0.0 })
+        .sum()
 }
 
 /// Returns true if the triangles from the first corner cover exactly the polygon: all of them have the winding of the
@@ -206,12 +208,12 @@ fn area(polygon: &[[f64; 2]]) -> f64 {
 fn is_fan(polygon: &[[f64; 2]]) -> bool {
     let ([first, second, .., last], [_, rest @ ..]) = (polygon, polygon) else { return false };
     let runs_on = rest.windows(2).all(|edge| match *edge {
-        [a, b] => between(*first, a, b) >= 0.0,
+        [a, b] => signed_triangle_area(*first, a, b) >= 0.0,
         _ => false,
     });
     let turns: f64 =
         rest.windows(2).map(|edge| if let &[a, b] = edge { angle(*first, a, b) } else { 0.0 }).sum();
-    runs_on && between(*first, *second, *last) >= 0.0 && turns < core::f64::consts::PI
+    runs_on && signed_triangle_area(*first, *second, *last) >= 0.0 && turns < core::f64::consts::PI
 }
 
 /// Returns the angle between the directions from one point to two others, in rad. Returns 0 if one of them is the point

@@ -11,7 +11,7 @@ use super::{Mesh, MeshError, Triangle};
 /// 2.5 degrees of the true one.
 const CIRCLE_SEGMENTS: u32 = 72;
 
-fn checked(shape: &'static str, what: &'static str, value: f64) -> Result<f64, MeshError> {
+fn check_positive(shape: &'static str, what: &'static str, value: f64) -> Result<f64, MeshError> {
     if value.is_finite() && value > 0.0 { Ok(value) } else { Err(MeshError::Size { shape, what, value }) }
 }
 
@@ -27,9 +27,9 @@ impl Mesh {
     /// Returns [`MeshError::Size`] if a length is not above 0.
     pub fn cuboid(size: [f64; 3]) -> Result<Self, MeshError> {
         let [x, y, z] = size;
-        let x = checked("box", "x", x)? / 2.0;
-        let y = checked("box", "y", y)? / 2.0;
-        let z = checked("box", "z", z)? / 2.0;
+        let x = check_positive("box", "x", x)? / 2.0;
+        let y = check_positive("box", "y", y)? / 2.0;
+        let z = check_positive("box", "z", z)? / 2.0;
         let point = |[i, j, k]: [f64; 3]| Point3::new(i * x, j * y, k * z);
         let sides = [
             [[1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [1.0, -1.0, 1.0]],
@@ -47,8 +47,8 @@ impl Mesh {
     /// # Errors
     /// Returns [`MeshError::Size`] if a size is not above 0.
     pub fn cylinder(radius: f64, length: f64) -> Result<Self, MeshError> {
-        let radius = checked("cylinder", "radius", radius)?;
-        let top = checked("cylinder", "length", length)? / 2.0;
+        let radius = check_positive("cylinder", "radius", radius)?;
+        let top = check_positive("cylinder", "length", length)? / 2.0;
         // The profile goes from the center of one end, along the wall, to the center of the other end.
         let profile = [(0.0, -top), (radius, -top), (radius, top), (0.0, top)];
         Self::new("cylinder", surface_of_revolution(&profile))
@@ -59,7 +59,7 @@ impl Mesh {
     /// # Errors
     /// Returns [`MeshError::Size`] if the radius is not above 0.
     pub fn sphere(radius: f64) -> Result<Self, MeshError> {
-        let radius = checked("sphere", "radius", radius)?;
+        let radius = check_positive("sphere", "radius", radius)?;
         let half = CIRCLE_SEGMENTS / 2;
         let profile: Vec<_> = (0..=half)
             .map(|step| {

@@ -7,7 +7,7 @@ use nalgebra::{Point3, Vector3};
 use super::Triangle;
 
 /// The factor by which the cubes of the grid grow if there are still too many triangles.
-const GROWTH: f64 = 1.12;
+const CUBE_GROWTH_FACTOR: f64 = 1.12;
 
 /// The coordinates of a cube in the grid.
 type Cube = [i64; 3];
@@ -28,11 +28,11 @@ pub fn simplify(mut parts: Vec<Vec<Triangle>>, most: usize) -> Vec<Vec<Triangle>
     // A flat surface keeps two triangles per cube, so this first size leaves about twice the allowed number.
     let mut size = (area / most.max(1) as f64).sqrt().max(1e-6);
     loop {
-        let fewer: Vec<_> = parts.iter().map(|part| clustered(part, size)).collect();
+        let fewer: Vec<_> = parts.iter().map(|part| merge_corners(part, size)).collect();
         if fewer.iter().map(Vec::len).sum::<usize>() <= most {
             return fewer;
         }
-        size *= GROWTH;
+        size *= CUBE_GROWTH_FACTOR;
     }
 }
 
@@ -43,7 +43,7 @@ fn area([a, b, c]: &Triangle) -> f64 {
 /// Merges the corners within each cube of this size. Returns the triangles whose corners are in three different cubes,
 /// without duplicates.
 #[expect(clippy::cast_possible_truncation, reason = "a coordinate over a size that is no smaller than 1 um")]
-fn clustered(part: &[Triangle], size: f64) -> Vec<Triangle> {
+fn merge_corners(part: &[Triangle], size: f64) -> Vec<Triangle> {
     // The grid begins at the smallest coordinates of the part, so that a cube of the part's size contains all of it.
     let infinite = Point3::new(f64::INFINITY, f64::INFINITY, f64::INFINITY);
     let low = part.iter().flatten().fold(infinite, |low, corner| low.inf(corner));

@@ -11,16 +11,16 @@ use nalgebra::Point3;
 
 use super::{MeshError, Triangle, damaged, syntax};
 
-const TITLE: usize = 80;
-const START: usize = TITLE + 4;
-const TRIANGLE: usize = 50;
-const NORMAL: usize = 12;
+const TITLE_BYTES: usize = 80;
+const HEADER_BYTES: usize = TITLE_BYTES + 4;
+const TRIANGLE_BYTES: usize = 50;
+const NORMAL_BYTES: usize = 12;
 
 /// Returns the triangles of a file with these contents. A file is binary if its length fits the number of triangles
 /// that it states, even if its title begins like an ASCII file.
 pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let binary = binary(bytes);
-    if let Some(Binary { announced, body }) = binary {
+    if let Some(BinaryContents { announced, body }) = binary {
         let (all, rest) = body.as_chunks();
         // Some exporters write a line break after the last triangle.
         if usize::try_from(announced) == Ok(all.len()) && matches!(rest, b"" | b"\n" | b"\r\n") {
@@ -28,18 +28,18 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
         }
     }
     if is_ascii(bytes) {
-        return ascii(name, bytes);
+        return parse_ascii(name, bytes);
     }
     match binary {
-        Some(Binary { announced, body }) => {
-            let (count, rest) = (body.len() / TRIANGLE, body.len() % TRIANGLE);
+        Some(BinaryContents { announced, body }) => {
+            let (count, rest) = (body.len() / TRIANGLE_BYTES, body.len() % TRIANGLE_BYTES);
             let rest = if rest == 0 { String::new() } else { format!(" and {rest} bytes") };
             Err(damaged(name, &format!("its header announces {announced} triangles, it has {count}{rest}")))
         }
         None => Err(damaged(
             name,
             &format!(
-                "it has {} bytes; a binary STL has {START} or more, an ASCII one begins with solid",
+                "it has {} bytes; a binary STL has {HEADER_BYTES} or more, an ASCII one begins with solid",
                 bytes.len()
             ),
         )),
@@ -48,40 +48,40 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
 
 /// The number of triangles that a binary file states, and the bytes after this number.
 #[derive(Clone, Copy)]
-struct Binary<'a> {
+struct BinaryContents<'a> {
     announced: u32,
     body: &'a [u8],
 }
 
-fn binary(bytes: &[u8]) -> Option<Binary<'_>> {
-    let (count, body) = bytes.get(TITLE..)?.split_first_chunk()?;
-    Some(Binary { announced: u32::from_le_bytes(*count), body })
+fn binary(bytes: &[u8]) -> Option<BinaryContents<'_>> {
+    let (count, body) = bytes.get(TITLE_BYTES..)?.split_first_chunk()?;
+    Some(BinaryContents { announced: u32::from_le_bytes(*count), body })
 }
 
-fn triangle(bytes: &[u8; TRIANGLE]) -> Triangle {
-    let corners = bytes.get(NORMAL..).unwrap_or_default();
+fn triangle(bytes: &[u8; TRIANGLE_BYTES]) -> Triangle {
+    let corners = bytes.get(NORMAL_BYTES..).unwrap_or_default();
     let mut values = corners.as_chunks().0.iter().map(|word| f64::from(f32::from_le_bytes(*word)));
     let mut next = || values.next().unwrap_or(f64::NAN);
     core::array::from_fn(|_| Point3::new(next(), next(), next()))
 }
 
 /// Returns the bytes without a byte order mark at their beginning.
-fn unmarked(bytes: &[u8]) -> &[u8] {
+fn strip_byte_order_mark(bytes: &[u8]) -> &[u8] {
     bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }
 
 /// Returns true if the contents are text that begins with `solid`. A binary file may begin in the same way, but has
 /// zeros in its title or its first triangles.
 fn is_ascii(bytes: &[u8]) -> bool {
-    let text = unmarked(bytes).trim_ascii_start();
-    let head = bytes.get(..bytes.len().min(START + TRIANGLE)).unwrap_or_default();
+    let text = strip_byte_order_mark(bytes).trim_ascii_start();
+    let head = bytes.get(..bytes.len().min(HEADER_BYTES + TRIANGLE_BYTES)).unwrap_or_default();
     text.get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid")) && !head.contains(&0)
 }
 
 /// Returns the triangles of an ASCII file. Numbers are rounded to single precision, as in binary files. The names of
 /// solids may have any encoding.
-fn ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
-    let text = String::from_utf8_lossy(unmarked(bytes));
+fn parse_ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
+    let text = String::from_utf8_lossy(strip_byte_order_mark(bytes));
     let mut triangles = Vec::new();
     let mut corners: Vec<Point3<f64>> = Vec::new();
     let mut last = String::new();
@@ -127,10 +127,10 @@ mod tests {
 
     /// Returns a binary file with twelve triangles that states the number `announced`.
     fn binary(announced: u32) -> Vec<u8> {
-        let mut bytes = vec![b' '; TITLE];
+        let mut bytes = vec![b' '; TITLE_BYTES];
         bytes.extend(announced.to_le_bytes());
         for number in 0_u8..12 {
-            bytes.extend([0; NORMAL]);
+            bytes.extend([0; NORMAL_BYTES]);
             for value in 0_u8..9 {
                 bytes.extend(f32::from(number + value * value).to_le_bytes());
             }
@@ -164,9 +164,9 @@ mod tests {
                 );
                 assert!(message.starts_with(&words), "{message}");
             }
-            for length in START..whole.len() {
+            for length in HEADER_BYTES..whole.len() {
                 let message = refused(&titled(whole.clone())[..length]);
-                let body = length - START;
+                let body = length - HEADER_BYTES;
                 assert!(
                     message.contains(&format!("announces 12 triangles, it has {}", body / 50)),
                     "{message}"

@@ -11,7 +11,7 @@ use std::collections::VecDeque;
 
 use crate::grid::Grid;
 use crate::place::CellPosition;
-use crate::surface::{real, tangents};
+use crate::surface::{count_to_f64, tangents};
 use crate::{CoverCell, CoverOptions};
 
 /// The number of ports of a cell.
@@ -21,22 +21,22 @@ pub const PORTS: usize = 4;
 pub const MAX_NODES: usize = 250;
 
 /// The maximum length of a wire, in pitches.
-const MAX_WIRE_LENGTH: f64 = 1.5;
+const MAX_WIRE_LENGTH_PITCHES: f64 = 1.5;
 
 /// The minimum cosine between the normals of two wired cells. Cells are wired around a sharp edge, but not through a
 /// wall.
 const MIN_NORMAL_COSINE: f64 = -0.2;
 
 /// The maximum deviation from a bus' even share that lets the bus end with a link, relative to its budget of nodes.
-const MAX_UNEVENNESS: f64 = 0.1;
+const MAX_SHARE_DEVIATION: f64 = 0.1;
 
 /// Returns the cells of all links with their wires, and the number of buses.
 pub(crate) fn wire_cells(placed: &[Vec<CellPosition>], options: &CoverOptions) -> (Vec<CoverCell>, usize) {
     let sizes: Vec<_> = placed.iter().map(Vec::len).collect();
-    let buses = shares(&sizes, options.nodes_per_bus);
+    let buses = cells_per_bus(&sizes, options.nodes_per_bus);
     let all = placed.iter().enumerate().flat_map(|(link, spots)| {
         let limb = Limb::from_cells(spots);
-        limb.order(spots, options.pitch).into_iter().map(move |spot| UnwiredCell {
+        limb.order_by_ring(spots, options.pitch).into_iter().map(move |spot| UnwiredCell {
             link,
             spot,
             axis: limb.axis,
@@ -46,13 +46,13 @@ pub(crate) fn wire_cells(placed: &[Vec<CellPosition>], options: &CoverOptions) -
     let mut cells = Vec::new();
     for (bus, &size) in buses.iter().enumerate() {
         let places: Vec<_> = all.by_ref().take(size).collect();
-        cells.extend(wired(bus, &places, options.pitch));
+        cells.extend(wire_bus(bus, &places, options.pitch));
     }
     (cells, buses.len())
 }
 
 /// Returns the number of cells of each bus, for links with these numbers of cells.
-fn shares(links: &[usize], budget: usize) -> Vec<usize> {
+fn cells_per_bus(links: &[usize], budget: usize) -> Vec<usize> {
     let mut ends = Vec::with_capacity(links.len());
     let mut total = 0;
     for size in links {
@@ -70,7 +70,7 @@ fn shares(links: &[usize], budget: usize) -> Vec<usize> {
         let of_links =
             ends.iter().map(|end| end.saturating_sub(from)).filter(|share| possible.contains(share));
         let share = of_links
-            .filter(|share| real(off(share)) <= MAX_UNEVENNESS * real(budget))
+            .filter(|share| count_to_f64(off(share)) <= MAX_SHARE_DEVIATION * count_to_f64(budget))
             .min_by_key(off)
             .unwrap_or(even);
         shares.push(share);
@@ -97,7 +97,7 @@ struct Limb {
 impl Limb {
     /// Computes the axis: the direction in which the cells spread farthest, away from the link's origin.
     fn from_cells(spots: &[CellPosition]) -> Self {
-        let count = real(spots.len().max(1));
+        let count = count_to_f64(spots.len().max(1));
         let middle = Point3::from(spots.iter().map(|spot| spot.point.coords).sum::<Vector3<f64>>() / count);
         let spread: Matrix3<f64> = spots
             .iter()
@@ -113,7 +113,7 @@ impl Limb {
     }
 
     /// Orders cells by ring along the axis, and around it within a ring.
-    fn order(&self, spots: &[CellPosition], pitch: f64) -> Vec<CellPosition> {
+    fn order_by_ring(&self, spots: &[CellPosition], pitch: f64) -> Vec<CellPosition> {
         let along = |spot: &CellPosition| (spot.point - self.middle).dot(&self.axis);
         let first = spots.iter().map(along).min_by(f64::total_cmp).unwrap_or_default();
         let row = pitch * 0.75_f64.sqrt();
@@ -132,8 +132,8 @@ impl Limb {
 }
 
 /// Wires the cells of one bus.
-fn wired(bus: usize, places: &[UnwiredCell], pitch: f64) -> Vec<CoverCell> {
-    let wires = wires_by_cell(places.len(), &near(places, pitch));
+fn wire_bus(bus: usize, places: &[UnwiredCell], pitch: f64) -> Vec<CoverCell> {
+    let wires = wires_by_cell(places.len(), &nearby_pairs(places, pitch));
     let roots = roots(&wires);
     let cell = |(index, place): (usize, &UnwiredCell)| {
         let others = wires.get(index).map_or(&[][..], Vec::as_slice);
@@ -146,9 +146,9 @@ fn wired(bus: usize, places: &[UnwiredCell], pitch: f64) -> Vec<CoverCell> {
             position: place.spot.point.coords.into(),
             normal: place.spot.normal.into(),
             bus,
-            node: node(index),
-            neighbors: ports::assigned(&place.spot.normal, &place.axis, &directions)
-                .map(|other| other.map(node)),
+            node: node_id(index),
+            neighbors: ports::assign_ports(&place.spot.normal, &place.axis, &directions)
+                .map(|other| other.map(node_id)),
             root: roots.contains(&index),
         }
     };
@@ -156,14 +156,14 @@ fn wired(bus: usize, places: &[UnwiredCell], pitch: f64) -> Vec<CoverCell> {
 }
 
 /// Returns the node id for an index on a bus.
-fn node(index: usize) -> u8 {
+fn node_id(index: usize) -> u8 {
     // A bus has at most MAX_NODES cells.
     u8::try_from(index + 1).unwrap_or(u8::MAX)
 }
 
 /// Returns pairs of cells that a wire may join, the nearest ones first.
-fn near(places: &[UnwiredCell], pitch: f64) -> Vec<[usize; 2]> {
-    let longest = MAX_WIRE_LENGTH * pitch;
+fn nearby_pairs(places: &[UnwiredCell], pitch: f64) -> Vec<[usize; 2]> {
+    let longest = MAX_WIRE_LENGTH_PITCHES * pitch;
     let mut found = Vec::new();
     let grid = Grid::with_points(longest, places.iter().map(|place| &place.spot.point));
     for (index, place) in places.iter().enumerate() {
@@ -220,21 +220,21 @@ fn roots(wires: &[Vec<usize>]) -> Vec<usize> {
         if seen.get(first).is_none_or(|seen| *seen) {
             continue;
         }
-        let mut group: Vec<_> = reached(wires, first).into_iter().map(|(cell, _)| cell).collect();
+        let mut group: Vec<_> = reachable_cells(wires, first).into_iter().map(|(cell, _)| cell).collect();
         group.sort_unstable();
         for &cell in &group {
             if let Some(seen) = seen.get_mut(cell) {
                 *seen = true;
             }
         }
-        let depth = |&from: &usize| reached(wires, from).last().map_or(0, |&(_, depth)| depth);
+        let depth = |&from: &usize| reachable_cells(wires, from).last().map_or(0, |&(_, depth)| depth);
         roots.extend(group.into_iter().min_by_key(depth));
     }
     roots
 }
 
 /// Returns the cells that are connected to a cell, with the number of wires between them, the nearest first.
-fn reached(wires: &[Vec<usize>], from: usize) -> Vec<(usize, usize)> {
+fn reachable_cells(wires: &[Vec<usize>], from: usize) -> Vec<(usize, usize)> {
     let mut seen = vec![false; wires.len()];
     let mut found = Vec::new();
     let mut next = VecDeque::from([(from, 0)]);

@@ -9,7 +9,7 @@
 //!
 //! The second term is the tangential and the centripetal acceleration. All terms are in units of g.
 
-use crate::central::Central;
+use crate::central::CentralComputation;
 use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 use protocol::skin::Skin;
@@ -51,7 +51,7 @@ impl RowMotion {
 /// The geometry of a bus's chain and the direction of gravity, from which the specific forces on its rows follow.
 #[derive(Clone, Debug)]
 pub struct Arm {
-    central: Central,
+    central: CentralComputation,
     kinds: Vec<RowKind>,
     /// Gravity in the robot's base frame, in m/s2.
     gravity: Vector3<f64>,
@@ -62,7 +62,11 @@ impl Arm {
     #[must_use]
     pub fn new(skin: &Skin, bus: usize, gravity: [f64; 3]) -> Self {
         let kinds = skin.chain(bus).rows.iter().map(|row| row.kind).collect();
-        Self { central: Central::unquantised(&skin.with_cells_of_bus(bus)), kinds, gravity: gravity.into() }
+        Self {
+            central: CentralComputation::unquantised(&skin.with_cells_of_bus(bus)),
+            kinds,
+            gravity: gravity.into(),
+        }
     }
 
     /// Returns the specific force field of each row of the chain, base to tip. The first entry is the base, which no

@@ -58,7 +58,7 @@ impl DataSheetInput {
     /// Returns the first value that is out of range.
     pub fn sheet(&self, at: &KeyPath) -> Result<DataSheet, DocumentFault> {
         let kinds = [("perfect", DataSheet::PERFECT), ("bma250", DataSheet::BMA250)];
-        let mut sheet = at.key("kind").choose(self.kind.as_deref().unwrap_or("bma250"), &kinds)?;
+        let mut sheet = at.key("kind").parse_choice(self.kind.as_deref().unwrap_or("bma250"), &kinds)?;
         let all = [
             ("bias_g", self.bias_g, &mut sheet.bias_g, [0.0, 1.0]),
             ("gain", self.gain, &mut sheet.gain, [0.0, 0.5]),
@@ -124,7 +124,7 @@ impl DataSheet {
 
     /// Returns the mean and the standard deviation of the age of a reading, in s.
     #[must_use]
-    pub fn age(&self) -> (f64, f64) {
+    pub fn age_mean_and_deviation_s(&self) -> (f64, f64) {
         let period = self.period_s();
         ((self.delay_s + period) / 2.0, self.delay_s.hypot(period) / 12.0_f64.sqrt())
     }
@@ -188,11 +188,11 @@ impl Accelerometer {
     /// delay, in s.
     #[must_use]
     pub fn sample_instant(&self, now: f64) -> f64 {
-        self.sample(now).1
+        self.newest_sample(now).1
     }
 
     /// Returns the number of the newest sample at `now` in s, and the time of the motion that it shows, in s.
-    fn sample(&self, now: f64) -> (f64, f64) {
+    fn newest_sample(&self, now: f64) -> (f64, f64) {
         if self.period > 0.0 {
             let number = ((now - self.phase) / self.period).floor();
             (number, number.mul_add(self.period, self.phase) - self.delay)
@@ -205,7 +205,7 @@ impl Accelerometer {
     /// [`Accelerometer::sample_instant`], in g.
     #[must_use]
     pub fn reading(&self, now: f64, force: &Vector3<f64>) -> Vector3<f64> {
-        let (number, _) = self.sample(now);
+        let (number, _) = self.newest_sample(now);
         let mut dice = Pcg64Mcg::seed_from_u64(mix_bits(self.seed ^ number.to_bits()));
         let noise = Vector3::from_fn(|_, _| standard_normal(&mut dice) * self.sheet.noise_g);
         let DataSheet { range_g, step_g, .. } = self.sheet;

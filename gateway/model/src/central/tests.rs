@@ -17,7 +17,7 @@ fn pressed(contact: f64, proximity: f64) -> SkinSensors {
 #[test]
 fn torques_agree_with_the_table_of_another_program() {
     let table = include_str!("../../../tests/vectors/ur5_torque.csv");
-    let mut central = Central::unquantised(&skin());
+    let mut central = CentralComputation::unquantised(&skin());
     let mut worst = 0.0_f64;
     for line in table.lines().skip(1) {
         let row: Vec<f64> = line.split(',').map(|field| field.parse().unwrap()).collect();
@@ -43,7 +43,7 @@ fn torques_agree_with_the_table_of_another_program() {
 #[test]
 fn words_and_numbers_agree_within_what_words_can_hold() {
     let skin = skin();
-    let (words, numbers) = (Central::new(&skin), Central::unquantised(&skin));
+    let (words, numbers) = (CentralComputation::new(&skin), CentralComputation::unquantised(&skin));
     let q = [0.3, -1.2, 1.0, -1.4, -1.57, 0.2];
     let joints = q.map(|angle| Q1_14::from_radians(angle).unwrap());
     let coarse = words.torque(0, &words.frames(&joints), 5.0);
@@ -62,13 +62,13 @@ fn an_offset_turns_the_joint() {
     let straight = SKIN.replacen("joint = 3", "joint = 4", 1);
     let [turned, straight] = [turned, straight].map(|text| Skin::parse("skin.toml", &text).unwrap());
     let (q, moved) = ([0.0, -1.2, 1.0, 0.25, 0.0, 0.0], [0.0, -1.2, 1.0, 1.0, 0.0, 0.0]);
-    let offset = Central::unquantised(&turned);
-    let plain = Central::unquantised(&straight);
+    let offset = CentralComputation::unquantised(&turned);
+    let plain = CentralComputation::unquantised(&straight);
     assert_eq!(
         offset.torque(0, &offset.frames_at_positions(&q), 1.0),
         plain.torque(0, &plain.frames_at_positions(&moved), 1.0)
     );
-    let (offset, plain) = (Central::new(&turned), Central::new(&straight));
+    let (offset, plain) = (CentralComputation::new(&turned), CentralComputation::new(&straight));
     let [q, moved] = [q, moved].map(|q| q.map(|angle| Q1_14::from_radians(angle).unwrap()));
     for (a, b) in
         offset.torque(0, &offset.frames(&q), 1.0).iter().zip(plain.torque(0, &plain.frames(&moved), 1.0))
@@ -79,7 +79,7 @@ fn an_offset_turns_the_joint() {
 
 #[test]
 fn contact_and_proximity_are_fused_above_their_thresholds() {
-    let central = Central::new(&skin());
+    let central = CentralComputation::new(&skin());
     let force = |contact, proximity| central.force(0, &pressed(contact, proximity));
     assert_eq!(force(3.0, 0.0), 3.0);
     assert_eq!(force(3.0, 0.5), 4.0);
@@ -97,9 +97,10 @@ fn the_torque_of_the_skin_is_the_sum_of_its_active_cells() {
     let mut skin = skin();
     let cell = skin.cells[0].clone();
     skin.cells = vec![cell; 3];
-    let central = Central::new(&skin);
+    let central = CentralComputation::new(&skin);
     let frames = central.frames(&[Q1_14::nearest(0.3); 6]);
-    let reference_torque = central.total(&frames, &[pressed(2.0, 0.0), pressed(0.0, 0.0), pressed(1.0, 0.0)]);
+    let reference_torque =
+        central.total_torque(&frames, &[pressed(2.0, 0.0), pressed(0.0, 0.0), pressed(1.0, 0.0)]);
     assert_eq!(reference_torque.active, 2);
     for (got, target) in reference_torque.torque.iter().zip(central.torque(0, &frames, 3.0)) {
         assert!((got - target).abs() < 1e-12);
@@ -113,7 +114,7 @@ proptest! {
     fn the_torque_is_the_work_of_the_force_per_angle(q in any::<[i16; 6]>(), k in 1_u8..=6) {
         let mut skin = skin();
         (skin.cells[0].joint, skin.cells[0].row) = (k, k);
-        let central = Central::unquantised(&skin);
+        let central = CentralComputation::unquantised(&skin);
         let q = q.map(|bits| Q1_14::from_bits(bits).to_radians());
         let place = central.cells[0];
         let at = |q: &[f64; 6]| central.frames_at_positions(q).frames[usize::from(k)] * place.position;
@@ -130,7 +131,7 @@ proptest! {
 
     #[test]
     fn torques_do_not_depend_on_the_first_joint(turn in any::<i16>(), q in any::<[i16; 6]>()) {
-        let central = Central::new(&skin());
+        let central = CentralComputation::new(&skin());
         let mut q = q.map(Q1_14::from_bits);
         let one = central.torque(0, &central.frames(&q), 2.0);
         q[0] = Q1_14::from_bits(turn);

@@ -33,12 +33,12 @@ impl AddressTable {
     }
 
     /// Returns the serial number of the owner of a node id.
-    pub(super) fn holder(&self, number: CellId) -> Option<u32> {
+    pub(super) fn owner_serial(&self, number: CellId) -> Option<u32> {
         self.0.get(number).and_then(AddressClaim::serial)
     }
 
     /// Returns all node ids in use, with the serial numbers of their owners.
-    pub(super) fn all(&self) -> impl Iterator<Item = (CellId, u32)> {
+    pub(super) fn owners(&self) -> impl Iterator<Item = (CellId, u32)> {
         self.0.iter().filter_map(|(number, claim)| Some((number, claim.serial()?)))
     }
 }

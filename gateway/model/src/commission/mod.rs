@@ -33,7 +33,7 @@ use address_table::AddressTable;
 use task::{Stage, Task};
 
 use crate::repeat::{Attempt, RetryAction, RetryLimits};
-pub use outcome::{AbortReason, Outcome, Reason, RequestStep};
+pub use outcome::{AbortReason, FailureReason, Outcome, RequestStep};
 pub use report::{CellReport, Progress, Report, UnknownNode};
 pub use task::CommissionOptions;
 
@@ -153,11 +153,11 @@ impl Commission {
     /// Records a message from another sender on the bus. Replies are sent by [`Commission::handle_time`], not here.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
         if let Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } = message {
-            self.end(AbortReason::OtherGateway);
+            self.abort(AbortReason::OtherGateway);
         } else if let Message::Configure { request: Request::Write { number, .. }, .. } = *message
             && is_stored(number)
         {
-            self.end(AbortReason::OtherWriter);
+            self.abort(AbortReason::OtherWriter);
         } else if let Message::Network {
             from: Node::Cell(node),
             page: NetworkPage::Heartbeat(heartbeat),
@@ -168,30 +168,30 @@ impl Commission {
         } else if let Message::Configured { from, tag, answer } = *message {
             let called = self.sent_broadcasts.iter().rev().copied().find(|(_, called)| *called == tag);
             let wish = self.wish;
-            let Some(task) = self.holder(from) else { return };
+            let Some(task) = self.task_of_node(from) else { return };
             task.handle_answer(now, tag, answer, called.map(|(step, _)| step), wish);
             if let Some(call) = self.broadcast.as_mut().filter(|_| called.is_some()) {
-                call.attempt.extend(now);
+                call.attempt.extend_timeout(now);
             }
         }
     }
 
     /// Returns the task of the described cell that holds a node id now.
-    fn holder(&mut self, number: CellId) -> Option<&mut Task> {
-        let serial = self.address_table.holder(number)?;
+    fn task_of_node(&mut self, number: CellId) -> Option<&mut Task> {
+        let serial = self.address_table.owner_serial(number)?;
         let task = self.tasks.get_mut(*self.by_serial.get(&serial)?)?;
         (task.number == Some(number)).then_some(task)
     }
 
     fn handle_heartbeat(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) {
-        let before = self.address_table.holder(number).filter(|&serial| serial != heartbeat.serial);
+        let before = self.address_table.owner_serial(number).filter(|&serial| serial != heartbeat.serial);
         if let Some([one, other]) = self.address_table.receive_heartbeat(now, number, heartbeat) {
             for (serial, other) in [(one, other), (other, one)] {
-                self.fail(serial, Reason::Shared { number, other });
+                self.fail(serial, FailureReason::Shared { number, other });
             }
             return;
         }
-        if self.address_table.holder(number) != Some(heartbeat.serial) {
+        if self.address_table.owner_serial(number) != Some(heartbeat.serial) {
             return; // an address claim for a taken node id, which will be given up
         }
         if let Some(loser) = before.and_then(|serial| self.task(serial))
@@ -212,13 +212,13 @@ impl Commission {
         self.tasks.get_mut(*self.by_serial.get(&serial)?)
     }
 
-    fn fail(&mut self, serial: u32, reason: Reason) {
+    fn fail(&mut self, serial: u32, reason: FailureReason) {
         if let Some(task) = self.task(serial) {
             task.fail(reason);
         }
     }
 
-    fn end(&mut self, trouble: AbortReason) {
+    fn abort(&mut self, trouble: AbortReason) {
         if self.phase != Phase::Over {
             self.trouble = Some(trouble);
             self.stop();
@@ -228,11 +228,11 @@ impl Commission {
     /// Stops the commissioning now, and discards the messages that have not been sent.
     pub fn stop(&mut self) {
         self.outbox.clear();
-        self.give_up(Reason::Stopped, Reason::Stopped);
+        self.fail_open_tasks(FailureReason::Stopped, FailureReason::Stopped);
     }
 
     /// Fails all cells that are not done: with the reason `unheard` if a cell sent no heartbeat, else with `heard`.
-    fn give_up(&mut self, unheard: Reason, heard: Reason) {
+    fn fail_open_tasks(&mut self, unheard: FailureReason, heard: FailureReason) {
         for task in self.tasks.iter_mut().filter(|task| !task.is_done()) {
             task.fail(if task.number.is_none() { unheard } else { heard });
         }
@@ -286,7 +286,7 @@ impl Commission {
                 if self.send_requests(now, |stage| matches!(stage, Stage::QueryAbilities | Stage::Write)) {
                     return None;
                 }
-                self.pending_broadcasts = self.all_stored().map(RequestStep::Read).collect();
+                self.pending_broadcasts = self.stored_parameters().map(RequestStep::Read).collect();
                 Some(Phase::Read)
             }
             Phase::Read => {
@@ -309,7 +309,7 @@ impl Commission {
                     }
                     return None;
                 }
-                self.give_up(Reason::Missing, Reason::Gone);
+                self.fail_open_tasks(FailureReason::Missing, FailureReason::Gone);
                 Some(Phase::Over)
             }
             Phase::Over => None,
@@ -378,11 +378,11 @@ impl Commission {
     /// Returns true if this request may be broadcast: the receive buffer must hold all answers, and a write must not
     /// reach cells outside the description.
     fn may_broadcast(&self, step: RequestStep) -> bool {
-        let fits = self.address_table.all().count() <= self.max_answers;
+        let fits = self.address_table.owners().count() <= self.max_answers;
         let known = |serial| self.by_serial.get(&serial).and_then(|&place| self.tasks.get(place));
         let ours = |serial| known(serial).is_some_and(|task| !is_failed(task.stage));
         fits && (matches!(step, RequestStep::Read(_))
-            || self.address_table.all().all(|(_, serial)| ours(serial)))
+            || self.address_table.owners().all(|(_, serial)| ours(serial)))
     }
 
     /// Returns the writes that are the same for all cells that need them.
@@ -396,13 +396,14 @@ impl Commission {
             let first = words.next();
             words.all(|other| Some(other) == first)
         };
-        self.all_stored().filter(common).map(RequestStep::Write).collect()
+        self.stored_parameters().filter(common).map(RequestStep::Write).collect()
     }
 
     /// Returns the parameters of the cell with the largest number of parameters.
-    fn all_stored(&self) -> impl Iterator<Item = Parameter> + use<> {
-        let longest = self.tasks.iter().map(|task| task.stored().count()).max().unwrap_or_default();
-        Parameter::stored(MAX_ROWS).take(longest)
+    fn stored_parameters(&self) -> impl Iterator<Item = Parameter> + use<> {
+        let longest =
+            self.tasks.iter().map(|task| task.stored_parameters().count()).max().unwrap_or_default();
+        Parameter::stored_for_rows(MAX_ROWS).take(longest)
     }
 
     fn request(&mut self, place: usize, to: Node, step: RequestStep, tag: u8) {

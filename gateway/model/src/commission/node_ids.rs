@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use protocol::id::CellId;
 use protocol::skin::Skin;
-use protocol::skin::file::{Edit, EditError, Value};
+use protocol::skin::file::{EditError, SkinEdit, Value};
 use thiserror::Error;
 
 /// The error for a description that cannot be renumbered.
@@ -34,7 +34,7 @@ pub type NodeIds = BTreeMap<u32, Option<CellId>>;
 ///
 /// # Errors
 /// Returns [`NodeIdsError`] if the node id of a cell is `None`, or if the text does not describe the skin.
-pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String, NodeIdsError> {
+pub fn renumber_nodes(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String, NodeIdsError> {
     for (bus, described) in skin.buses.iter().enumerate() {
         let here = || skin.cells_on_bus(bus).filter_map(|cell| node_ids.get(&cell.serial));
         let missing = here().filter(|number| number.is_none()).count();
@@ -51,7 +51,7 @@ pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String,
     let renamed: BTreeMap<_, _> =
         skin.cells.iter().map(|cell| ((cell.bus, cell.node), number(cell.serial, cell.node))).collect();
     let not_the_text = |error: EditError| NodeIdsError::Text(error.to_string());
-    let mut edit = Edit::new(skin, text).map_err(not_the_text)?;
+    let mut edit = SkinEdit::new(skin, text).map_err(not_the_text)?;
     for (index, cell) in skin.cells.iter().enumerate() {
         let new = number(cell.serial, cell.node);
         if new != cell.node {
@@ -136,7 +136,7 @@ neighbors = [2, 0, 0, 0]
                 "[0.0, 0.1, 0.2]\norientation = [0.0, 0.0, 0.0, 1.0]\nneighbors = [2,",
                 "[0.0, 0.1, 0.2]\norientation = [0.0, 0.0, 0.0, 1.0]\nneighbors = [50,",
             );
-        let copy = renumbered(&skin, &text, &node_ids).unwrap();
+        let copy = renumber_nodes(&skin, &text, &node_ids).unwrap();
         assert_eq!(copy, expected);
         // Both skins have the same cells by serial number, with the same wiring.
         let copied = Skin::parse("copy.toml", &copy).unwrap();
@@ -151,7 +151,7 @@ neighbors = [2, 0, 0, 0]
         let text = text();
         let skin = Skin::parse("skin.toml", &text).unwrap();
         let node_ids = skin.cells.iter().map(|cell| (cell.serial, Some(cell.node))).collect();
-        assert_eq!(renumbered(&skin, &text, &node_ids).unwrap(), text);
+        assert_eq!(renumber_nodes(&skin, &text, &node_ids).unwrap(), text);
     }
 
     #[test]
@@ -159,7 +159,7 @@ neighbors = [2, 0, 0, 0]
         let text = text();
         let skin = Skin::parse("skin.toml", &text).unwrap();
         let node_ids = NodeIds::from([(7, Some(cell(2))), (2, None), (9, Some(cell(3)))]);
-        let said = renumbered(&skin, &text, &node_ids).unwrap_err().to_string();
+        let said = renumber_nodes(&skin, &text, &node_ids).unwrap_err().to_string();
         assert_eq!(said, "1 of the 3 cells on vcan0 sent no heartbeat, so their node ids are not known");
     }
 }

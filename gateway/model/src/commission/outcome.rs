@@ -6,7 +6,7 @@ use protocol::id::CellId;
 use protocol::message::VERSION;
 use protocol::packet::WORDS;
 use protocol::parameters::{MissingAbility, Parameter};
-use protocol::schema::reason;
+use protocol::schema::refusal_reason;
 use serde::{Serialize, Serializer};
 use thiserror::Error;
 
@@ -59,12 +59,12 @@ pub enum Outcome {
     #[serde(rename = "would be written")]
     WouldWrite,
     /// The commissioning of the cell failed. The cell has either its old configuration or all of the new one.
-    Failed(Reason),
+    Failed(FailureReason),
 }
 
 /// The reason why a cell was not commissioned.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
-pub enum Reason {
+pub enum FailureReason {
     /// The cell sent no heartbeat.
     #[error("is not on the bus: switch it on, or check its wiring")]
     Missing,
@@ -97,7 +97,7 @@ pub enum Reason {
         tries: u8,
     },
     /// The cell refused a request.
-    #[error("refuses {step}: {}", reason(i64::from(*.code)))]
+    #[error("refuses {step}: {}", refusal_reason(i64::from(*.code)))]
     Refused {
         /// The refused request.
         step: RequestStep,
@@ -134,7 +134,7 @@ pub enum Reason {
     Stopped,
 }
 
-impl Serialize for Reason {
+impl Serialize for FailureReason {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_str(self)
     }

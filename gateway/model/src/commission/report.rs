@@ -4,7 +4,7 @@ use protocol::id::CellId;
 use serde::Serialize;
 
 use super::task::{Stage, Task};
-use super::{AbortReason, Commission, Outcome, Phase, Reason, is_failed};
+use super::{AbortReason, Commission, FailureReason, Outcome, Phase, is_failed};
 
 /// The progress of a commissioning, for display.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -100,7 +100,7 @@ impl Commission {
                 | Stage::QueryAbilities
                 | Stage::Write
                 | Stage::Read
-                | Stage::AwaitHeartbeat(_) => Outcome::Failed(Reason::Stopped),
+                | Stage::AwaitHeartbeat(_) => Outcome::Failed(FailureReason::Stopped),
             },
         };
         let unknown_node = |(number, serial): (CellId, u32)| UnknownNode {
@@ -108,7 +108,7 @@ impl Commission {
             serial,
             belongs: self.elsewhere.get(&serial).cloned(),
         };
-        let unknown = self.address_table.all().filter(|(_, serial)| !self.by_serial.contains_key(serial));
+        let unknown = self.address_table.owners().filter(|(_, serial)| !self.by_serial.contains_key(serial));
         Report {
             cells: self.tasks.iter().map(cell).collect(),
             unknown_nodes: unknown.map(unknown_node).collect(),

@@ -6,7 +6,7 @@ use protocol::packet::WORDS;
 use protocol::parameters::{Abilities, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
-use super::outcome::{Outcome, Reason, RequestStep};
+use super::outcome::{FailureReason, Outcome, RequestStep};
 use crate::repeat::{Attempt, RetryAction, RetryLimits};
 
 /// Retry limit and timeout of a request to one cell.
@@ -18,7 +18,7 @@ const REQUEST_LIMITS: RetryLimits = RetryLimits {
 /// Retry limit and timeouts of a commit request; longer than [`ANSWER`], because the cell writes its flash.
 const COMMIT_LIMITS: RetryLimits = RetryLimits { first_timeout: Span::from_millis(400), ..REQUEST_LIMITS };
 /// Maximum number of times that the writing of a cell starts over after the cell restarted meanwhile.
-const MAX_ROUNDS: u8 = 6;
+const MAX_WRITE_RESTARTS: u8 = 6;
 /// Maximum time for a cell to hold a node id after it started or lost its node id.
 pub(super) const SETTLE_TIMEOUT: Span = Span::from_millis(3_000);
 /// Time to wait for a heartbeat with the expected hash, after all parameters were read back.
@@ -43,7 +43,7 @@ pub(super) enum Stage {
 
 /// A request to the cell that has not been answered yet.
 #[derive(Clone, Copy, Debug)]
-struct Pending {
+struct PendingRequest {
     step: RequestStep,
     tag: u8,
     attempt: Attempt,
@@ -67,7 +67,7 @@ pub(super) struct Task {
     /// Bit i is set if stored parameter i is staged in the cell, or was read back with the expected value.
     written: u64,
     read: u64,
-    pending: Option<Pending>,
+    pending: Option<PendingRequest>,
     tag: u8,
     rounds: u8,
     /// The node id that the cell had before its present one.
@@ -121,17 +121,20 @@ impl Task {
     }
 
     /// Returns the parameters that the skin's configuration of the cell has.
-    pub(super) fn stored(&self) -> impl Iterator<Item = Parameter> + use<> {
-        Parameter::stored(self.target.all_rows().len())
+    pub(super) fn stored_parameters(&self) -> impl Iterator<Item = Parameter> + use<> {
+        Parameter::stored_for_rows(self.target.all_rows().len())
     }
 
     /// Returns the bit of a parameter in `written`; zero if the cell's configuration lacks the parameter.
     fn bit(&self, parameter: Parameter) -> u64 {
-        self.stored().position(|stored| stored == parameter).map_or(0, bit)
+        self.stored_parameters().position(|stored| stored == parameter).map_or(0, bit)
     }
 
     fn first_missing(&self, mask: u64) -> Option<Parameter> {
-        self.stored().enumerate().find(|(place, _)| mask & bit(*place) == 0).map(|(_, parameter)| parameter)
+        self.stored_parameters()
+            .enumerate()
+            .find(|(place, _)| mask & bit(*place) == 0)
+            .map(|(_, parameter)| parameter)
     }
 
     pub(super) const fn is_done(&self) -> bool {
@@ -165,7 +168,7 @@ impl Task {
         if let Some(old) = self.number.filter(|&old| old != number) {
             // One change is a cell with a new node id; a change back means two cells.
             if self.previous_number == Some(number) {
-                return self.fail(Reason::Twins(old.min(number), old.max(number)));
+                return self.fail(FailureReason::Twins(old.min(number), old.max(number)));
             }
             self.previous_number = Some(old);
             self.restart();
@@ -174,7 +177,7 @@ impl Task {
         self.reported_hash = heartbeat.configuration;
         let version = heartbeat.state.version();
         if version != u16::from(VERSION) {
-            return self.fail(Reason::Version { got: version });
+            return self.fail(FailureReason::Version { got: version });
         }
         if heartbeat.state.has(State::CLAIMING) {
             self.unsettled = Some(now);
@@ -225,7 +228,7 @@ impl Task {
         self.restart();
     }
 
-    pub(super) fn fail(&mut self, reason: Reason) {
+    pub(super) fn fail(&mut self, reason: FailureReason) {
         if !matches!(self.stage, Stage::Done(Outcome::Failed(_))) {
             self.pending = None;
             self.stage = Stage::Done(Outcome::Failed(reason));
@@ -253,27 +256,27 @@ impl Task {
         self.touched |= step == RequestStep::Commit;
         let attempt =
             Attempt::new(now, if step == RequestStep::Commit { COMMIT_LIMITS } else { REQUEST_LIMITS });
-        self.pending = Some(Pending { step, tag: self.tag, attempt });
+        self.pending = Some(PendingRequest { step, tag: self.tag, attempt });
         Some((step, self.tag))
     }
 
     /// Handles timeouts: repeats the request, and fails at the retry limit or if the cell does not settle.
     pub(super) fn handle_timeout(&mut self, now: Micros) -> Option<(RequestStep, u8)> {
         if self.unsettled.is_some_and(|since| now.elapsed_since(since) >= SETTLE_TIMEOUT) && !self.is_done() {
-            self.fail(Reason::Gone);
+            self.fail(FailureReason::Gone);
         }
         if let Stage::AwaitHeartbeat(since) = self.stage
             && now.elapsed_since(since) >= HEARTBEAT_TIMEOUT
         {
-            self.fail(Reason::Hash { target: self.hash, got: self.reported_hash });
+            self.fail(FailureReason::Hash { target: self.hash, got: self.reported_hash });
         }
-        let Pending { step, tag, attempt } = self.pending.as_mut()?;
+        let PendingRequest { step, tag, attempt } = self.pending.as_mut()?;
         let (step, tag, tries) = (*step, *tag, attempt.transmissions());
         match attempt.handle_timeout(now) {
             RetryAction::Wait => None,
             RetryAction::Resend => Some((step, tag)),
             RetryAction::GiveUp => {
-                self.fail(Reason::Silent { step, tries });
+                self.fail(FailureReason::Silent { step, tries });
                 None
             }
         }
@@ -309,9 +312,9 @@ impl Task {
                 self.pending = None;
                 if step == RequestStep::Commit && reason == Answer::WRONG_HASH {
                     // The cell restarted in between, without a heartbeat that arrived.
-                    return self.start_over(Reason::Refused { step, code: reason });
+                    return self.start_over(FailureReason::Refused { step, code: reason });
                 }
-                self.fail(Reason::Refused { step, code: reason });
+                self.fail(FailureReason::Refused { step, code: reason });
             }
             Answer::Value { number, written, words }
                 if number == parameter.number() && written == is_write =>
@@ -320,7 +323,7 @@ impl Task {
                 if self.stage == Stage::QueryAbilities {
                     let [.., abilities] = words;
                     return match (Abilities::from_word(abilities).first_missing(&self.target), wish.dry_run) {
-                        (Some(ability), _) => self.fail(Reason::Cannot(ability)),
+                        (Some(ability), _) => self.fail(FailureReason::Cannot(ability)),
                         (None, true) => self.stage = Stage::Done(Outcome::WouldWrite),
                         (None, false) => self.stage = Stage::Write,
                     };
@@ -329,7 +332,7 @@ impl Task {
                 if words == target {
                     return self.confirm(now, step);
                 }
-                let differs = Reason::Differs { step, target, got: words };
+                let differs = FailureReason::Differs { step, target, got: words };
                 if is_write {
                     self.fail(differs);
                 } else if wish.dry_run {
@@ -362,9 +365,9 @@ impl Task {
     }
 
     /// Starts the writing of the cell over; fails with `why` after the maximum number of rounds.
-    fn start_over(&mut self, why: Reason) {
+    fn start_over(&mut self, why: FailureReason) {
         self.rounds += 1;
-        if self.rounds > MAX_ROUNDS {
+        if self.rounds > MAX_WRITE_RESTARTS {
             return self.fail(why);
         }
         (self.written, self.read, self.stage) = (0, 0, Stage::Write);

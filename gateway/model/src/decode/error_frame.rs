@@ -5,7 +5,7 @@ use core::fmt::{Display, Formatter, Result};
 use protocol::can::Frame;
 
 /// Names of the error class bits in the identifier, from bit 0.
-const CLASSES: [&str; 10] = [
+const ERROR_CLASSES: [&str; 10] = [
     "tx-timeout",
     "lost-arbitration",
     "controller-problem",
@@ -17,11 +17,11 @@ const CLASSES: [&str; 10] = [
     "restarted-after-bus-off",
     "error-counter-tx-rx",
 ];
-const LOST_ARBITRATION: u32 = 1 << 1;
-const CONTROLLER: u32 = 1 << 2;
-const PROTOCOL: u32 = 1 << 3;
-const TRANSCEIVER: u32 = 1 << 4;
-const COUNTERS: u32 = 1 << 9;
+const LOST_ARBITRATION_BIT: u32 = 1 << 1;
+const CONTROLLER_ERROR_BIT: u32 = 1 << 2;
+const PROTOCOL_ERROR_BIT: u32 = 1 << 3;
+const TRANSCEIVER_ERROR_BIT: u32 = 1 << 4;
+const ERROR_COUNTERS_BIT: u32 = 1 << 9;
 
 /// Names of the controller problem bits in data byte 1, from bit 0.
 const CONTROLLER_PROBLEMS: [&str; 7] = [
@@ -35,7 +35,7 @@ const CONTROLLER_PROBLEMS: [&str; 7] = [
 ];
 
 /// Names of the protocol violation bits in data byte 2, from bit 0.
-const VIOLATIONS: [&str; 8] = [
+const PROTOCOL_VIOLATIONS: [&str; 8] = [
     "single-bit-error",
     "frame-format-error",
     "bit-stuffing-error",
@@ -63,7 +63,7 @@ impl ErrorFrame {
 
 /// Returns the error classes in the identifier of an error frame.
 pub fn error_classes(id: u32) -> impl Iterator<Item = &'static str> {
-    set_bit_names(id, &CLASSES)
+    set_bit_names(id, &ERROR_CLASSES)
 }
 
 /// Returns the names of the bits that are set in `bits`.
@@ -76,19 +76,21 @@ impl Display for ErrorFrame {
         let [arbitration, controller, violation, place, transceiver, _, tx, rx] = self.data;
         let details = |bits: u8, all: &[&str]| set_bit_names(bits.into(), all).collect::<Vec<_>>().join(",");
         let mut is_first = true;
-        for (bit, name) in (0..).zip(CLASSES) {
+        for (bit, name) in (0..).zip(ERROR_CLASSES) {
             let class = self.classes & 1 << bit;
             if class == 0 {
                 continue;
             }
             let more = match class {
-                LOST_ARBITRATION if arbitration > 0 => format!("{{at bit {arbitration}}}"),
-                CONTROLLER if controller > 0 => format!("{{{}}}", details(controller, &CONTROLLER_PROBLEMS)),
-                PROTOCOL if violation > 0 || place > 0 => {
-                    format!("{{{}}}{{location 0x{place:02X}}}", details(violation, &VIOLATIONS))
+                LOST_ARBITRATION_BIT if arbitration > 0 => format!("{{at bit {arbitration}}}"),
+                CONTROLLER_ERROR_BIT if controller > 0 => {
+                    format!("{{{}}}", details(controller, &CONTROLLER_PROBLEMS))
                 }
-                TRANSCEIVER if transceiver > 0 => format!("{{0x{transceiver:02X}}}"),
-                COUNTERS => format!("{{{tx}}}{{{rx}}}"),
+                PROTOCOL_ERROR_BIT if violation > 0 || place > 0 => {
+                    format!("{{{}}}{{location 0x{place:02X}}}", details(violation, &PROTOCOL_VIOLATIONS))
+                }
+                TRANSCEIVER_ERROR_BIT if transceiver > 0 => format!("{{0x{transceiver:02X}}}"),
+                ERROR_COUNTERS_BIT => format!("{{{tx}}}{{{rx}}}"),
                 _ => String::new(),
             };
             let comma = if core::mem::take(&mut is_first) { "" } else { "," };
@@ -104,7 +106,7 @@ mod tests {
 
     #[test]
     fn details_are_shown_where_there_are_some() {
-        let of = |data| ErrorFrame { classes: PROTOCOL, data }.to_string();
+        let of = |data| ErrorFrame { classes: PROTOCOL_ERROR_BIT, data }.to_string();
         let name = of([0; 8]);
         assert!(!name.contains('{'), "{name}");
         assert_eq!(of([0, 0, 0, 8, 0, 0, 0, 0]), format!("{name}{{}}{{location 0x08}}"));

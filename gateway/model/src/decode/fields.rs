@@ -53,7 +53,7 @@ pub(super) struct Bytes<'a> {
 
 /// Writes the fields of a layout.
 pub(super) fn write_fields(f: &mut Formatter<'_>, layout: &Layout, words: Bytes<'_>) -> fmt::Result {
-    let number = layout.fields.first().map_or(0, |first| first.raw(words.bytes, 0));
+    let number = layout.fields.first().map_or(0, |first| first.raw_value(words.bytes, 0));
     write_parts(f, &layout.text, u16::try_from(number).unwrap_or_default(), words, &|_, name| {
         Ok(field(&layout.fields, name))
     })
@@ -79,7 +79,7 @@ pub(super) fn write_parts<'a>(
 ) -> fmt::Result {
     for part in text {
         let of = part.of.as_deref().map(|name| find(f, name)).transpose()?.flatten();
-        let number = of.map_or_else(|| i64::from(number), |field| field.raw(words.bytes, 0));
+        let number = of.map_or_else(|| i64::from(number), |field| field.raw_value(words.bytes, 0));
         if !(part.when[0].into()..=part.when[1].into()).contains(&number) {
             continue;
         }
@@ -103,7 +103,7 @@ fn write_pieces<'a>(
                 }
             }
             TextPiece::Either { name, words: [no, yes] } => {
-                let is = find(f, name)?.is_some_and(|field| field.raw(words.bytes, 0) == 1);
+                let is = find(f, name)?.is_some_and(|field| field.raw_value(words.bytes, 0) == 1);
                 f.write_str(if is { yes } else { no })?;
             }
         }
@@ -119,7 +119,7 @@ fn write_field(
     Bytes { bytes, units }: Bytes<'_>,
     decimals: usize,
 ) -> fmt::Result {
-    let first = field.raw(bytes, 0);
+    let first = field.raw_value(bytes, 0);
     match &field.format {
         FieldFormat::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
         FieldFormat::Hex => write!(f, "{first:04X}"),
@@ -127,7 +127,7 @@ fn write_field(
         FieldFormat::Ports(..) => write!(f, "{}", PortSet(first)),
         FieldFormat::State => write!(f, "{}", StateText(State(u16::try_from(first).unwrap_or_default()))),
         FieldFormat::Parameter(_) => write!(f, "{}", ParameterName::from_raw(first)),
-        FieldFormat::Reason => write!(f, "{} (reason {first})", schema::reason(first)),
+        FieldFormat::Reason => write!(f, "{} (reason {first})", schema::refusal_reason(first)),
         FieldFormat::Total(_) => write!(f, "{:.decimals$}", field.sum_of_words(bytes)),
         FieldFormat::Group(parts) => write_neighbors(f, parts, bytes, field.elements()),
         FieldFormat::Fixed(_)
@@ -142,16 +142,16 @@ fn write_field(
         | FieldFormat::Flag(_)
         | FieldFormat::Page(_) => (0..field.elements_in(bytes)).try_for_each(|element| {
             f.write_str(if element == 0 { "" } else { " " })?;
-            let raw = field.raw(bytes, element);
+            let raw = field.raw_value(bytes, element);
             match i16::try_from(raw) {
                 Ok(i16::MAX) if field.is_saturating() => f.write_str("+saturated"),
                 Ok(i16::MIN) if field.is_saturating() => f.write_str("-saturated"),
                 _ if field.fraction() > 0 => {
-                    write!(f, "{:.decimals$}", field.real_in(raw, element, units))
+                    write!(f, "{:.decimals$}", field.element_value(raw, element, units))
                 }
                 _ => write!(f, "{raw}"),
             }?;
-            match field.unit_in(element, units) {
+            match field.element_unit(element, units) {
                 unit if unit == field.unit => Ok(()),
                 unit => write!(f, " {unit}"),
             }

@@ -12,7 +12,7 @@ use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
 use super::fields::ParameterName;
 use super::ports::PortSet;
-use super::{Decoded, Foreign, wires};
+use super::{Decoded, ForeignReason, wires};
 
 /// The JSON object of a frame.
 #[derive(serde::Serialize)]
@@ -36,7 +36,7 @@ struct FrameObject<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     tag: Option<u8>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    values: Option<Values>,
+    values: Option<PacketValues>,
     #[serde(skip_serializing_if = "Option::is_none")]
     saturated: Option<bool>,
     /// The CRC in the packet.
@@ -48,7 +48,7 @@ struct FrameObject<'a> {
 }
 
 /// The values of a packet's words, with keys that depend on the packet kind and page.
-struct Values {
+struct PacketValues {
     link_id: Option<LinkId>,
     end: &'static [Field],
     layout: &'static Layout,
@@ -56,7 +56,7 @@ struct Values {
     units: Units,
 }
 
-impl Serialize for Values {
+impl Serialize for PacketValues {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
         let Self { link_id, end, layout, bytes, units } = self;
@@ -72,9 +72,9 @@ impl Serialize for Values {
 }
 
 /// The fields that share one word, as one JSON object.
-struct Group<'a>(&'a [Field], &'a [u8]);
+struct FieldGroup<'a>(&'a [Field], &'a [u8]);
 
-impl Serialize for Group<'_> {
+impl Serialize for FieldGroup<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
         serialize_fields(&mut map, self.0, "", self.1, Units::default())?;
@@ -92,7 +92,7 @@ fn serialize_fields<M: SerializeMap>(
 ) -> Result<(), M::Error> {
     let Some(first) = fields.first() else { return Ok(()) };
     for field in fields.iter().filter(|field| !matches!(field.name.as_str(), "" | "epoch" | "tag")) {
-        let raw = field.raw(bytes, 0);
+        let raw = field.raw_value(bytes, 0);
         if !field.is_present(bytes, first) {
             if field.absent == WhenAbsent::Null {
                 map.serialize_entry(&field.name, &())?;
@@ -107,7 +107,7 @@ fn serialize_fields<M: SerializeMap>(
         } else {
             map.serialize_entry(&field.name, &FieldValue(field, bytes, units))?;
             if field.format == FieldFormat::Reason {
-                map.serialize_entry("because", schema::reason(raw))?;
+                map.serialize_entry("because", schema::refusal_reason(raw))?;
             }
         }
     }
@@ -120,8 +120,8 @@ struct FieldValue<'a>(&'a Field, &'a [u8], Units);
 impl Serialize for FieldValue<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let Self(field, bytes, units) = *self;
-        let (first, elements) = (field.raw(bytes, 0), 0..field.elements_in(bytes));
-        let real = |element| field.real_in(field.raw(bytes, element), element, units);
+        let (first, elements) = (field.raw_value(bytes, 0), 0..field.elements_in(bytes));
+        let real = |element| field.element_value(field.raw_value(bytes, element), element, units);
         match &field.format {
             FieldFormat::Choice => serializer.serialize_str(field.name_of(first).unwrap_or_default()),
             FieldFormat::Flag(_) => serializer.serialize_bool(first == 1),
@@ -130,7 +130,7 @@ impl Serialize for FieldValue<'_> {
             FieldFormat::Ports(..) => serializer.collect_seq(PortSet(first).ports()),
             FieldFormat::Total(_) => serializer.serialize_f64(field.sum_of_words(bytes)),
             FieldFormat::Group(parts) => {
-                let of = |element: usize| Group(parts, bytes.get(element * 2..).unwrap_or_default());
+                let of = |element: usize| FieldGroup(parts, bytes.get(element * 2..).unwrap_or_default());
                 serializer.collect_seq(elements.map(of))
             }
             FieldFormat::Fixed(_)
@@ -155,7 +155,7 @@ impl Serialize for FieldValue<'_> {
                 if field.labels.is_empty() {
                     serializer.serialize_i64(first)
                 } else {
-                    serializer.collect_seq(elements.map(|element| field.raw(bytes, element)))
+                    serializer.collect_seq(elements.map(|element| field.raw_value(bytes, element)))
                 }
             }
         }
@@ -191,7 +191,7 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
     };
     match *decoded {
         Decoded::Foreign(foreign) => {
-            if let Foreign::Data(fault) = foreign {
+            if let ForeignReason::Data(fault) = foreign {
                 line.set_crc_error(fault);
             }
             line.error = Some(foreign.to_string());
@@ -199,9 +199,9 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
         Decoded::Wire(link_id, message) => {
             line.kind = Some("wire");
             line.crc = Some(hex_word(packet_crc(record)));
-            let (bytes, layout) = wires::encoded(message);
+            let (bytes, layout) = wires::encode_with_layout(message);
             line.epoch = wires::epoch(message);
-            line.values = Some(Values { link_id: Some(link_id), end: &[], layout, bytes, units });
+            line.values = Some(PacketValues { link_id: Some(link_id), end: &[], layout, bytes, units });
         }
         Decoded::Segment { id } => line.set_subject(id),
         Decoded::Damaged { id, fault } => {
@@ -254,8 +254,13 @@ impl FrameObject<'_> {
         let layout = schema::layout(message, &packet);
         let end = PacketSchema::for_id(packet.id).map_or(&[][..], |schema| schema.trailing_fields(layout));
         let is_bare = end.is_empty() && layout.fields.is_empty();
-        self.values =
-            (!is_bare).then(|| Values { link_id: None, end, layout, bytes: packet.fields(), units });
+        self.values = (!is_bare).then(|| PacketValues {
+            link_id: None,
+            end,
+            layout,
+            bytes: packet.field_bytes(),
+            units,
+        });
     }
 }
 
@@ -408,7 +413,7 @@ mod tests {
         assert_eq!((&wrong["crc"], &wrong["crc_expected"]), (&json!("E74B"), &json!("9C2A")));
         assert_eq!(wrong["error"], json!("no packet: CRC E74B, not 9C2A"));
         let frame = candump::parse_frame("20C##10011").unwrap();
-        let time = candump::Timestamp::six_digits(0);
+        let time = candump::Timestamp::with_six_digits(0);
         let record = Record { time, interface: "can0", frame, direction: None };
         let id = protocol::packet::data_id(&frame).unwrap();
         let mut line = Vec::new();

@@ -32,7 +32,7 @@ use protocol::time::Micros;
 use std::collections::VecDeque;
 use thiserror::Error;
 
-use crate::packets::{ByIdentifier, NoPacket, PacketReader, Received};
+use crate::packets::{ByIdentifier, FrameWithPacket, NoPacket, PacketReader};
 
 /// Maximum number of buses whose state is kept. Beyond it, the state of the oldest bus is dropped.
 pub const MAX_BUSES: usize = 64;
@@ -41,7 +41,7 @@ pub const MAX_BUSES: usize = 64;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Decoded {
     /// A frame of another protocol.
-    Foreign(Foreign),
+    Foreign(ForeignReason),
     /// A message of a cell, or of the gateway, over a simulated wire. Real buses do not carry such frames.
     Wire(port::LinkId, PortMessage),
     /// A segment of a packet in classic frames, except the last one; when [`Decoder::decode`] returns it, the frame may
@@ -70,7 +70,7 @@ pub enum Decoded {
 
 /// The reason why a frame does not belong to this protocol.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-pub enum Foreign {
+pub enum ForeignReason {
     /// The frame has a 29-bit identifier.
     #[error("29-bit identifier")]
     Extended,
@@ -85,7 +85,7 @@ pub enum Foreign {
     Data(PacketError),
 }
 
-impl Foreign {
+impl ForeignReason {
     fn from_frame(frame: &Frame) -> Self {
         if frame.is_error() {
             Self::Error(ErrorFrame::new(frame))
@@ -138,9 +138,9 @@ pub fn wire_message(frame: &Frame) -> Option<(port::LinkId, PortMessage)> {
 }
 
 /// Classifies a frame that cannot be a packet.
-fn not_data(frame: &Frame) -> Decoded {
+fn classify_non_data(frame: &Frame) -> Decoded {
     let wired = wire_message(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
-    wired.unwrap_or_else(|| Decoded::Foreign(Foreign::from_frame(frame)))
+    wired.unwrap_or_else(|| Decoded::Foreign(ForeignReason::from_frame(frame)))
 }
 
 /// Frame counts of one identifier, which decide whether it carries packets.
@@ -196,35 +196,35 @@ struct BusDecoder {
 /// Classifies the frames of one bus that a [`PacketReader`] has read.
 #[derive(Clone, Debug, Default)]
 struct Classifier {
-    ids: ByIdentifier<Slot>,
+    ids: ByIdentifier<IdentifierState>,
 }
 
 /// The state of one identifier of a bus.
 #[derive(Clone, Debug, Default)]
-struct Slot {
+struct IdentifierState {
     /// Numbers of the frames that may be segments of a packet and wait for its other segments.
     waiting: VecDeque<u64>,
     traffic: IdentifierTraffic,
 }
 
-impl Slot {
+impl IdentifierState {
     /// Settles the pending frames as refused, except the newest `kept`; their numbers and classes are appended to
     /// `settled`.
     fn refuse_older(&mut self, kept: usize, id: Id, settled: &mut Vec<(u64, Decoded)>) {
         for _ in kept..self.waiting.len() {
             if let Some(number) = self.waiting.pop_front() {
-                settled.push((number, self.refuse(id, PacketError::Incomplete)));
+                settled.push((number, self.classify_unreadable(id, PacketError::Incomplete)));
             }
         }
     }
 
     /// Classifies a frame that is neither a packet nor a segment.
-    const fn refuse(&mut self, id: Id, fault: PacketError) -> Decoded {
+    const fn classify_unreadable(&mut self, id: Id, fault: PacketError) -> Decoded {
         self.traffic.count_other();
         if self.traffic.carries_packets() {
             Decoded::Damaged { id, fault }
         } else {
-            Decoded::Foreign(Foreign::Data(fault))
+            Decoded::Foreign(ForeignReason::Data(fault))
         }
     }
 }
@@ -235,7 +235,7 @@ type Classified = (Decoded, Vec<(u64, Decoded)>);
 
 impl Classifier {
     /// Classifies the frame with this number.
-    fn classify(&mut self, number: u64, received: &Received<'_>) -> Classified {
+    fn classify(&mut self, number: u64, received: &FrameWithPacket<'_>) -> Classified {
         let id = match received.packet {
             Ok((packet, message)) => {
                 let settled = self.packet(&packet);
@@ -244,14 +244,14 @@ impl Classifier {
                     Err(error) => (Decoded::Meaningless { packet, error }, settled),
                 };
             }
-            Err(NoPacket::NotData) => return (not_data(received.frame), Vec::new()),
+            Err(NoPacket::NotData) => return (classify_non_data(received.frame), Vec::new()),
             Err(NoPacket::Segment(id) | NoPacket::AfterLost(id)) => id,
             Err(NoPacket::Damaged(id, fault)) => {
                 let (slot, mut settled) = (self.ids.entry(id), Vec::new());
                 if fault == PacketError::Ambiguous {
                     slot.refuse_older(0, id, &mut settled);
                 }
-                return (slot.refuse(id, fault), settled);
+                return (slot.classify_unreadable(id, fault), settled);
             }
         };
         let (slot, mut settled) = (self.ids.entry(id), Vec::new());
@@ -280,7 +280,7 @@ impl Decoder {
     }
 
     /// Classifies the next frame. A classic frame may be a [`Decoded::Segment`] first and be settled later;
-    /// [`settle::Settler`] waits for that. Memory is bounded for any input. Never panics.
+    /// [`settle::OrderedDecoder`] waits for that. Memory is bounded for any input. Never panics.
     pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
         self.classify(0, at, bus, frame).1.0
     }
@@ -288,26 +288,26 @@ impl Decoder {
     /// Classifies the frame with this number. Also returns the number of its bus.
     fn classify(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> (u64, Classified) {
         if data_id(frame).is_err() {
-            return (0, (not_data(frame), Vec::new()));
+            return (0, (classify_non_data(frame), Vec::new()));
         }
         let bus = self.bus(bus);
         (bus.number, bus.classifier.classify(number, &bus.packets.read(at, frame)))
     }
 
     /// Returns the class of a segment whose packet will not be completed.
-    fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
+    fn classify_incomplete(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
         let found = self.buses.iter_mut().find(|it| it.number == bus).and_then(|bus| {
             let slot = bus.classifier.ids.get_mut(id)?;
             (slot.waiting.front() == Some(&number)).then_some((slot, &mut bus.packets))
         });
         let Some((slot, packets)) = found else {
-            return Decoded::Foreign(Foreign::Data(PacketError::Incomplete));
+            return Decoded::Foreign(ForeignReason::Data(PacketError::Incomplete));
         };
         slot.waiting.pop_front();
         if slot.waiting.is_empty() {
             packets.drop_segments(id);
         }
-        slot.refuse(id, PacketError::Incomplete)
+        slot.classify_unreadable(id, PacketError::Incomplete)
     }
 
     fn bus(&mut self, name: &str) -> &mut BusDecoder {

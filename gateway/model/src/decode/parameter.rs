@@ -10,7 +10,7 @@ use thiserror::Error;
 pub use super::fields::{ParameterName, ParameterWords};
 
 /// The largest parameter number. The next higher bit of the byte marks a write.
-const MAX: u8 = 127;
+const MAX_PARAMETER_NUMBER: u8 = 127;
 
 /// The error for text that is not a parameter or not a valid value of one.
 #[derive(Clone, Debug, Error, PartialEq)]
@@ -19,7 +19,7 @@ pub enum ParameterTextError {
     /// The name is not that of a parameter.
     #[error(
         "{got:?} is not a parameter: allowed are identity, mount, pose, contact, timing, mode, reply, sensing, events, \
-         links_down, baseline, tare, row1 to row6, commit, and every number from 0 to {MAX}"
+         links_down, baseline, tare, row1 to row6, commit, and every number from 0 to {MAX_PARAMETER_NUMBER}"
     )]
     Unknown {
         /// The given name.
@@ -73,7 +73,7 @@ fn value_count_text(count: usize) -> String {
 /// Returns [`ParameterTextError::Unknown`] if the text is neither a name nor a number up to 127.
 pub fn parse_number(text: &str) -> Result<u8, ParameterTextError> {
     let named = schema::find_parameter(text).map(|layout| layout.number);
-    let number = || text.parse().ok().filter(|&number| number <= MAX);
+    let number = || text.parse().ok().filter(|&number| number <= MAX_PARAMETER_NUMBER);
     named.or_else(number).ok_or_else(|| ParameterTextError::Unknown { got: text.to_owned() })
 }
 
@@ -151,13 +151,13 @@ pub fn parse_value(field: &Field, text: &str) -> Result<i16, String> {
         }
         FieldFormat::Signed | FieldFormat::Flag(_) => text.parse().ok().filter(known).ok_or_else(allowed),
         FieldFormat::Angle | FieldFormat::Position => parse_angle(text),
-        FieldFormat::Threshold(fraction) => parse_fixed(text, fraction, Q::<0>::try_at_least),
+        FieldFormat::Threshold(fraction) => parse_fixed(text, fraction, Q::<0>::try_round_up),
         FieldFormat::Fixed(fraction) | FieldFormat::Saturating(fraction) | FieldFormat::Total(fraction) => {
             let word = parse_fixed(text, fraction, Q::<0>::try_nearest);
             match field.range {
                 FieldRange::All | FieldRange::NotNegativeAtCommit => word,
                 FieldRange::NotNegative => {
-                    let max = field.real(i64::from(i16::MAX));
+                    let max = field.raw_to_real(i64::from(i16::MAX));
                     word.ok().filter(|word| *word >= 0).ok_or_else(|| format!("it must be in [0, {max}]"))
                 }
                 FieldRange::Within(min, max) => {
@@ -237,7 +237,7 @@ mod tests {
 
     #[test]
     fn every_parameter_has_a_name_that_leads_back() {
-        for byte in 0..=MAX {
+        for byte in 0..=MAX_PARAMETER_NUMBER {
             let name = ParameterName(byte).to_string();
             let known = Parameter::from_number(byte).is_some();
             assert_eq!(known, !name.starts_with("parameter "), "{byte}");

@@ -68,14 +68,14 @@ pub fn parse_node(word: &str) -> Result<Node, String> {
 
 /// A node, on one bus or on any.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Party {
+pub struct NodeSelector {
     /// The bus; `None` matches any.
     pub bus: Option<String>,
     /// The node on that bus.
     pub node: Node,
 }
 
-impl FromStr for Party {
+impl FromStr for NodeSelector {
     type Err = String;
 
     /// Parses `NODE` or `BUS:NODE`; a node is `gateway`, `everyone`, or a node id.
@@ -140,7 +140,7 @@ pub struct FrameFilter {
     /// Shows any of these kinds; all if empty.
     pub kinds: Vec<Selector>,
     /// Shows frames with any of these senders or addressees; all if empty. Commands are from the gateway.
-    pub parties: Vec<Party>,
+    pub parties: Vec<NodeSelector>,
     /// Shows frames of these buses; of all if empty.
     pub buses: Vec<String>,
     /// Shows frames with any of these identifiers; all if empty.
@@ -176,9 +176,9 @@ impl FrameFilter {
     /// # Errors
     /// Returns a sentence that names the node and the buses, if the filters exclude each other.
     pub fn check(&self) -> Result<(), String> {
-        let is_out = |party: &&Party| party.bus.as_ref().is_some_and(|bus| !self.buses.contains(bus));
+        let is_out = |party: &&NodeSelector| party.bus.as_ref().is_some_and(|bus| !self.buses.contains(bus));
         match self.parties.iter().find(is_out).filter(|_| !self.buses.is_empty()) {
-            Some(Party { bus: Some(bus), node }) => {
+            Some(NodeSelector { bus: Some(bus), node }) => {
                 let buses = self.buses.join(", ");
                 Err(format!(
                     "{bus}:{node} is not on a selected bus ({buses}): leave out one of the two filters"
@@ -217,7 +217,8 @@ impl FrameFilter {
             | Kind::Configured
             | Kind::Stimulus => Node::from_byte(id.node),
         });
-        let is = |party: &Party| Some(party.node) == node && party.bus.as_ref().is_none_or(|it| it == bus);
+        let is =
+            |party: &NodeSelector| Some(party.node) == node && party.bus.as_ref().is_none_or(|it| it == bus);
         self.parties.is_empty() || self.parties.iter().any(is)
     }
 }
@@ -225,7 +226,7 @@ impl FrameFilter {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::decode::{Decoder, Foreign};
+    use crate::decode::{Decoder, ForeignReason};
     use protocol::can::{EXTENDED, Format};
     use protocol::packet::{Epoch, Packet};
     use protocol::port;
@@ -289,7 +290,7 @@ mod tests {
     fn times_count_from_the_first_frame_and_leave_out_the_end() {
         let pick = FrameFilter { from: Some(10), to: Some(20), ..FrameFilter::default() };
         let taken: Vec<u64> = (95..=125)
-            .filter(|&at| pick.matches(100, at, "can0", &frame(1), &Decoded::Foreign(Foreign::Remote)))
+            .filter(|&at| pick.matches(100, at, "can0", &frame(1), &Decoded::Foreign(ForeignReason::Remote)))
             .collect();
         assert_eq!(taken, (110..120).collect::<Vec<_>>());
     }

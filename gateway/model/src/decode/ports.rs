@@ -26,8 +26,9 @@ pub(super) fn write_neighbors(
 ) -> fmt::Result {
     for index in 0..ports {
         let word = bytes.get(2 * index..).unwrap_or_default();
-        let part =
-            |name: &str| parts.iter().find(|part| part.name == name).map_or(0, |part| part.raw(word, 0));
+        let part = |name: &str| {
+            parts.iter().find(|part| part.name == name).map_or(0, |part| part.raw_value(word, 0))
+        };
         write!(f, "{}{index} ", if index == 0 { "" } else { ", " })?;
         if part("hears") == 0 {
             f.write_str("silent")?;

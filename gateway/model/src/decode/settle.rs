@@ -24,7 +24,7 @@ const REORDER_TOLERANCE: Span = Span::from_millis(100);
 
 /// Classifies frames in order of arrival. A `T` is passed in with each frame and returned with its class.
 #[derive(Debug)]
-pub struct Settler<T> {
+pub struct OrderedDecoder<T> {
     decoder: Decoder,
     waiting: VecDeque<Entry<T>>,
     /// Number of the oldest pending frame.
@@ -48,7 +48,7 @@ enum EntryState {
     Pending(u64, Id),
 }
 
-impl<T> Settler<T> {
+impl<T> OrderedDecoder<T> {
     /// Creates a settler for buses of one frame format; with `None`, the format of each frame is used.
     #[must_use]
     pub const fn new(format: Option<Format>) -> Self {
@@ -61,7 +61,7 @@ impl<T> Settler<T> {
         }
     }
 
-    /// Adds the next frame. Call [`Settler::pop`] until it returns `None` before adding another.
+    /// Adds the next frame. Call [`OrderedDecoder::pop`] until it returns `None` before adding another.
     pub fn push(&mut self, at: Micros, bus: &str, frame: &Frame, item: T) {
         let number = self.oldest + self.waiting.len() as u64;
         let (bus, (decoded, settled)) = self.decoder.classify(number, at, bus, frame);
@@ -105,7 +105,7 @@ impl<T> Settler<T> {
             if is_in_time && !self.is_at_end && self.waiting.len() < MAX_PENDING_FRAMES {
                 return None;
             }
-            let decoded = self.decoder.give_up(self.oldest, bus, id);
+            let decoded = self.decoder.classify_incomplete(self.oldest, bus, id);
             self.waiting.front_mut()?.state = EntryState::Settled(decoded);
         }
         let Entry { item, state, .. } = self.waiting.pop_front()?;

@@ -2,7 +2,7 @@
 
 use core::f64::consts::FRAC_PI_2;
 
-use super::settle::Settler;
+use super::settle::OrderedDecoder;
 use super::*;
 use proptest::prelude::*;
 use protocol::candump::{self, CandumpLine, Timestamp};
@@ -19,7 +19,7 @@ const CLASSIC: &str = include_str!("../../../../protocol/tests/golden/classic.lo
 
 /// Returns each frame's comment in the log with its decoded text.
 fn decoded(log: &str, format: Option<Format>) -> Vec<(String, String)> {
-    let mut settler = Settler::new(format);
+    let mut settler = OrderedDecoder::new(format);
     let mut comment = "";
     for line in log.lines() {
         match candump::parse(line).unwrap() {
@@ -285,7 +285,7 @@ fn with_an_identifier_that_carries_packets_it_is_damaged() {
     assert_eq!(text(None, "20C##5001000F8"), "length  torque 12: 4 data bytes, not 16");
     assert_eq!(text(Some(Format::Classic), wrong), "length  torque 12: 16 data bytes, not 8");
     assert_eq!(text(None, "20D##5001000F8"), "foreign no packet: 4 data bytes, not 16");
-    let mut settler = Settler::new(None);
+    let mut settler = OrderedDecoder::new(None);
     let packet = candump::parse_frame("20C##5001000F80100FFFF0000000007014BE7").unwrap();
     for frame in [packet, packet, candump::parse_frame("20C#0000000007014BE7").unwrap()] {
         settler.push(Micros(0), "vcan0", &frame, ());
@@ -441,8 +441,12 @@ fn joints_and_torques_are_in_the_units_of_their_bus() {
         let epoch = protocol::packet::Epoch(7);
         let packet = Packet { id, words: words.into(), epoch, count };
         let frame = packet.frames(Format::Fd).next().unwrap();
-        let record =
-            candump::Record { time: Timestamp::six_digits(0), interface: "vcan0", frame, direction: None };
+        let record = candump::Record {
+            time: Timestamp::with_six_digits(0),
+            interface: "vcan0",
+            frame,
+            direction: None,
+        };
         let decoded = Decoder::new(None).decode(Micros(0), "vcan0", &frame);
         let mut line = Vec::new();
         json::write(&mut line, &record, &decoded, units).unwrap();

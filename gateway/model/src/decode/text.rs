@@ -37,18 +37,18 @@ impl Display for InUnits<'_> {
         match *decoded {
             Decoded::Foreign(foreign) => write!(f, "{foreign}"),
             Decoded::Wire(link_id, message) => write!(f, "{}", WireText(link_id, message)),
-            Decoded::Segment { id } => write!(f, "{}", Subject(id)),
-            Decoded::Damaged { id, fault } => write!(f, "{}: {fault}", Subject(id)),
-            Decoded::Meaningless { packet, error } => write!(f, "{}: {error}", Subject(packet.id)),
+            Decoded::Segment { id } => write!(f, "{}", IdText(id)),
+            Decoded::Damaged { id, fault } => write!(f, "{}: {fault}", IdText(id)),
+            Decoded::Meaningless { packet, error } => write!(f, "{}: {error}", IdText(packet.id)),
             Decoded::Message(message) => write!(f, "{}", MessageText(&message, units)),
         }
     }
 }
 
 /// The subject of an identifier: `torque 12`, `halt`, `command 9`.
-struct Subject(Id);
+struct IdText(Id);
 
-impl Display for Subject {
+impl Display for IdText {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Id { kind, node } = self.0;
         f.write_str(self.0.name())?;
@@ -68,11 +68,11 @@ struct MessageText<'a>(&'a Message, Units);
 impl Display for MessageText<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let packet = self.0.encode();
-        write!(f, "{}", Subject(packet.id))?;
+        write!(f, "{}", IdText(packet.id))?;
         let Some(schema) = PacketSchema::for_id(packet.id).filter(|schema| !schema.text.is_empty()) else {
             return Ok(());
         };
-        let (layout, bytes) = (schema::layout(self.0, &packet), packet.fields());
+        let (layout, bytes) = (schema::layout(self.0, &packet), packet.field_bytes());
         f.write_str(" ")?;
         let words = Bytes { bytes: &bytes, units: self.1 };
         write_parts(f, &schema.text, u16::from(packet.count), words, &|f, name| match name {

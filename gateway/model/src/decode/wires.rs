@@ -3,20 +3,23 @@
 use core::fmt::{self, Display, Formatter};
 
 use protocol::message::VERSION;
-use protocol::packet::{BYTES, Bytes};
-use protocol::port::{Hello, LinkId, PortMessage, Rank, Walk};
+use protocol::packet::{Bytes, PACKET_BYTES};
+use protocol::port::{Hello, LinkId, NodeIdWalk, PortMessage, TreeRank};
 use protocol::schema::{self, Layout};
 
 use super::fields::write_layout;
 use super::ports::PortName;
 
 /// Encodes a message over a wire. Returns the bytes and the layout of their fields.
-pub(super) fn encoded(message: PortMessage) -> (Bytes, &'static Layout) {
+pub(super) fn encode_with_layout(message: PortMessage) -> (Bytes, &'static Layout) {
     let body = message.encode();
-    let bytes = body.into_iter().chain([0; BYTES]).take(BYTES).collect();
+    let bytes = body.into_iter().chain([0; PACKET_BYTES]).take(PACKET_BYTES).collect();
     (
         bytes,
-        schema::wires().iter().find(|layout| layout.number == body[0]).expect("every message has a layout"),
+        schema::wire_layouts()
+            .iter()
+            .find(|layout| layout.number == body[0])
+            .expect("every message has a layout"),
     )
 }
 
@@ -31,12 +34,12 @@ pub(super) struct WireText(pub(super) LinkId, pub(super) PortMessage);
 impl Display for WireText {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Self(LinkId { wire, back }, message) = *self;
-        let (bytes, layout) = encoded(message);
+        let (bytes, layout) = encode_with_layout(message);
         write!(f, "wire {wire} {}: {}", if back { "<-" } else { "->" }, layout.name)?;
         if let PortMessage::Hello(hello) = message {
             return write_hello(f, hello);
         }
-        if let PortMessage::Return(Walk { walk, first, last }) = message {
+        if let PortMessage::Return(NodeIdWalk { walk, first, last }) = message {
             write!(f, ", walk {walk}, ")?;
             return if first > last {
                 f.write_str("none remaining")
@@ -67,12 +70,12 @@ fn write_hello(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
 }
 
 /// The rank of a cell as text; `None` for a cell without a route.
-struct RankText(Option<Rank>);
+struct RankText(Option<TreeRank>);
 
 impl Display for RankText {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match self.0 {
-            Some(Rank { round, depth }) => write!(f, "round {round} depth {depth}"),
+            Some(TreeRank { round, depth }) => write!(f, "round {round} depth {depth}"),
             None => f.write_str("unreachable"),
         }
     }

@@ -177,7 +177,7 @@ impl Rings {
     }
 
     /// Returns the ring of a cell and its index in that ring; odd rings are counted backwards.
-    const fn spot(&self, number: usize) -> (usize, usize) {
+    const fn ring_and_index(&self, number: usize) -> (usize, usize) {
         let (ring, place) = (number / self.cells_per_ring, number % self.cells_per_ring);
         (ring, if ring % 2 == 0 { place } else { self.cells_per_ring - 1 - place })
     }
@@ -191,7 +191,7 @@ impl Rings {
     fn wired_cells(&self, limb: &Limb, all: usize, numbers: core::ops::Range<usize>) -> Vec<PlacedCell> {
         let rings = all.div_ceil(self.cells_per_ring);
         let place = |number| {
-            let (ring, place) = self.spot(number);
+            let (ring, place) = self.ring_and_index(number);
             let last = self.cells_per_ring - 1;
             let neighbors = [
                 Some((ring, if place == 0 { last } else { place - 1 })),
@@ -200,13 +200,14 @@ impl Rings {
                 Some((ring + 1, place)),
             ];
             let within = |spot| Some(self.number(spot)).filter(|number| numbers.contains(number));
-            let turn = TAU * (real(place) + real(ring % 2) / 2.0) / real(self.cells_per_ring);
-            let radius = real(self.cells_per_ring) * self.pitch / TAU;
+            let turn = TAU * (count_to_f64(place) + count_to_f64(ring % 2) / 2.0)
+                / count_to_f64(self.cells_per_ring);
+            let radius = count_to_f64(self.cells_per_ring) * self.pitch / TAU;
             let [x, z] = limb.middle;
             PlacedCell {
                 joint: limb.joint,
                 position: [
-                    x + (real(rings - 1) / 2.0 - real(ring)) * self.ring_distance(),
+                    x + (count_to_f64(rings - 1) / 2.0 - count_to_f64(ring)) * self.ring_distance(),
                     radius * turn.sin(),
                     z + radius * turn.cos(),
                 ],
@@ -258,10 +259,10 @@ pub(super) fn depth(places: &[PlacedCell], from: usize) -> usize {
 }
 
 fn metres(pitch_mm: usize) -> f64 {
-    real(pitch_mm) / 1e3
+    count_to_f64(pitch_mm) / 1e3
 }
 
 #[expect(clippy::cast_precision_loss, reason = "counts of cells")]
-fn real(count: usize) -> f64 {
+fn count_to_f64(count: usize) -> f64 {
     count as f64
 }

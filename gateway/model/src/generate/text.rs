@@ -1,7 +1,7 @@
 //! Formats a generated skin as the text of a `skin.toml`.
 
 use protocol::skin::DenavitHartenberg;
-use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
+use protocol::skin::file::{CellFacing, DraftBus, DraftCell, SkinDraft, Value};
 
 use super::arm::{self, CoveredArm, PlacedCell};
 use super::{Format, Reply, SkinRequest};
@@ -21,36 +21,38 @@ pub(super) fn toml(target: &SkinRequest, arm: &CoveredArm) -> String {
     ];
     let options: String =
         options.into_iter().filter_map(|(is_unusual, option)| is_unusual.then_some(option)).collect();
-    let mut draft = Draft::default();
-    draft.comment(&format!("skinbus skin generate --cells {cells}{options}"));
-    draft.comment("");
-    draft.comment(&format!(
+    let mut draft = SkinDraft::default();
+    draft.add_comment(&format!("skinbus skin generate --cells {cells}{options}"));
+    draft.add_comment("");
+    draft.add_comment(&format!(
         "Hexagonal cells, {} mm apart, in rings that are turned by half a cell",
         arm.pitch_mm
     ));
-    draft.comment(&format!(
+    draft.add_comment(&format!(
         "against each other: {on_upper} around the {upper}, {on_lower} around the {lower}."
     ));
-    draft.comment("Ports: 0 and 1 along the ring, 2 to the ring before, 3 to the ring after.");
+    draft.add_comment("Ports: 0 and 1 along the ring, 2 to the ring before, 3 to the ring after.");
     if arm.buses.len() == 1 && on_upper > 0 && on_lower > 0 {
-        draft
-            .comment(&format!("A cable leads from node {on_upper} over the elbow to node {}.", on_upper + 1));
+        draft.add_comment(&format!(
+            "A cable leads from node {on_upper} over the elbow to node {}.",
+            on_upper + 1
+        ));
     }
     draft.set("version", Value::Integer(1));
     draft.set("name", Value::Text(&format!("{}-{cells}", arm.name.to_lowercase())));
-    draft.table("[robot]", None);
+    draft.add_table_header("[robot]", None);
     draft.set("name", Value::Text(arm.name));
     let rows = arm.joints.iter().map(|&DenavitHartenberg { a, alpha, d, theta_offset }| {
         let values = [("a", a), ("alpha", alpha), ("d", d), ("theta_offset", theta_offset)];
         values.map(|(key, value)| (key, Value::Number(value))).to_vec()
     });
     draft.set_rows("joints", Some("standard Denavit-Hartenberg, base to tip; m, rad"), rows);
-    draft.paper(*broadcast_hz);
+    draft.add_paper_settings(*broadcast_hz);
     for (bus, places) in arm.buses.iter().enumerate() {
         let slot_us = (*reply == Reply::Sum).then(|| slot_us(places, *broadcast_hz));
-        draft.bus(&DraftBus { name: &bus_name(bus), chain: None, slot_us, format: *format });
+        draft.add_bus(&DraftBus { name: &bus_name(bus), chain: None, slot_us, format: *format });
     }
-    draft.table("[controller]", Some("M q'' + D q' = tau, joint by joint"));
+    draft.add_table_header("[controller]", Some("M q'' + D q' = tau, joint by joint"));
     draft.set("kind", Value::Text("kinesthetic"));
     draft.set_with_comment("inertia", Value::Numbers(&[1.0, 1.0, 1.0, 0.5, 0.5, 0.5]), 11, "kg m2");
     draft.set_with_comment("damping", Value::Numbers(&[4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), 11, "Nm s/rad");
@@ -66,11 +68,11 @@ fn bus_name(bus: usize) -> String {
 }
 
 /// Adds a cell to the draft, on a bus and with a node id.
-fn add_cell(draft: &mut Draft, bus: usize, place: &PlacedCell, node: usize) {
+fn add_cell(draft: &mut SkinDraft, bus: usize, place: &PlacedCell, node: usize) {
     // A rotation about x, the limb's direction: the cell's z axis points away from the limb.
     let (sin, cos) = (-place.turn / 2.0).sin_cos();
     let [qx, qw] = [sin, cos].map(|value| round(value, 1e9));
-    draft.cell(&DraftCell {
+    draft.add_cell(&DraftCell {
         remark: None,
         bus: &bus_name(bus),
         node,
@@ -78,7 +80,7 @@ fn add_cell(draft: &mut Draft, bus: usize, place: &PlacedCell, node: usize) {
         joint: place.joint.into(),
         row: None,
         position: place.position.map(|value| round(value, 1e6)),
-        facing: Facing::Orientation([qx, 0.0, 0.0, qw]),
+        facing: CellFacing::Orientation([qx, 0.0, 0.0, qw]),
         neighbors: Some(place.wires.map(|wire| wire.map_or(0, |at| u8::try_from(at + 1).unwrap_or(u8::MAX)))),
         root: place.root,
     });

@@ -24,6 +24,6 @@ pub mod packets;
 pub mod state;
 pub mod touched;
 
-pub use packets::{LatchedPackets, ReceivedFrame};
+pub use packets::{LatchedFrame, LatchedPackets};
 pub use state::LatchedState;
 pub use touched::KnownContacts;

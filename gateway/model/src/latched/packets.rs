@@ -26,7 +26,7 @@ use crate::tracker::{AddressClaim, ContactState, HeartbeatKind, PerCell};
 
 /// A frame that was received from the bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ReceivedFrame {
+pub struct LatchedFrame {
     /// Arrival time in ns since 1970.
     pub at_nanos: u64,
     /// True if the gateway sent the frame.
@@ -39,7 +39,7 @@ pub struct ReceivedFrame {
 #[derive(Debug)]
 struct PlacedPacket {
     place: u64,
-    frames: Vec<ReceivedFrame>,
+    frames: Vec<LatchedFrame>,
 }
 
 type SharedPacket = Option<Arc<PlacedPacket>>;
@@ -87,7 +87,7 @@ pub struct LatchedPackets {
     halt: SharedPacket,
     packets: PacketReader,
     /// Segments of incomplete packets, by identifier.
-    waiting: ByIdentifier<Vec<ReceivedFrame>>,
+    waiting: ByIdentifier<Vec<LatchedFrame>>,
     /// Identifiers of the gateway's packets with pending segments, each with the time of its newest segment in ns since
     /// 1970.
     open: BTreeMap<u16, u64>,
@@ -110,9 +110,9 @@ impl Default for LatchedPackets {
 impl LatchedCell {
     /// Resets the contact state to no contact, after a start or a write of the mode. `obeys` is true for a cell in test
     /// mode.
-    fn clear(&mut self, obeys: bool) {
-        self.contact.write_mode();
-        self.contact.set_obeys(obeys);
+    fn reset_contact(&mut self, obeys: bool) {
+        self.contact.record_mode_write();
+        self.contact.set_obeys_stimuli(obeys);
         self.shown = None;
     }
 
@@ -124,21 +124,21 @@ impl LatchedCell {
         show: impl FnOnce(&mut ContactState<ContactPage>, ContactPage),
     ) {
         let placed_packet = Arc::clone(&contact_page.placed_packet);
-        let before = self.contact.known().is_some();
+        let before = self.contact.certain_skin().is_some();
         show(&mut self.contact, contact_page);
-        if !before && self.contact.known().is_some() {
+        if !before && self.contact.certain_skin().is_some() {
             self.shown = Some(placed_packet);
         }
     }
 
-    fn heartbeat(&mut self, heartbeat: &Heartbeat, placed_packet: &Arc<PlacedPacket>) {
+    fn apply_heartbeat(&mut self, heartbeat: &Heartbeat, placed_packet: &Arc<PlacedPacket>) {
         let at = placed_packet.frames.last().map_or(Micros(0), |seen| Micros(seen.at_nanos / 1_000));
         let word = self.claim.receive(at, heartbeat);
         if matches!(word, HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
             return;
         }
         if let HeartbeatKind::Started { .. } = word {
-            self.clear(true);
+            self.reset_contact(true);
             self.switches.clear();
             self.staged.clear();
             self.requested = None;
@@ -153,7 +153,7 @@ impl LatchedCell {
         self.heartbeat = Some(Arc::clone(placed_packet));
     }
 
-    fn write(&mut self, number: u8, placed_packet: &Arc<PlacedPacket>, obeys: bool) {
+    fn apply_write(&mut self, number: u8, placed_packet: &Arc<PlacedPacket>, obeys: bool) {
         let parameter = Parameter::from_number(number);
         if parameter == Some(Parameter::Commit) {
             self.requested = Some(Arc::clone(placed_packet));
@@ -163,7 +163,7 @@ impl LatchedCell {
             self.staged.insert(number, Arc::clone(placed_packet));
         }
         if parameter == Some(Parameter::Mode) {
-            self.clear(obeys);
+            self.reset_contact(obeys);
         }
     }
 
@@ -178,7 +178,7 @@ impl LatchedCell {
     }
 
     /// Applies the cell's own report of its sensors, which counts only if the contact state is not known otherwise.
-    fn learn(&mut self, page: SensorPage, contact_page: ContactPage) {
+    fn apply_sensor_report(&mut self, page: SensorPage, contact_page: ContactPage) {
         let joints = contact_page.before.as_ref().map_or(0, |joints| joints.place);
         if !self
             .contact
@@ -206,7 +206,7 @@ impl LatchedCell {
 
 impl LatchedPackets {
     /// Applies a frame from the bus; ignores frames that are not packets. Bounded work.
-    pub fn receive(&mut self, seen: ReceivedFrame) {
+    pub fn receive(&mut self, seen: LatchedFrame) {
         let Ok(id) = packet::data_id(&seen.frame) else { return };
         match id.kind {
             Kind::Command | Kind::Network | Kind::Stimulus | Kind::Configure => {}
@@ -275,7 +275,7 @@ impl LatchedPackets {
         } else if let Message::Network { from, page, .. } = *message {
             let Some(cell) = self.cells.addressed_mut(from).first_mut() else { return };
             if let NetworkPage::Heartbeat(heartbeat) = page {
-                cell.heartbeat(&heartbeat, placed_packet);
+                cell.apply_heartbeat(&heartbeat, placed_packet);
             } else if let NetworkPage::Tree(_) = page {
                 cell.tree = Some(Arc::clone(placed_packet));
             } else if let NetworkPage::Received(heard) = page {
@@ -283,7 +283,10 @@ impl LatchedPackets {
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             let obeys = words.first() == Some(&1);
-            self.cells.addressed_mut(to).iter_mut().for_each(|cell| cell.write(number, placed_packet, obeys));
+            self.cells
+                .addressed_mut(to)
+                .iter_mut()
+                .for_each(|cell| cell.apply_write(number, placed_packet, obeys));
         } else if let Message::Configured {
             from,
             answer: Answer::Value { number, written: true, words },
@@ -305,14 +308,14 @@ impl LatchedPackets {
         } else if let Message::Sensors { from, epoch, page } = *message {
             let contact_page = contact_page();
             if let Some(cell) = self.cells.get_mut(from).filter(|_| last.is_none_or(|last| last == epoch)) {
-                cell.learn(page, contact_page);
+                cell.apply_sensor_report(page, contact_page);
             }
         }
     }
 
     /// Returns all frames that still have an effect, in the order of the bus.
     #[must_use]
-    pub fn frames(&self) -> Vec<ReceivedFrame> {
+    pub fn frames(&self) -> Vec<LatchedFrame> {
         let joints = self.joints.iter().map(|(_, joints)| joints);
         let packets = self.cells.iter().flat_map(|(_, cell)| cell.packets()).chain(joints).chain(&self.halt);
         let ordered: BTreeMap<_, _> =
@@ -326,12 +329,12 @@ mod tests {
     use super::*;
     use protocol::fixed::Q5_10;
     use protocol::id::{CellId, Node};
-    use protocol::message::{AppliesFrom, Joints, SkinSensors, Tree};
+    use protocol::message::{Joints, SkinSensors, StimulusStart, TreePage};
     use protocol::packet::WORDS;
 
     fn say(force: &mut LatchedPackets, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
         let frames: Vec<_> = message.encode().frames(format).collect();
-        frames.iter().for_each(|&frame| force.receive(ReceivedFrame { at_nanos, from_gateway: true, frame }));
+        frames.iter().for_each(|&frame| force.receive(LatchedFrame { at_nanos, from_gateway: true, frame }));
         frames
     }
 
@@ -339,7 +342,7 @@ mod tests {
         let skin = SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() };
         Message::Stimulus {
             to: Node::from_byte(node),
-            from: AppliesFrom::Epoch(Epoch(epoch)),
+            from: StimulusStart::Epoch(Epoch(epoch)),
             page: SensorPage::Skin(skin),
         }
     }
@@ -368,7 +371,7 @@ mod tests {
             let tree = |parent| Message::Network {
                 from: Node::Cell(cell),
                 epoch: Epoch(0),
-                page: NetworkPage::Tree(Tree { parent: Some(parent), ..Tree::default() }),
+                page: NetworkPage::Tree(TreePage { parent: Some(parent), ..TreePage::default() }),
             };
             say(&mut force, 1, format, &write(7, 1));
             say(&mut force, 1, format, &write(1, 1));
@@ -447,7 +450,7 @@ mod tests {
         let segments = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
         let (ours, theirs) = (segments(&joints(1)), segments(&heartbeat(3, 1)));
         let mut take = |at_nanos, frame| {
-            force.receive(ReceivedFrame { at_nanos, from_gateway: true, frame });
+            force.receive(LatchedFrame { at_nanos, from_gateway: true, frame });
             [0, 14_000_000, 16_000_000].map(|later| force.is_within_a_packet(at_nanos + later))
         };
         assert_eq!(take(5, theirs[0]), [false; 3]);

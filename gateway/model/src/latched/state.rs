@@ -12,7 +12,7 @@
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    AppliesFrom, Joints, Message, NetworkPage, Readings, Request, SensorPage, SkinSensors,
+    Joints, Message, NetworkPage, Request, SensorPage, SensorReadings, SkinSensors, StimulusStart,
 };
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
@@ -30,7 +30,7 @@ type KnownContact = ContactState<()>;
 /// Resets the contact state to no contact; `obeys` is true for a cell in test mode.
 fn reset_contact(contact_state: &mut KnownContact, obeys: bool) {
     contact_state.reset();
-    contact_state.set_obeys(obeys);
+    contact_state.set_obeys_stimuli(obeys);
 }
 
 /// Returns true if the cell is in contact at the joints of `epoch` and later; `None` if unknown.
@@ -38,16 +38,16 @@ fn is_touched_from(contact_state: &KnownContact, epoch: Epoch) -> Option<bool> {
     let touches =
         |(skin, ()): &(SkinSensors, ())| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
     if contact_state.pending().is_empty() {
-        return contact_state.skin().map(touches);
+        return contact_state.presumed_skin().map(touches);
     }
     let mut then = contact_state.clone();
     then.latch(epoch, |()| {});
-    then.skin().map(touches)
+    then.presumed_skin().map(touches)
 }
 
 /// Returns the latched sensors pages that differ from those of a cell that has just started.
 fn pages(contact_state: &KnownContact) -> impl Iterator<Item = SensorPage> {
-    let nothing = Readings::default().pages();
+    let nothing = SensorReadings::default().pages();
     contact_state.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
 }
 
@@ -80,7 +80,7 @@ impl StateBeforeJoints {
         } else if let Message::Stimulus { to, from, page } = *message {
             self.cells.addressed_mut(to).iter_mut().for_each(|cell| cell.push(from, page, (), last));
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
-            self.write(to, number, *message);
+            self.record_write(to, number, *message);
             if number == Parameter::Mode.number() {
                 self.cells
                     .addressed_mut(to)
@@ -98,7 +98,7 @@ impl StateBeforeJoints {
 
     /// Keeps a parameter write. It replaces an earlier write of the same parameter to the same cells, unless a commit
     /// has activated the earlier one. So memory grows only with the number of commits.
-    fn write(&mut self, to: Node, number: u8, message: Message) {
+    fn record_write(&mut self, to: Node, number: u8, message: Message) {
         let commit = Parameter::Commit.number();
         let since_commit =
             self.writes.iter().rposition(|(_, number, _)| *number == commit).map_or(0, |at| at + 1);
@@ -123,7 +123,7 @@ impl LatchedState {
         if let Message::Joints { epoch, joints } = *message {
             // Cells drop joints of the last epoch.
             if self.joints.is_none_or(|(last, _)| last != epoch) {
-                self.fold();
+                self.fold_pending_messages();
                 self.joints = Some((epoch, joints));
             }
         } else if let Message::Halt
@@ -132,7 +132,7 @@ impl LatchedState {
         | Message::Configure { request: Request::Write { .. }, .. } = message
         {
             if self.messages_since.len() == MAX_PENDING_MESSAGES {
-                self.fold();
+                self.fold_pending_messages();
             }
             self.messages_since.push(*message);
         } else if let Message::Sensors { from, epoch, page } = *message {
@@ -162,7 +162,7 @@ impl LatchedState {
     }
 
     /// Moves the messages since the last joints into the state before them, as new joints follow.
-    fn fold(&mut self) {
+    fn fold_pending_messages(&mut self) {
         let last = self.joints.map(|(epoch, _)| epoch);
         if let Some(epoch) = last {
             self.before.cells.iter_mut().for_each(|(_, cell)| cell.latch(epoch, |()| {}));
@@ -235,7 +235,7 @@ impl LatchedState {
         let contact: Vec<_> = known
             .iter()
             .flat_map(|(cell, contact_state)| {
-                pages(contact_state).map(|page| stimulus(*cell, AppliesFrom::Next, page))
+                pages(contact_state).map(|page| stimulus(*cell, StimulusStart::Next, page))
             })
             .collect();
         let pending = known
@@ -278,7 +278,7 @@ mod tests {
         CellId::new(node).unwrap()
     }
 
-    fn to(node: i64, from: AppliesFrom, newtons: f64) -> Message {
+    fn to(node: i64, from: StimulusStart, newtons: f64) -> Message {
         Message::Stimulus { to: Node::Cell(cell(node)), from, page: press(newtons) }
     }
 
@@ -304,32 +304,32 @@ mod tests {
 
     #[test]
     fn latched_waiting_and_later_stimuli_are_distinguished() {
-        let at = |epoch| AppliesFrom::Epoch(Epoch(epoch));
+        let at = |epoch| StimulusStart::Epoch(Epoch(epoch));
         let said = [
             joints(10),
             to(1, at(11), 1.0),
             joints(11),
             to(1, at(13), 2.0),
             joints(12),
-            to(2, AppliesFrom::Next, 3.0),
+            to(2, StimulusStart::Next, 3.0),
         ];
         let expected = [
             Message::Resume,
             joints(10),
-            to(1, AppliesFrom::Next, 1.0),
+            to(1, StimulusStart::Next, 1.0),
             joints(11),
             to(1, at(13), 2.0),
             joints(12),
-            to(2, AppliesFrom::Next, 3.0),
+            to(2, StimulusStart::Next, 3.0),
         ];
         assert_eq!(restored(&said), expected);
     }
 
     #[test]
     fn a_late_stimulus_waits_for_the_next_joints() {
-        let late = to(1, AppliesFrom::Epoch(Epoch(11)), 1.0);
+        let late = to(1, StimulusStart::Epoch(Epoch(11)), 1.0);
         assert_eq!(restored(&[joints(11), late]), [Message::Resume, joints(11), late]);
-        let next = to(1, AppliesFrom::Next, 1.0);
+        let next = to(1, StimulusStart::Next, 1.0);
         let expected = [Message::Resume, joints(10), joints(11), next, joints(12)];
         assert_eq!(restored(&[joints(11), late, joints(12)]), expected);
     }
@@ -349,16 +349,16 @@ mod tests {
         let heartbeat = Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() };
         let page = NetworkPage::Heartbeat(heartbeat);
         let restarted = Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page };
-        for end in [to(1, AppliesFrom::Next, 0.0), restarted] {
-            let said = [to(1, AppliesFrom::Next, 1.0), joints(1), end, joints(2), joints(3)];
+        for end in [to(1, StimulusStart::Next, 0.0), restarted] {
+            let said = [to(1, StimulusStart::Next, 1.0), joints(1), end, joints(2), joints(3)];
             assert_eq!(restored(&said), [Message::Resume, joints(3)]);
         }
         let measure = mode(Node::Everyone, 0);
         let said = [
-            to(1, AppliesFrom::Next, 1.0),
+            to(1, StimulusStart::Next, 1.0),
             joints(1),
             measure,
-            to(1, AppliesFrom::Next, 1.0),
+            to(1, StimulusStart::Next, 1.0),
             joints(2),
             joints(3),
         ];
@@ -430,7 +430,7 @@ mod tests {
         let says =
             |newtons, epoch| Message::Sensors { from: cell(1), epoch: Epoch(epoch), page: press(newtons) };
         let said = [joints(1), says(5.0, 0), says(1.0, 1), says(2.0, 1)];
-        let expected = [Message::Resume, joints(255), to(1, AppliesFrom::Next, 1.0), joints(0), joints(1)];
+        let expected = [Message::Resume, joints(255), to(1, StimulusStart::Next, 1.0), joints(0), joints(1)];
         assert_eq!(restored(&said), expected);
     }
 
@@ -445,12 +445,12 @@ mod tests {
     #[test]
     fn only_cells_that_are_there_are_pressed() {
         let mut state = LatchedState::default();
-        state.apply(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page: press(1.0) });
+        state.apply(&Message::Stimulus { to: Node::Everyone, from: StimulusStart::Next, page: press(1.0) });
         state.apply(&joints(1));
         let messages = state.restoring_messages(|it| it.get() == 7, None);
         assert_eq!(
             messages,
-            [Message::Resume, joints(255), joints(0), to(7, AppliesFrom::Next, 1.0), joints(1)]
+            [Message::Resume, joints(255), joints(0), to(7, StimulusStart::Next, 1.0), joints(1)]
         );
     }
 
@@ -469,10 +469,10 @@ mod tests {
         let said = [
             owner,
             write(7),
-            to(1, AppliesFrom::Next, 1.0),
+            to(1, StimulusStart::Next, 1.0),
             joints(1),
             joints(2),
-            to(1, AppliesFrom::Next, 2.0),
+            to(1, StimulusStart::Next, 2.0),
             write(8),
         ];
         let whole = restored(&said);

@@ -6,12 +6,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
 use protocol::id::CellId;
-use protocol::message::{Heartbeat, Ports, State, Tree, VERSION};
+use protocol::message::{Heartbeat, PortsPage, State, TreePage, VERSION};
 use protocol::port::PORTS;
 use protocol::skin::Wires;
 use thiserror::Error;
 
-use super::tree::{TreePlaces, tree_places};
+use super::tree::{ReportedTree, tree_places};
 
 /// The reports of one cell, and the description of the cell.
 #[derive(Clone, Copy, Debug)]
@@ -27,9 +27,9 @@ pub struct ObservedCell {
     /// True if the cell sends now.
     pub alive: bool,
     /// Reported place of the cell in the tree.
-    pub tree: Option<Tree>,
+    pub tree: Option<TreePage>,
     /// Reported neighbours at the ports of the cell.
-    pub ports: Option<Ports>,
+    pub ports: Option<PortsPage>,
 }
 
 /// One end of a wire: a port of a cell.
@@ -84,7 +84,7 @@ pub enum Difference {
         serial: u32,
     },
     /// The cell that holds a node id has another serial number than described.
-    #[error("{}", other_cell(*cell, *serial, *described, *belongs))]
+    #[error("{}", other_cell_message(*cell, *serial, *described, *belongs))]
     OtherCell {
         /// The node id.
         cell: CellId,
@@ -99,7 +99,7 @@ pub enum Difference {
     #[error("two cells have node id {0}: stop one of the two")]
     Duplicate(CellId),
     /// A cell has another version of the protocol.
-    #[error("cell {cell} speaks {}", other_version(*version))]
+    #[error("cell {cell} speaks {}", other_version_message(*version))]
     Version {
         /// The cell.
         cell: CellId,
@@ -149,7 +149,7 @@ pub enum Difference {
     Unreachable(Vec<CellId>),
 }
 
-fn other_cell(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>) -> String {
+fn other_cell_message(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>) -> String {
     match belongs {
         Some(belongs) => format!(
             "node id {cell} is used by the cell with serial number {serial}, which is described as cell {belongs}; \
@@ -162,7 +162,7 @@ fn other_cell(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>
     }
 }
 
-fn other_version(version: Option<u16>) -> String {
+fn other_version_message(version: Option<u16>) -> String {
     match version {
         Some(version) => format!(
             "version {version} of the protocol, and this gateway version {VERSION}: give both the same firmware"
@@ -204,11 +204,11 @@ impl Difference {
 #[must_use]
 pub fn differences(wires: &Wires, cells: &[ObservedCell]) -> Vec<Difference> {
     let mut found: Vec<_> = cells.iter().flat_map(|cell| cell_differences(cell, cells)).collect();
-    let versions = other_versions(wires, cells);
+    let versions = differing_versions(wires, cells);
     found.extend(versions.iter().map(|(&cell, &version)| Difference::Version { cell, version }));
     let network = PortMap::new(wires, cells, &versions);
     network.wire_differences(&mut found);
-    let TreePlaces { cycles: circles, unreachable, .. } =
+    let ReportedTree { cycles: circles, unreachable, .. } =
         tree_places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
     let circling: BTreeSet<_> = circles.iter().flatten().copied().collect();
     found.extend(circles.into_iter().map(Difference::Circle));
@@ -245,7 +245,7 @@ fn cell_differences(cell: &ObservedCell, all: &[ObservedCell]) -> Vec<Difference
 }
 
 /// Returns the cells with another version of the protocol, by their own reports or by those of their neighbours.
-fn other_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId, Option<u16>> {
+fn differing_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId, Option<u16>> {
     let alive = || cells.iter().filter(|cell| cell.alive && cell.serial.is_some());
     let mut versions = BTreeMap::new();
     for cell in alive() {
@@ -272,7 +272,7 @@ fn other_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId, Opt
 struct PortMap<'a> {
     wires: &'a Wires,
     /// The cells whose ports can be compared: present, with a unique node id, and of this program's version.
-    comparable: BTreeMap<CellId, &'a Ports>,
+    comparable: BTreeMap<CellId, &'a PortsPage>,
 }
 
 impl<'a> PortMap<'a> {

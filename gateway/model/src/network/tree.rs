@@ -3,12 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::id::CellId;
-use protocol::message::Tree;
+use protocol::message::TreePage;
 use protocol::port::UPLINK;
 
 /// The tree of a bus by the reports of its cells.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub struct TreePlaces {
+pub struct ReportedTree {
     /// Number of wires from each reachable cell to its root; a root has 0.
     pub depths: BTreeMap<CellId, u8>,
     /// True if every reachable cell reports the depth that follows from the parents.
@@ -19,7 +19,7 @@ pub struct TreePlaces {
     pub cycles: Vec<Vec<CellId>>,
 }
 
-impl TreePlaces {
+impl ReportedTree {
     /// Returns the depth of the deepest cell.
     #[must_use]
     pub fn max_depth(&self) -> Option<u8> {
@@ -29,14 +29,14 @@ impl TreePlaces {
 
 /// Computes the tree from each cell's node id, a flag that is true if the cell sends now, and the cell's report of its
 /// place.
-pub fn tree_places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> TreePlaces {
+pub fn tree_places(cells: impl Iterator<Item = (CellId, bool, Option<TreePage>)>) -> ReportedTree {
     let alive: BTreeMap<_, _> =
         cells.filter(|(_, alive, _)| *alive).map(|(node, _, tree)| (node, tree)).collect();
     let parent = |node: &CellId| {
         let tree = alive.get(node).copied().flatten()?;
         Some((tree, tree.parent.and_then(|parent| CellId::new(parent.into()).ok())))
     };
-    let mut places = TreePlaces { agree: true, ..TreePlaces::default() };
+    let mut places = ReportedTree { agree: true, ..ReportedTree::default() };
     let mut circling = BTreeSet::new();
     for &node in alive.keys() {
         let (mut route, mut at, mut steps) = (Vec::new(), node, 0_u8);
@@ -44,7 +44,7 @@ pub fn tree_places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) ->
             if route.contains(&at) {
                 let circle: Vec<_> = route.iter().copied().skip_while(|&cell| cell != at).collect();
                 if circle.iter().all(|&cell| circling.insert(cell)) {
-                    places.cycles.push(from_the_smallest(circle));
+                    places.cycles.push(rotate_to_smallest(circle));
                 }
                 break places.unreachable.push(node);
             }
@@ -65,11 +65,11 @@ pub fn tree_places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) ->
 }
 
 /// Returns true if the cell is wired to the gateway and uses that wire to send its sums.
-fn is_root(tree: &Tree) -> bool {
+fn is_root(tree: &TreePage) -> bool {
     tree.parent == Some(0) && usize::from(tree.parent_port) == UPLINK
 }
 
-fn from_the_smallest(mut circle: Vec<CellId>) -> Vec<CellId> {
+fn rotate_to_smallest(mut circle: Vec<CellId>) -> Vec<CellId> {
     let min = circle.iter().enumerate().min_by_key(|(_, cell)| **cell).map_or(0, |(place, _)| place);
     circle.rotate_left(min);
     circle
@@ -83,8 +83,8 @@ mod tests {
         CellId::new(node).unwrap()
     }
 
-    fn says(node: i64, parent: Option<u8>, up: u8, depth: u8) -> (CellId, bool, Option<Tree>) {
-        (cell(node), true, Some(Tree { parent, parent_port: up, depth, ..Tree::default() }))
+    fn says(node: i64, parent: Option<u8>, up: u8, depth: u8) -> (CellId, bool, Option<TreePage>) {
+        (cell(node), true, Some(TreePage { parent, parent_port: up, depth, ..TreePage::default() }))
     }
 
     #[test]
@@ -105,7 +105,7 @@ mod tests {
             says(2, None, 0, 0),
             says(3, Some(2), 0, 1),
             says(4, Some(9), 0, 1),
-            (cell(5), false, Some(Tree { parent: Some(0), parent_port: 4, ..Tree::default() })),
+            (cell(5), false, Some(TreePage { parent: Some(0), parent_port: 4, ..TreePage::default() })),
             says(6, Some(5), 0, 1),
             (cell(7), true, None),
             says(8, Some(0), 2, 0),

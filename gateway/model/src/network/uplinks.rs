@@ -10,7 +10,7 @@ use std::collections::{BTreeSet, VecDeque};
 
 use protocol::id::CellId;
 use protocol::message::VERSION;
-use protocol::port::{Hello, PortMessage, Rank, Walk};
+use protocol::port::{Hello, NodeIdWalk, PortMessage, TreeRank};
 use protocol::time::{Micros, Span};
 
 /// Interval of the hellos that the gateway sends to each root.
@@ -35,7 +35,7 @@ struct RootWire {
 #[derive(Clone, Copy, Debug)]
 struct ActiveWalk {
     root: usize,
-    walk: Walk,
+    walk: NodeIdWalk,
     since: Micros,
 }
 
@@ -85,8 +85,8 @@ impl Uplinks {
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
         let lost = self.active_walk.map(|walking| walking.since + WALK_TIMEOUT);
-        let waits =
-            Some(self.next_walk).filter(|_| self.active_walk.is_none() && self.needs_node_ids().is_some());
+        let waits = Some(self.next_walk)
+            .filter(|_| self.active_walk.is_none() && self.root_needing_node_ids().is_some());
         [lost, waits].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
@@ -98,7 +98,7 @@ impl Uplinks {
 
     /// Handles a message from a root over its wire.
     pub fn handle_message(&mut self, now: Micros, root: usize, message: PortMessage) {
-        let rank = Rank { round: self.round, depth: 0 };
+        let rank = TreeRank { round: self.round, depth: 0 };
         let Some(wire) = self.wires.get_mut(root) else { return };
         match message {
             PortMessage::Hello(hello) => {
@@ -147,7 +147,7 @@ impl Uplinks {
             receives: heard.is_some_and(|(_, at)| now.elapsed_since(at) <= HELLO_TIMEOUT),
             is_parent: false,
             unnumbered: false,
-            rank: Some(Rank { round: self.round, depth: 0 }),
+            rank: Some(TreeRank { round: self.round, depth: 0 }),
         };
         self.outbox.push_back((root, PortMessage::Hello(hello)));
     }
@@ -177,7 +177,7 @@ impl Uplinks {
     }
 
     /// Returns the index of a root that has a cell without a node id below it.
-    fn needs_node_ids(&self) -> Option<usize> {
+    fn root_needing_node_ids(&self) -> Option<usize> {
         let needs =
             |wire: &&RootWire| wire.is_child && wire.last_hello.is_some_and(|(hello, _)| hello.unnumbered);
         self.wires.iter().find(needs).map(|wire| wire.root)
@@ -188,9 +188,9 @@ impl Uplinks {
         if self.active_walk.is_some() || now < self.next_walk {
             return;
         }
-        let Some((root, (first, last))) = self.needs_node_ids().zip(self.free_range()) else { return };
+        let Some((root, (first, last))) = self.root_needing_node_ids().zip(self.free_range()) else { return };
         self.last_walk_number = self.last_walk_number.wrapping_add(1);
-        let walk = Walk { walk: self.last_walk_number, first, last };
+        let walk = NodeIdWalk { walk: self.last_walk_number, first, last };
         self.active_walk = Some(ActiveWalk { root, walk, since: now });
         self.outbox.push_back((root, PortMessage::NodeId(walk)));
     }
@@ -203,7 +203,7 @@ impl Uplinks {
         Some((first, last))
     }
 
-    fn end_walk(&mut self, now: Micros, root: usize, remaining: Walk) {
+    fn end_walk(&mut self, now: Micros, root: usize, remaining: NodeIdWalk) {
         let Some(walking) = self.active_walk.filter(|it| it.root == root && it.walk.walk == remaining.walk)
         else {
             return;
@@ -230,7 +230,7 @@ mod tests {
 
     /// Returns a hello of a root with the gateway as its parent.
     fn hello_up(unnumbered: bool) -> PortMessage {
-        let rank = Some(Rank { round: 1, depth: 1 });
+        let rank = Some(TreeRank { round: 1, depth: 1 });
         PortMessage::Hello(Hello {
             version: VERSION,
             number: 1,
@@ -278,7 +278,7 @@ mod tests {
             uplinks.mark_used(CellId::new(used).unwrap());
         }
         uplinks.handle_message(Micros(0), 0, hello_up(true));
-        let walk = |walk, first, last| PortMessage::NodeId(Walk { walk, first, last });
+        let walk = |walk, first, last| PortMessage::NodeId(NodeIdWalk { walk, first, last });
         let walks = |uplinks: &mut Uplinks| {
             let mut messages = said(uplinks);
             messages.retain(|(_, message)| matches!(message, PortMessage::NodeId(_)));
@@ -286,9 +286,13 @@ mod tests {
         };
         assert_eq!(walks(&mut uplinks), [(0, walk(8, 3, 4))]);
         // One of them was assigned.
-        uplinks.handle_message(Micros(MS), 0, PortMessage::Return(Walk { walk: 8, first: 4, last: 4 }));
+        uplinks.handle_message(Micros(MS), 0, PortMessage::Return(NodeIdWalk { walk: 8, first: 4, last: 4 }));
         assert_eq!(walks(&mut uplinks), [(0, walk(9, 4, 4))]);
-        uplinks.handle_message(Micros(2 * MS), 0, PortMessage::Return(Walk { walk: 9, first: 5, last: 4 }));
+        uplinks.handle_message(
+            Micros(2 * MS),
+            0,
+            PortMessage::Return(NodeIdWalk { walk: 9, first: 5, last: 4 }),
+        );
         assert_eq!(walks(&mut uplinks), [(0, walk(10, 6, CellId::MAX.get()))]);
     }
 }

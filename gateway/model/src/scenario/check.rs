@@ -52,7 +52,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         [("hold", Some(MotionKind::Hold)), ("sine", None), ("kinesthetic", Some(MotionKind::Kinesthetic))];
     let needed = "needed with kind = \"sine\"";
     let only = "only with kind = \"sine\"";
-    let (kind, reach) = match (at.key("kind").choose(&raw.kind, &kinds)?, amplitude, raw.period_s) {
+    let (kind, reach) = match (at.key("kind").parse_choice(&raw.kind, &kinds)?, amplitude, raw.period_s) {
         (Some(kind), None, None) => (kind, [0.0; MAX_ROBOT_JOINTS]),
         (Some(_), Some(_), _) => return Err(at.key(key).fault("", only)),
         (Some(_), None, Some(got)) => return Err(at.key("period_s").fault(got, only)),
@@ -123,7 +123,7 @@ fn modes(raw: &[raw::Mode], end: DurationS) -> Checked<Vec<ModeChange>> {
             return Err(path.key("at_s").fault(raw.at_s, "modes must be in order of time"));
         }
         let kinds = [TorqueSource::Compare, TorqueSource::Distributed].map(|mode| (mode.name(), mode));
-        modes.push(ModeChange { at, mode: path.key("kind").choose(&raw.kind, &kinds)? });
+        modes.push(ModeChange { at, mode: path.key("kind").parse_choice(&raw.kind, &kinds)? });
     }
     Ok(modes)
 }

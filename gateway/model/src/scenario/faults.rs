@@ -7,7 +7,7 @@ use super::names::{CellSelection, NameTable};
 use super::times::{DurationS, check_duration};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
-pub(super) const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
+pub(super) const FAULT_KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
      \"stuck\", \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
 
 /// Checks the faults and sorts them by time.
@@ -35,17 +35,17 @@ impl FaultEntry<'_> {
         let raw = self.raw;
         let at = end.time_before_end(&self.at.key("at_s"), raw.at_s)?;
         let kind = match raw.kind.as_str() {
-            "kill" => self.process(ProcessAction::Kill)?,
-            "stop" => self.process(ProcessAction::Stop)?,
-            "continue" => self.process(ProcessAction::Continue)?,
-            "restart" => self.process(ProcessAction::Restart)?,
+            "kill" => self.process_fault(ProcessAction::Kill)?,
+            "stop" => self.process_fault(ProcessAction::Stop)?,
+            "continue" => self.process_fault(ProcessAction::Continue)?,
+            "restart" => self.process_fault(ProcessAction::Restart)?,
             // The second names are former ones.
-            "link_down" | "cut" => self.wire(true, &["for_s", "one_way"])?,
-            "link_up" | "mend" => self.wire(false, &["one_way"])?,
-            "stuck" => self.sensor(SensorFault::Stuck, &["for_s"])?,
+            "link_down" | "cut" => self.wire_fault(true, &["for_s", "one_way"])?,
+            "link_up" | "mend" => self.wire_fault(false, &["one_way"])?,
+            "stuck" => self.sensor_fault(SensorFault::Stuck, &["for_s"])?,
             "drift" => {
                 let n_per_s = self.required("n_per_s", raw.n_per_s, f64::NEG_INFINITY, f64::INFINITY)?;
-                self.sensor(SensorFault::Drift { n_per_s }, &["for_s", "n_per_s"])?
+                self.sensor_fault(SensorFault::Drift { n_per_s }, &["for_s", "n_per_s"])?
             }
             "drop" => self.random_bus_fault(|probability| BusFault::Drop { probability })?,
             "duplicate" => self.random_bus_fault(|probability| BusFault::Duplicate { probability })?,
@@ -55,26 +55,26 @@ impl FaultEntry<'_> {
                 let probability = self.required("probability", raw.probability, 0.0, 1.0)?;
                 let delay = self.delay()?;
                 let keys = &["for_s", "probability", "delay_us"];
-                self.bus(BusFault::Delay { probability, delay }, keys)?
+                self.bus_fault(BusFault::Delay { probability, delay }, keys)?
             }
             "babble" => {
                 let frames_per_s = self.required("frames_per_s", raw.frames_per_s, 1.0, 100_000.0)?;
                 let got = raw.id.unwrap_or(0);
                 let id = u16::try_from(got).ok().filter(|&id| id < 0x800);
                 let id = id.ok_or_else(|| self.at.key("id").fault(got, "an identifier is 0 to 0x7FF"))?;
-                self.bus(BusFault::Babble { frames_per_s, id }, &["for_s", "frames_per_s", "id"])?
+                self.bus_fault(BusFault::Babble { frames_per_s, id }, &["for_s", "frames_per_s", "id"])?
             }
-            got => return Err(self.at.key("kind").fault(format_args!("{got:?}"), KINDS)),
+            got => return Err(self.at.key("kind").fault(format_args!("{got:?}"), FAULT_KINDS)),
         };
         Ok(Fault { at, kind })
     }
 
-    fn process(&self, action: ProcessAction) -> Checked<FaultKind> {
+    fn process_fault(&self, action: ProcessAction) -> Checked<FaultKind> {
         self.refuse_other_keys(&[])?;
         Ok(FaultKind::Process { action, cells: self.cells()? })
     }
 
-    fn wire(&self, link_down: bool, keys: &[&str]) -> Checked<FaultKind> {
+    fn wire_fault(&self, link_down: bool, keys: &[&str]) -> Checked<FaultKind> {
         self.refuse_other_keys(keys)?;
         if self.raw.all {
             return Err(self.at.key("all").fault(true, "the two cells of a wire are needed"));
@@ -90,25 +90,25 @@ impl FaultEntry<'_> {
             return Ok(None);
         }
         let kind = FaultKind::Wire { link_down: false, from, to, both_ways };
-        Ok(Some(Fault { at: fault.at + self.length()?, kind }))
+        Ok(Some(Fault { at: fault.at + self.duration()?, kind }))
     }
 
-    fn sensor(&self, fault: SensorFault, keys: &[&str]) -> Checked<FaultKind> {
+    fn sensor_fault(&self, fault: SensorFault, keys: &[&str]) -> Checked<FaultKind> {
         self.refuse_other_keys(keys)?;
-        Ok(FaultKind::Sensor { fault, length: self.length()?, cells: self.cells()? })
+        Ok(FaultKind::Sensor { fault, length: self.duration()?, cells: self.cells()? })
     }
 
     fn random_bus_fault(&self, make: impl FnOnce(f64) -> BusFault) -> Checked<FaultKind> {
         let probability = self.required("probability", self.raw.probability, 0.0, 1.0)?;
-        self.bus(make(probability), &["for_s", "probability"])
+        self.bus_fault(make(probability), &["for_s", "probability"])
     }
 
-    fn bus(&self, fault: BusFault, keys: &[&str]) -> Checked<FaultKind> {
+    fn bus_fault(&self, fault: BusFault, keys: &[&str]) -> Checked<FaultKind> {
         self.refuse_other_keys(keys)?;
         let bus = self.names.bus(self.selection())?;
         let is_filtered = self.raw.cells.is_some();
         let cells = if is_filtered { self.names.cells_on(self.selection(), bus)? } else { Vec::new() };
-        Ok(FaultKind::Bus { fault, length: self.length()?, bus, cells })
+        Ok(FaultKind::Bus { fault, length: self.duration()?, bus, cells })
     }
 
     fn cells(&self) -> Checked<Vec<usize>> {
@@ -121,7 +121,7 @@ impl FaultEntry<'_> {
     }
 
     /// Returns the duration of the fault; without `for_s` it lasts to the end.
-    fn length(&self) -> Checked<Span> {
+    fn duration(&self) -> Checked<Span> {
         self.raw.for_s.map_or(Ok(Span(u64::MAX)), |seconds| check_duration(&self.at.key("for_s"), seconds))
     }
 

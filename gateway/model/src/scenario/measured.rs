@@ -6,18 +6,18 @@
 //! ```
 
 use protocol::fixed::Q9_6;
-use protocol::message::{Readings, SkinSensors};
+use protocol::message::{SensorReadings, SkinSensors};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::force::contact_words;
-use super::sensors::{ForceErrors, REFERENCE_C, Sensors};
+use super::sensors::{ForceErrors, REFERENCE_TEMPERATURE_C, SensorErrors};
 use crate::accelerometer::sensor::standard_normal;
 
 /// Time constants of creep in s; their sum approximates a logarithm of time.
-const CREEP_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
+const CREEP_TIME_CONSTANTS_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
 
 /// The true input of a cell's sensors, before sensor errors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -25,7 +25,7 @@ pub(super) struct TrueInput {
     /// Total force of all touches on the cell, in N.
     pub(super) force_n: f64,
     /// The values set by touches besides the force.
-    pub(super) readings: Readings,
+    pub(super) readings: SensorReadings,
     pub(super) is_warmed: bool,
     /// Offset in N that a fault adds to the reading.
     pub(super) added_n: f64,
@@ -35,12 +35,12 @@ pub(super) struct TrueInput {
 /// The imperfect sensors of all cells.
 #[derive(Clone, Debug)]
 pub(super) struct ImperfectSensors {
-    sensors: Sensors,
+    sensors: SensorErrors,
     seed: u64,
     period_s: f64,
     cells: Vec<CellSensors>,
     /// The readings of the epoch before `next`.
-    words: Vec<Readings>,
+    words: Vec<SensorReadings>,
     next: u64,
 }
 
@@ -55,14 +55,14 @@ struct CellSensors {
     temperature_n: f64,
     temperature_gain: f64,
     read_n: f64,
-    creep_n: [f64; CREEP_S.len()],
+    creep_n: [f64; CREEP_TIME_CONSTANTS_S.len()],
     drift_n: f64,
     dice: Pcg64Mcg,
 }
 
 impl ImperfectSensors {
     /// Creates the sensors of a skin, before the first epoch.
-    pub(super) fn new(sensors: &Sensors, seed: u64, skin: &Skin) -> Self {
+    pub(super) fn new(sensors: &SensorErrors, seed: u64, skin: &Skin) -> Self {
         let find = |cell: &protocol::skin::Cell, node| {
             skin.cells.iter().position(|other| other.bus == cell.bus && other.node == node)
         };
@@ -76,17 +76,17 @@ impl ImperfectSensors {
         let neighbours = skin.cells.iter().map(neighbours);
         let cells = neighbours.zip(0..).map(|(neighbours, index)| CellSensors::new(neighbours, seed, index));
         let period_s = 1.0 / skin.timing.broadcast_hz();
-        let words = vec![Readings::default(); skin.cells.len()];
+        let words = vec![SensorReadings::default(); skin.cells.len()];
         Self { sensors: sensors.clone(), seed, period_s, cells: cells.collect(), words, next: 0 }
     }
 
     /// Returns the reading of each cell in the epoch before [`Self::next`]; the default before the first.
-    pub(super) fn words(&self) -> &[Readings] {
+    pub(super) fn readings(&self) -> &[SensorReadings] {
         &self.words
     }
 
     /// Returns the number of the next epoch to compute.
-    pub(super) const fn next(&self) -> u64 {
+    pub(super) const fn next_epoch(&self) -> u64 {
         self.next
     }
 
@@ -95,13 +95,13 @@ impl ImperfectSensors {
         for (cell, index) in self.cells.iter_mut().zip(0..) {
             *cell = CellSensors::new(core::mem::take(&mut cell.neighbours), self.seed, index);
         }
-        self.words.fill(Readings::default());
+        self.words.fill(SensorReadings::default());
         self.next = 0;
     }
 
     /// Computes the next epoch, at `time`, from the true inputs of the cells.
     pub(super) fn step(&mut self, time: Micros, there: &[TrueInput]) {
-        let ambient = self.sensors.temperature_at(time).unwrap_or(REFERENCE_C);
+        let ambient = self.sensors.temperature_at(time).unwrap_or(REFERENCE_TEMPERATURE_C);
         for ((cell, there_is), words) in self.cells.iter_mut().zip(there).zip(&mut self.words) {
             let beside: f64 =
                 cell.neighbours.iter().filter_map(|&index| Some(there.get(index)?.force_n)).sum();
@@ -112,10 +112,11 @@ impl ImperfectSensors {
             let [temperature, _] = readings.skin.temperature;
             let errors = &self.sensors.force;
             let force_n = there_is.force_n + errors.crosstalk * beside;
-            let read_n = cell.read(force_n, temperature.to_f64() - REFERENCE_C, errors, self.period_s);
+            let read_n =
+                cell.read(force_n, temperature.to_f64() - REFERENCE_TEMPERATURE_C, errors, self.period_s);
             if !there_is.is_stuck {
                 let contact = contact_words(read_n + there_is.added_n);
-                *words = Readings { skin: SkinSensors { contact, ..readings.skin }, ..readings };
+                *words = SensorReadings { skin: SkinSensors { contact, ..readings.skin }, ..readings };
             }
         }
         self.next += 1;
@@ -134,7 +135,7 @@ impl CellSensors {
             temperature_n,
             temperature_gain,
             read_n: 0.0,
-            creep_n: [0.0; CREEP_S.len()],
+            creep_n: [0.0; CREEP_TIME_CONSTANTS_S.len()],
             drift_n: 0.0,
             dice,
         }
@@ -146,7 +147,7 @@ impl CellSensors {
         // Hysteresis as a play between the curves of a rising and of a falling force.
         let falling = force_n * (1.0 + errors.hysteresis);
         self.read_n = self.read_n.clamp(force_n.min(falling), force_n.max(falling));
-        for (creep, time_s) in self.creep_n.iter_mut().zip(CREEP_S) {
+        for (creep, time_s) in self.creep_n.iter_mut().zip(CREEP_TIME_CONSTANTS_S) {
             *creep += (force_n - *creep) * -(-period_s / time_s).exp_m1();
         }
         if errors.drift_n > 0.0 {

@@ -29,7 +29,7 @@ use serde::{Deserialize, Serialize};
 use crate::accelerometer::RobotState;
 
 pub use force::{MAX_FORCE_N, contact_words};
-pub use sensors::{ForceErrors, REFERENCE_C, Sensors};
+pub use sensors::{ForceErrors, REFERENCE_TEMPERATURE_C, SensorErrors};
 pub use touch_values::TouchValues;
 pub use touches::{Stimulus, Touches};
 
@@ -55,7 +55,7 @@ pub struct Scenario {
     /// The faults, in order of time.
     pub faults: Vec<Fault>,
     /// The errors of the sensors.
-    pub sensors: Sensors,
+    pub sensors: SensorErrors,
 }
 
 /// The motion of the robot.
@@ -363,7 +363,7 @@ impl Scenario {
     pub fn parse(path: &str, text: &str, skin: &Skin) -> Result<Self, DocumentError> {
         let what = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, |raw| check::scenario(raw, skin))
-            .map_err(|error: DocumentError| error.or_wrong_kind(text, SKIN_KEYS, &[], what))
+            .map_err(|error: DocumentError| error.detect_wrong_kind(text, SKIN_KEYS, &[], what))
     }
 
     /// Returns a scenario without touches and faults, in which the skin's controller moves the robot from zero.
@@ -378,7 +378,7 @@ impl Scenario {
             touches: Vec::new(),
             touches_repeat: None,
             faults: Vec::new(),
-            sensors: Sensors::PERFECT,
+            sensors: SensorErrors::PERFECT,
         }
     }
 

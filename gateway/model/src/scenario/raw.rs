@@ -50,8 +50,8 @@ impl Default for Profile {
 
 impl<'de> Deserialize<'de> for Profile {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        struct Either;
-        impl<'de> Visitor<'de> for Either {
+        struct RawValueVisitor;
+        impl<'de> Visitor<'de> for RawValueVisitor {
             type Value = Profile;
 
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -70,7 +70,7 @@ impl<'de> Deserialize<'de> for Profile {
                 Ok(Profile::Points(points))
             }
         }
-        from.deserialize_any(Either)
+        from.deserialize_any(RawValueVisitor)
     }
 }
 
@@ -94,8 +94,8 @@ impl fmt::Display for CellReference {
 
 impl<'de> Deserialize<'de> for CellReference {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        struct Either;
-        impl Visitor<'_> for Either {
+        struct RawValueVisitor;
+        impl Visitor<'_> for RawValueVisitor {
             type Value = CellReference;
 
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -110,7 +110,7 @@ impl<'de> Deserialize<'de> for CellReference {
                 Ok(CellReference::Text(text.to_owned()))
             }
         }
-        from.deserialize_any(Either)
+        from.deserialize_any(RawValueVisitor)
     }
 }
 

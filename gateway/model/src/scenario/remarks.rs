@@ -1,6 +1,6 @@
 //! Warnings about scenarios that are valid but probably not intended.
 
-use protocol::message::{Readings, SkinSensors};
+use protocol::message::{SensorReadings, SkinSensors};
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::Span;
 
@@ -31,7 +31,7 @@ fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
 
 /// Returns a warning if the force and the proximity of a touch are below the thresholds of all its cells.
 fn weak_touch(touch: &Touch, skin: &Skin) -> Option<String> {
-    let mut readings = Readings::default();
+    let mut readings = SensorReadings::default();
     touch.values.apply(&mut readings);
     let sensors = SkinSensors { contact: contact_words(touch.force_n), ..readings.skin };
     let mut cells = touch.cells.iter().filter_map(|&cell| skin.cells.get(cell));

@@ -10,12 +10,12 @@ use super::times::DurationS;
 use crate::accelerometer::sensor::DataSheet;
 
 /// The reference temperature of data sheet errors, in °C.
-pub const REFERENCE_C: f64 = 25.0;
+pub const REFERENCE_TEMPERATURE_C: f64 = 25.0;
 
 /// The errors of all sensors; the default is perfect sensors. The errors of each cell are drawn with the scenario's
 /// seed.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Sensors {
+pub struct SensorErrors {
     /// The temperature of all cells in °C by time, in order of time: linear between the entries, constant before the
     /// first and after the last. If empty, temperature is not simulated.
     pub temperature: Vec<(Micros, f64)>,
@@ -48,7 +48,7 @@ pub struct ForceErrors {
     pub noise_n: f64,
 }
 
-impl Sensors {
+impl SensorErrors {
     /// Sensors without errors.
     pub const PERFECT: Self =
         Self { temperature: Vec::new(), force: ForceErrors::PERFECT, acceleration: None };
@@ -98,12 +98,12 @@ impl ForceErrors {
 }
 
 /// Checks the table `[sensors]`.
-pub(super) fn sensors(raw: &raw::Sensors, end: DurationS) -> Checked<Sensors> {
+pub(super) fn sensors(raw: &raw::Sensors, end: DurationS) -> Checked<SensorErrors> {
     let at = KeyPath::top_level_key("sensors");
     let temperature = temperature(&at.key("temperature_c"), &raw.temperature_c, end)?;
     let force = raw.force.as_ref().map_or(Ok(ForceErrors::PERFECT), |raw| force(&at.key("force"), raw))?;
     let acceleration = raw.acceleration.as_ref().map(|raw| raw.sheet(&at.key("acceleration"))).transpose()?;
-    Ok(Sensors { temperature, force, acceleration })
+    Ok(SensorErrors { temperature, force, acceleration })
 }
 
 fn temperature(at: &KeyPath, points: &[[f64; 2]], end: DurationS) -> Checked<Vec<(Micros, f64)>> {
@@ -126,7 +126,7 @@ fn force(at: &KeyPath, raw: &raw::ForceErrors) -> Checked<ForceErrors> {
         ("piezoresistive", ForceErrors::PIEZORESISTIVE),
         ("resistive", ForceErrors::RESISTIVE),
     ];
-    let mut errors = at.key("kind").choose(raw.kind.as_deref().unwrap_or("piezoresistive"), &kinds)?;
+    let mut errors = at.key("kind").parse_choice(raw.kind.as_deref().unwrap_or("piezoresistive"), &kinds)?;
     let keys = [
         ("offset_n", raw.offset_n, &mut errors.offset_n, 30.0),
         ("gain", raw.gain, &mut errors.gain, 0.9),
@@ -155,7 +155,7 @@ mod tests {
     use crate::scenario::Scenario;
     use crate::testing::skin;
 
-    fn read(text: &str) -> Result<Sensors, String> {
+    fn read(text: &str) -> Result<SensorErrors, String> {
         let text = format!("duration_s = 600.0\n{text}");
         Scenario::parse("s.toml", &text, &skin())
             .map(|scenario| scenario.sensors)
@@ -187,7 +187,7 @@ mod tests {
         let sensors = read("[sensors]\ntemperature_c = [[60.0, 25.0], [600.0, 35.0]]\n").unwrap();
         let at = |seconds: u64| sensors.temperature_at(Micros(seconds * 1_000_000)).unwrap();
         assert_eq!([0, 60, 330, 600, 700].map(at), [25.0, 25.0, 30.0, 35.0, 35.0]);
-        assert_eq!(Sensors::PERFECT.temperature_at(Micros(0)), None);
+        assert_eq!(SensorErrors::PERFECT.temperature_at(Micros(0)), None);
     }
 
     #[test]

@@ -158,7 +158,7 @@ fn every_kind_of_fault_and_motion_is_named_as_it_is_read() {
         let text = format!("version = 1\n[[fault]]\nat_s = 0.5\nkind = \"{kind}\"\ncells = [1]\n{more}\n");
         let scenario = Scenario::parse("s.toml", &text, &skin).unwrap();
         assert_eq!(scenario.faults.first().map(|fault| fault.kind.name()), Some(kind));
-        assert!(faults::KINDS.contains(&format!("{kind:?}")), "{kind}");
+        assert!(faults::FAULT_KINDS.contains(&format!("{kind:?}")), "{kind}");
     }
     for motion in [
         "kind = \"hold\"",

@@ -13,7 +13,7 @@ impl DurationS {
         if (0.0..self.0).contains(&seconds) {
             return Ok(Micros(span_from_seconds(seconds).0));
         }
-        self.outside(at, seconds)
+        self.out_of_range_error(at, seconds)
     }
 
     /// Checks that a time in s is from 0 to the end of the scenario, the end included.
@@ -21,10 +21,10 @@ impl DurationS {
         if (0.0..=self.0).contains(&seconds) {
             return Ok(Micros(span_from_seconds(seconds).0));
         }
-        self.outside(at, seconds)
+        self.out_of_range_error(at, seconds)
     }
 
-    fn outside(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
+    fn out_of_range_error(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         let why = format_args!("the scenario goes from 0 to duration_s = {}", self.0);
         Err(at.fault(seconds, why))
     }

@@ -2,7 +2,7 @@
 
 use protocol::document::{Checked, KeyPath};
 use protocol::fixed::{Q, Q1_14, Q9_6};
-use protocol::message::Readings;
+use protocol::message::SensorReadings;
 use serde_json::{Value, json};
 
 use super::raw;
@@ -32,13 +32,13 @@ impl TouchValues {
 
     /// Applies the values after those of earlier touches in the file: the nearest proximity counts, and the last
     /// temperature.
-    pub(super) fn apply(&self, readings: &mut Readings) {
+    pub(super) fn apply(&self, readings: &mut SensorReadings) {
         readings.skin.proximity = readings.skin.proximity.max(self.proximity);
         readings.skin.temperature = self.temperature.unwrap_or(readings.skin.temperature);
     }
 
     /// Returns the keys and rounded values that the file sets.
-    pub fn listed(&self) -> impl Iterator<Item = (&'static str, Value)> {
+    pub fn key_values(&self) -> impl Iterator<Item = (&'static str, Value)> {
         let proximity = self.proximity.to_f64();
         let proximity = (proximity > 0.0).then(|| json!((proximity * 1e4).round() / 1e4));
         let temperature = self.temperature.map(|both| both.map(|one| (one.to_f64() * 1e2).round() / 1e2));

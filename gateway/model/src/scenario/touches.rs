@@ -5,7 +5,7 @@
 //! epoch by epoch ([`Measured`]).
 
 use protocol::id::CellId;
-use protocol::message::{Readings, SensorPage, SkinSensors};
+use protocol::message::{SensorPage, SensorReadings, SkinSensors};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
@@ -24,7 +24,7 @@ pub struct Stimulus {
     /// Node id of the cell on that bus.
     pub node: CellId,
     /// Its readings.
-    pub readings: Readings,
+    pub readings: SensorReadings,
     /// The pages to send, by [`SensorPage::simulated`].
     sent: [bool; SensorPage::SIMULATED.len()],
 }
@@ -36,7 +36,7 @@ impl Stimulus {
     }
 }
 
-/// The touches of a scenario, by cell. A cell without a touch has [`Readings::default`], as every cell has before
+/// The touches of a scenario, by cell. A cell without a touch has [`SensorReadings::default`], as every cell has before
 /// the first epoch.
 #[derive(Clone, Debug)]
 pub struct Touches {
@@ -54,7 +54,7 @@ pub struct Touches {
     /// Scratch memory of [`Touches::changes`]; the next two fields are, too.
     changed: Vec<Stimulus>,
     there: Vec<TrueInput>,
-    before: Vec<Readings>,
+    before: Vec<SensorReadings>,
     /// The pages that touches set: the skin's, and others that differ from their default in some touch.
     set: [bool; SensorPage::SIMULATED.len()],
 }
@@ -109,9 +109,9 @@ impl Touches {
         if measured.is_none() {
             cells.retain(|touched| !touched.touches.is_empty() || !touched.faults.is_empty());
         }
-        let mut readings = Readings::default();
+        let mut readings = SensorReadings::default();
         scenario.touches.iter().for_each(|touch| touch.values.apply(&mut readings));
-        let mut set = differing(&Readings::default(), &readings);
+        let mut set = differing_pages(&SensorReadings::default(), &readings);
         let [of_skin, ..] = &mut set;
         *of_skin = true;
         Self {
@@ -155,12 +155,12 @@ impl Touches {
         self.before.clear();
         if let Some(before) = before {
             self.advance_to(&mut measured, before);
-            self.before.extend(measured.words());
+            self.before.extend(measured.readings());
         } else {
-            self.before.resize(self.cells.len(), Readings::default());
+            self.before.resize(self.cells.len(), SensorReadings::default());
         }
         self.advance_to(&mut measured, epoch);
-        let words = self.cells.iter().zip(&self.before).zip(measured.words());
+        let words = self.cells.iter().zip(&self.before).zip(measured.readings());
         changed.extend(words.filter_map(|((touched, before), now)| touched.stimulus(before, now)));
         self.measured = Some(measured);
     }
@@ -168,12 +168,12 @@ impl Touches {
     /// Computes the readings of imperfect sensors up to an epoch. If that epoch is earlier than the last computed one,
     /// the computation starts again from the first.
     fn advance_to(&mut self, measured: &mut ImperfectSensors, epoch: u64) {
-        if measured.next() > epoch + 1 {
+        if measured.next_epoch() > epoch + 1 {
             measured.restart();
         }
         let mut there = core::mem::take(&mut self.there);
-        while measured.next() <= epoch {
-            let time = self.time_of(measured.next());
+        while measured.next_epoch() <= epoch {
+            let time = self.time_of(measured.next_epoch());
             there.clear();
             there.extend(self.cells.iter().map(|touched| self.true_input(touched, time)));
             measured.step(time, &there);
@@ -203,7 +203,7 @@ impl Touches {
 
     fn perfect_changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
         let times = [before.map(|before| self.time_of(before)), Some(self.time_of(epoch))];
-        let phases = times.map(|time| time.map(|time| self.phase(time)));
+        let phases = times.map(|time| time.map(|time| self.time_in_cycle(time)));
         for (levels, touch) in self.levels.iter_mut().zip(&self.touches) {
             *levels = phases.map(|phase| phase.and_then(|phase| touch.force_at(phase)));
         }
@@ -212,7 +212,9 @@ impl Touches {
             let [before, now] = if touched.faults.is_empty() {
                 this.scratch_words(touched)?
             } else {
-                times.map(|time| time.map_or_else(Readings::default, |time| this.words_at(touched, time)))
+                times.map(|time| {
+                    time.map_or_else(SensorReadings::default, |time| this.words_at(touched, time))
+                })
             };
             touched.stimulus(&before, &now)
         })
@@ -235,21 +237,21 @@ impl Touches {
         pages.zip(self.set).filter_map(|(page, is_set)| is_set.then_some(page))
     }
 
-    fn readings(&self, cell: usize, epoch: u64) -> Readings {
+    fn readings(&self, cell: usize, epoch: u64) -> SensorReadings {
         if let Some(measured) = &self.measured {
-            if measured.next() == epoch + 1 {
-                return measured.words().get(cell).copied().unwrap_or_default();
+            if measured.next_epoch() == epoch + 1 {
+                return measured.readings().get(cell).copied().unwrap_or_default();
             }
             let (mut this, mut again) = (self.clone(), measured.clone());
             this.advance_to(&mut again, epoch);
-            return again.words().get(cell).copied().unwrap_or_default();
+            return again.readings().get(cell).copied().unwrap_or_default();
         }
         match self.cells.binary_search_by_key(&cell, |touched| touched.cell) {
             Ok(at) => self
                 .cells
                 .get(at)
-                .map_or_else(Readings::default, |touched| self.words_at(touched, self.time_of(epoch))),
-            Err(_) => Readings::default(),
+                .map_or_else(SensorReadings::default, |touched| self.words_at(touched, self.time_of(epoch))),
+            Err(_) => SensorReadings::default(),
         }
     }
 
@@ -266,7 +268,7 @@ impl Touches {
     }
 
     /// Returns the time since the touches last began, if they repeat; else the time itself.
-    fn phase(&self, time: Micros) -> Micros {
+    fn time_in_cycle(&self, time: Micros) -> Micros {
         match self.repeat {
             Some(Span(repeat @ 1..)) => Micros(time.0 % repeat),
             Some(Span(0)) | None => time,
@@ -275,11 +277,11 @@ impl Touches {
 
     /// Returns the force of a touch in N at a time; `None` if the touch is not active.
     fn force_at(&self, touch: &Touch, time: Micros) -> Option<f64> {
-        touch.force_at(self.phase(time))
+        touch.force_at(self.time_in_cycle(time))
     }
 
     /// Returns the words before and now, from the scratch memory; `None` if no touch of this cell changed.
-    fn scratch_words(&self, touched: &AffectedCell) -> Option<[Readings; 2]> {
+    fn scratch_words(&self, touched: &AffectedCell) -> Option<[SensorReadings; 2]> {
         let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
         if levels().all(|(_, [before, now])| before == now) {
             return None;
@@ -290,7 +292,7 @@ impl Touches {
     }
 
     /// Returns the words of a cell at a time, with its faults.
-    fn words_at(&self, touched: &AffectedCell, time: Micros) -> Readings {
+    fn words_at(&self, touched: &AffectedCell, time: Micros) -> SensorReadings {
         let faults = || touched.faults.iter().filter(|wrong| wrong.is_active_at(time));
         // A stuck sensor keeps its value from the start of the fault.
         let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
@@ -309,8 +311,8 @@ impl Touches {
     }
 
     /// Combines touches: forces add up, the other values as by [`super::TouchValues`].
-    fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> Readings {
-        let mut readings = Readings::default();
+    fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> SensorReadings {
+        let mut readings = SensorReadings::default();
         for (index, level) in levels {
             let (Some(touch), Some(level)) = (self.touches.get(index), level) else { continue };
             force_n += level;
@@ -323,14 +325,20 @@ impl Touches {
 
 impl AffectedCell {
     /// Returns the stimulus for a change of readings, if there is one.
-    fn stimulus(&self, before: &Readings, now: &Readings) -> Option<Stimulus> {
+    fn stimulus(&self, before: &SensorReadings, now: &SensorReadings) -> Option<Stimulus> {
         let &Self { cell, bus, node, .. } = self;
-        (before != now).then(|| Stimulus { cell, bus, node, readings: *now, sent: differing(before, now) })
+        (before != now).then(|| Stimulus {
+            cell,
+            bus,
+            node,
+            readings: *now,
+            sent: differing_pages(before, now),
+        })
     }
 }
 
 /// Returns the pages that differ, by [`SensorPage::simulated`].
-fn differing(before: &Readings, now: &Readings) -> [bool; SensorPage::SIMULATED.len()] {
+fn differing_pages(before: &SensorReadings, now: &SensorReadings) -> [bool; SensorPage::SIMULATED.len()] {
     let mut differ = [false; SensorPage::SIMULATED.len()];
     for ((differ, before), now) in differ.iter_mut().zip(before.pages()).zip(now.pages()) {
         *differ = before != now;

@@ -4,21 +4,21 @@ use protocol::fixed::{TorqueFormat, is_saturated};
 use protocol::packet::Words;
 use protocol::parameters::MAX_JOINTS;
 
-use super::errors::Errors;
-use super::replies::Expected;
+use super::errors::TorqueErrors;
+use super::replies::ExpectedTorques;
 
 /// The errors of a torque format: exact torques rounded to its words.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RoundingErrors {
     /// Rounding errors of the torques within the range of the format.
-    pub errors: Errors,
+    pub errors: TorqueErrors,
     /// Number of torques beyond the range of the format, whose words saturate.
     pub beyond: u64,
 }
 
 impl RoundingErrors {
     fn add(&mut self, format: TorqueFormat, torque: f64) {
-        let word = format.nearest(torque);
+        let word = format.nearest_word(torque);
         if is_saturated(word) {
             self.beyond += 1;
         } else {
@@ -26,7 +26,7 @@ impl RoundingErrors {
         }
     }
 
-    fn with(self, other: Self) -> Self {
+    fn merged(self, other: Self) -> Self {
         Self { errors: self.errors.merged(other.errors), beyond: self.beyond + other.beyond }
     }
 }
@@ -35,16 +35,16 @@ impl RoundingErrors {
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Accuracy {
     /// Errors of single cells against the central computation with the same quantised words.
-    pub single: Errors,
+    pub single: TorqueErrors,
     /// Errors of single cells against the central computation with unrounded angles, lengths and poses.
-    pub unquantised: Errors,
+    pub unquantised: TorqueErrors,
     /// Errors of the summed torque of the whole skin, on all joints, in epochs that all cells answered in time.
-    pub whole: Errors,
+    pub whole: TorqueErrors,
     /// Errors of a bus's torque as summed along the tree, in epochs with complete sums in time, on the joints that some
     /// cell in the sums loads.
-    pub sums: Errors,
+    pub sums: TorqueErrors,
     /// Errors as in `sums`, but averaged over 32 consecutive epochs in which no contact changed.
-    pub sums_averaged: Errors,
+    pub sums_averaged: TorqueErrors,
     /// Number of saturated words, which are not compared.
     pub saturated: u64,
     /// Rounding errors of the central torques of `single`, saturated ones included, in each of [`TorqueFormat::ALL`].
@@ -52,10 +52,10 @@ pub struct Accuracy {
     pub formats: [RoundingErrors; TorqueFormat::ALL.len()],
     /// The errors of `single` for each joint.
     #[serde(skip)]
-    pub single_by_joint: [Errors; MAX_JOINTS],
+    pub single_by_joint: [TorqueErrors; MAX_JOINTS],
     /// The errors of `whole` for each joint.
     #[serde(skip)]
-    pub whole_by_joint: [Errors; MAX_JOINTS],
+    pub whole_by_joint: [TorqueErrors; MAX_JOINTS],
 }
 
 impl Accuracy {
@@ -66,8 +66,8 @@ impl Accuracy {
         joint: usize,
         format: TorqueFormat,
         words: &Words,
-        expected: &Expected,
-        of_cell: &mut Errors,
+        expected: &ExpectedTorques,
+        of_cell: &mut TorqueErrors,
     ) -> [f64; MAX_JOINTS] {
         let mut errors = [0.0; MAX_JOINTS];
         let both = expected.quantised.iter().zip(&expected.unquantised);
@@ -92,7 +92,7 @@ impl Accuracy {
         errors
     }
 
-    pub(super) fn whole_skin(&mut self, errors: &[f64]) {
+    pub(super) fn add_whole_skin_errors(&mut self, errors: &[f64]) {
         for (&error, of_joint) in errors.iter().zip(&mut self.whole_by_joint) {
             self.whole.add(error);
             of_joint.add(error);
@@ -101,8 +101,8 @@ impl Accuracy {
 
     /// Merges the errors of two buses.
     #[must_use]
-    pub fn with(self, other: Self) -> Self {
-        let joint_by_joint = |mut sum: [Errors; MAX_JOINTS], other: [Errors; MAX_JOINTS]| {
+    pub fn merged(self, other: Self) -> Self {
+        let joint_by_joint = |mut sum: [TorqueErrors; MAX_JOINTS], other: [TorqueErrors; MAX_JOINTS]| {
             for (sum, other) in sum.iter_mut().zip(other) {
                 *sum = sum.merged(other);
             }
@@ -110,7 +110,7 @@ impl Accuracy {
         };
         let mut formats = self.formats;
         for (sum, other) in formats.iter_mut().zip(other.formats) {
-            *sum = sum.with(other);
+            *sum = sum.merged(other);
         }
         Self {
             formats,
@@ -135,6 +135,6 @@ mod tests {
         let (format, mut rounded) = (TorqueFormat::Q3_12, RoundingErrors::default());
         [1.0, 1.0 + 0.25 / 4_096.0, 8.0, -9.0].into_iter().for_each(|torque| rounded.add(format, torque));
         assert_eq!((rounded.errors.count(), rounded.errors.max(), rounded.beyond), (2, 0.25 / 4_096.0, 2));
-        assert_eq!(rounded.with(rounded).beyond, 4);
+        assert_eq!(rounded.merged(rounded).beyond, 4);
     }
 }

@@ -2,26 +2,26 @@
 
 use protocol::id::CellId;
 use protocol::message::{
-    Answer, AppliesFrom, Heartbeat, NetworkPages, Readings, SensorPage, SkinSensors, State,
+    Answer, Heartbeat, NetworkPages, SensorPage, SensorReadings, SkinSensors, State, StimulusStart,
 };
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Events, LinksDown, MAX_JOINTS, Parameter, Parameters};
-use protocol::skin::{self, Safety};
+use protocol::skin::{self, SafetyLimits};
 use protocol::time::Micros;
 
-use super::errors::Errors;
+use super::errors::TorqueErrors;
 use super::held::{HeldTorque, SumChange};
-use super::replies::{Outstanding, Replies, ReplyExpectation};
+use super::replies::{OutstandingReplies, Replies, ReplyExpectation};
 use super::root_totals::RootSums;
 use super::sensed::SensorFrames;
 use super::sent::SentJoints;
 use super::status::CellStatus;
 use super::switched::{SWITCHES, Switch, SwitchStates};
-use crate::tracker::{CellTracker, ContactState, HeartbeatKind, Update, Uplink};
+use crate::tracker::{CellTracker, CellUpdate, ContactState, HeartbeatKind, Uplink};
 
 /// The packets that a cell has sent since they were requested.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Responded {
+pub struct ResponseFlags {
     /// True if the cell sent a heartbeat since the last sync.
     pub heartbeat: bool,
     /// True if the cell sent its counters since the last report command.
@@ -59,12 +59,12 @@ pub struct CellState {
     /// Sensors frames of the cell.
     pub sensed: SensorFrames,
     pub(super) tracked: CellTracker,
-    pub(super) said: Responded,
+    pub(super) said: ResponseFlags,
     contact: ContactState<()>,
     switched: SwitchStates,
     halt: HaltState,
     sent: SentJoints,
-    pub(super) outstanding: Outstanding,
+    pub(super) outstanding: OutstandingReplies,
     pub(super) answered: Option<u64>,
     held_torque: HeldTorque,
     pub(super) sums: Option<RootSums>,
@@ -89,12 +89,12 @@ impl CellState {
             replies: Replies::default(),
             sensed: SensorFrames::default(),
             tracked: CellTracker::default(),
-            said: Responded::default(),
+            said: ResponseFlags::default(),
             contact: ContactState::default(),
             switched,
             halt: HaltState::default(),
             sent: SentJoints::default(),
-            outstanding: Outstanding::default(),
+            outstanding: OutstandingReplies::default(),
             answered: None,
             held_torque: HeldTorque::default(),
             sums: summed.then(|| RootSums::new(described.root)),
@@ -115,7 +115,7 @@ impl CellState {
 
     /// Returns the errors of the cell's torques against the central ones, on the joints that move the cell.
     #[must_use]
-    pub const fn errors(&self) -> Errors {
+    pub const fn errors(&self) -> TorqueErrors {
         self.outstanding.errors
     }
 
@@ -133,7 +133,7 @@ impl CellState {
 
     /// Returns true if the cell measures, so that stimuli have no effect on it; `None` before its first heartbeat.
     #[must_use]
-    pub fn measures(&self) -> Option<bool> {
+    pub fn is_measuring(&self) -> Option<bool> {
         self.heartbeat().map(|heartbeat| !heartbeat.state.has(State::TEST_MODE))
     }
 
@@ -144,11 +144,11 @@ impl CellState {
     }
 
     /// Starts counting again: earlier packets do not count.
-    pub(super) fn begin_accounts(&mut self) {
+    pub(super) fn reset_counts(&mut self) {
         self.tracked.account = Default::default();
         (self.replies, self.sensed) = Default::default();
-        self.outstanding.begin_accounts();
-        self.sent.begin();
+        self.outstanding.reset_counts();
+        self.sent.reset_count();
     }
 
     /// Records the cell's receive counters. `passed` is the number of joints that were sent while the page was on its
@@ -162,7 +162,7 @@ impl CellState {
     /// Applies a heartbeat of the cell. Returns the change of the running sum.
     pub(super) fn apply_heartbeat(
         &mut self,
-        update: &Update,
+        update: &CellUpdate,
         heartbeat: &Heartbeat,
         epoch: Epoch,
     ) -> SumChange {
@@ -190,25 +190,25 @@ impl CellState {
             if word == HeartbeatKind::Shared {
                 self.contact.reset();
             } else {
-                self.contact.start(());
+                self.contact.record_start(());
             }
             self.sensed.restart();
             self.switched.restart();
             self.restart(word, update.taken_back, heartbeat.sent);
             (self.reply, self.ports_down) = (None, 0);
-        } else if !self.tracked.account.is_in_question() {
-            self.sent.confirm();
+        } else if !self.tracked.account.is_start_in_doubt() {
+            self.sent.confirm_start();
         }
         // A heartbeat does not release a sum, which may hold torques of other cells.
         if self.sums.is_some() || !started && heartbeat.state.has(State::ACTIVE) {
             return SumChange::default();
         }
-        self.release()
+        self.release_torque()
     }
 
     /// Returns the requested packets that the cell has sent.
     #[must_use]
-    pub const fn responded(&self) -> Responded {
+    pub const fn responded(&self) -> ResponseFlags {
         self.said
     }
 
@@ -224,12 +224,12 @@ impl CellState {
 
     /// Returns the newest sensor values by the stimuli and pages received; the default for unknown ones.
     #[must_use]
-    pub fn readings(&self) -> Readings {
+    pub fn readings(&self) -> SensorReadings {
         self.contact.readings()
     }
 
     /// Records a stimulus on the bus; `last` is the epoch of the last joints.
-    pub(super) fn stimulate(&mut self, from: AppliesFrom, page: SensorPage, last: Option<Epoch>) {
+    pub(super) fn stimulate(&mut self, from: StimulusStart, page: SensorPage, last: Option<Epoch>) {
         self.contact.push(from, page, (), last);
     }
 
@@ -268,14 +268,14 @@ impl CellState {
     /// Returns the sensor words with which the cell computes. Returns `None` if they are unknown: the cell measures,
     /// subtracts its own zero, may be off the bus, or may have received stimuli that did not arrive here.
     pub(super) fn sensors(&self) -> Option<SkinSensors> {
-        self.contact.known().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
+        self.contact.certain_skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
     }
 
     /// Returns the sensor words of the cell for display, from the stimuli and pages that arrived. Older stimuli that
     /// did not arrive may have changed them.
     #[must_use]
     pub fn presumed_sensors(&self) -> Option<SkinSensors> {
-        self.contact.skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
+        self.contact.presumed_skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
     }
 
     /// Returns true if the cell's torques follow from stimuli alone: it neither measures nor subtracts a zero.
@@ -289,7 +289,7 @@ impl CellState {
     /// write of the cell's mode clears such stimuli.
     #[must_use]
     pub fn has_unseen_stimuli(&self) -> bool {
-        self.is_ready() && self.computes_with_stimuli() && self.contact.known().is_none()
+        self.is_ready() && self.computes_with_stimuli() && self.contact.certain_skin().is_none()
     }
 
     /// Returns the sensor words of the cell from the joints of this epoch on; `None` if unknown.
@@ -300,15 +300,20 @@ impl CellState {
 
     /// Starts a broadcast for the cell: a reply that did not arrive within three epochs counts as missing, and the held
     /// torque decays. Returns the change of the running sum, and the number of epochs without a new torque.
-    pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (SumChange, u32) {
-        self.sent.count();
+    pub(super) fn open_epoch(
+        &mut self,
+        number: u64,
+        in_contact: bool,
+        safety: &SafetyLimits,
+    ) -> (SumChange, u32) {
+        self.sent.count_broadcast();
         let due = in_contact && self.is_ready();
         let is_known = self.sensors().is_some();
         if let Some(sums) = &mut self.sums {
             self.outstanding.restart_with(due, is_known);
-            sums.open();
+            sums.open_epoch();
         } else {
-            if self.outstanding.open(due, is_known) {
+            if self.outstanding.open_broadcast(due, is_known) {
                 self.replies.count_missing(1, self.tracked.is_dead());
             }
             self.replies.due += u64::from(due);
@@ -323,7 +328,7 @@ impl CellState {
 
     /// Records a repeated broadcast, which the cell receives and drops; no reply is due.
     pub(super) const fn count_repeated_joints(&mut self) {
-        self.sent.count();
+        self.sent.count_broadcast();
     }
 
     /// Returns true if the running sum contains a torque of the cell.
@@ -340,7 +345,7 @@ impl CellState {
     /// true for a zero torque, which only ends a contact. Returns whether the torque was due.
     pub(super) fn record_reply(&mut self, number: u64, lag: usize, is_zero: bool) -> ReplyExpectation {
         self.answered = Some(number);
-        let asked = self.outstanding.answer(lag);
+        let asked = self.outstanding.record_answer(lag);
         let replies = &mut self.replies;
         match (asked, lag) {
             (ReplyExpectation::Due, 0) => replies.in_time += 1,
@@ -378,14 +383,14 @@ impl CellState {
     }
 
     /// Releases the held torque. Returns the change of the running sum.
-    pub(super) fn release(&mut self) -> SumChange {
-        self.held_torque.release()
+    pub(super) fn release_torque(&mut self) -> SumChange {
+        self.held_torque.release_torque()
     }
 
     /// Records a halt on the bus: the cell stops answering. Returns the change of the running sum.
     pub(super) fn halt(&mut self) -> SumChange {
         self.halt = HaltState { halted: true, commanded: true };
-        self.release()
+        self.release_torque()
     }
 
     /// Records a resume on the bus: the cell answers the next broadcast.
@@ -401,35 +406,35 @@ impl CellState {
     }
 
     /// Records that the bus was lost: replies that were due may have been sent and lost.
-    pub(super) fn interrupt(&mut self) {
+    pub(super) fn handle_connection_loss(&mut self) {
         self.forget_contact();
-        self.tracked.account.interrupt();
+        self.tracked.account.handle_connection_loss();
     }
 
     /// Forgets the contact state of the cell: the replies now due are in doubt.
     fn forget_contact(&mut self) {
-        self.doubt_outstanding();
+        self.mark_replies_in_doubt();
         self.contact.reset();
     }
 
     /// Records a write of a parameter that changes how the cell answers from now on.
     pub(super) fn record_write(&mut self, number: u8) {
-        self.doubt_outstanding();
+        self.mark_replies_in_doubt();
         if number == Parameter::Mode.number() {
-            self.contact.write_mode();
+            self.contact.record_mode_write();
         } else {
-            self.contact.forget();
+            self.contact.mark_unknown();
         }
     }
 
-    fn doubt_outstanding(&mut self) {
+    fn mark_replies_in_doubt(&mut self) {
         let due = self.outstanding.clear();
         // On a bus with sums, the sum counts a missing contribution.
         self.replies.count_missing(if self.sums.is_some() { 0 } else { due }, true);
     }
 
     /// Ends the counting: replies still outstanding count as missing.
-    pub(super) fn settle(&mut self) {
+    pub(super) fn finish_counts(&mut self) {
         self.tracked.account.finish();
         if self.sums.is_none() {
             let due = self.outstanding.clear();

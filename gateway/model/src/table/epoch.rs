@@ -6,9 +6,9 @@ use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
-use super::Table;
+use super::BusTable;
 use super::cell::CellState;
-use super::replies::Expected as Reply;
+use super::replies::ExpectedTorques as Reply;
 use super::root_totals::ExpectedSum;
 use crate::tracker::MAX_LATE_EPOCHS;
 
@@ -64,17 +64,17 @@ impl Broadcast {
     }
 
     /// Returns the number, the epoch and the time of the broadcast.
-    pub(super) const fn joints(&self) -> (u64, Epoch, Micros) {
+    pub(super) const fn number_epoch_and_time(&self) -> (u64, Epoch, Micros) {
         (self.number, self.epoch, self.at)
     }
 
     /// Sets the counts of due and received replies to zero.
-    pub(super) const fn begin_accounts(&mut self) {
+    pub(super) const fn reset_counts(&mut self) {
         (self.due, self.in_time, self.is_whole, self.last_reply) = (0, 0, true, None);
     }
 }
 
-impl Table {
+impl BusTable {
     /// Records new joints on the bus: closes the previous epoch, and computes which cells must answer this one.
     pub(super) fn open_epoch(
         &mut self,
@@ -126,7 +126,7 @@ impl Table {
             self.apply(change);
         }
         if let Some(root_totals) = &mut self.root_totals {
-            root_totals.open(due, known, whole);
+            root_totals.open_epoch(due, known, whole);
         }
         let sums = &mut self.snapshot.sums;
         (sums.stale, sums.age, sums.read_back) = (stale, age, Some(epoch));
@@ -150,7 +150,7 @@ impl Table {
             self.delays.record_last_reply(last.elapsed_since(before.at));
         }
         if let Some(root_totals) = &mut self.root_totals {
-            let (due, complete) = root_totals.close();
+            let (due, complete) = root_totals.close_epoch();
             return self.counters.count_epoch(due, complete);
         }
         self.counters.count_epoch(before.due > 0, before.in_time == before.due);
@@ -158,7 +158,7 @@ impl Table {
         let is_compared = self.is_comparing && is_complete && before.is_whole;
         self.difference = is_compared.then_some(before.error);
         if is_compared {
-            self.accuracy.whole_skin(before.error.get(..self.carried.joints).unwrap_or_default());
+            self.accuracy.add_whole_skin_errors(before.error.get(..self.carried.joints).unwrap_or_default());
         }
     }
 
@@ -166,21 +166,24 @@ impl Table {
     /// joint of the chain; saturated words do not count. Returns `None` if the torques were not compared, or if not all
     /// due replies arrived in time.
     #[must_use]
-    pub fn difference(&self) -> Option<[f64; MAX_JOINTS]> {
+    pub fn torque_difference(&self) -> Option<[f64; MAX_JOINTS]> {
         self.root_totals.as_ref().map_or(self.difference, |root_totals| root_totals.error.last)
     }
 
     /// Records that the bus was lost: packets in transit are in doubt. The held torques stay, and decay in the control
     /// loop.
-    pub fn interrupt(&mut self) {
+    pub fn handle_bus_loss(&mut self) {
         self.interrupted = true;
-        self.interrupt_cells(|_| true);
+        self.handle_unreachable_cells(|_| true);
     }
 
     /// Records that cells were unreachable while the bus worked, or are now: packets from and to these cells may be
     /// lost.
-    pub fn interrupt_cells(&mut self, is_in_doubt: impl Fn(CellId) -> bool) {
-        self.cells.iter_mut().filter(|cell| is_in_doubt(cell.node)).for_each(CellState::interrupt);
+    pub fn handle_unreachable_cells(&mut self, is_in_doubt: impl Fn(CellId) -> bool) {
+        self.cells
+            .iter_mut()
+            .filter(|cell| is_in_doubt(cell.node))
+            .for_each(CellState::handle_connection_loss);
     }
 
     /// Releases the torques that decayed in the control loop while the bus carried no joints, so that they do not
@@ -191,7 +194,7 @@ impl Table {
         let gap = recent.map(|(before, _)| epoch.epochs_since(before)).min().unwrap_or(0);
         let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;
         if core::mem::take(&mut self.interrupted) || over {
-            self.each_cell(CellState::release);
+            self.change_all_cells(CellState::release_torque);
         }
     }
 }

@@ -4,13 +4,13 @@ use serde::ser::{Serialize, SerializeStruct, Serializer};
 
 /// Mean and maximum of absolute errors, in Nm; serialised as `mean_nm`, `max_nm` and `count`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Errors {
+pub struct TorqueErrors {
     sum: f64,
     max: f64,
     count: u64,
 }
 
-impl Serialize for Errors {
+impl Serialize for TorqueErrors {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut errors = serializer.serialize_struct("Errors", 3)?;
         errors.serialize_field("mean_nm", &self.mean())?;
@@ -20,7 +20,7 @@ impl Serialize for Errors {
     }
 }
 
-impl FromIterator<f64> for Errors {
+impl FromIterator<f64> for TorqueErrors {
     /// Collects errors in Nm, of either sign.
     fn from_iter<T: IntoIterator<Item = f64>>(errors: T) -> Self {
         let mut all = Self::default();
@@ -29,7 +29,7 @@ impl FromIterator<f64> for Errors {
     }
 }
 
-impl Errors {
+impl TorqueErrors {
     pub(super) fn add(&mut self, error: f64) {
         self.sum += error.abs();
         self.max = self.max.max(error.abs());
@@ -68,7 +68,7 @@ mod tests {
 
     #[test]
     fn errors_have_a_mean_and_a_maximum_and_add_up() {
-        let mut errors = Errors::default();
+        let mut errors = TorqueErrors::default();
         assert_eq!(errors.mean(), None);
         [0.5, -1.0, 3.0].into_iter().for_each(|error| errors.add(error));
         assert_eq!((errors.mean(), errors.max(), errors.count()), (Some(1.5), 3.0, 3));

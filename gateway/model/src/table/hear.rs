@@ -2,7 +2,7 @@
 
 use protocol::can::Frame;
 use protocol::id::{CellId, Command, Id, Kind, Node};
-use protocol::message::{AppliesFrom, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
+use protocol::message::{Heartbeat, Message, NetworkPage, Request, SensorPage, State, StimulusStart};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
@@ -10,17 +10,17 @@ use protocol::time::Micros;
 use super::cell::CellState;
 use super::held::SumChange;
 use super::replies::ReplyExpectation;
-use super::root_totals::{RootTotals, Sum, SumUse};
-use super::{Event, Notice, PositionLookup, Table};
-use crate::packets::{NoPacket, Pending, Received};
-use crate::tracker::{HeartbeatKind, Update};
+use super::root_totals::{RootSum, RootTotals, SumUse};
+use super::{BusTable, Event, Notice, PositionLookup};
+use crate::packets::{FrameWithPacket, NoPacket, PendingSegments};
+use crate::tracker::{CellUpdate, HeartbeatKind};
 
 /// Parameters whose write changes at once how a cell answers.
 const REPLY_PARAMETERS: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
-impl Table {
+impl BusTable {
     /// Reassembles and decodes a frame of this bus, for [`receive`](Self::receive) and other consumers.
-    pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> Received<'f> {
+    pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> FrameWithPacket<'f> {
         self.packets.read(at, frame)
     }
 
@@ -33,7 +33,7 @@ impl Table {
                 let message = self.packets.decode(&packet);
                 self.receive_packet(at, own, packet.id, message.as_ref().ok(), positions);
             }
-            Err(no_packet) => self.refuse(own, frame, no_packet, pending),
+            Err(no_packet) => self.count_non_packet(own, frame, no_packet, pending),
         }
     }
 
@@ -42,14 +42,14 @@ impl Table {
         &mut self,
         at: Micros,
         own: bool,
-        received: &Received<'_>,
+        received: &FrameWithPacket<'_>,
         positions: &mut PositionLookup<'_>,
     ) {
         match &received.packet {
             Ok((packet, message)) => {
                 self.receive_packet(at, own, packet.id, message.as_ref().ok(), positions);
             }
-            Err(no_packet) => self.refuse(own, received.frame, *no_packet, received.pending),
+            Err(no_packet) => self.count_non_packet(own, received.frame, *no_packet, received.pending),
         }
     }
 
@@ -66,12 +66,12 @@ impl Table {
         match message {
             Some(message) if own => self.receive_own(at, message, positions),
             Some(message) => self.receive_foreign(at, id, message),
-            None => self.reject(id, own, Event::Meaning),
+            None => self.count_unusable_frame(id, own, Event::Meaning),
         }
     }
 
     /// Counts a frame that neither is nor completes a packet.
-    fn refuse(&mut self, own: bool, frame: &Frame, no_packet: NoPacket, pending: Pending) {
+    fn count_non_packet(&mut self, own: bool, frame: &Frame, no_packet: NoPacket, pending: PendingSegments) {
         let (id, event) = match no_packet {
             NoPacket::NotData => {
                 let is_error = frame.is_error();
@@ -87,7 +87,7 @@ impl Table {
             return self.counters.count(Event::Foreign);
         }
         self.counters.count_frame(id.kind, own);
-        self.reject(id, own, event);
+        self.count_unusable_frame(id, own, event);
     }
 
     /// Returns true if the skin describes a sender with this identifier on this bus.
@@ -102,10 +102,10 @@ impl Table {
     }
 
     /// Counts an unusable frame, for the bus and for the cell with its identifier.
-    fn reject(&mut self, id: Id, own: bool, event: Event) {
+    fn count_unusable_frame(&mut self, id: Id, own: bool, event: Event) {
         self.counters.count(event);
         if let (false, Some(cell)) = (own, self.sender(id)) {
-            cell.tracked.account.reject();
+            cell.tracked.account.count_rejected();
         }
     }
 
@@ -120,7 +120,7 @@ impl Table {
                 self.record_write(to, number);
             }
         } else if *message == Message::Halt {
-            self.each_cell(CellState::halt);
+            self.change_all_cells(CellState::halt);
         } else if *message == Message::Sync {
             self.cells.iter_mut().for_each(|cell| cell.said.heartbeat = false);
         } else if *message == Message::Report {
@@ -143,7 +143,7 @@ impl Table {
             Message::Network { from: Node::Gateway, .. } => self.counters.count(Event::OtherGateway),
             Message::Halt => {
                 self.snapshot.sums.halts += 1;
-                self.each_cell(CellState::halt);
+                self.change_all_cells(CellState::halt);
             }
             Message::Resume => {
                 self.snapshot.sums.resumes += 1;
@@ -165,7 +165,7 @@ impl Table {
         }
     }
 
-    fn record_stimulus(&mut self, to: Node, from: AppliesFrom, page: SensorPage) {
+    fn record_stimulus(&mut self, to: Node, from: StimulusStart, page: SensorPage) {
         let last = self.broadcast.map(|broadcast| broadcast.epoch);
         for cell in self.cells.iter_mut().filter(|cell| to.addresses(cell.node)) {
             cell.stimulate(from, page, last);
@@ -208,7 +208,7 @@ impl Table {
             if let NetworkPage::Heartbeat(heartbeat) = page {
                 self.receive_heartbeat(at, place, &update, &heartbeat, epoch);
             } else if let NetworkPage::Received(_) = page {
-                cell.sensed.answer_report();
+                cell.sensed.begin_report();
                 cell.record_counters(
                     self.broadcast.as_ref().map_or(0, |newest| newest.broadcasts_since(epoch)),
                 );
@@ -223,7 +223,7 @@ impl Table {
         } else if let Message::Torque { epoch, torque, .. } = *message {
             self.receive_torque(at, place, epoch, &torque);
         } else if let Message::Sum { epoch, count, torque, .. } = *message {
-            self.receive_sum(at, place, epoch, Sum { count, words: torque.padded().map(i32::from) });
+            self.receive_sum(at, place, epoch, RootSum { count, words: torque.padded().map(i32::from) });
         }
     }
 
@@ -231,7 +231,7 @@ impl Table {
         &mut self,
         at: Micros,
         place: usize,
-        update: &Update,
+        update: &CellUpdate,
         heartbeat: &Heartbeat,
         epoch: Epoch,
     ) {
@@ -292,9 +292,10 @@ impl Table {
         if let (ReplyExpectation::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
             let error =
                 self.accuracy.compare(cell.joint, format, torque, &expected, &mut cell.outstanding.errors);
-            cell.outstanding
-                .stuck
-                .compare_torque(torque.padded(), expected.quantised.map(|torque| format.nearest(torque)));
+            cell.outstanding.stuck.compare_torque(
+                torque.padded(),
+                expected.quantised.map(|torque| format.nearest_word(torque)),
+            );
             if lag == 0 {
                 for (sum, error) in broadcast.error.iter_mut().zip(error) {
                     *sum += error;
@@ -305,7 +306,7 @@ impl Table {
         self.apply(change);
     }
 
-    fn receive_sum(&mut self, at: Micros, place: usize, epoch: Epoch, sum: Sum) {
+    fn receive_sum(&mut self, at: Micros, place: usize, epoch: Epoch, sum: RootSum) {
         let (Some(root_totals), Some(cell)) = (&mut self.root_totals, self.cells.get_mut(place)) else {
             return self.counters.count(Event::UnknownNode);
         };
@@ -333,18 +334,18 @@ impl Table {
             self.counters.count(Event::Saturated);
         }
         // In the steps of the running sum.
-        let change = cell.hold_sum(number, sum.count, sum.in_steps());
+        let change = cell.hold_sum(number, sum.count, sum.words_in_q3_12());
         self.apply(change);
-        self.release_moved(number);
+        self.release_duplicate_sums(number);
     }
 
     /// Releases the held sum of a silent root once the sum of another root contains its cells.
-    fn release_moved(&mut self, number: u64) {
-        let Some(due) = self.root_totals.as_ref().and_then(RootTotals::due) else { return };
+    fn release_duplicate_sums(&mut self, number: u64) {
+        let Some(due) = self.root_totals.as_ref().and_then(RootTotals::cells_due) else { return };
         if self.snapshot.sums.contributing > due {
-            self.each_cell(
-                |cell| if cell.is_outdated(number) { cell.release() } else { SumChange::default() },
-            );
+            self.change_all_cells(|cell| {
+                if cell.is_outdated(number) { cell.release_torque() } else { SumChange::default() }
+            });
         }
     }
 }

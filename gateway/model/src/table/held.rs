@@ -2,7 +2,7 @@
 //! and is part of the running sum.
 
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::Safety;
+use protocol::skin::SafetyLimits;
 
 /// A change of the running sum: steps by joint, and cells.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -27,40 +27,40 @@ impl HeldTorque {
     /// sum.
     pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> SumChange {
         self.torque = (words != [0; MAX_JOINTS]).then_some((words, 1));
-        self.contribute(words, u8::from(self.torque.is_some()))
+        self.set_contribution(words, u8::from(self.torque.is_some()))
     }
 
     /// Holds a sum of `count` cells; a sum of zero cells ends all contacts. Returns the change of the running sum.
     pub(super) fn hold_sum(&mut self, words: [i32; MAX_JOINTS], count: u8) -> SumChange {
         // Even with cells in contact, all words may round to 0.
         self.torque = (count > 0).then_some((words, count));
-        self.contribute(words, count)
+        self.set_contribution(words, count)
     }
 
     /// Releases the torque. Returns the change of the running sum.
-    pub(super) fn release(&mut self) -> SumChange {
+    pub(super) fn release_torque(&mut self) -> SumChange {
         self.torque = None;
-        self.contribute([0; MAX_JOINTS], 0)
+        self.set_contribution([0; MAX_JOINTS], 0)
     }
 
     /// Keeps the torque or lets it decay, after this number of unanswered epochs. Returns the change of the running
     /// sum.
-    pub(super) fn decay(&mut self, unanswered: u32, safety: &Safety, is_sum: bool) -> SumChange {
+    pub(super) fn decay(&mut self, unanswered: u32, safety: &SafetyLimits, is_sum: bool) -> SumChange {
         let Some((held, cells)) = self.torque else { return SumChange::default() };
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(unanswered);
         if left == 0 && unanswered > 0 {
             // The contribution has decayed to zero, although the cell has not reported the end of its contact.
-            return self.contribute([0; MAX_JOINTS], 0);
+            return self.set_contribution([0; MAX_JOINTS], 0);
         }
         let decay = safety.decay_epochs.max(1);
         let keep = i32::try_from(left.min(decay)).unwrap_or(i32::MAX);
         let whole = i32::try_from(decay).unwrap_or(i32::MAX);
         let rest = held.map(|word| word * keep / whole);
         let counts = is_sum || rest != [0; MAX_JOINTS];
-        self.contribute(rest, if counts { cells } else { 0 })
+        self.set_contribution(rest, if counts { cells } else { 0 })
     }
 
-    fn contribute(&mut self, words: [i32; MAX_JOINTS], cells: u8) -> SumChange {
+    fn set_contribution(&mut self, words: [i32; MAX_JOINTS], cells: u8) -> SumChange {
         let counted = core::mem::replace(&mut self.contributing, cells);
         let before = core::mem::replace(&mut self.contribution, words);
         let mut torque = words;

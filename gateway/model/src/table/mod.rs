@@ -33,10 +33,10 @@ use protocol::id::{CellId, Id};
 use protocol::message::{Heartbeat, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::{Events, MAX_JOINTS, Sensing};
-use protocol::skin::{Safety, Skin, SkinReply};
+use protocol::skin::{SafetyLimits, Skin, SkinReply};
 use protocol::time::Micros;
 
-use crate::central::Central;
+use crate::central::CentralComputation;
 use crate::network::check::ObservedCell;
 use crate::packets::PacketReader;
 
@@ -48,11 +48,11 @@ use switched::SwitchStates;
 
 pub use crate::tracker::Uplink;
 pub use accuracy::{Accuracy, RoundingErrors};
-pub use cell::{CellState, Responded};
+pub use cell::{CellState, ResponseFlags};
 pub use counters::{Counters, Event};
 pub use delays::Delays;
 pub use epoch::PositionLookup;
-pub use errors::Errors;
+pub use errors::TorqueErrors;
 pub use replies::Replies;
 pub use root_totals::{Contributions, SumCounts};
 pub use sensed::SensorFrames;
@@ -120,12 +120,12 @@ pub enum Notice {
 
 /// The state of one bus.
 #[derive(Clone, Debug)]
-pub struct Table {
+pub struct BusTable {
     carried: BusFormat,
-    safety: Safety,
+    safety: SafetyLimits,
     events: Events,
-    central: Central,
-    unquantised: Central,
+    central: CentralComputation,
+    unquantised: CentralComputation,
     is_comparing: bool,
     cells: Vec<CellState>,
     /// For each node id, the index of the cell in `cells`.
@@ -156,7 +156,7 @@ struct BusFormat {
     joints: usize,
 }
 
-impl Table {
+impl BusTable {
     /// Creates the table of a bus of the skin, before any frame has arrived.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize) -> Self {
@@ -181,8 +181,8 @@ impl Table {
             },
             safety: skin.safety,
             events: skin.events,
-            central: Central::new(&part),
-            unquantised: Central::unquantised(&part),
+            central: CentralComputation::new(&part),
+            unquantised: CentralComputation::unquantised(&part),
             is_comparing: false,
             cells,
             places,
@@ -209,12 +209,12 @@ impl Table {
 
     /// Sets whether a root sends its sums to the gateway. If it does not, the sum of another root contains them, and
     /// the held sum is released so that it does not count twice.
-    pub fn set_feeds(&mut self, root: CellId, feeds: bool) {
+    pub fn set_root_feeds_gateway(&mut self, root: CellId, feeds: bool) {
         let Some(cell) = self.cell_mut(root) else { return };
         let Some(sums) = &mut cell.sums else { return };
         sums.is_for_gateway = feeds;
         if !feeds {
-            let change = cell.release();
+            let change = cell.release_torque();
             self.apply(change);
         }
     }
@@ -316,10 +316,10 @@ impl Table {
     }
 
     /// Starts counting: earlier frames have set the state, but do not count.
-    pub fn begin_accounts(&mut self) {
-        self.cells.iter_mut().for_each(CellState::begin_accounts);
+    pub fn reset_counts(&mut self) {
+        self.cells.iter_mut().for_each(CellState::reset_counts);
         if let Some(broadcast) = &mut self.broadcast {
-            broadcast.begin_accounts();
+            broadcast.reset_counts();
         }
         if let Some(root_totals) = &mut self.root_totals {
             *root_totals = RootTotals::default();
@@ -336,7 +336,7 @@ impl Table {
             if cell.tracked.handle_timeout(now) {
                 self.snapshot.sums.dead += 1;
                 self.notices.push_back(Notice::Dead(cell.node));
-                let change = cell.release();
+                let change = cell.release_torque();
                 self.apply(change);
             }
         }
@@ -350,11 +350,11 @@ impl Table {
             root_totals.finish();
         }
         for cell in &mut self.cells {
-            cell.settle();
+            cell.finish_counts();
         }
     }
 
-    fn each_cell(&mut self, change: impl Fn(&mut CellState) -> SumChange) {
+    fn change_all_cells(&mut self, change: impl Fn(&mut CellState) -> SumChange) {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let change = change(cell);
@@ -401,7 +401,7 @@ impl Table {
     /// Returns the number, the epoch and the time of the newest joints, which the cells are answering.
     #[must_use]
     pub fn newest_joints(&self) -> Option<(u64, Epoch, Micros)> {
-        self.broadcast.as_ref().map(Broadcast::joints)
+        self.broadcast.as_ref().map(Broadcast::number_epoch_and_time)
     }
 
     /// Returns for each cell its sensor words since the newest joints, from the stimuli and pages that arrived, and its

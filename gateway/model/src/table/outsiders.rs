@@ -7,7 +7,7 @@ use protocol::message::Heartbeat;
 use protocol::time::{Micros, Span};
 
 /// Number of joints from another sender within [`WITHIN`] that prove another gateway.
-const GATEWAY_JOINTS: usize = 4;
+const MIN_GATEWAY_JOINTS: usize = 4;
 /// The time window for these joints; the slowest gateway sends fifteen in it.
 const GATEWAY_WINDOW: Span = Span::from_millis(1_000);
 
@@ -17,7 +17,7 @@ pub(super) struct Outsiders {
     /// Nodes that are not in the skin, each with its last heartbeat.
     pub(super) nodes: BTreeMap<CellId, Heartbeat>,
     /// Arrival times of the last joints, newest first.
-    joints: [Option<Micros>; GATEWAY_JOINTS],
+    joints: [Option<Micros>; MIN_GATEWAY_JOINTS],
 }
 
 impl Outsiders {

@@ -3,7 +3,7 @@
 use derive_more::{Add, Sum};
 use protocol::parameters::MAX_JOINTS;
 
-use super::errors::Errors;
+use super::errors::TorqueErrors;
 use super::stuck::StuckDetector;
 use crate::tracker::MAX_LATE_EPOCHS;
 
@@ -59,7 +59,7 @@ pub(super) enum ReplyExpectation {
 
 /// The central torques of one epoch that a cell's answer is compared with, in Nm.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Expected {
+pub(super) struct ExpectedTorques {
     pub(super) number: u64,
     pub(super) quantised: [f64; MAX_JOINTS],
     pub(super) unquantised: [f64; MAX_JOINTS],
@@ -67,22 +67,22 @@ pub(super) struct Expected {
 
 /// The replies of one cell that are still outstanding for the newest epochs.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Outstanding {
+pub(super) struct OutstandingReplies {
     /// Bit n is set if the n-th broadcast before the newest one is due and not answered yet.
     due: u8,
     /// Bit n is set if the cell's contact was known at the n-th broadcast before the newest one.
     known: u8,
-    expected: [Option<Expected>; MAX_LATE_EPOCHS + 1],
+    expected: [Option<ExpectedTorques>; MAX_LATE_EPOCHS + 1],
     /// Errors of the cell's torques.
-    pub(super) errors: Errors,
+    pub(super) errors: TorqueErrors,
     /// The cell's words beside the expected ones, to detect words that stay constant.
     pub(super) stuck: StuckDetector,
 }
 
-impl Outstanding {
+impl OutstandingReplies {
     /// Starts a broadcast, which the cell must answer if `due`; `is_known` is true if its contact is known. Returns
     /// true if the oldest broadcast was due and can no longer be answered.
-    pub(super) fn open(&mut self, due: bool, is_known: bool) -> bool {
+    pub(super) fn open_broadcast(&mut self, due: bool, is_known: bool) -> bool {
         let oldest = 1 << MAX_LATE_EPOCHS;
         let unanswered = self.due & oldest != 0;
         self.due = (self.due & (oldest - 1)) << 1 | u8::from(due);
@@ -91,7 +91,7 @@ impl Outstanding {
     }
 
     /// Drops the outstanding replies, so that earlier epochs do not count.
-    pub(super) fn begin_accounts(&mut self) {
+    pub(super) fn reset_counts(&mut self) {
         *self = Self { known: self.known, ..Self::default() };
     }
 
@@ -106,7 +106,7 @@ impl Outstanding {
     }
 
     /// Records the answer to the broadcast `lag` broadcasts before the newest one. Returns whether the answer was due.
-    pub(super) const fn answer(&mut self, lag: usize) -> ReplyExpectation {
+    pub(super) const fn record_answer(&mut self, lag: usize) -> ReplyExpectation {
         let bit = 1 << lag;
         let was_due = self.due & bit != 0;
         self.due &= !bit;
@@ -128,7 +128,7 @@ impl Outstanding {
     }
 
     /// Sets the torques that are expected in answer to the newest broadcast.
-    pub(super) fn expect(&mut self, expected: Expected) {
+    pub(super) fn expect(&mut self, expected: ExpectedTorques) {
         self.expected.rotate_right(1);
         if let Some(newest) = self.expected.first_mut() {
             *newest = Some(expected);
@@ -136,7 +136,7 @@ impl Outstanding {
     }
 
     /// Returns the torques that are expected in answer to the broadcast with this number, if known.
-    pub(super) fn expected(&self, number: u64) -> Option<Expected> {
+    pub(super) fn expected(&self, number: u64) -> Option<ExpectedTorques> {
         self.expected.iter().flatten().find(|expected| expected.number == number).copied()
     }
 }
@@ -147,16 +147,16 @@ mod tests {
 
     #[test]
     fn an_answer_is_to_the_broadcast_so_many_before_the_newest_and_counts_once() {
-        let mut outstanding = Outstanding::default();
+        let mut outstanding = OutstandingReplies::default();
         use ReplyExpectation::{Due, NotDue, Unknown};
         let broadcasts = [(false, false), (true, true), (false, true), (true, true)];
-        broadcasts.into_iter().for_each(|(due, is_known)| _ = outstanding.open(due, is_known));
+        broadcasts.into_iter().for_each(|(due, is_known)| _ = outstanding.open_broadcast(due, is_known));
         assert!(outstanding.is_due());
-        let answers = [0, 0, 1, 2, 2, 3].map(|lag| outstanding.answer(lag));
+        let answers = [0, 0, 1, 2, 2, 3].map(|lag| outstanding.record_answer(lag));
         assert_eq!(answers, [Due, NotDue, NotDue, Due, NotDue, Unknown]);
         assert_eq!(outstanding.clear(), 0);
-        (0..5).for_each(|_| _ = outstanding.open(true, true));
+        (0..5).for_each(|_| _ = outstanding.open_broadcast(true, true));
         assert_eq!(outstanding.clear(), 4, "the newest, and three before it");
-        assert_eq!(outstanding.answer(0), Unknown, "what was known is in doubt");
+        assert_eq!(outstanding.record_answer(0), Unknown, "what was known is in doubt");
     }
 }

@@ -4,7 +4,7 @@ use protocol::fixed::TorqueFormat;
 use protocol::parameters::MAX_JOINTS;
 use serde::Serialize;
 
-use super::errors::Errors;
+use super::errors::TorqueErrors;
 use crate::tracker::MAX_LATE_EPOCHS;
 
 /// Number of epochs over which errors of sums are averaged.
@@ -47,17 +47,18 @@ pub struct Contributions {
 
 /// A root's sum for one epoch.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) struct Sum {
+pub(super) struct RootSum {
     /// Number of cells in the sum.
     pub(super) count: u8,
     /// The torque of each joint, in steps of Q7.8.
     pub(super) words: [i32; MAX_JOINTS],
 }
 
-impl Sum {
+impl RootSum {
     /// Returns the words in steps of 2^-12 Nm.
-    pub(super) fn in_steps(&self) -> [i32; MAX_JOINTS] {
-        self.words.map(|word| word << (TorqueFormat::Q3_12.fraction() - TorqueFormat::Q7_8.fraction()))
+    pub(super) fn words_in_q3_12(&self) -> [i32; MAX_JOINTS] {
+        self.words
+            .map(|word| word << (TorqueFormat::Q3_12.fraction_bits() - TorqueFormat::Q7_8.fraction_bits()))
     }
 
     pub(super) fn is_saturated(&self) -> bool {
@@ -71,7 +72,7 @@ pub(super) struct RootSums {
     /// True if the root sends its sums to the gateway; otherwise another cell receives them.
     pub(super) is_for_gateway: bool,
     /// For each of the newest epochs, the sum with the most cells.
-    pub(super) epochs: [Option<Sum>; MAX_LATE_EPOCHS + 1],
+    pub(super) epochs: [Option<RootSum>; MAX_LATE_EPOCHS + 1],
 }
 
 impl RootSums {
@@ -80,7 +81,7 @@ impl RootSums {
     }
 
     /// Starts a new epoch, for which no sum has arrived yet.
-    pub(super) fn open(&mut self) {
+    pub(super) fn open_epoch(&mut self) {
         self.epochs.rotate_right(1);
         if let Some(newest) = self.epochs.first_mut() {
             *newest = None;
@@ -127,8 +128,8 @@ impl ExpectedSum {
 /// Errors of sums over consecutive epochs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct SumError {
-    pub(super) single: Errors,
-    pub(super) averaged: Errors,
+    pub(super) single: TorqueErrors,
+    pub(super) averaged: TorqueErrors,
     /// Number of words that were skipped because they were saturated.
     pub(super) saturated: u64,
     /// Number of consecutive epochs that are averaged, and the sum of their errors.
@@ -142,11 +143,11 @@ impl SumError {
     /// Compares the sum of a complete epoch, in steps of Q7.8, with the expected one.
     pub(super) fn compare(&mut self, words: &[i32; MAX_JOINTS], saturated: bool, expected: &ExpectedSum) {
         if !expected.constant {
-            self.interrupt();
+            self.restart_average();
         }
         if saturated {
             self.saturated += expected.joints as u64;
-            return self.interrupt();
+            return self.restart_average();
         }
         let mut errors = [0.0; MAX_JOINTS];
         let compared = errors.iter_mut().zip(words).zip(expected.torque).zip(&mut self.sum);
@@ -162,12 +163,12 @@ impl SumError {
             for sum in sums.iter().take(expected.joints) {
                 self.averaged.add(sum / f64::from(AVERAGED_EPOCHS));
             }
-            self.interrupt();
+            self.restart_average();
         }
     }
 
     /// Restarts the average with the next epoch.
-    pub(super) const fn interrupt(&mut self) {
+    pub(super) const fn restart_average(&mut self) {
         (self.epochs, self.sum) = (0, [0.0; MAX_JOINTS]);
     }
 }
@@ -194,7 +195,7 @@ pub(super) enum SumUse {
 impl RootTotals {
     /// Records a root's sum for the epoch `lag` before the newest; `best` is the root's sum with the most cells for
     /// that epoch so far.
-    pub(super) fn record_sum(&mut self, lag: usize, best: &mut Option<Sum>, sum: Sum) -> SumUse {
+    pub(super) fn record_sum(&mut self, lag: usize, best: &mut Option<RootSum>, sum: RootSum) -> SumUse {
         let before = *best;
         match before {
             Some(_) => self.counts.resent += 1,
@@ -216,13 +217,13 @@ impl RootTotals {
     }
 
     /// Returns the number of cells due in the sum of the newest epoch; `None` if the contact of some cell is unknown.
-    pub(super) fn due(&self) -> Option<u32> {
+    pub(super) fn cells_due(&self) -> Option<u32> {
         self.epochs.first().copied().flatten().filter(|open| open.known).map(|open| open.due)
     }
 
     /// Starts an epoch in whose sum `due` cells should be. If `known`, no other cells can be in it. Ends the counting
     /// of the oldest epoch.
-    pub(super) fn open(&mut self, due: u32, known: bool, expected: Option<ExpectedSum>) {
+    pub(super) fn open_epoch(&mut self, due: u32, known: bool, expected: Option<ExpectedSum>) {
         self.epochs.rotate_right(1);
         if let Some(oldest) = self.epochs.first_mut() {
             let settled = oldest.replace(OpenEpoch {
@@ -234,13 +235,13 @@ impl RootTotals {
                 saturated: false,
                 expected,
             });
-            self.contributions.settle(settled);
+            self.contributions.count_epoch(settled);
         }
     }
 
     /// Ends the time for in-time sums of the newest epoch. Returns whether cells were due in its sum, and whether all
     /// of them arrived in time.
-    pub(super) fn close(&mut self) -> (bool, bool) {
+    pub(super) fn close_epoch(&mut self) -> (bool, bool) {
         self.error.last = None;
         let Some(Some(open)) = self.epochs.first_mut() else { return (false, false) };
         open.in_time = Some(open.received_cells);
@@ -252,7 +253,7 @@ impl RootTotals {
         {
             self.error.compare(&open.sum, open.saturated, expected);
         } else {
-            self.error.interrupt();
+            self.error.restart_average();
         }
         (open.due > 0, complete)
     }
@@ -260,13 +261,13 @@ impl RootTotals {
     /// Ends the run: ends the counting of all epochs.
     pub(super) fn finish(&mut self) {
         for open in &mut self.epochs {
-            self.contributions.settle(open.take());
+            self.contributions.count_epoch(open.take());
         }
     }
 }
 
 impl Contributions {
-    fn settle(&mut self, open: Option<OpenEpoch>) {
+    fn count_epoch(&mut self, open: Option<OpenEpoch>) {
         let Some(OpenEpoch { due, known, received_cells: came, in_time, .. }) = open else { return };
         let in_time = in_time.unwrap_or(came).min(due);
         let all = came.min(due);
@@ -288,7 +289,7 @@ mod tests {
         let of = |word: i16| {
             let mut words = [1; MAX_JOINTS];
             words[2] = word.into();
-            Sum { count: 3, words }.is_saturated()
+            RootSum { count: 3, words }.is_saturated()
         };
         let words = [0, i16::MAX, i16::MIN, i16::MAX - 1, i16::MIN + 1];
         assert_eq!(words.map(of), [false, true, true, false, false]);

@@ -5,7 +5,7 @@
 use protocol::message::SensorPage;
 use protocol::parameters::Events;
 use protocol::time::{Micros, Span};
-use protocol::touch::{Touch, contact_force};
+use protocol::touch::{TouchState, contact_force};
 
 /// Counts of the sensors frames of one cell.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -16,7 +16,7 @@ pub struct SensorFrames {
     pub touches: u64,
     /// Number of releases: the contact fell below the threshold minus the hysteresis.
     pub releases: u64,
-    contact: Touch,
+    contact: TouchState,
     /// Number of frames that the cell sent without a report command.
     unrequested: u64,
     /// Arrival times of the first and the last frame that was sent without a report command.
@@ -32,7 +32,7 @@ const MIN_RATE_SPAN: Span = Span::from_millis(1_000);
 
 impl SensorFrames {
     /// Records a report command: the cell answers with one page of each kind at once.
-    pub(super) const fn answer_report(&mut self) {
+    pub(super) const fn begin_report(&mut self) {
         self.requested = u8::MAX;
     }
 
@@ -55,13 +55,13 @@ impl SensorFrames {
         let SensorPage::Skin(skin) = page else { return };
         let before = self.contact;
         self.contact = before.next(contact_force(skin), events.contact.to_bits(), events.hysteresis);
-        self.touches += u64::from(before != Touch::Touched && self.contact == Touch::Touched);
-        self.releases += u64::from(before == Touch::Touched && self.contact != Touch::Touched);
+        self.touches += u64::from(before != TouchState::Touched && self.contact == TouchState::Touched);
+        self.releases += u64::from(before == TouchState::Touched && self.contact != TouchState::Touched);
     }
 
     /// Records a restart: the cell is not in contact, and this does not count as a release.
     pub(super) const fn restart(&mut self) {
-        self.contact = Touch::Free;
+        self.contact = TouchState::Free;
     }
 
     /// Returns the rate in Hz of the frames sent without a report command, from the first to the last; `None` for fewer
@@ -121,13 +121,13 @@ mod tests {
         let mut sensed = SensorFrames::default();
         for second in 0..10 {
             let at = Micros(second * 1_000_000);
-            sensed.answer_report();
+            sensed.begin_report();
             sensed.record(at, &skin(), &Events::default());
             sensed.record(Micros(at.0 + 1), &ACCELERATION, &Events::default());
         }
         assert_eq!((sensed.rate_hz(), sensed.frames), (None, 20));
         // The acceleration of the answer was lost, and the next one does not belong to it.
-        sensed.answer_report();
+        sensed.begin_report();
         sensed.record(Micros(0), &skin(), &Events::default());
         sensed.end_report();
         for at in [0, 1_000_000, 2_000_000] {

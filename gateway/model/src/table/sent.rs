@@ -23,12 +23,12 @@ struct CountsSince {
 
 impl SentJoints {
     /// Counts a broadcast.
-    pub(super) const fn count(&mut self) {
+    pub(super) const fn count_broadcast(&mut self) {
         self.since.joints += 1;
     }
 
     /// Sets the count to zero.
-    pub(super) const fn begin(&mut self) {
+    pub(super) const fn reset_count(&mut self) {
         self.since.joints = 0;
     }
 
@@ -41,7 +41,7 @@ impl SentJoints {
     }
 
     /// Confirms the last start, which can no longer be taken back.
-    pub(super) const fn confirm(&mut self) {
+    pub(super) const fn confirm_start(&mut self) {
         self.before = None;
     }
 

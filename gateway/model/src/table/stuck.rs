@@ -17,7 +17,7 @@ use protocol::packet::padded;
 use protocol::parameters::MAX_JOINTS;
 
 /// Number of equal words in a row from which a cell counts as stuck.
-const STUCK_RUN: u64 = 32;
+const MIN_STUCK_WORDS: u64 = 32;
 /// Minimum number of changes of the expected words during such a run.
 const MIN_EXPECTED_CHANGES: u32 = 4;
 /// Smallest change of an expected word that counts, in steps of the word.
@@ -64,7 +64,7 @@ impl WordRun {
     }
 
     const fn is_stuck(&self) -> bool {
-        self.run_length >= STUCK_RUN && self.changes >= MIN_EXPECTED_CHANGES
+        self.run_length >= MIN_STUCK_WORDS && self.changes >= MIN_EXPECTED_CHANGES
     }
 }
 
@@ -77,7 +77,7 @@ impl StuckDetector {
     /// Compares a sensors page of the cell with the page `right` that stimuli set. Pages of different kinds are not
     /// compared.
     pub(super) fn compare_page(&mut self, sent: &SensorPage, right: &SensorPage) {
-        let page = sent.simulated().filter(|page| right.simulated() == Some(*page));
+        let page = sent.simulated_index().filter(|page| right.simulated_index() == Some(*page));
         if let Some(words) = page.and_then(|page| self.pages.get_mut(page)) {
             words.compare(padded(&sent.words()), padded(&right.words()));
         }

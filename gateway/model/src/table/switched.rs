@@ -49,7 +49,9 @@ impl SwitchStates {
         let (of, words) = match *answer {
             Answer::Value { number, written: true, words } => (number, Some(words)),
             // A cell without the option can only have zeros.
-            Answer::Refused { number, reason: Answer::UNKNOWN_PARAMETER | Answer::INVALID } => (number, None),
+            Answer::Refused { number, reason: Answer::UNKNOWN_PARAMETER | Answer::INVALID_WORDS } => {
+                (number, None)
+            }
             Answer::Value { .. } | Answer::Refused { .. } => return,
         };
         if let (Some(words), true) = (words, of == Parameter::Baseline.number()) {

@@ -8,8 +8,8 @@ use protocol::packet::{self, Packet};
 use protocol::parameters::Parameter;
 
 /// Returns a table that received these messages in the frames of the bus, from the gateway itself or from a cell.
-fn table(heard: &[(bool, Message)]) -> Table {
-    let mut table = Table::new(&crate::testing::skin(), 0);
+fn table(heard: &[(bool, Message)]) -> BusTable {
+    let mut table = BusTable::new(&crate::testing::skin(), 0);
     for (own, message) in heard {
         let packet: Packet = message.encode();
         for frame in packet.frames(Format::Fd) {
@@ -24,7 +24,7 @@ fn what_is_no_packet_is_rejected_with_a_cells_identifier_and_foreign_with_an_unu
     let mut skin = crate::testing::skin();
     for format in [Format::Fd, Format::Classic] {
         skin.buses[0].format = format;
-        let mut table = Table::new(&skin, 0);
+        let mut table = BusTable::new(&skin, 0);
         let mut hear = |id, byte, at| {
             let data = [byte; 16];
             let (length, flags) = if format == Format::Fd { (16, 1) } else { (8, 0) };
@@ -50,7 +50,7 @@ fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
     let joints =
         |epoch| Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } };
     let torque = |epoch| Message::Torque { from: cell, epoch: Epoch(epoch), torque: [i16::MAX; 6].into() };
-    let hear = |table: &mut Table, own, message: Message| {
+    let hear = |table: &mut BusTable, own, message: Message| {
         for frame in message.encode().frames(Format::Fd) {
             table.handle_frame(Micros(0), own, &frame, &mut |_| None);
         }
@@ -60,7 +60,7 @@ fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
         let mut table = table(&[(true, joints(1)), (false, torque(1))]);
         assert_eq!(table.snapshot().sums.contributing, 1);
         if interrupted {
-            table.interrupt();
+            table.handle_bus_loss();
             assert_eq!(table.snapshot().sums.contributing, 1, "the loop lets it decay");
         }
         let after = hear(&mut table, true, joints(next));
@@ -82,9 +82,11 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
     };
     let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    let press =
-        (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page });
-    let hear = |table: &mut Table, heard: &[(bool, Message)]| {
+    let press = (
+        true,
+        Message::Stimulus { to: Node::Cell(cell), from: protocol::message::StimulusStart::Next, page },
+    );
+    let hear = |table: &mut BusTable, heard: &[(bool, Message)]| {
         for (own, message) in heard {
             for frame in message.encode().frames(Format::Fd) {
                 table.handle_frame(Micros(0), *own, &frame, &mut |_| None);
@@ -103,7 +105,7 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
         },
     );
     assert_eq!(hear(&mut table, &[heartbeat(1), untouched, press, joints(1), joints(2)]), (2, 0, 0));
-    table.interrupt();
+    table.handle_bus_loss();
     // The cell may return later than the bus, and so may have missed this stimulus.
     assert_eq!(hear(&mut table, &[joints(3), press, joints(4)]), (2, 2, 2));
     assert_eq!(table.notices().count(), 0);
@@ -140,11 +142,13 @@ fn a_start_that_was_none_takes_no_counters_that_explain_missing_replies() {
     };
     let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    let press =
-        (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page });
+    let press = (
+        true,
+        Message::Stimulus { to: Node::Cell(cell), from: protocol::message::StimulusStart::Next, page },
+    );
     let mut table = table(&[]);
     let mut ms = 0;
-    let mut hear = |table: &mut Table, heard: &[(bool, Message)]| {
+    let mut hear = |table: &mut BusTable, heard: &[(bool, Message)]| {
         for (own, message) in heard {
             ms += 10;
             for frame in message.encode().frames(Format::Fd) {
@@ -202,7 +206,8 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
     };
     let settled = State::CONFIGURED.with(State::TEST_MODE, true);
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    let press = Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page };
+    let press =
+        Message::Stimulus { to: Node::Cell(cell), from: protocol::message::StimulusStart::Next, page };
     let joints = |epoch| {
         let joints = Joints { in_use: 6, ..Joints::default() };
         (true, Message::Joints { epoch: Epoch(epoch), joints })
@@ -237,7 +242,7 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
 fn heartbeats_say_for_how_long_joints_were_not_taken() {
     let cell = CellId::new(1).unwrap();
     let joints = |epoch| Message::Joints { epoch, joints: Joints { in_use: 6, ..Joints::default() } };
-    let mut table = Table::new(&crate::testing::skin(), 0);
+    let mut table = BusTable::new(&crate::testing::skin(), 0);
     let mut hear = |at_ms: u64, message: Message| {
         let own = matches!(message, Message::Joints { .. });
         for frame in message.encode().frames(Format::Fd) {
@@ -287,7 +292,7 @@ fn a_cell_is_active_stale_or_quiet_by_the_torque_that_is_held() {
 
 /// A cell that started before the gateway, with a stimulus from another sender that did not arrive here.
 struct There {
-    table: Table,
+    table: BusTable,
     epoch: u8,
 }
 
@@ -331,7 +336,7 @@ impl There {
     }
 
     fn stimulate(&mut self, newtons: f64) {
-        let from = protocol::message::AppliesFrom::Next;
+        let from = protocol::message::StimulusStart::Next;
         let page = Self::press(newtons);
         self.hear(true, &Message::Stimulus { to: Node::Cell(Self::cell()), from, page });
     }

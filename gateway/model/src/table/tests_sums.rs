@@ -3,7 +3,9 @@
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, ReceivedCounts, SensorPage, State, Tree};
+use protocol::message::{
+    Joints, Message, NetworkPage, ReceivedCounts, SensorPage, State, StimulusStart, TreePage,
+};
 use protocol::packet::{self, Length, Words};
 use protocol::time::Span;
 
@@ -25,7 +27,7 @@ fn skin() -> Skin {
 const NEIGHBORS: [&str; 4] = ["[3, 0, 0, 0]", "[0, 0, 0, 0]", "[1, 4, 0, 0]", "[3, 0, 0, 0]"];
 
 struct Bench {
-    table: Table,
+    table: BusTable,
     at: u64,
 }
 
@@ -36,7 +38,7 @@ fn cell(node: i64) -> CellId {
 impl Bench {
     /// All cells are ready, some of them pressed with 1 N in each contact word.
     fn new(pressed: &[i64]) -> Self {
-        let mut bench = Self { table: Table::new(&skin(), 0), at: 0 };
+        let mut bench = Self { table: BusTable::new(&skin(), 0), at: 0 };
         bench.table.set_comparing(true);
         for node in 1..=4 {
             bench.heartbeat(node, 0, State::default());
@@ -69,7 +71,7 @@ impl Bench {
     fn press(&mut self, node: i64, newtons: f64) {
         let contact = [Q5_10::nearest(newtons); 3];
         let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-        self.say(true, Message::Stimulus { to: Node::Cell(cell(node)), from: AppliesFrom::Next, page });
+        self.say(true, Message::Stimulus { to: Node::Cell(cell(node)), from: StimulusStart::Next, page });
     }
 
     fn joints(&mut self, epoch: u8) -> BusTotals {
@@ -147,7 +149,7 @@ fn contributions_in_time_late_and_missing_add_up_to_those_due() {
 #[test]
 fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_releases_it() {
     let mut bench = Bench::new(&[3, 4]);
-    let Safety { hold_epochs, decay_epochs, .. } = skin().safety;
+    let SafetyLimits { hold_epochs, decay_epochs, .. } = skin().safety;
     bench.joints(0);
     bench.sum(1, 0, 2, 64);
     bench.sum(2, 0, 1, 100);
@@ -213,13 +215,13 @@ fn a_root_below_another_cell_is_in_that_ones_sum() {
     bench.joints(0);
     bench.sum(1, 0, 3, 30);
     assert_eq!(first(&bench.sum(2, 0, 1, 10)), (40.0, 4));
-    bench.table.set_feeds(cell(2), false);
+    bench.table.set_root_feeds_gateway(cell(2), false);
     assert_eq!(first(&bench.table.snapshot().sums), (30.0, 3), "it is about to come with the first one's");
     bench.joints(1);
     bench.sum(2, 1, 1, 10);
     assert_eq!(first(&bench.sum(1, 1, 4, 41)), (41.0, 4));
     assert_eq!((bench.counts().overheard, bench.counts().first), (1, 3));
-    bench.table.set_feeds(cell(2), true);
+    bench.table.set_root_feeds_gateway(cell(2), true);
     bench.joints(2);
     bench.sum(1, 2, 3, 31);
     assert_eq!(first(&bench.sum(2, 2, 1, 9)), (40.0, 4));
@@ -242,7 +244,7 @@ fn a_halt_releases_sums_and_no_cell_is_due() {
 fn the_error_of_whole_sums_is_taken_of_complete_epochs_only_and_averaged_over_32() {
     let mut bench = Bench::new(&[1, 3]);
     let skin = skin();
-    let central = Central::new(&skin);
+    let central = CentralComputation::new(&skin);
     let page = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
     let frames = central.frames(&[Q1_14::ZERO; 6]);
     let one = central.torque(0, &frames, central.force(0, &page));
@@ -272,7 +274,7 @@ fn sums_that_may_contain_a_cell_of_unknown_contact_are_not_compared() {
         let mut bench = Bench::new(pressed);
         if unknown {
             // Cell 4 returns from an outage: it may have received stimuli from other senders.
-            bench.table.interrupt_cells(|it| it == cell(4));
+            bench.table.handle_unreachable_cells(|it| it == cell(4));
             bench.heartbeat(4, 0, State::default());
         }
         bench.joints(0);
@@ -292,7 +294,7 @@ fn sums_that_may_contain_a_cell_of_unknown_contact_are_not_compared() {
 fn packets_that_the_gateway_does_not_receive_are_counted_by_their_sender() {
     let mut bench = Bench::new(&[]);
     bench.table.receive_root_sums_only();
-    let tree = |sent| NetworkPage::Tree(Tree { sent, ..Tree::default() });
+    let tree = |sent| NetworkPage::Tree(TreePage { sent, ..TreePage::default() });
     let page = |bench: &mut Bench, sent| {
         let from = Node::Cell(cell(3));
         bench.say(false, Message::Network { from, epoch: Epoch(0), page: tree(sent) });
@@ -312,7 +314,7 @@ fn packets_that_the_gateway_does_not_receive_are_counted_by_their_sender() {
 #[test]
 fn the_network_is_of_all_cells_that_are_described_or_heard() {
     let mut bench = Bench::new(&[]);
-    let tree = Tree { parent: Some(1), depth: 1, ..Tree::default() };
+    let tree = TreePage { parent: Some(1), depth: 1, ..TreePage::default() };
     let page = NetworkPage::Tree(tree);
     bench.say(false, Message::Network { from: Node::Cell(cell(3)), epoch: Epoch(0), page });
     bench.heartbeat(9, 0, State::default());

@@ -10,7 +10,7 @@
 //!   129 joints; then a stimulus, or the cell's page ──> earlier stimuli are latched and replaced
 //! ```
 
-use protocol::message::{AppliesFrom, Readings, SensorPage, SkinSensors};
+use protocol::message::{SensorPage, SensorReadings, SkinSensors, StimulusStart};
 use protocol::packet::Epoch;
 
 /// Maximum number of pending stimuli in a cell.
@@ -20,7 +20,7 @@ pub const MAX_PENDING_STIMULI: usize = 8;
 /// as its time or its frames.
 #[derive(Clone, Debug)]
 pub struct ContactState<T> {
-    pending: Vec<(AppliesFrom, SensorPage, T)>,
+    pending: Vec<(StimulusStart, SensorPage, T)>,
     skin: Option<(SkinSensors, T)>,
     /// The other pages, by [`SensorPage::simulated`].
     others: [Option<(SensorPage, T)>; SensorPage::SIMULATED.len()],
@@ -85,10 +85,10 @@ impl<T> Default for ContactState<T> {
 impl<T> ContactState<T> {
     /// Adds a stimulus to the pending ones, unless the cell measures or has too many pending; `last` is the epoch of
     /// the last joints.
-    pub fn push(&mut self, from: AppliesFrom, page: SensorPage, tag: T, last: Option<Epoch>) {
+    pub fn push(&mut self, from: StimulusStart, page: SensorPage, tag: T, last: Option<Epoch>) {
         self.received_stimuli = self.received_stimuli.map(|came| came.wrapping_add(1));
         if self.obeys != Some(false) && self.pending.len() < MAX_PENDING_STIMULI {
-            self.pending.push((if is_late(from, last) { AppliesFrom::Next } else { from }, page, tag));
+            self.pending.push((if is_late(from, last) { StimulusStart::Next } else { from }, page, tag));
         }
     }
 
@@ -97,16 +97,16 @@ impl<T> ContactState<T> {
     pub fn latch(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
         self.unseen.latch(epoch);
         self.has_missed_stimuli &= self.unseen != UnseenStimuli::None;
-        let is_due = move |(from, _, _): &mut (AppliesFrom, SensorPage, T)| match from {
-            AppliesFrom::Next => true,
-            AppliesFrom::Epoch(first) => epoch.epochs_since(*first) >= 0,
+        let is_due = move |(from, _, _): &mut (StimulusStart, SensorPage, T)| match from {
+            StimulusStart::Next => true,
+            StimulusStart::Epoch(first) => epoch.epochs_since(*first) >= 0,
         };
         for (_, page, mut tag) in self.pending.extract_if(.., is_due) {
             latched(&mut tag);
             if let SensorPage::Skin(skin) = page {
                 self.skin = Some((skin, tag));
                 self.is_known |= self.unseen == UnseenStimuli::None;
-            } else if let Some(other) = other(&mut self.others, &page) {
+            } else if let Some(other) = other_page_slot(&mut self.others, &page) {
                 *other = Some((page, tag));
             }
         }
@@ -122,7 +122,7 @@ impl<T> ContactState<T> {
             } else if !self.has_missed_stimuli {
                 self.skin.get_or_insert((skin, tag));
             }
-        } else if let Some(other) = other(&mut self.others, &page) {
+        } else if let Some(other) = other_page_slot(&mut self.others, &page) {
             other.get_or_insert((page, tag));
         }
     }
@@ -138,14 +138,14 @@ impl<T> ContactState<T> {
     }
 
     /// Records a start of the cell: it is not in contact, and has no pending stimulus.
-    pub fn start(&mut self, tag: T) {
+    pub fn record_start(&mut self, tag: T) {
         self.reset();
         self.mark_known(tag);
     }
 
     /// Records a write of the mode. Once the cell has received it, the cell has no contact state and no pending
     /// stimuli.
-    pub fn write_mode(&mut self) {
+    pub fn record_mode_write(&mut self) {
         self.reset();
         self.mode_pending = true;
     }
@@ -166,14 +166,14 @@ impl<T> ContactState<T> {
 
     /// Returns the skin sensors of the cell if they are certain.
     #[must_use]
-    pub fn known(&self) -> Option<&(SkinSensors, T)> {
+    pub fn certain_skin(&self) -> Option<&(SkinSensors, T)> {
         self.skin.as_ref().filter(|_| self.is_known)
     }
 
     /// Returns the skin sensors of the cell by the stimuli and pages received here; older stimuli may have changed
     /// them.
     #[must_use]
-    pub const fn skin(&self) -> Option<&(SkinSensors, T)> {
+    pub const fn presumed_skin(&self) -> Option<&(SkinSensors, T)> {
         self.skin.as_ref()
     }
 
@@ -185,15 +185,15 @@ impl<T> ContactState<T> {
 
     /// Returns the values of all latched or reported pages, and the default of others.
     #[must_use]
-    pub fn readings(&self) -> Readings {
-        let mut readings = Readings::default();
+    pub fn readings(&self) -> SensorReadings {
+        let mut readings = SensorReadings::default();
         self.latched().for_each(|(page, _)| readings.set(&page));
         readings
     }
 
     /// Returns the pending stimuli in order, each with the joints at which the cell latches it.
     #[must_use]
-    pub fn pending(&self) -> &[(AppliesFrom, SensorPage, T)] {
+    pub fn pending(&self) -> &[(StimulusStart, SensorPage, T)] {
         &self.pending
     }
 
@@ -206,7 +206,7 @@ impl<T> ContactState<T> {
     }
 
     /// Marks the contact state as unknown until the next stimulus; stimuli stay pending in the cell.
-    pub fn forget(&mut self) {
+    pub fn mark_unknown(&mut self) {
         (self.skin, self.others) = (None, [const { None }; SensorPage::SIMULATED.len()]);
         (self.is_known, self.received_stimuli) = (false, None);
     }
@@ -214,29 +214,29 @@ impl<T> ContactState<T> {
     /// Returns true if the cell is in test mode and obeys stimuli; `None` if unknown, in which case callers assume that
     /// it does.
     #[must_use]
-    pub const fn obeys(&self) -> Option<bool> {
+    pub const fn obeys_stimuli(&self) -> Option<bool> {
         self.obeys
     }
 
     /// Sets whether the cell obeys stimuli or measures from now on.
-    pub const fn set_obeys(&mut self, obeys: bool) {
+    pub const fn set_obeys_stimuli(&mut self, obeys: bool) {
         self.obeys = Some(obeys);
     }
 }
 
 /// Returns the place of a page; `None` for a baseline, which belongs to the computation and is not a reading.
-fn other<'a, T>(
+fn other_page_slot<'a, T>(
     others: &'a mut [Option<(SensorPage, T)>],
     page: &SensorPage,
 ) -> Option<&'a mut Option<(SensorPage, T)>> {
-    others.get_mut(page.simulated()?)
+    others.get_mut(page.simulated_index()?)
 }
 
 /// Returns true if the joints from which a stimulus should apply have passed, so that it applies from the next ones.
 /// `last` is the epoch of the last joints.
 #[must_use]
-pub fn is_late(from: AppliesFrom, last: Option<Epoch>) -> bool {
-    matches!((from, last), (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0)
+pub fn is_late(from: StimulusStart, last: Option<Epoch>) -> bool {
+    matches!((from, last), (StimulusStart::Epoch(first), Some(last)) if last.epochs_since(first) >= 0)
 }
 
 #[cfg(test)]
@@ -250,15 +250,15 @@ mod tests {
 
     fn latch(contact: &mut ContactState<u64>, epoch: u8) -> Option<(f64, u64)> {
         contact.latch(Epoch(epoch), |_| {});
-        contact.skin().map(|(skin, tag)| (skin.contact[0].to_f64(), *tag))
+        contact.presumed_skin().map(|(skin, tag)| (skin.contact[0].to_f64(), *tag))
     }
 
     #[test]
     fn stimuli_wait_for_their_epoch_and_late_ones_for_the_next() {
         let mut contact = ContactState::default();
         assert_eq!(latch(&mut contact, 253), None, "not known");
-        contact.push(AppliesFrom::Epoch(Epoch(1)), press(2.0), 5, Some(Epoch(253)));
-        contact.push(AppliesFrom::Epoch(Epoch(253)), press(1.0), 6, Some(Epoch(253)));
+        contact.push(StimulusStart::Epoch(Epoch(1)), press(2.0), 5, Some(Epoch(253)));
+        contact.push(StimulusStart::Epoch(Epoch(253)), press(1.0), 6, Some(Epoch(253)));
         assert_eq!(latch(&mut contact, 254), Some((1.0, 6)), "late, so from the next on");
         assert_eq!(latch(&mut contact, 0), Some((1.0, 6)));
         assert_eq!(latch(&mut contact, 1), Some((2.0, 5)));
@@ -270,9 +270,9 @@ mod tests {
     fn the_ninth_waiting_stimulus_is_refused_whatever_its_page() {
         let mut contact = ContactState::default();
         for _ in 0..MAX_PENDING_STIMULI {
-            contact.push(AppliesFrom::Next, SensorPage::Acceleration([Q3_12::ZERO; 3]), 0, None);
+            contact.push(StimulusStart::Next, SensorPage::Acceleration([Q3_12::ZERO; 3]), 0, None);
         }
-        contact.push(AppliesFrom::Next, press(1.0), 0, None);
+        contact.push(StimulusStart::Next, press(1.0), 0, None);
         assert_eq!(contact.pending().len(), MAX_PENDING_STIMULI);
         assert_eq!(latch(&mut contact, 0), None);
         assert_eq!(contact.latched().count(), 1);
@@ -283,21 +283,21 @@ mod tests {
         let mut contact = ContactState::default();
         contact.apply_reported_page(press(3.0), 1);
         assert_eq!(latch(&mut contact, 0), Some((3.0, 1)));
-        contact.push(AppliesFrom::Next, press(1.0), 2, None);
+        contact.push(StimulusStart::Next, press(1.0), 2, None);
         assert_eq!(latch(&mut contact, 1), Some((1.0, 2)));
         contact.apply_reported_page(press(3.0), 3);
         assert_eq!(latch(&mut contact, 2), Some((1.0, 2)), "an old page");
     }
 
     fn known(contact: &ContactState<u64>) -> Option<f64> {
-        contact.known().map(|(skin, _)| skin.contact[0].to_f64())
+        contact.certain_skin().map(|(skin, _)| skin.contact[0].to_f64())
     }
 
     #[test]
     fn a_contact_is_known_from_a_start_a_confirmed_mode_or_equal_counts_on() {
         let mut contact = ContactState::default();
         contact.apply_reported_page(press(3.0), 1);
-        contact.push(AppliesFrom::Next, press(1.0), 1, None);
+        contact.push(StimulusStart::Next, press(1.0), 1, None);
         assert_eq!((latch(&mut contact, 1), known(&contact)), (Some((1.0, 1)), None), "others may wait");
         contact.compare_count(2, 1);
         assert_eq!(known(&contact), None, "it has taken one that did not come here");
@@ -306,17 +306,17 @@ mod tests {
         contact.reset();
         contact.compare_count(1, 1);
         assert_eq!(known(&contact), None, "the count is of stimuli that are forgotten");
-        contact.start(1);
+        contact.record_start(1);
         assert_eq!(known(&contact), Some(0.0));
-        contact.write_mode();
-        contact.push(AppliesFrom::Next, press(2.0), 1, None);
+        contact.record_mode_write();
+        contact.push(StimulusStart::Next, press(2.0), 1, None);
         assert_eq!((latch(&mut contact, 2), known(&contact)), (Some((2.0, 1)), None), "not confirmed");
         contact.confirm_mode(1);
         assert_eq!(known(&contact), Some(2.0), "the stimulus came after the write");
-        contact.forget();
+        contact.mark_unknown();
         contact.confirm_mode(1);
         assert_eq!(known(&contact), None, "nothing was written");
-        contact.push(AppliesFrom::Next, press(1.0), 1, None);
+        contact.push(StimulusStart::Next, press(1.0), 1, None);
         assert_eq!((latch(&mut contact, 3), known(&contact)), (Some((1.0, 1)), Some(1.0)));
         contact.reset();
         contact.confirm_mode(1);
@@ -357,27 +357,27 @@ mod tests {
         contact.compare_count(1, 1);
         contact.apply_reported_page(press(0.0), 1);
         assert_eq!(latch(&mut contact, 1), None, "the other one may wait");
-        contact.push(AppliesFrom::Next, press(1.0), 2, None);
+        contact.push(StimulusStart::Next, press(1.0), 2, None);
         assert_eq!(latch(&mut contact, 2), Some((1.0, 2)));
     }
 
     #[test]
     fn a_cell_that_measures_takes_no_stimuli() {
         let mut contact = ContactState::default();
-        assert_eq!(contact.obeys(), None);
-        contact.set_obeys(false);
-        assert_eq!(contact.obeys(), Some(false));
-        contact.push(AppliesFrom::Next, press(1.0), 1, None);
+        assert_eq!(contact.obeys_stimuli(), None);
+        contact.set_obeys_stimuli(false);
+        assert_eq!(contact.obeys_stimuli(), Some(false));
+        contact.push(StimulusStart::Next, press(1.0), 1, None);
         assert_eq!(latch(&mut contact, 0), None);
     }
 
     #[test]
     fn a_stimulus_is_late_at_its_own_joints_and_after_them() {
-        let of = |first, last: Option<u8>| is_late(AppliesFrom::Epoch(Epoch(first)), last.map(Epoch));
+        let of = |first, last: Option<u8>| is_late(StimulusStart::Epoch(Epoch(first)), last.map(Epoch));
         assert_eq!(
             [of(5, Some(4)), of(5, Some(5)), of(255, Some(1)), of(5, None)],
             [false, true, true, false]
         );
-        assert!(!is_late(AppliesFrom::Next, Some(Epoch(5))));
+        assert!(!is_late(StimulusStart::Next, Some(Epoch(5))));
     }
 }

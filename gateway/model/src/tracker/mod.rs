@@ -34,7 +34,7 @@ pub const MAX_LATE_EPOCHS: usize = 3;
 
 /// The effect of a packet on a cell's state.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Update {
+pub struct CellUpdate {
     /// The meaning of the packet as a heartbeat, if it is one.
     pub word: Option<HeartbeatKind>,
     /// True if the cell counted as dead before the packet.
@@ -58,21 +58,23 @@ pub struct CellTracker {
 
 impl CellTracker {
     /// Records a packet that arrived at `at`, and returns its effect; `joints` is the number of the newest joints.
-    pub fn receive(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> Update {
+    pub fn receive(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> CellUpdate {
         let is_first = self.last_packet.replace(at).is_none();
         let revived = core::mem::take(&mut self.dead);
         self.account.count_packet();
-        let Message::Network { page, .. } = message else { return Update { revived, ..Update::default() } };
+        let Message::Network { page, .. } = message else {
+            return CellUpdate { revived, ..CellUpdate::default() };
+        };
         let NetworkPage::Heartbeat(heartbeat) = page else {
             self.pages.record(page);
             if let NetworkPage::Tree(tree) = page {
-                self.account.sums_sent(tree.sent, joints);
+                self.account.record_sums_sent(tree.sent, joints);
             }
-            return Update { revived, ..Update::default() };
+            return CellUpdate { revived, ..CellUpdate::default() };
         };
         let away = self.account.is_interrupted();
         if !self.claim.is_in_question(at) {
-            self.account.confirm();
+            self.account.confirm_start();
         }
         let mut word = self.claim.receive(at, heartbeat);
         if let HeartbeatKind::Started { again } = &mut word {
@@ -80,27 +82,27 @@ impl CellTracker {
         }
         let mut taken_back = false;
         match word {
-            HeartbeatKind::Continued => self.account.settle(heartbeat.sent),
-            HeartbeatKind::First => self.account.begin(heartbeat.sent, false),
+            HeartbeatKind::Continued => self.account.record_heartbeat(heartbeat.sent),
+            HeartbeatKind::First => self.account.record_start(heartbeat.sent, false),
             HeartbeatKind::Shared => {
-                taken_back = self.account.take_back(heartbeat.sent);
+                taken_back = self.account.revoke_start(heartbeat.sent);
                 // Some pages may be from the other sender.
                 self.pages = NetworkPages::default();
             }
             HeartbeatKind::Started { again } => {
-                self.account.begin(heartbeat.sent, again);
+                self.account.record_start(heartbeat.sent, again);
                 self.pages = NetworkPages::default();
             }
             HeartbeatKind::Overtaken => self.account.count_overtaken(),
             HeartbeatKind::Claimant | HeartbeatKind::Outsider => self.account.count_outsider(),
         }
-        self.account.heartbeat_at(joints);
+        self.account.set_joints_at_heartbeat(joints);
         let returned = away
             && matches!(
                 word,
                 HeartbeatKind::First | HeartbeatKind::Continued | HeartbeatKind::Started { again: false }
             );
-        Update { word: Some(word), revived, returned, taken_back }
+        CellUpdate { word: Some(word), revived, returned, taken_back }
     }
 
     /// Returns the owner of the node id, and its last heartbeat.

@@ -79,8 +79,8 @@ impl UplinkAccount {
     }
 
     /// Records that the bus was lost: packets of the cell do not arrive until its next heartbeat.
-    pub fn interrupt(&mut self) {
-        self.each(|counts| counts.interrupted = true);
+    pub fn handle_connection_loss(&mut self) {
+        self.change_counts(|counts| counts.interrupted = true);
     }
 
     /// Returns true if the bus was lost since the cell's last heartbeat, so that the cell may still be disconnected.
@@ -91,12 +91,12 @@ impl UplinkAccount {
 
     /// Counts a packet that arrived.
     pub(super) fn count_packet(&mut self) {
-        self.each(|counts| counts.arrived += 1);
+        self.change_counts(|counts| counts.arrived += 1);
     }
 
     /// Counts an unusable frame with this cell's identifier.
-    pub fn reject(&mut self) {
-        self.each(|counts| {
+    pub fn count_rejected(&mut self) {
+        self.change_counts(|counts| {
             counts.arrived += 1;
             counts.rejected += 1;
         });
@@ -104,17 +104,17 @@ impl UplinkAccount {
 
     /// Declares that the gateway does not receive this cell's sums.
     pub fn exclude_sums(&mut self) {
-        self.each(|counts| _ = counts.sums.get_or_insert_default());
+        self.change_counts(|counts| _ = counts.sums.get_or_insert_default());
     }
 
     /// Records the number of sums that the cell reports as sent, modulo 2^16; `joints` is the number of the newest
     /// joints.
-    pub(super) fn sums_sent(&mut self, reported: u16, joints: Option<u64>) {
-        self.now.sums_sent(reported, joints);
+    pub(super) fn record_sums_sent(&mut self, reported: u16, joints: Option<u64>) {
+        self.now.record_sums_sent(reported, joints);
     }
 
     /// Records the number of the newest joints at its heartbeat, after the account is settled.
-    pub(super) const fn heartbeat_at(&mut self, joints: Option<u64>) {
+    pub(super) const fn set_joints_at_heartbeat(&mut self, joints: Option<u64>) {
         if let Some(sums) = &mut self.now.sums {
             sums.heartbeat_at = joints;
         }
@@ -127,18 +127,18 @@ impl UplinkAccount {
 
     /// Records the first heartbeat since a start. The cell had sent `sent` packets before it, modulo 2^16; `again` is
     /// true if the cell was present before the start.
-    pub(super) fn begin(&mut self, sent: u16, again: bool) {
+    pub(super) fn record_start(&mut self, sent: u16, again: bool) {
         if again {
             self.before.get_or_insert(self.now);
         }
         self.before.iter_mut().for_each(Counts::count_outsider);
-        self.now.begin(sent, again);
+        self.now.record_start(sent, again);
     }
 
     /// Records a further heartbeat; the cell had sent `sent` packets before it, modulo 2^16.
-    pub(super) fn settle(&mut self, sent: u16) {
+    pub(super) fn record_heartbeat(&mut self, sent: u16) {
         self.before.iter_mut().for_each(Counts::count_outsider);
-        self.now.settle(sent);
+        self.now.record_heartbeat(sent);
     }
 
     /// Records a heartbeat that is older than the last one, since the cell's last start.
@@ -147,43 +147,43 @@ impl UplinkAccount {
     }
 
     /// Confirms the last start, which can no longer be taken back.
-    pub(super) const fn confirm(&mut self) {
+    pub(super) const fn confirm_start(&mut self) {
         self.before = None;
     }
 
     /// Records a heartbeat that continues the counts from before the last start, and so disproves that start. Returns
     /// true if the earlier counts are known.
-    pub(super) fn take_back(&mut self, sent: u16) -> bool {
+    pub(super) fn revoke_start(&mut self, sent: u16) -> bool {
         let before = self.before.take();
         match before {
             Some(before) => {
                 self.now = before;
-                self.now.settle(sent);
+                self.now.record_heartbeat(sent);
             }
-            None => self.now.begin(sent, false),
+            None => self.now.record_start(sent, false),
         }
         before.is_some()
     }
 
     /// Returns true if the last start may still be taken back.
     #[must_use]
-    pub const fn is_in_question(&self) -> bool {
+    pub const fn is_start_in_doubt(&self) -> bool {
         self.before.is_some()
     }
 
     /// Records that the last heartbeat is from another sender with this node id.
     pub(super) fn count_outsider(&mut self) {
-        self.each(Counts::count_outsider);
+        self.change_counts(Counts::count_outsider);
     }
 
-    fn each(&mut self, change: impl Fn(&mut Counts)) {
+    fn change_counts(&mut self, change: impl Fn(&mut Counts)) {
         change(&mut self.now);
         self.before.iter_mut().for_each(change);
     }
 }
 
 impl Counts {
-    fn sums_sent(&mut self, reported: u16, joints: Option<u64>) {
+    fn record_sums_sent(&mut self, reported: u16, joints: Option<u64>) {
         let Some(sums) = &mut self.sums else { return };
         let before = sums.reported.replace(reported).unwrap_or(reported);
         sums.count += u64::from(reported.wrapping_sub(before));
@@ -201,7 +201,7 @@ impl Counts {
         sums.count = sums.count.max(sums.found);
     }
 
-    fn begin(&mut self, sent: u16, again: bool) {
+    fn record_start(&mut self, sent: u16, again: bool) {
         if again {
             self.total.restarts += 1;
             self.finish();
@@ -218,8 +218,8 @@ impl Counts {
         self.rejected = 0;
     }
 
-    fn settle(&mut self, sent: u16) {
-        let Some(before) = self.reported else { return self.begin(sent, false) };
+    fn record_heartbeat(&mut self, sent: u16) {
+        let Some(before) = self.reported else { return self.record_start(sent, false) };
         let reported = sent.wrapping_add(1);
         let (arrived, rejected) = (core::mem::take(&mut self.arrived), core::mem::take(&mut self.rejected));
         let sent = u64::from(reported.wrapping_sub(before));
@@ -251,19 +251,19 @@ mod tests {
     fn packets_that_did_not_arrive_by_the_next_heartbeat_are_lost() {
         let mut account = UplinkAccount::default();
         account.count_packet();
-        account.begin(65_534, false);
+        account.record_start(65_534, false);
         account.count_packet();
-        account.reject();
+        account.count_rejected();
         account.count_packet();
         account.count_outsider();
         account.count_packet(); // the heartbeat itself
-        account.settle(3); // four were sent in between, and this one
+        account.record_heartbeat(3); // four were sent in between, and this one
         let uplink = account.uplink();
         assert_eq!((uplink.sent, uplink.delivered, uplink.rejected, uplink.lost), (6, 4, 1, 2));
         assert_eq!(uplink.surplus, 1, "the claim of another cell");
         account.count_packet(); // a last packet
         account.count_packet(); // the claim after its restart
-        account.begin(0, true);
+        account.record_start(0, true);
         let uplink = account.uplink();
         assert_eq!((uplink.sent, uplink.lost, uplink.in_doubt), (7, 2, 1));
         assert_eq!((uplink.restarts, uplink.unsettled), (1, 0));
@@ -272,21 +272,21 @@ mod tests {
     #[test]
     fn packets_lost_in_an_outage_are_counted_as_such() {
         let mut account = UplinkAccount::default();
-        account.begin(0, false);
-        account.interrupt();
+        account.record_start(0, false);
+        account.handle_connection_loss();
         account.count_packet();
-        account.settle(5);
+        account.record_heartbeat(5);
         let lost =
             |account: &UplinkAccount| (account.uplink().sent, account.uplink().lost, account.uplink().outage);
         assert_eq!(lost(&account), (6, 4, 4));
         account.count_packet();
-        account.settle(8);
+        account.record_heartbeat(8);
         assert_eq!(lost(&account), (9, 6, 4), "the bus is back");
-        account.interrupt();
+        account.handle_connection_loss();
         account.count_packet();
-        account.begin(0, true);
+        account.record_start(0, true);
         account.count_packet();
-        account.settle(2);
+        account.record_heartbeat(2);
         assert_eq!(lost(&account), (12, 7, 4), "a restart begins a new account");
     }
 
@@ -294,16 +294,16 @@ mod tests {
     fn a_start_that_was_none_is_taken_back_with_all_that_came_since() {
         let mut account = UplinkAccount::default();
         account.count_packet();
-        account.begin(900, false);
+        account.record_start(900, false);
         account.count_packet(); // a torque
         account.count_packet();
-        account.begin(100, true); // an old heartbeat again
+        account.record_start(100, true); // an old heartbeat again
         account.count_packet(); // a torque
         account.count_packet();
-        account.settle(104); // another old one
+        account.record_heartbeat(104); // another old one
         assert_eq!(account.uplink().restarts, 1);
         account.count_packet();
-        account.take_back(904); // the cell's own: it sent three torques before it
+        account.revoke_start(904); // the cell's own: it sent three torques before it
         let uplink = account.uplink();
         assert_eq!((uplink.restarts, uplink.in_doubt, uplink.unsettled), (0, 0, 0));
         assert_eq!((uplink.sent, uplink.lost), (5, 1), "{uplink:?}");
@@ -317,14 +317,14 @@ mod tests {
             if !takes_sums { account.exclude_sums(); }
             for (said, arrived, rejected, what, sums) in said {
                 for _ in 0..arrived { account.count_packet(); }
-                for _ in 0..rejected { account.reject(); }
+                for _ in 0..rejected { account.count_rejected(); }
                 account.count_packet();
                 match what {
-                    0 => account.begin(said, true),
-                    1 => account.settle(said),
-                    _ => _ = account.take_back(said),
+                    0 => account.record_start(said, true),
+                    1 => account.record_heartbeat(said),
+                    _ => _ = account.revoke_start(said),
                 }
-                if let Some((sums, at)) = sums { account.sums_sent(sums, at); }
+                if let Some((sums, at)) = sums { account.record_sums_sent(sums, at); }
             }
             account.finish();
             let uplink = account.uplink();

@@ -1,6 +1,6 @@
 //! Writes the section on benches of up to ten thousand cells.
 
-use super::{ACTIVE_SHARE, BenchFigures, MIN_IN_TIME_SHARE, Scale, SizeFigures, cells_of};
+use super::{ACTIVE_SHARE, BenchFigures, MIN_IN_TIME_SHARE, ScaleMeasurements, SizeFigures, cells_of};
 use crate::distributed::{self, TickTimes};
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table, number};
 
@@ -14,8 +14,8 @@ const MAX_TICK_RATIO_SAME_BUSES: f64 = 1.2;
 
 /// Writes the section with figures, findings and a table.
 #[must_use]
-pub fn section(measured: &Scale) -> Section {
-    let Scale { sizes, ticks, beside } = measured;
+pub fn section(measured: &ScaleMeasurements) -> Section {
+    let ScaleMeasurements { sizes, ticks, beside } = measured;
     let most = sizes.last();
     Section::new("scale", "A bench over its cells")
         .text(format!(
@@ -30,11 +30,11 @@ pub fn section(measured: &Scale) -> Section {
              without threads, with every cell active, on as many buses for all numbers of cells; the central computation is \
              timed in the same rounds.",
         )
-        .figures(of_benches(sizes))
+        .figures(bench_figures(sizes))
         .figures([over_cells(ticks)])
-        .findings(most.map(of_most).into_iter().flatten())
-        .findings(of_ticks(sizes, beside))
-        .findings(distributed::of_share("active cell", ticks))
+        .findings(most.map(largest_bench_findings).into_iter().flatten())
+        .findings(tick_findings(sizes, beside))
+        .findings(distributed::slope_findings("active cell", ticks))
         .tables([table(sizes)])
 }
 
@@ -42,28 +42,28 @@ pub fn section(measured: &Scale) -> Section {
 type Curve<'a> = (&'a str, fn(&SizeFigures) -> f64);
 
 /// Returns a figure over the number of cells, with one curve for each element of the array.
-fn drawn<const N: usize>(
+fn figure_over_cells<const N: usize>(
     (name, title): (&str, &str),
     y: Axis,
     sizes: &[SizeFigures],
     series: [Curve<'_>; N],
 ) -> Figure {
-    let figure = Figure::new(format!("scale-{name}"), title, Axis::new("cells", ""), y).half();
+    let figure = Figure::new(format!("scale-{name}"), title, Axis::new("cells", ""), y).half_width();
     series.into_iter().fold(figure, |figure, (caption, value)| {
         let points = sizes.iter().map(|size| (cells_of(size), value(size)));
         figure.draw(caption, Shape::Line, points.collect())
     })
 }
 
-fn of_benches(sizes: &[SizeFigures]) -> [Figure; 7] {
+fn bench_figures(sizes: &[SizeFigures]) -> [Figure; 7] {
     [
-        drawn(
+        figure_over_cells(
             ("start", "From the start to the first joints"),
             Axis::new("time", "s"),
             sizes,
             [("none active", |size| size.quiet.start_s), ("5 % active", |size| size.active.start_s)],
         ),
-        drawn(
+        figure_over_cells(
             ("processor", "Processor, 5 % active"),
             Axis::new("processor", "cores"),
             sizes,
@@ -75,7 +75,7 @@ fn of_benches(sizes: &[SizeFigures]) -> [Figure; 7] {
                 ("cells", |size| size.active.cores[2]),
             ],
         ),
-        drawn(
+        figure_over_cells(
             ("memory", "Private memory, 5 % active"),
             Axis::new("memory", "MB"),
             sizes,
@@ -85,13 +85,13 @@ fn of_benches(sizes: &[SizeFigures]) -> [Figure; 7] {
                 ("the largest process of cells", |size| size.active.memory_mb[2]),
             ],
         ),
-        drawn(
+        figure_over_cells(
             ("tick", "Median of the distributed tick"),
             Axis::new("time in a tick", "µs"),
             sizes,
             [("none active", |size| size.quiet.tick_us), ("5 % active", |size| size.active.tick_us)],
         ),
-        drawn(
+        figure_over_cells(
             ("late", "Lateness of 99 % of the ticks"),
             Axis::new("late by at most", "µs"),
             sizes,
@@ -101,13 +101,13 @@ fn of_benches(sizes: &[SizeFigures]) -> [Figure; 7] {
                 ("an idle thread", |size| size.quiet.late_us[1]),
             ],
         ),
-        drawn(
+        figure_over_cells(
             ("replies", "Replies in time, 5 % active, at the highest rate that holds"),
             Axis::new("replies in time", "%").with_ends(0.0, 100.0),
             sizes,
             [("", |size| size.active.share() * 100.0)],
         ),
-        drawn(
+        figure_over_cells(
             ("rate", "The highest rate that holds, or the lowest tried"),
             Axis::new("rate", "Hz"),
             sizes,
@@ -127,36 +127,37 @@ fn over_cells(over: &TickTimes) -> Figure {
 }
 
 /// Returns the findings on the bench with the largest number of cells.
-fn of_most(size: &SizeFigures) -> Vec<Finding> {
+fn largest_bench_findings(size: &SizeFigures) -> Vec<Finding> {
     let SizeFigures { cells, hz, holds, quiet, active, .. } = size;
     let of = |what: &str| format!("{what}, {cells} cells");
     let BenchFigures { start_s, memory_mb, .. } = active;
     let at = format!("replies in time at {} Hz, 5 % active", number(*hz));
     let bar = format!("at least {} %, none unknown", MIN_IN_TIME_SHARE * 100.0);
     vec![
-        Finding::stated(of("from the start to the first joints"), (*start_s, "s")).at_most(MAX_START_S),
-        Finding::stated(of(&at), (active.share() * 100.0, "%")).with_requirement(bar, *holds),
-        Finding::stated(
+        Finding::new_unrated(of("from the start to the first joints"), (*start_s, "s")).at_most(MAX_START_S),
+        Finding::new_unrated(of(&at), (active.share() * 100.0, "%")).with_requirement(bar, *holds),
+        Finding::new_unrated(
             of("replies and packets missing for no known reason"),
             active.unknown + quiet.unknown,
         )
         .at_most(0.0),
-        Finding::stated(of("private memory of the gateway"), (memory_mb[0], "MB")).at_most(MAX_MEMORY_MB),
-        Finding::stated(of("processor, none active"), (quiet.cores.iter().sum::<f64>(), "cores")),
-        Finding::stated(of("processor, 5 % active"), (active.cores.iter().sum::<f64>(), "cores")),
+        Finding::new_unrated(of("private memory of the gateway"), (memory_mb[0], "MB"))
+            .at_most(MAX_MEMORY_MB),
+        Finding::new_unrated(of("processor, none active"), (quiet.cores.iter().sum::<f64>(), "cores")),
+        Finding::new_unrated(of("processor, 5 % active"), (active.cores.iter().sum::<f64>(), "cores")),
     ]
 }
 
 /// Compares the time of a tick with the most cells with that of a tick with the fewest.
-fn of_ticks(sizes: &[SizeFigures], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Finding> {
+fn tick_findings(sizes: &[SizeFigures], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Finding> {
     let (Some(fewest), Some(largest)) = (sizes.first(), sizes.last()) else { return Vec::new() };
     let (cells, buses, fewest_cells) = (largest.cells, largest.buses, fewest.cells);
     let beside = |what: &str| format!("distributed tick of {cells} cells by that of {fewest_cells}{what}");
     vec![
-        Finding::stated(beside(", without threads, all active"), most / few).at_most(MAX_TICK_RATIO),
-        Finding::stated(beside(&format!(" on {buses} buses too, the same way")), most / few_on_as_many)
+        Finding::new_unrated(beside(", without threads, all active"), most / few).at_most(MAX_TICK_RATIO),
+        Finding::new_unrated(beside(&format!(" on {buses} buses too, the same way")), most / few_on_as_many)
             .at_most(MAX_TICK_RATIO_SAME_BUSES),
-        Finding::stated(
+        Finding::new_unrated(
             beside(", medians of benches, 5 % active"),
             largest.active.tick_us / fewest.active.tick_us,
         ),

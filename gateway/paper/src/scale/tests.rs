@@ -4,7 +4,7 @@ use std::cell::Cell;
 
 use super::*;
 use crate::arm::Reply;
-use crate::moving::Run;
+use crate::moving::BenchRun;
 use analysis::report::figure::FindingVerdict;
 use model::scenario::Scenario;
 use protocol::skin::Skin;
@@ -26,13 +26,13 @@ impl Lab for FakeLab {
         self.clock.get()
     }
 
-    fn bench(&mut self, _: Reply, _: Effort) -> Result<Run, &'static str> {
+    fn run_bench(&mut self, _: Reply, _: Effort) -> Result<BenchRun, &'static str> {
         Err("no bench of the moving arm is asked for")
     }
 
-    fn scaled(&mut self, bench: &ScaleBench) -> Result<Value, &'static str> {
+    fn run_scaled_bench(&mut self, bench: &ScaleBench) -> Result<Value, &'static str> {
         self.ran.push(*bench);
-        Ok(summary(bench, bench.hz * count(bench.cells) <= self.most))
+        Ok(summary(bench, bench.hz * count_to_f64(bench.cells) <= self.most))
     }
 
     fn check_stopped(&mut self) -> Result<(), &'static str> {
@@ -42,7 +42,7 @@ impl Lab for FakeLab {
 
 /// Returns the summary of a bench. If `in_time` is false, half of the replies are late.
 pub(crate) fn summary(bench: &ScaleBench, in_time: bool) -> Value {
-    let due = if bench.active { count(touched_cells(bench.cells)) * bench.hz } else { 0.0 };
+    let due = if bench.active { count_to_f64(touched_cells(bench.cells)) * bench.hz } else { 0.0 };
     let bus = json!({
         "replies": { "due": due / 2.0, "in_time": if in_time { due / 2.0 } else { due / 4.0 }, "unknown": 0 },
         "uplink": { "unknown": 0 },
@@ -77,7 +77,7 @@ fn every_bench_has_a_skin_and_a_scenario_that_fits_it_and_a_name_of_its_own() {
 #[test]
 fn rates_are_tried_from_the_highest_until_one_holds() {
     let mut lab = made(500.0 * 62.5);
-    let found = |lab: &mut FakeLab, cells| size(lab, cells, FULL).unwrap();
+    let found = |lab: &mut FakeLab, cells| measure_size(lab, cells, FULL).unwrap();
     let small = found(&mut lab, 253);
     assert_eq!((small.buses, small.hz.to_string(), small.holds), (1, "62.5".to_owned(), true));
     assert_eq!(lab.ran.len(), 2, "one active and one quiet");
@@ -94,19 +94,19 @@ fn a_summary_is_added_up_over_its_buses() {
     let bench = ScaleBench { cells: 300, buses: 2, hz: 20.0, active: true, seconds: 1.0 };
     let figures = BenchFigures::from_summary(&summary(&bench, true));
     assert!((figures.due - 300.0).abs() < 1e-9 && (figures.share() - 1.0).abs() < 1e-9);
-    assert!(figures.done && figures.holds());
+    assert!(figures.done && figures.holds_rate());
     assert!((figures.memory_mb[0] - 102.4).abs() < 1e-9);
     let mut lost = summary(&bench, true);
     lost["buses"][1]["uplink"]["unknown"] = json!(1);
-    assert!(!BenchFigures::from_summary(&lost).holds(), "a packet is missing for no known reason");
+    assert!(!BenchFigures::from_summary(&lost).holds_rate(), "a packet is missing for no known reason");
     let halted = json!({ "outcome": "halted" });
-    assert!(!BenchFigures::from_summary(&halted).holds());
+    assert!(!BenchFigures::from_summary(&halted).holds_rate());
 }
 
 #[test]
 fn bars_are_rated_by_what_was_measured() {
     let mut measured = measure(&mut made(1e9), Effort::Quick).unwrap();
-    let rated = |measured: &Scale, what: &str| {
+    let rated = |measured: &ScaleMeasurements, what: &str| {
         let section = section(measured);
         let found = section.findings.iter().find(|finding| finding.what.contains(what)).unwrap();
         (found.ours.value, found.verdict)

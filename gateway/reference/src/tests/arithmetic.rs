@@ -6,7 +6,7 @@ use cell_node::contact::{Force, Torque};
 use cell_node::sum::{EpochStart, Sum, SumWords};
 use protocol::fixed::{Q, Q1_14, TorqueFormat};
 use protocol::packet::{Epoch, WORDS, padded};
-use protocol::parameters::{Parameter, Parameters, Slots};
+use protocol::parameters::{Parameter, Parameters, SumSchedule};
 use protocol::time::{Micros, Span};
 use serde_json::Value;
 
@@ -53,7 +53,7 @@ fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
     for row in rows("sums") {
         let mut sum = Sum::default();
         let carry = row["carry"] == 1;
-        sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry }));
+        sum.set_slots(Some(SumSchedule { slot_us: 1_000, deepest: 1, carry }));
         let mut epoch = Epoch(253);
         for (index, step) in (0..).zip(row["epochs"].as_array().unwrap()) {
             epoch = epoch.next();
@@ -69,7 +69,7 @@ fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
             };
             let own = step["own"].as_object().map(|_| {
                 let (jacobian, force) = jacobian_and_force(&step["own"]);
-                Torque::new(&jacobian, force).exact()
+                Torque::new(&jacobian, force).exact_torques()
             });
             sum.begin(&begin, own.as_ref());
             for (port, child) in children.iter().enumerate() {

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Isometry3, Point3};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
-use protocol::skin::{MAX_REACH, reach};
+use protocol::skin::{MAX_REACH, max_frame_distance};
 
 use super::path::{CarriedLink, frames_after_joints, motion_kind, path};
 use super::{ChainJoint, LinkFrame, NotCarried, UrdfChain};
@@ -20,7 +20,7 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<UrdfCh
     let root = urdf.index(root.unwrap_or_else(|| urdf.root()))?;
     let path = path(urdf, root, urdf.index(tip)?)?;
     let joints = joints(urdf, urdf.link_name(root), tip, &path)?;
-    let build = |row_cost| with_rows(urdf, root, tip, &path, &joints, row_cost);
+    let build = |row_cost| build_with_row_cost(urdf, root, tip, &path, &joints, row_cost);
     let [usual, smallest] = rows::ROW_COSTS_M;
     build(usual).or_else(|error| {
         let is_long = matches!(*error.problem, RobotProblem::Reach { .. } | RobotProblem::Length { .. });
@@ -29,7 +29,7 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<UrdfCh
 }
 
 /// Builds the chain. A fixed row is added only if it shortens the rows by at least `row_cost`, in m.
-fn with_rows(
+fn build_with_row_cost(
     urdf: &Urdf,
     root: usize,
     tip: &str,
@@ -45,7 +45,7 @@ fn with_rows(
     let behind = frames_after_joints(path, &[]);
     let carried = hanging.iter().map(|it| (it.link.clone(), link_frame(&rows, &at_zero, &behind, it)));
     let carried: Vec<_> = carried.collect();
-    let below = urdf.pose(&root_name, &|joint| urdf.rest(joint))?;
+    let below = urdf.pose(&root_name, &|joint| urdf.rest_position(joint))?;
     let mut chain = UrdfChain {
         below,
         root: root_name,
@@ -60,7 +60,7 @@ fn with_rows(
     };
     let rows = chain.chain_rows();
     for (link, LinkFrame { row, frame, .. }) in &chain.carried {
-        let reach = reach(rows.get(..*row).unwrap_or_default(), frame.translation.vector.into());
+        let reach = max_frame_distance(rows.get(..*row).unwrap_or_default(), frame.translation.vector.into());
         // Links beside the path may have no cells, so only the path must be within reach.
         if reach >= MAX_REACH && path.iter().any(|joint| urdf.link_name(joint.child) == link) {
             return Err(urdf.error(RobotProblem::Reach { link: link.clone(), reach }));
@@ -124,7 +124,7 @@ fn rows_of_path(
         .collect();
     let end = path.iter().fold(Isometry3::identity(), |pose, joint| pose * joint.origin);
     let end = Point3::from(end.translation.vector);
-    let (base, rows) = rows::chain(&axes, &end, row_cost);
+    let (base, rows) = rows::rows_for_axes(&axes, &end, row_cost);
     if rows.len() > MAX_ROWS {
         return Err(urdf.error(RobotProblem::TooManyRows { count: rows.len(), tip: tip.to_owned() }));
     }

@@ -4,7 +4,7 @@ use std::fs;
 
 use crate::{Geometry, JointKind, RowKind, Urdf, UrdfChain};
 use nalgebra::Point3;
-use protocol::skin::reach;
+use protocol::skin::max_frame_distance;
 
 use super::common::{difference, folder};
 
@@ -34,7 +34,7 @@ fn chain(xml: &str, tip: &str) -> UrdfChain {
 /// Returns the reach of the tip in m: its maximum distance from the joints that move it.
 fn far(chain: &UrdfChain) -> f64 {
     let place = chain.link(&chain.tip).unwrap();
-    reach(&chain.chain_rows()[..place.row], place.frame.translation.vector.into())
+    max_frame_distance(&chain.chain_rows()[..place.row], place.frame.translation.vector.into())
 }
 
 /// Returns the position of the tip with the joints at these positions, in m.

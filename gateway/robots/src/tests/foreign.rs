@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use crate::{RobotError, RobotProblem, Urdf};
 use nalgebra::{Point3, Vector3};
-use protocol::skin::reach;
+use protocol::skin::max_frame_distance;
 
 use super::common::{folder, torques};
 
@@ -69,7 +69,7 @@ fn every_chain_is_imported_or_refused_for_a_reason() {
                     worst = worst.max(chain.residual);
                     let rows = chain.chain_rows();
                     let far = |(_, place): (&str, crate::LinkFrame)| {
-                        reach(&rows[..place.row], place.frame.translation.vector.into())
+                        max_frame_distance(&rows[..place.row], place.frame.translation.vector.into())
                     };
                     let far = chain.links().map(far).fold(0.0, f64::max);
                     let longest =

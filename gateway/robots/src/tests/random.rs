@@ -5,7 +5,7 @@ use core::f64::consts::{FRAC_PI_2, PI};
 use crate::{RobotProblem, RowKind, Urdf};
 use nalgebra::{Matrix4, Point3, Rotation3, Unit, Vector3};
 use proptest::prelude::*;
-use protocol::skin::reach;
+use protocol::skin::max_frame_distance;
 
 use super::common::torques;
 use super::written::{FIVE_DIGITS, TWELVE_DIGITS, TestJoint, robot};
@@ -122,7 +122,7 @@ proptest! {
             }
             let place = chain.link(&tip).unwrap();
             let position = place.frame * point;
-            let far = reach(&chain.chain_rows()[..place.row], position.coords.into());
+            let far = max_frame_distance(&chain.chain_rows()[..place.row], position.coords.into());
             let first = chain.rows.iter().position(|row| row.kind == RowKind::Revolute);
             for (index, frame) in frames.iter().enumerate().take(chain.rows.len()).skip(first.unwrap_or(usize::MAX)) {
                 let lever = at - frame * Point3::origin();

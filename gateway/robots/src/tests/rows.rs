@@ -4,7 +4,7 @@ use core::f64::consts::{FRAC_PI_2, PI};
 
 use crate::{DhRow, JointKind, RowKind, Urdf, UrdfChain};
 use nalgebra::{Isometry3, Point3};
-use protocol::skin::reach;
+use protocol::skin::max_frame_distance;
 
 use super::common::{difference, named};
 use super::written::{TWELVE_DIGITS, TestJoint, robot};
@@ -164,7 +164,8 @@ fn rows_do_not_fold_back_beside_the_robot() {
         let urdf = Urdf::parse("t.urdf", &robot(&tilted_shoulder(forearm))).unwrap();
         let chain = urdf.chain(None, "l8").unwrap();
         let place = chain.link("l8").unwrap();
-        let bound = reach(&chain.chain_rows()[..place.row], place.frame.translation.vector.into());
+        let bound =
+            max_frame_distance(&chain.chain_rows()[..place.row], place.frame.translation.vector.into());
         let seen = farthest(&urdf, &chain);
         assert!((0.9..1.15).contains(&(bound / seen)), "{bound} m for {seen} m");
         assert!(chain.rows[..7].iter().all(|row| row.a.abs().max(row.d.abs()) < 0.26), "{:?}", chain.rows);

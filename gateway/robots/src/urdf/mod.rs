@@ -157,7 +157,7 @@ impl Urdf {
     /// Returns the rest position of a joint in rad or m: zero, or the middle of its limits if zero is not between them.
     /// Returns zero for a joint that does not exist.
     #[must_use]
-    pub fn rest(&self, joint: &str) -> f64 {
+    pub fn rest_position(&self, joint: &str) -> f64 {
         let Some(joint) = self.joints.iter().find(|it| it.name == joint) else { return 0.0 };
         let [lower, upper] = joint.limits;
         let limited = matches!(joint.kind, UrdfJointKind::Revolute | UrdfJointKind::Prismatic);

@@ -13,10 +13,10 @@ const MIN_AXIS_LENGTH: f64 = 1e-6;
 
 /// Parses the text of a URDF file.
 pub(super) fn read(file: &str, xml: &str) -> Result<Urdf, RobotError> {
-    let prepared = xml::prepared(file, xml)?;
-    let document = xml::parsed(file, &prepared)?;
+    let prepared = xml::prepare_text(file, xml)?;
+    let document = xml::parse_document(file, &prepared)?;
     let breaks = prepared.text.match_indices('\n').map(|(at, _)| at).collect();
-    UrdfParser { file, document: &document, lines_before: prepared.lines_before, breaks }.robot()
+    UrdfParser { file, document: &document, lines_before: prepared.lines_before, breaks }.parse_robot()
 }
 
 /// The state of the parser.
@@ -30,12 +30,12 @@ struct UrdfParser<'a> {
 }
 
 impl<'a> UrdfParser<'a> {
-    fn robot(&self) -> Result<Urdf, RobotError> {
+    fn parse_robot(&self) -> Result<Urdf, RobotError> {
         let robot = self.document.root_element();
         self.refuse_xacro(robot)?;
         let outermost = robot.tag_name().name();
         if outermost != "robot" {
-            let kind = protocol::xml::kind_of_root(outermost).map(|kind| format!(" ({kind})"));
+            let kind = protocol::xml::format_of_root_element(outermost).map(|kind| format!(" ({kind})"));
             let element = format!("{outermost:?}{}", kind.unwrap_or_default());
             return Err(self.error(robot, RobotProblem::NotARobot(element)));
         }
@@ -63,7 +63,7 @@ impl<'a> UrdfParser<'a> {
         for node in robot.descendants().filter(is_xacro) {
             if !defines(&node) {
                 let name = format!("element <xacro:{}>", node.tag_name().name());
-                return Err(self.xacro(node, name));
+                return Err(self.xacro_error(node, name));
             }
             any = any.or(Some(node));
         }
@@ -75,18 +75,18 @@ impl<'a> UrdfParser<'a> {
             let text = node.is_text().then(|| node.text()).flatten();
             let values = node.attributes().map(|attribute| attribute.value());
             if let Some(expression) = values.chain(text).find_map(expression) {
-                return Err(self.xacro(node, format!("expression {expression}")));
+                return Err(self.xacro_error(node, format!("expression {expression}")));
             }
         }
         Ok(())
     }
 
-    fn xacro(&self, node: Node<'a, 'a>, what: String) -> RobotError {
+    fn xacro_error(&self, node: Node<'a, 'a>, what: String) -> RobotError {
         self.error(node, RobotProblem::Xacro { what, file: self.file.to_owned() })
     }
 
     fn link(&self, node: Node<'a, 'a>) -> Result<LinkWithLine, RobotError> {
-        let name = self.text(node, "link", "name")?;
+        let name = self.required_attribute(node, "link", "name")?;
         let thing = format!("link {name:?}");
         let shapes = |element| {
             let shapes = self.children(node, element).map(|node| self.shape(node, &thing));
@@ -102,23 +102,23 @@ impl<'a> UrdfParser<'a> {
         let geometry = self.child(node, "geometry").and_then(|node| node.first_element_child());
         let Some(node) = geometry else { return Ok(None) };
         let size = |attribute| {
-            let [size] = self.numbers(node, thing, attribute, "a length in m")?.ok_or_else(|| {
+            let [size] = self.parse_numbers(node, thing, attribute, "a length in m")?.ok_or_else(|| {
                 self.error(node, RobotProblem::Missing { thing: thing.to_owned(), missing: attribute })
             })?;
             Ok(size)
         };
         let geometry = match node.tag_name().name() {
             "mesh" => {
-                let path = self.text(node, thing, "filename")?;
+                let path = self.required_attribute(node, thing, "filename")?;
                 if let Some(expression) = expression(&path) {
-                    return Err(self.xacro(node, format!("expression {expression}")));
+                    return Err(self.xacro_error(node, format!("expression {expression}")));
                 }
                 let allowed = "three factors, as in \"0.001 0.001 0.001\"";
-                let scale = self.numbers(node, thing, "scale", allowed)?.unwrap_or([1.0; 3]);
+                let scale = self.parse_numbers(node, thing, "scale", allowed)?.unwrap_or([1.0; 3]);
                 Geometry::Mesh { path, scale }
             }
             "box" => {
-                let size = self.numbers(node, thing, "size", "three lengths in m")?;
+                let size = self.parse_numbers(node, thing, "size", "three lengths in m")?;
                 let missing = || RobotProblem::Missing { thing: thing.to_owned(), missing: "size" };
                 Geometry::Box { size: size.ok_or_else(|| self.error(node, missing()))? }
             }
@@ -130,9 +130,9 @@ impl<'a> UrdfParser<'a> {
     }
 
     fn joint(&self, node: Node<'a, 'a>) -> Result<UnlinkedJoint, RobotError> {
-        let name = self.text(node, "joint", "name")?;
+        let name = self.required_attribute(node, "joint", "name")?;
         let thing = format!("joint {name:?}");
-        let kind = match self.text(node, &thing, "type")?.as_str() {
+        let kind = match self.required_attribute(node, &thing, "type")?.as_str() {
             "revolute" => UrdfJointKind::Revolute,
             "continuous" => UrdfJointKind::Continuous,
             "prismatic" => UrdfJointKind::Prismatic,
@@ -141,18 +141,18 @@ impl<'a> UrdfParser<'a> {
             "planar" => UrdfJointKind::Planar,
             other => {
                 let allowed = "revolute, continuous, prismatic, fixed, floating or planar";
-                return Err(self.value(node, &thing, "type", other, allowed));
+                return Err(self.value_error(node, &thing, "type", other, allowed));
             }
         };
         let link = |role: &'static str| {
             let missing = || RobotProblem::Missing { thing: thing.clone(), missing: role };
             let found = self.child(node, role).ok_or_else(|| self.error(node, missing()))?;
-            self.text(found, &format!("the {role} of {thing}"), "link")
+            self.required_attribute(found, &format!("the {role} of {thing}"), "link")
         };
         let (parent, child) = (link("parent")?, link("child")?);
         let limit = self.child(node, "limit");
         let read = |attribute| match limit {
-            Some(limit) => self.any_number(limit, &thing, attribute),
+            Some(limit) => self.parse_number(limit, &thing, attribute),
             None => Ok(None),
         };
         let joint = UrdfJoint {
@@ -186,27 +186,34 @@ impl<'a> UrdfParser<'a> {
         }
         let Some(node) = self.child(node, "axis") else { return Ok(Vector3::x_axis()) };
         let allowed = "three numbers, not all zero";
-        let axis = self.numbers(node, thing, "xyz", allowed)?.unwrap_or([1.0, 0.0, 0.0]);
+        let axis = self.parse_numbers(node, thing, "xyz", allowed)?.unwrap_or([1.0, 0.0, 0.0]);
         let axis = Vector3::from(axis);
-        Unit::try_new(axis, MIN_AXIS_LENGTH)
-            .filter(|_| axis.norm().is_finite())
-            .ok_or_else(|| self.value(node, thing, "xyz", node.attribute("xyz").unwrap_or_default(), allowed))
+        Unit::try_new(axis, MIN_AXIS_LENGTH).filter(|_| axis.norm().is_finite()).ok_or_else(|| {
+            self.value_error(node, thing, "xyz", node.attribute("xyz").unwrap_or_default(), allowed)
+        })
     }
 
     fn mimic(&self, node: Node<'a, 'a>, thing: &str) -> Result<Mimic, RobotError> {
-        let joint = self.text(node, &format!("the mimic of {thing}"), "joint")?;
-        let multiplier = self.any_number(node, thing, "multiplier")?.unwrap_or(1.0);
-        let offset = self.any_number(node, thing, "offset")?.unwrap_or_default();
+        let joint = self.required_attribute(node, &format!("the mimic of {thing}"), "joint")?;
+        let multiplier = self.parse_number(node, thing, "multiplier")?.unwrap_or(1.0);
+        let offset = self.parse_number(node, thing, "offset")?.unwrap_or_default();
         Ok(Mimic { joint, multiplier, offset })
     }
 
     fn origin(&self, node: Node<'a, 'a>, thing: &str) -> Result<Isometry3<f64>, RobotError> {
         let Some(node) = self.child(node, "origin") else { return Ok(Isometry3::identity()) };
         if let Some(got) = node.attribute("quat_xyzw") {
-            return Err(self.value(node, thing, "quat_xyzw", got, "write it as rpy, the angles in rad"));
+            return Err(self.value_error(
+                node,
+                thing,
+                "quat_xyzw",
+                got,
+                "write it as rpy, the angles in rad",
+            ));
         }
-        let [x, y, z] = self.numbers(node, thing, "xyz", "three lengths in m")?.unwrap_or_default();
-        let [roll, pitch, yaw] = self.numbers(node, thing, "rpy", "three angles in rad")?.unwrap_or_default();
+        let [x, y, z] = self.parse_numbers(node, thing, "xyz", "three lengths in m")?.unwrap_or_default();
+        let [roll, pitch, yaw] =
+            self.parse_numbers(node, thing, "rpy", "three angles in rad")?.unwrap_or_default();
         let turn = UnitQuaternion::from_euler_angles(roll, pitch, yaw);
         Ok(Isometry3::from_parts(Translation3::new(x, y, z), turn))
     }
@@ -225,14 +232,19 @@ impl<'a> UrdfParser<'a> {
     }
 
     /// Returns the value of a required attribute.
-    fn text(&self, node: Node<'a, 'a>, thing: &str, attribute: &'static str) -> Result<String, RobotError> {
+    fn required_attribute(
+        &self,
+        node: Node<'a, 'a>,
+        thing: &str,
+        attribute: &'static str,
+    ) -> Result<String, RobotError> {
         let text = node.attribute(attribute).map(str::trim).filter(|text| !text.is_empty());
         let missing = || RobotProblem::Missing { thing: thing.to_owned(), missing: attribute };
         text.map(str::to_owned).ok_or_else(|| self.error(node, missing()))
     }
 
     /// Parses an optional attribute that consists of `N` finite numbers.
-    fn numbers<const N: usize>(
+    fn parse_numbers<const N: usize>(
         &self,
         node: Node<'a, 'a>,
         thing: &str,
@@ -242,11 +254,11 @@ impl<'a> UrdfParser<'a> {
         let Some(text) = node.attribute(attribute) else { return Ok(None) };
         let numbers = text.split_whitespace().map(|word| word.parse().ok().filter(|it: &f64| it.is_finite()));
         let numbers = numbers.collect::<Option<Vec<_>>>().and_then(|numbers| numbers.try_into().ok());
-        numbers.map(Some).ok_or_else(|| self.value(node, thing, attribute, text, allowed))
+        numbers.map(Some).ok_or_else(|| self.value_error(node, thing, attribute, text, allowed))
     }
 
     /// Parses an optional attribute that is one number, possibly infinite.
-    fn any_number(
+    fn parse_number(
         &self,
         node: Node<'a, 'a>,
         thing: &str,
@@ -255,12 +267,12 @@ impl<'a> UrdfParser<'a> {
         let Some(text) = node.attribute(attribute) else { return Ok(None) };
         let number = text.trim().parse().ok().filter(|it: &f64| !it.is_nan());
         let allowed = if text.contains(',') { "one number, with a point" } else { "a number" };
-        number.map(Some).ok_or_else(|| self.value(node, thing, attribute, text, allowed))
+        number.map(Some).ok_or_else(|| self.value_error(node, thing, attribute, text, allowed))
     }
 
     /// Creates the error for a value that is not allowed. If the value contains a xacro expression, the error is about
     /// the expression.
-    fn value(
+    fn value_error(
         &self,
         node: Node<'a, 'a>,
         thing: &str,
@@ -269,7 +281,7 @@ impl<'a> UrdfParser<'a> {
         allowed: &'static str,
     ) -> RobotError {
         if let Some(expression) = expression(value) {
-            return self.xacro(node, format!("expression {expression}"));
+            return self.xacro_error(node, format!("expression {expression}"));
         }
         let commas = if value.contains([',', ';']) && allowed.starts_with("three") {
             "; blanks between them, no commas"

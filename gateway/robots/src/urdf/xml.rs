@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use protocol::usage::printable;
-use protocol::xml::{ForeignFile, Prepared, XmlFault, detect_foreign, prepare, utf16_name};
+use protocol::xml::{ForeignFile, PreparedXml, XmlFault, detect_foreign, prepare, utf16_encoding_name};
 use roxmltree::{Document, Error};
 
 use crate::error::{RobotError, RobotProblem};
@@ -16,7 +16,7 @@ use crate::error::{RobotError, RobotProblem};
 /// saved web page).
 pub fn text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError> {
     refuse_foreign(file, bytes)?;
-    if let Some(name) = utf16_name(bytes) {
+    if let Some(name) = utf16_encoding_name(bytes) {
         let what = format!(
             "it is UTF-16, which ROS does not read either: save it as UTF-8, as with `iconv -f {name} -t utf-8 FILE > NEW`"
         );
@@ -25,7 +25,7 @@ pub fn text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError>
     protocol::xml::decode(bytes).map_err(|fault| error(file, fault))
 }
 
-pub(super) fn prepared<'a>(file: &str, text: &'a str) -> Result<Prepared<'a>, RobotError> {
+pub(super) fn prepare_text<'a>(file: &str, text: &'a str) -> Result<PreparedXml<'a>, RobotError> {
     refuse_foreign(file, text.as_bytes())?;
     let prepared = prepare(text).map_err(|fault| error(file, fault))?;
     if prepared.text.is_empty() {
@@ -38,7 +38,10 @@ pub(super) fn prepared<'a>(file: &str, text: &'a str) -> Result<Prepared<'a>, Ro
     Ok(prepared)
 }
 
-pub(super) fn parsed<'a>(file: &str, prepared: &'a Prepared<'_>) -> Result<Document<'a>, RobotError> {
+pub(super) fn parse_document<'a>(
+    file: &str,
+    prepared: &'a PreparedXml<'_>,
+) -> Result<Document<'a>, RobotError> {
     Document::parse(&prepared.text).map_err(|reason| {
         let is_cut =
             matches!(reason, Error::UnclosedRootNode | Error::UnexpectedEndOfStream | Error::NoRootNode);

@@ -5,13 +5,13 @@ use std::io::{self, Write};
 use analysis::fit::traffic::BenchFrames;
 use analysis::fit::verdict::percent;
 use analysis::shadow::{
-    Answering, BusShadow, Delays, FrameTiming, Identifier, Loads, Peak, Replies, Shadow, ShadowReport,
-    StartUp, Stretches,
+    Answering, BusShadow, BusyStretches, Delays, FrameTiming, Identifier, Loads, Peak, Replies, Shadow,
+    ShadowReport, StartUp,
 };
 
 use trace::capture::seconds_since;
 
-use crate::print::{KeyValueTable, comma_separated, count, escape_controls, or_else_text};
+use crate::print::{KeyValueTable, comma_separated, count_with_noun, escape_controls, or_else_text};
 
 /// Writes the frames whose sending the model has computed, one object per line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
@@ -27,7 +27,7 @@ pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Res
 fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming) -> io::Result<()> {
     let FrameTiming { nanos, id, extended, bits, sent, .. } = *frame;
     line.extend_from_slice(b"{\"time\":");
-    seconds(line, Some(nanos));
+    append_seconds(line, Some(nanos));
     line.extend_from_slice(b",\"bus\":");
     line.extend_from_slice(escape_controls(serde_json::to_string(&bus)?).as_bytes());
     write!(line, ",\"id\":\"{}\"", Identifier(id, extended))?;
@@ -37,7 +37,7 @@ fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming) -> io
     }
     for (key, nanos) in [("start", sent.map(|(start, _)| start)), ("end", sent.map(|(_, end)| end))] {
         write!(line, ",\"{key}_s\":")?;
-        seconds(line, nanos);
+        append_seconds(line, nanos);
     }
     line.extend_from_slice(b"}\n");
     Ok(())
@@ -45,18 +45,18 @@ fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming) -> io
 
 /// Writes seconds with nine digits after the point. A double cannot hold that many for times since 1970, and `fmt` is
 /// much slower.
-fn seconds(line: &mut Vec<u8>, nanos: Option<u64>) {
-    const NANOS: u64 = 1_000_000_000;
+fn append_seconds(line: &mut Vec<u8>, nanos: Option<u64>) {
+    const NANOS_PER_SECOND: u64 = 1_000_000_000;
     let Some(nanos) = nanos else { return line.extend_from_slice(b"null") };
     let mut digits = itoa::Buffer::new();
-    line.extend_from_slice(digits.format(nanos / NANOS).as_bytes());
+    line.extend_from_slice(digits.format(nanos / NANOS_PER_SECOND).as_bytes());
     line.push(b'.');
     // Add a leading 1, which is then skipped, so that zeros at the beginning are kept.
-    line.extend(digits.format(NANOS + nanos % NANOS).bytes().skip(1));
+    line.extend(digits.format(NANOS_PER_SECOND + nanos % NANOS_PER_SECOND).bytes().skip(1));
 }
 
 /// Formats the result for all buses as a table.
-pub(super) fn text(name: &str, what: &str, missing: u64, report: &ShadowReport) -> String {
+pub(super) fn format_report(name: &str, what: &str, missing: u64, report: &ShadowReport) -> String {
     let head = format!("{what}, {} frames", report.frames);
     let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
     let mut rows = KeyValueTable::new(name, head, beside).names_in_one_line();
@@ -64,7 +64,7 @@ pub(super) fn text(name: &str, what: &str, missing: u64, report: &ShadowReport) 
         bus_rows(&mut rows, bus, report);
     }
     rows.row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
-    rows.text()
+    rows.to_text()
 }
 
 fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
@@ -75,19 +75,19 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
     } else {
         String::new()
     };
-    rows.section(format!("{} at {}", bus.bus, bus.name), count, missing);
-    fit(rows, bus, report.has_times);
+    rows.add_section(format!("{} at {}", bus.bus, bus.name), count, missing);
+    add_fit_rows(rows, bus, report.has_times);
     if bus.this_run.is_some() {
-        operation(rows, bus);
+        add_operation_rows(rows, bus);
     }
     if let Some(start_up) = &bus.start_up {
         start_up_rows(rows, bus, start_up);
     }
     if bit_error_rate > 0.0 {
         let each = format!("of each bit {bit_error_rate:e}");
-        rows.row("damaged, and sent again", format!("{} attempts", bus.counts.damaged), each);
+        rows.add_row("damaged, and sent again", format!("{} attempts", bus.counts.damaged), each);
     }
-    bench(rows, bus);
+    add_bench_traffic_row(rows, bus);
     let of_all =
         |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
     rows.row_unless_zero("left out: error frames", bus.counts.error_frames, "of a driver, never on a wire");
@@ -101,62 +101,66 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
 }
 
 /// Adds rows on whether the traffic fits on the bus, in the worst case and in this run.
-fn fit(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
+fn add_fit_rows(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
     match (&bus.worst_case, &bus.answering) {
-        (Some(worst), _) => rows.row(worst.case_name(), worst.table_value(), worst.cells),
-        (None, Some(_)) => rows.row("worst case", "?", "needs a skin with this bus: --skin"),
+        (Some(worst), _) => rows.add_row(worst.case_name(), worst.table_value(), worst.cells),
+        (None, Some(_)) => rows.add_row("worst case", "?", "needs a skin with this bus: --skin"),
         (None, None) => {}
     }
     match &bus.this_run {
-        Some(run) => rows.row(run.case_name(), run.table_value(), run.cells),
-        None if !has_times => rows.row("this run", "?", "its frames have no times"),
-        None if bus.duration_s == 0.0 => rows.row("this run", "?", "its frames have one time"),
-        None => rows.row("this run", "no joints in it", ""),
+        Some(run) => rows.add_row(run.case_name(), run.table_value(), run.cells),
+        None if !has_times => rows.add_row("this run", "?", "its frames have no times"),
+        None if bus.duration_s == 0.0 => rows.add_row("this run", "?", "its frames have one time"),
+        None => rows.add_row("this run", "no joints in it", ""),
     }
     match bus.answering {
         Some(Answering { epochs, epochs_halted: 0, mean: Some(mean), .. }) => {
-            rows.row("  cells that answered", format!("{mean:.1} on average"), format!("{epochs} joints"));
+            rows.add_row(
+                "  cells that answered",
+                format!("{mean:.1} on average"),
+                format!("{epochs} joints"),
+            );
         }
         Some(Answering { epochs, epochs_halted, mean: Some(mean), .. }) => {
             let beside = format!("{epochs} joints, and {epochs_halted} while halted are left out");
-            rows.row("  cells that answered", format!("{mean:.1} on average"), beside);
+            rows.add_row("  cells that answered", format!("{mean:.1} on average"), beside);
         }
         Some(Answering { epochs_halted: halted @ 1.., mean: None, .. }) => {
-            rows.row("  cells that answered", "halted all the time", format!("{halted} joints"));
+            rows.add_row("  cells that answered", "halted all the time", format!("{halted} joints"));
         }
         _ => {}
     }
 }
 
-fn operation(rows: &mut KeyValueTable, bus: &BusShadow) {
-    load(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
-    rows.row("  bus taken", share(bus.load.busy), "");
-    pauses(rows, bus, &bus.stretches);
-    rows.row("delay, µs", "50 % / 99 % / max", "until it is sent");
-    rows.row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
+fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
+    add_load_rows(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
+    rows.add_row("  bus taken", share(bus.load.busy), "");
+    add_busy_stretch_row(rows, bus, &bus.stretches);
+    rows.add_row("delay, µs", "50 % / 99 % / max", "until it is sent");
+    rows.add_row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
     for kind in &bus.kinds {
         let (name, delay) = (kind.kind, &kind.delay_us);
-        rows.row(format!("  {name}"), delays(delay), format!("{} frames", delay.count));
+        rows.add_row(format!("  {name}"), delays(delay), format!("{} frames", delay.count));
     }
     if let Some(replies) = &bus.replies {
-        answers(rows, replies);
+        add_answer_rows(rows, replies);
     }
-    rows.row("most that waited", format!("{} frames", bus.queue.value), at(bus, bus.queue));
+    rows.add_row("most that waited", format!("{} frames", bus.queue.value), format_peak_time(bus, bus.queue));
     if bus.queue_of_one.value > 0.0 {
         let of = format!("{} frames of {}", bus.queue_of_one.value, Identifier(bus.queue_of_one_id, false));
-        rows.row("  of one identifier", of, at(bus, bus.queue_of_one));
+        rows.add_row("  of one identifier", of, format_peak_time(bus, bus.queue_of_one));
     }
 }
 
 /// Adds rows on the start-up, for which no limits apply.
 fn start_up_rows(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUp) {
     let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
-    load(rows, bus, &start_up.load, ("start-up: average load", &beside));
-    pauses(rows, bus, &start_up.stretches);
-    rows.row("  delay, µs", delays(&start_up.delay_us), "50 % / 99 % / max");
+    add_load_rows(rows, bus, &start_up.load, ("start-up: average load", &beside));
+    add_busy_stretch_row(rows, bus, &start_up.stretches);
+    rows.add_row("  delay, µs", delays(&start_up.delay_us), "50 % / 99 % / max");
 }
 
-fn bench(rows: &mut KeyValueTable, bus: &BusShadow) {
+fn add_bench_traffic_row(rows: &mut KeyValueTable, bus: &BusShadow) {
     let BenchFrames { stimuli, syncs, reports, wires } = bus.counts.bench;
     if bus.counts.bench.total() == 0 {
         return;
@@ -164,35 +168,43 @@ fn bench(rows: &mut KeyValueTable, bus: &BusShadow) {
     let name = if bus.counts.bench_omitted { "left out: bench traffic" } else { "counted: bench traffic" };
     let parts = [("stimuli", stimuli), ("sync", syncs), ("report", reports), ("simulated wires", wires)];
     let parts = parts.iter().filter(|it| it.1 > 0).map(|(what, count)| format!("{count} {what}"));
-    rows.row(name, format!("{} frames", bus.counts.bench.total()), comma_separated(parts));
+    rows.add_row(name, format!("{} frames", bus.counts.bench.total()), comma_separated(parts));
 }
 
-fn load(rows: &mut KeyValueTable, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
-    rows.row(name, share(load.mean), beside);
-    rows.row("  most in any 16 ms", percent(load.worst_16_ms.value), at(bus, load.worst_16_ms));
-    rows.row("  most in any second", percent(load.worst_1_s.value), at(bus, load.worst_1_s));
+fn add_load_rows(rows: &mut KeyValueTable, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
+    rows.add_row(name, share(load.mean), beside);
+    rows.add_row(
+        "  most in any 16 ms",
+        percent(load.worst_16_ms.value),
+        format_peak_time(bus, load.worst_16_ms),
+    );
+    rows.add_row(
+        "  most in any second",
+        percent(load.worst_1_s.value),
+        format_peak_time(bus, load.worst_1_s),
+    );
 }
 
-fn pauses(rows: &mut KeyValueTable, bus: &BusShadow, stretches: &Stretches) {
+fn add_busy_stretch_row(rows: &mut KeyValueTable, bus: &BusShadow, stretches: &BusyStretches) {
     let longest = stretches.longest_s;
-    let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, at(bus, longest));
-    let times = format!("{}, {:.3} s", count(stretches.count, "time"), stretches.total_s);
-    rows.row("  no pause for 16 ms", times, beside);
+    let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, format_peak_time(bus, longest));
+    let times = format!("{}, {:.3} s", count_with_noun(stretches.count, "time"), stretches.total_s);
+    rows.add_row("  no pause for 16 ms", times, beside);
 }
 
 fn share(share: Option<f64>) -> String {
     or_else_text(share.map(percent), "?")
 }
 
-fn answers(rows: &mut KeyValueTable, replies: &Replies) {
+fn add_answer_rows(rows: &mut KeyValueTable, replies: &Replies) {
     let Replies { count, late_before, late, late_when_ready, after_joints_us } = replies;
-    rows.row("answers after joints, µs", delays(after_joints_us), "50 % / 99 % / max");
+    rows.add_row("answers after joints, µs", delays(after_joints_us), "50 % / 99 % / max");
     let beside = [
         Some("after the next joints".to_owned()),
         (*late_when_ready > 0).then(|| format!("{late_when_ready} were ready too late for any bus")),
         (*late_before > 0).then(|| format!("{late_before} more were late in the recording already")),
     ];
-    rows.row("  late", format!("{late} of {count}"), comma_separated(beside.into_iter().flatten()));
+    rows.add_row("  late", format!("{late} of {count}"), comma_separated(beside.into_iter().flatten()));
 }
 
 fn delays(delays: &Delays) -> String {
@@ -200,7 +212,7 @@ fn delays(delays: &Delays) -> String {
     format!("{p50:.0} / {p99:.0} / {max:.0}")
 }
 
-fn at(bus: &BusShadow, most: Peak) -> String {
+fn format_peak_time(bus: &BusShadow, most: Peak) -> String {
     format!("at {:.3} s", seconds_since(bus.zero_ns, most.at_ns))
 }
 
@@ -212,12 +224,12 @@ mod tests {
     fn seconds_are_written_as_fmt_writes_them() {
         for nanos in [0, 1, 9, 10, 999_999_999, 1_000_000_000, 1_700_000_000_000_000_000, u64::MAX] {
             let mut line = Vec::new();
-            seconds(&mut line, Some(nanos));
+            append_seconds(&mut line, Some(nanos));
             let expected = format!("{}.{:09}", nanos / 1_000_000_000, nanos % 1_000_000_000);
             assert_eq!(String::from_utf8(line).unwrap(), expected);
         }
         let mut line = Vec::new();
-        seconds(&mut line, None);
+        append_seconds(&mut line, None);
         assert_eq!(line, b"null");
     }
 }

@@ -98,7 +98,7 @@ fn a_run_that_is_well_is_short_and_fits_eighty_columns() {
         (run("two-cells", &["vcan0"], 2, 0), 18),
         (run(LONG, &[LONG, "abcdefghijklmn2"], 126, 17_772), 25),
     ] {
-        let text = text(&summary, EIGHTY);
+        let text = format_summary(&summary, EIGHTY);
         assert!(widest(&text) <= 80 && text.lines().count() <= lines, "{}\n{text}", text.lines().count());
     }
 }
@@ -106,7 +106,7 @@ fn a_run_that_is_well_is_short_and_fits_eighty_columns() {
 #[test]
 fn the_verdict_is_the_first_line() {
     let first = |summary: &Summary, columns| {
-        text(summary, TableStyle { columns, ..EIGHTY }).split('┌').next().unwrap().to_owned()
+        format_summary(summary, TableStyle { columns, ..EIGHTY }).split('┌').next().unwrap().to_owned()
     };
     let well = "all well: 253 cells, 575 of 575 epochs complete, 17772 replies in time, error 6.2e-5 Nm\n";
     assert_eq!(first(&demo(), Some(100)), well);
@@ -128,7 +128,7 @@ fn the_verdict_is_the_first_line() {
     let many = Summary { verdict: Verdict { well: false, look_at: vec!["one".to_owned(); 9] }, ..demo() };
     let all = first(&many, Some(80));
     assert!(all.lines().count() == 7 && all.ends_with("\n         and 3 more, with --verbose\n"), "{all}");
-    let verbose = text(&many, TableStyle { is_verbose: true, ..EIGHTY });
+    let verbose = format_summary(&many, TableStyle { is_verbose: true, ..EIGHTY });
     assert_eq!(verbose.lines().take_while(|line| line.ends_with("one")).count(), 9, "{verbose}");
 }
 
@@ -136,7 +136,7 @@ fn the_verdict_is_the_first_line() {
 fn verbose_has_all_rows() {
     let columns = Some(110);
     let [brief, verbose] =
-        [false, true].map(|is_verbose| text(&demo(), TableStyle { is_verbose, columns, ..EIGHTY }));
+        [false, true].map(|is_verbose| format_summary(&demo(), TableStyle { is_verbose, columns, ..EIGHTY }));
     let usual = [
         "against unrounded",
         "central computation",
@@ -155,7 +155,7 @@ fn verbose_has_all_rows() {
     for row in ["single cells", "the whole skin", "began late", "replies due", "recording", "vcan0"] {
         assert!(verbose.contains(row) && brief.contains(row), "{row}\n{brief}\n{verbose}");
     }
-    assert!(widest(&text(&demo(), TableStyle { is_verbose: true, ..EIGHTY })) <= 80);
+    assert!(widest(&format_summary(&demo(), TableStyle { is_verbose: true, ..EIGHTY })) <= 80);
     assert!(!brief.contains("-0.000") && !verbose.contains("-0.000"), "{verbose}");
 }
 
@@ -182,7 +182,7 @@ fn what_is_not_usual_is_shown_without_verbose() {
         let mut summary = demo();
         change(&mut summary);
         let columns = Some(110);
-        let text = text(&summary.with_verdict(None), TableStyle { columns, ..EIGHTY });
+        let text = format_summary(&summary.with_verdict(None), TableStyle { columns, ..EIGHTY });
         assert!(text.contains(shown) && text.starts_with("look at: "), "{shown}:\n{text}");
     }
 }
@@ -193,9 +193,9 @@ fn colours_say_how_bad_it_is_and_only_where_they_are_due() {
         let mut summary = demo();
         change(&mut summary);
         let summary = summary.with_verdict(None);
-        let plain = text(&summary, EIGHTY);
+        let plain = format_summary(&summary, EIGHTY);
         assert!(!plain.contains('\x1b'), "{plain}");
-        let coloured = text(&summary, TableStyle { is_coloured: true, ..EIGHTY });
+        let coloured = format_summary(&summary, TableStyle { is_coloured: true, ..EIGHTY });
         // Colours change no text.
         let mut without = String::new();
         let mut letters = coloured.chars();
@@ -225,6 +225,6 @@ fn names_cannot_command_a_terminal() {
     summary.skin = "a\x1b[2Jb".to_owned();
     summary.buses[0].name = "c\x1b[2Jd".to_owned();
     summary.buses[0].silent_cells = vec![7];
-    let text = text(&summary.with_verdict(None), TableStyle { columns: Some(110), ..EIGHTY });
+    let text = format_summary(&summary.with_verdict(None), TableStyle { columns: Some(110), ..EIGHTY });
     assert!(!text.contains('\x1b') && text.matches("\\u{1b}[2J").count() >= 3, "{text}");
 }

@@ -165,7 +165,7 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
             let expected = format!(
                 "skinbus: no cell 250 sent anything on vcan0 for 1 s: `skinbus cells vcan0` lists the cells; the format \
                  of the bus may be --format {}\n",
-                format.other().name()
+                format.other_format().name()
             );
             assert_eq!(nobody.2, expected);
         });

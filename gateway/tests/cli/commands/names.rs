@@ -115,7 +115,7 @@ impl Place {
             let joints = Joints { positions: Default::default(), in_use: 6 };
             let message = Message::Joints { epoch: Epoch(epoch), joints };
             for frame in message.encode().frames(Format::Fd) {
-                let (time, direction) = (Timestamp::nine_digits(nanos), Some(Direction::Received));
+                let (time, direction) = (Timestamp::with_nine_digits(nanos), Some(Direction::Received));
                 mcap.write(&mut topic, nanos, &Record { time, interface: "vcan0", frame, direction })
                     .unwrap();
             }

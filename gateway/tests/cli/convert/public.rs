@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::process::{Output, Stdio};
 use std::time::{Duration, Instant};
 
-use trace::capture::{Entry, Reader};
+use trace::capture::{CaptureEntry, Reader};
 
 use super::Folder;
 
@@ -296,7 +296,7 @@ fn frames(path: &std::path::Path) -> usize {
     let Ok(mut reader) = Reader::open(path) else { return 0 };
     let mut frames = 0;
     while let Ok(Some(entry)) = reader.next() {
-        frames += usize::from(matches!(entry, Entry::Frame(_)));
+        frames += usize::from(matches!(entry, CaptureEntry::Frame(_)));
     }
     frames
 }

@@ -15,7 +15,7 @@ use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
 use rand::{Rng, RngExt};
 use rand_pcg::Pcg64Mcg;
-use trace::capture::Note;
+use trace::capture::CaptureNote;
 use trace::recording::file::FileWriter;
 use trace::recording::recover::{RecoverError, recover};
 use trace::ros2::standard::JointState;
@@ -106,7 +106,7 @@ impl Seed {
 /// A recording by this project's writer with `flushes` flushes.
 fn own(flushes: u64, ends: bool, chance: &mut impl Rng) -> Vec<u8> {
     let mut writer = FileWriter::new(Vec::new()).unwrap();
-    writer.metadata("program", &[("a".to_owned(), "b".to_owned())].into()).unwrap();
+    writer.write_metadata("program", &[("a".to_owned(), "b".to_owned())].into()).unwrap();
     writer.attach("skin.toml", "application/toml", 7, b"version = 1\n").unwrap();
     let facts = [("time_digits", "9")];
     let mut buses = ["can0", "can1"].map(|bus| {
@@ -114,7 +114,7 @@ fn own(flushes: u64, ends: bool, chance: &mut impl Rng) -> Vec<u8> {
         (bus, writer.channel::<Record<'_>>(&topic, &facts).unwrap())
     });
     let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
-    let mut notes = writer.channel::<Note<'_>>("/can/notes", &[]).unwrap();
+    let mut notes = writer.channel::<CaptureNote<'_>>("/can/notes", &[]).unwrap();
     if chance.random() {
         writer.flush().unwrap();
     }
@@ -125,7 +125,8 @@ fn own(flushes: u64, ends: bool, chance: &mut impl Rng) -> Vec<u8> {
             let (interface, channel) = &mut buses[usize::from(chance.random::<bool>())];
             let data: [u8; 8] = chance.random();
             let frame = Frame::classic(chance.random_range(0..0x800), &data).unwrap();
-            let record = Record { time: Timestamp::nine_digits(nanos), interface, frame, direction: None };
+            let record =
+                Record { time: Timestamp::with_nine_digits(nanos), interface, frame, direction: None };
             writer.write(channel, nanos, &record).unwrap();
             let q = [chance.random::<f64>()];
             let state = JointState { nanos, names: &[], position: &q, velocity: &[], effort: &[] };
@@ -133,7 +134,7 @@ fn own(flushes: u64, ends: bool, chance: &mut impl Rng) -> Vec<u8> {
         }
         if flush % 16 == 3 {
             let kind = trace::capture::NoteKind::Text;
-            let note = Note { kind, nanos, interface: "can0", line: 0, text: b"a word" };
+            let note = CaptureNote { kind, nanos, interface: "can0", line: 0, text: b"a word" };
             writer.write(&mut notes, nanos, &note).unwrap();
         }
         writer.flush().unwrap();

@@ -14,7 +14,7 @@ use protocol::message::{Joints, Message as Packet};
 use protocol::packet::Epoch;
 use trace::capture::Reader;
 use trace::capture::convert::{CaptureWriter, convert};
-use trace::capture::log::Style;
+use trace::capture::log::LogStyle;
 use trace::ros2::cdr::CdrWriter as Cdr;
 use trace::ros2::skin::{LoopTiming, Torques};
 use trace::ros2::standard::JointState;
@@ -54,7 +54,8 @@ pub(crate) fn all(skin: &str) -> Vec<(&'static str, Vec<u8>)> {
 fn converted(log: &str) -> Vec<u8> {
     let mut out = Vec::new();
     let mut from = Reader::from_read("log", std::io::Cursor::new(log.to_owned().into_bytes())).unwrap();
-    let mut to = CaptureWriter::new(&mut out, trace::capture::CaptureFormat::Mcap, Style::default()).unwrap();
+    let mut to =
+        CaptureWriter::new(&mut out, trace::capture::CaptureFormat::Mcap, LogStyle::default()).unwrap();
     convert(&mut from, &mut to, |_, _| Ok(())).unwrap();
     to.finish().unwrap();
     drop(to);
@@ -90,7 +91,7 @@ impl File {
 
     fn packet(&mut self, topic: &str, nanos: u64, packet: &Packet) {
         for frame in packet.encode().frames(Format::Fd) {
-            let time = Timestamp::nine_digits(nanos);
+            let time = Timestamp::with_nine_digits(nanos);
             let record = Record { time, interface: "vcan0", frame, direction: None };
             self.message(topic, nanos, &record);
         }
@@ -151,7 +152,7 @@ pub(crate) fn run(skin: &str, options: WriteOptions, files_last: bool) -> Vec<u8
             }
         }
     }
-    let note = trace::capture::Note {
+    let note = trace::capture::CaptureNote {
         kind: trace::capture::NoteKind::Dropped(12),
         nanos: BEGAN,
         interface: "vcan0",

@@ -2,10 +2,10 @@
 
 use std::io::{self, Write};
 
-use super::log::{LogWriter, OmittedProperties, Style, WriteOutcome};
+use super::log::{LogStyle, LogWriter, OmittedProperties, WriteOutcome};
 use super::mcap::McapWriter;
-pub use super::mcap::Origin;
-use super::{CaptureError, CaptureFormat, Entry, Note, NoteKind, Reader};
+pub use super::mcap::RecordingOrigin;
+use super::{CaptureEntry, CaptureError, CaptureFormat, CaptureNote, NoteKind, Reader};
 use thiserror::Error;
 
 /// The file that [`convert`] writes: a candump log or an MCAP recording.
@@ -23,10 +23,10 @@ impl<W: Write> CaptureWriter<W> {
     ///
     /// # Errors
     /// Returns an error if the head of the file cannot be written.
-    pub fn new(out: W, format: CaptureFormat, style: Style) -> io::Result<Self> {
+    pub fn new(out: W, format: CaptureFormat, style: LogStyle) -> io::Result<Self> {
         Ok(match format {
             CaptureFormat::Candump => Self(FormatWriter::Log(Box::new(LogWriter::new(out, style)))),
-            CaptureFormat::Mcap => Self::new_mcap(out, Origin { of_log: true, file: None })?,
+            CaptureFormat::Mcap => Self::new_mcap(out, RecordingOrigin { of_log: true, file: None })?,
         })
     }
 
@@ -34,7 +34,7 @@ impl<W: Write> CaptureWriter<W> {
     ///
     /// # Errors
     /// Returns an error if the head of the file cannot be written.
-    pub fn new_mcap(out: W, origin: Origin<'_>) -> io::Result<Self> {
+    pub fn new_mcap(out: W, origin: RecordingOrigin<'_>) -> io::Result<Self> {
         Ok(Self(FormatWriter::Mcap(Box::new(McapWriter::new(out, origin)?))))
     }
 
@@ -42,7 +42,7 @@ impl<W: Write> CaptureWriter<W> {
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
-    pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
+    pub fn write(&mut self, entry: &CaptureEntry<'_>) -> io::Result<WriteOutcome> {
         match &mut self.0 {
             FormatWriter::Log(log) => log.write(entry),
             FormatWriter::Mcap(mcap) => mcap.write(entry).map(|()| WriteOutcome::All),
@@ -89,7 +89,7 @@ pub trait EntrySink {
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
-    fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome>;
+    fn write(&mut self, entry: &CaptureEntry<'_>) -> io::Result<WriteOutcome>;
 
     /// Flushes the buffered lines.
     ///
@@ -99,7 +99,7 @@ pub trait EntrySink {
 }
 
 impl<W: Write> EntrySink for CaptureWriter<W> {
-    fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
+    fn write(&mut self, entry: &CaptureEntry<'_>) -> io::Result<WriteOutcome> {
         Self::write(self, entry)
     }
 
@@ -166,7 +166,7 @@ pub enum ConvertError {
 pub fn convert(
     from: &mut Reader,
     to: &mut impl EntrySink,
-    mut unreadable: impl FnMut(&Note<'_>, &str) -> Result<(), String>,
+    mut unreadable: impl FnMut(&CaptureNote<'_>, &str) -> Result<(), String>,
 ) -> Result<ConversionCounts, ConvertError> {
     let mut done = ConversionCounts::default();
     loop {
@@ -180,9 +180,9 @@ pub fn convert(
             }
         };
         match &entry {
-            Entry::Frame(_) => done.frames += 1,
-            Entry::Note(note) => {
-                done.note(note);
+            CaptureEntry::Frame(_) => done.frames += 1,
+            CaptureEntry::Note(note) => {
+                done.count_note(note);
                 if let NoteKind::Unreadable(why) = &note.kind {
                     unreadable(note, why).map_err(ConvertError::Strict)?;
                 }
@@ -190,7 +190,7 @@ pub fn convert(
         }
         match to.write(&entry).map_err(ConvertError::Write)? {
             WriteOutcome::All => {}
-            WriteOutcome::Less(less) => done.shortened.count(less),
+            WriteOutcome::Less(less) => done.shortened.count_omitted(less),
             WriteOutcome::Nothing => {
                 done.notes -= 1;
                 done.omitted += 1;
@@ -204,7 +204,7 @@ pub fn convert(
 }
 
 impl LossCounts {
-    fn count(&mut self, less: OmittedProperties) {
+    fn count_omitted(&mut self, less: OmittedProperties) {
         let OmittedProperties { digits, direction, raw_dlc, name } = less;
         self.digits += u64::from(digits);
         self.direction += u64::from(direction);
@@ -214,7 +214,7 @@ impl LossCounts {
 }
 
 impl ConversionCounts {
-    fn note(&mut self, note: &Note<'_>) {
+    fn count_note(&mut self, note: &CaptureNote<'_>) {
         self.notes += 1;
         match &note.kind {
             NoteKind::Text => {}

@@ -6,7 +6,7 @@ use std::os::unix::fs::FileExt;
 
 use ::mcap::records::op;
 
-use super::text_kinds::ASC;
+use super::text_kinds::ASC_KIND;
 use crate::container::{self, read_uninterrupted};
 
 /// The number of bytes at a file's beginning within which the header record of a recording must end.
@@ -32,7 +32,7 @@ const MAGIC: &[(&[u8], InputFormat)] = &[
     (b"LOGG", InputFormat::Other("a BLF file", EXPORT)),
     (b"MDF  ", MDF),
     (b"UnFinMF ", MDF),
-    (b"date ", InputFormat::Other(ASC.0, ASC.1)),
+    (b"date ", InputFormat::Other(ASC_KIND.0, ASC_KIND.1)),
     (b";$FILEVERSION", TRC),
     (b"\xEF\xBB\xBF;$FILEVERSION", TRC),
     (b"timestamp,", CSV),

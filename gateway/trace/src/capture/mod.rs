@@ -6,7 +6,7 @@
 //!   MCAP ─────────┘                      └── dump, replay, explain
 //! ```
 //!
-//! An [`Entry`] keeps all information that either format holds of a frame, so that a capture survives the round trip
+//! An [`CaptureEntry`] keeps all information that either format holds of a frame, so that a capture survives the round trip
 //! through the other format. Entries are in the order of the file, which is not always the order of their times.
 
 pub mod convert;
@@ -34,7 +34,7 @@ pub use place::{SeekIndex, SeekPoint};
 pub use reader::Reader;
 pub use text_kinds::SKIN_OR_SCENARIO;
 
-pub use crate::note::{BusNote, Note, NoteKind};
+pub use crate::note::{BusNote, CaptureNote, NoteKind};
 
 use std::fs::File;
 use std::io::Read;
@@ -55,18 +55,18 @@ pub enum CaptureFormat {
 
 /// One entry of a capture.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Entry<'a> {
+pub enum CaptureEntry<'a> {
     /// A CAN frame.
     Frame(Record<'a>),
     /// A comment, a report of lost frames, or another line between frames.
-    Note(Note<'a>),
+    Note(CaptureNote<'a>),
 }
 
 /// One item of a recording that is read with all its topics.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Item<'a> {
+pub enum RecordingItem<'a> {
     /// A frame or a note.
-    Entry(Entry<'a>),
+    Entry(CaptureEntry<'a>),
     /// A message of another topic.
     Other(OtherMessage<'a>),
 }

@@ -95,7 +95,7 @@ pub struct RecordingPart {
 
 impl RecordingPart {
     /// Reads the identity of a part from the metadata of its file. Returns `None` if the file is not a part.
-    fn of(path: &Path, extras: &RecordingExtras) -> Option<Self> {
+    fn from_extras(path: &Path, extras: &RecordingExtras) -> Option<Self> {
         let (began, number) =
             extras.metadata_value("program", "began_ns").zip(extras.metadata_value("part", "number"))?;
         Some(Self { path: path.to_owned(), began: began.to_owned(), number: number.parse().ok()? })
@@ -123,7 +123,7 @@ impl CaptureFile {
         first: Option<u64>,
         lines: u64,
     ) -> Self {
-        let (part, is_text) = (RecordingPart::of(path, extras), first.is_none() && lines > 0);
+        let (part, is_text) = (RecordingPart::from_extras(path, extras), first.is_none() && lines > 0);
         Self { path: path.to_owned(), format, part, first, is_text }
     }
 }

@@ -41,7 +41,7 @@ pub(super) struct IndexedFile {
 impl SeekIndex {
     /// Returns the latest time in the capture, in ns since 1970, as far as the index knows; 0 for an empty capture.
     #[must_use]
-    pub fn latest(&self) -> u64 {
+    pub fn latest_ns(&self) -> u64 {
         self.marks.last().map_or(0, |(latest, _)| *latest)
     }
 
@@ -62,9 +62,9 @@ impl SeekIndex {
     }
 
     /// Passes the schemas and channels of a part to the state of a reader.
-    pub(super) fn describe(&self, part: usize, state: &mut McapState) -> Result<(), ReadFault> {
+    pub(super) fn apply_descriptions(&self, part: usize, state: &mut McapState) -> Result<(), ReadFault> {
         for (opcode, body) in self.parts.get(part).into_iter().flat_map(|part| &part.descriptions) {
-            state.process(*opcode, body, false)?;
+            state.process_record(*opcode, body, false)?;
         }
         Ok(())
     }

@@ -16,7 +16,7 @@ use protocol::input;
 use super::log::{LogReader, MAX_LINE_BYTES as LONGEST_LINE, known_time};
 use super::magic::is_mcap;
 use super::place::{IndexedFile, SeekIndex, SeekPoint};
-use super::{CaptureError, Entry, Reader};
+use super::{CaptureEntry, CaptureError, Reader};
 use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, seek_record};
 use crate::order::WINDOW_NS;
 
@@ -60,7 +60,7 @@ impl SeekIndex {
     /// entries before the next position.
     fn add_point(&mut self, place: SeekPoint, latest: u64) {
         let place = SeekPoint { part: self.parts.len() - 1, ..place };
-        let latest = latest.max(self.latest());
+        let latest = latest.max(self.latest_ns());
         match self.marks.last_mut() {
             Some((of, last)) if last.part == place.part && place.offset - last.offset < self.min_distance => {
                 *of = latest
@@ -143,11 +143,11 @@ impl SeekIndex {
         loop {
             let (offset, line, clock) = (log.offset(), log.lines(), log.clock());
             match log.next()? {
-                Some(Entry::Frame(record)) => {
+                Some(CaptureEntry::Frame(record)) => {
                     let place = SeekPoint { offset, line, clock, ..SeekPoint::default() };
                     self.add_point(place, record.time.nanos);
                 }
-                Some(Entry::Note(_)) => {}
+                Some(CaptureEntry::Note(_)) => {}
                 None => return Ok(()),
             }
         }

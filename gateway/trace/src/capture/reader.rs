@@ -15,7 +15,7 @@ use super::parts::{self, CaptureFile, PartsError};
 use super::place::{SeekIndex, SeekPoint};
 use super::text_kinds::kind_of;
 use super::times::TimeChecks;
-use super::{CaptureError, CaptureFormat, Entry, FileWrapper, Item, RecordingExtras};
+use super::{CaptureEntry, CaptureError, CaptureFormat, FileWrapper, RecordingExtras, RecordingItem};
 
 /// Reads a capture from its beginning to its end in bounded memory. The parts of a split recording are one capture.
 pub struct Reader {
@@ -23,7 +23,7 @@ pub struct Reader {
     name: String,
     /// The name of the file that is being read.
     file: String,
-    source: Source,
+    source: CaptureSource,
     /// True if messages of other topics are returned too, not only frames and notes.
     all_topics: bool,
     entries: u64,
@@ -43,12 +43,12 @@ pub struct Reader {
     remarks: Vec<Remark>,
 }
 
-enum Source {
+enum CaptureSource {
     Log(LogReader),
     Mcap(Box<McapReader>),
 }
 
-impl Source {
+impl CaptureSource {
     /// Opens one file. The attachments and metadata of a recording are read at once if it is a regular file.
     fn open(
         path: &Path,
@@ -61,14 +61,14 @@ impl Source {
         let about = file.metadata().map_err(failed)?;
         let mut regular = None;
         if about.is_file() && is_mcap(&mut file).map_err(failed)? {
-            state.find_files(&mut file).and_then(|()| file.rewind()).map_err(failed)?;
+            state.read_extras_ahead(&mut file).and_then(|()| file.rewind()).map_err(failed)?;
             regular = Some(file.try_clone().map_err(failed)?);
         }
-        let source = Self::begin(&name, through(file), state, regular)?;
+        let source = Self::detect(&name, through(file), state, regular)?;
         Ok((name, source))
     }
 
-    fn begin(
+    fn detect(
         name: &str,
         input: impl Read + Send + 'static,
         state: McapState,
@@ -126,7 +126,7 @@ impl Reader {
         input: impl Read + Send + 'static,
     ) -> Result<Self, CaptureError> {
         let name = name.into();
-        let source = Source::begin(&name, input, McapState::new(false, None), None)?;
+        let source = CaptureSource::detect(&name, input, McapState::new(false, None), None)?;
         Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), without_wrapper(), false))
     }
 
@@ -161,7 +161,7 @@ impl Reader {
         {
             let name = "standard input".to_owned();
             let file = input::open(one).map_err(|source| CaptureError::Io { name: name.clone(), source })?;
-            let source = Source::begin(&name, through(file), McapState::new(others, None), None)?;
+            let source = CaptureSource::detect(&name, through(file), McapState::new(others, None), None)?;
             return Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), through, others));
         }
         let ordered = Self::ordered(paths)?;
@@ -169,7 +169,8 @@ impl Reader {
         let mut rest = VecDeque::from(ordered);
         let first = rest.pop_front().ok_or(PartsError::None)?;
         let buses = Self::survey([&first].into_iter().chain(&rest));
-        let opened = Source::open(&first, &through, McapState::new(others, None).with_buses(buses.clone()))?;
+        let opened =
+            CaptureSource::open(&first, &through, McapState::new(others, None).with_buses(buses.clone()))?;
         Ok(Self { buses, ..Self::begin(name, opened, rest, through, others) })
     }
 
@@ -215,8 +216,8 @@ impl Reader {
     fn first_time(&mut self) -> Option<u64> {
         loop {
             match self.next() {
-                Ok(Some(Entry::Frame(record))) => return Some(record.time.nanos),
-                Ok(Some(Entry::Note(_))) => {}
+                Ok(Some(CaptureEntry::Frame(record))) => return Some(record.time.nanos),
+                Ok(Some(CaptureEntry::Note(_))) => {}
                 Ok(None) | Err(_) => return None,
             }
         }
@@ -229,8 +230,8 @@ impl Reader {
     pub fn has_frame(&mut self) -> Result<bool, CaptureError> {
         loop {
             match self.next()? {
-                Some(Entry::Frame(_)) => return Ok(true),
-                Some(Entry::Note(_)) => {}
+                Some(CaptureEntry::Frame(_)) => return Ok(true),
+                Some(CaptureEntry::Note(_)) => {}
                 None => return Ok(false),
             }
         }
@@ -238,7 +239,7 @@ impl Reader {
 
     fn begin(
         name: String,
-        (file, source): (String, Source),
+        (file, source): (String, CaptureSource),
         rest: VecDeque<PathBuf>,
         through: FileWrapper,
         others: bool,
@@ -280,10 +281,10 @@ impl Reader {
         }
         let state = McapState::new(self.all_topics, Some(before)).with_buses(self.buses.clone());
         let source;
-        (self.file, source) = Source::open(&path, &self.through, state)?;
+        (self.file, source) = CaptureSource::open(&path, &self.through, state)?;
         self.source = match source {
-            Source::Log(log) => Source::Log(log.with_line_count(lines)),
-            mcap @ Source::Mcap(_) => mcap,
+            CaptureSource::Log(log) => CaptureSource::Log(log.with_line_count(lines)),
+            mcap @ CaptureSource::Mcap(_) => mcap,
         };
         Ok(true)
     }
@@ -292,11 +293,11 @@ impl Reader {
     #[must_use]
     pub const fn place(&self) -> SeekPoint {
         let (offset, skip) = match &self.source {
-            Source::Log(log) => {
+            CaptureSource::Log(log) => {
                 let (offset, line, clock) = (log.offset(), log.lines(), log.clock());
                 return SeekPoint { part: self.part, offset, line, skip: 0, clock };
             }
-            Source::Mcap(mcap) => mcap.anchor(),
+            CaptureSource::Mcap(mcap) => mcap.resume_point(),
         };
         SeekPoint { part: self.part, offset, line: 0, skip, clock: Clock::NEW }
     }
@@ -310,7 +311,7 @@ impl Reader {
         if self.part != place.part || place.offset == 0 {
             let before = (place.part > 0).then(|| self.extras().clone());
             let state = McapState::new(self.all_topics, before).with_buses(self.buses.clone());
-            (self.file, self.source) = Source::open(path, &self.through, state)?;
+            (self.file, self.source) = CaptureSource::open(path, &self.through, state)?;
             self.part = place.part;
             self.remaining = places.paths_after(place.part).cloned().collect();
         }
@@ -322,17 +323,22 @@ impl Reader {
             let regular = file.try_clone().map_err(failed)?;
             file.seek(SeekFrom::Start(place.offset)).map_err(failed)?;
             let input = (self.through)(file);
-            let empty = Source::Log(LogReader::new(&[], Box::new(io::empty())));
+            let empty = CaptureSource::Log(LogReader::new(&[], Box::new(io::empty())));
             self.source = match std::mem::replace(&mut self.source, empty) {
-                Source::Log(_) => {
-                    Source::Log(LogReader::resume((place.offset, place.line, place.clock), input))
+                CaptureSource::Log(_) => {
+                    CaptureSource::Log(LogReader::resume((place.offset, place.line, place.clock), input))
                 }
-                Source::Mcap(mcap) => {
+                CaptureSource::Mcap(mcap) => {
                     let mut state = mcap.into_state();
                     places
-                        .describe(place.part, &mut state)
+                        .apply_descriptions(place.part, &mut state)
                         .map_err(|fault| fault.into_capture_error(&name, self.entries))?;
-                    Source::Mcap(Box::new(McapReader::resume(place.offset, input, state, Some(regular))))
+                    CaptureSource::Mcap(Box::new(McapReader::resume(
+                        place.offset,
+                        input,
+                        state,
+                        Some(regular),
+                    )))
                 }
             };
         }
@@ -346,8 +352,8 @@ impl Reader {
     #[must_use]
     pub const fn format(&self) -> CaptureFormat {
         match self.source {
-            Source::Log(_) => CaptureFormat::Candump,
-            Source::Mcap(_) => CaptureFormat::Mcap,
+            CaptureSource::Log(_) => CaptureFormat::Candump,
+            CaptureSource::Mcap(_) => CaptureFormat::Mcap,
         }
     }
 
@@ -359,11 +365,11 @@ impl Reader {
         clippy::should_implement_trait,
         reason = "an entry borrows from the reader; an iterator's cannot"
     )]
-    pub fn next(&mut self) -> Result<Option<Entry<'_>>, CaptureError> {
+    pub fn next(&mut self) -> Result<Option<CaptureEntry<'_>>, CaptureError> {
         // Only a reader that was opened with all topics returns other messages.
         Ok(match self.next_item()? {
-            Some(Item::Entry(entry)) => Some(entry),
-            Some(Item::Other(_)) | None => None,
+            Some(RecordingItem::Entry(entry)) => Some(entry),
+            Some(RecordingItem::Other(_)) | None => None,
         })
     }
 
@@ -372,19 +378,21 @@ impl Reader {
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
-    pub fn next_item(&mut self) -> Result<Option<Item<'_>>, CaptureError> {
+    pub fn next_item(&mut self) -> Result<Option<RecordingItem<'_>>, CaptureError> {
         while !self.remaining.is_empty() && self.source.is_at_its_end(&self.file, self.entries)? {
             self.open_next_part()?;
         }
         let Self { file: name, source, entries, times, before, .. } = self;
         let next = match source {
-            Source::Log(log) => log.next().map(|next| next.map(Item::Entry)).map_err(ReadFault::from),
-            Source::Mcap(mcap) => mcap.next(),
+            CaptureSource::Log(log) => {
+                log.next().map(|next| next.map(RecordingItem::Entry)).map_err(ReadFault::from)
+            }
+            CaptureSource::Mcap(mcap) => mcap.next(),
         };
         let next = next.map_err(|fault| fault.into_capture_error(name, *entries))?;
-        *entries += u64::from(matches!(next, Some(Item::Entry(_))));
-        if let Some(Item::Entry(Entry::Frame(record))) = &next {
-            if let Some(before) = before.take().filter(|_| record.time.nanos < times.latest()) {
+        *entries += u64::from(matches!(next, Some(RecordingItem::Entry(_))));
+        if let Some(RecordingItem::Entry(CaptureEntry::Frame(record))) = &next {
+            if let Some(before) = before.take().filter(|_| record.time.nanos < times.latest_ns()) {
                 times.record_overlap(name, &before);
             }
             times.check(record.interface, record.time.nanos);
@@ -406,23 +414,23 @@ impl Reader {
     #[must_use]
     pub const fn line_count(&self) -> u64 {
         match &self.source {
-            Source::Log(log) => log.lines(),
-            Source::Mcap(_) => 0,
+            CaptureSource::Log(log) => log.lines(),
+            CaptureSource::Mcap(_) => 0,
         }
     }
 
     /// Returns remarks on the times, flags and buses of the frames read so far, one line each.
     #[must_use]
     pub fn remarks(&self) -> Vec<String> {
-        self.times.backwards().into_iter().chain(self.remarks_except_order()).collect()
+        self.times.backwards_remark().into_iter().chain(self.remarks_except_order()).collect()
     }
 
     /// Returns the remarks except the one on times that run backwards.
     #[must_use]
     pub fn remarks_except_order(&self) -> Vec<String> {
         let shared = match &self.source {
-            Source::Mcap(mcap) => mcap.buses().is_shared(),
-            Source::Log(_) => false,
+            CaptureSource::Mcap(mcap) => mcap.buses().is_shared(),
+            CaptureSource::Log(_) => false,
         };
         let shared = shared.then(|| {
             "topics have frames of one frame_id: each topic is a bus of its own, and is called by its topic".to_owned()
@@ -433,7 +441,7 @@ impl Reader {
 
     fn log_remarks(&self) -> Vec<Remark> {
         let mut remarks = self.remarks.clone();
-        if let Source::Log(log) = &self.source {
+        if let CaptureSource::Log(log) = &self.source {
             remarks.extend(log.remarks().iter().filter(|remark| !self.remarks.contains(remark)));
         }
         remarks
@@ -449,8 +457,8 @@ impl Reader {
     #[must_use]
     pub fn text_kind(&self) -> Option<(&'static str, &'static str)> {
         match &self.source {
-            Source::Log(log) => kind_of(log.sample()),
-            Source::Mcap(_) => None,
+            CaptureSource::Log(log) => kind_of(log.sample()),
+            CaptureSource::Mcap(_) => None,
         }
     }
 
@@ -458,8 +466,8 @@ impl Reader {
     #[must_use]
     pub fn has_foreign_frames(&self) -> bool {
         match &self.source {
-            Source::Mcap(mcap) => mcap.has_foreign(),
-            Source::Log(_) => false,
+            CaptureSource::Mcap(mcap) => mcap.has_foreign(),
+            CaptureSource::Log(_) => false,
         }
     }
 
@@ -468,8 +476,8 @@ impl Reader {
     #[must_use]
     pub fn is_drained(&self) -> bool {
         match &self.source {
-            Source::Log(log) => log.is_drained(),
-            Source::Mcap(_) => false,
+            CaptureSource::Log(log) => log.is_drained(),
+            CaptureSource::Mcap(_) => false,
         }
     }
 
@@ -478,8 +486,8 @@ impl Reader {
     #[must_use]
     pub fn extras(&self) -> &RecordingExtras {
         match &self.source {
-            Source::Log(_) => RecordingExtras::NONE,
-            Source::Mcap(mcap) => mcap.extras(),
+            CaptureSource::Log(_) => RecordingExtras::NONE,
+            CaptureSource::Mcap(mcap) => mcap.extras(),
         }
     }
 }

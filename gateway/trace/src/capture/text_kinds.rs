@@ -1,8 +1,8 @@
 //! Recognises the kind of a text that has no frames, by its first lines.
 
-const EXPORT: &str =
+const EXPORT_ADVICE: &str =
     "no converter of it is known here: export it as a candump log from the program that wrote it";
-pub(super) const ASC: (&str, &str) =
+pub(super) const ASC_KIND: (&str, &str) =
     ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
 
 /// The name of the kind for skin and scenario files.
@@ -20,7 +20,7 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
     let words = |line: &str| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
     let begins_with = |begin: &'static str| any(&|line| line.starts_with(begin));
     let kinds: [(bool, (&'static str, &'static str)); 16] = [
-        (begins_with("***BUSMASTER"), ("a BUSMASTER log", EXPORT)),
+        (begins_with("***BUSMASTER"), ("a BUSMASTER log", EXPORT_ADVICE)),
         (
             any(&|line| SKIN_TABLES.iter().any(|table| line.starts_with(table))),
             (SKIN_OR_SCENARIO, "there are no frames in it: name a capture"),
@@ -30,8 +30,8 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
                 || begins_with("VERSION \""),
             ("a DBC file", "it describes signals and holds no frames: name a capture"),
         ),
-        (any(&|line| line.starts_with("base hex") || line.starts_with("base dec")), ASC),
-        (any(&|line| line.starts_with("Begin Triggerblock") || line == "// version 7.0.0"), ASC),
+        (any(&|line| line.starts_with("base hex") || line.starts_with("base dec")), ASC_KIND),
+        (any(&|line| line.starts_with("Begin Triggerblock") || line == "// version 7.0.0"), ASC_KIND),
         (
             any(&|line| is_trc(&words(line))),
             (
@@ -41,17 +41,17 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
         ),
         (
             any(&|line| words(line).get(..3).is_some_and(|head| head == ["Time", "ID", "DLC"])),
-            ("a CANHacker trace", EXPORT),
+            ("a CANHacker trace", EXPORT_ADVICE),
         ),
-        (begins_with("# Logger type:"), ("a CSS Electronics CLX000 log", EXPORT)),
-        (any(&|line| line.starts_with("< frame ")), ("what socketcand sends", EXPORT)),
+        (begins_with("# Logger type:"), ("a CSS Electronics CLX000 log", EXPORT_ADVICE)),
+        (any(&|line| line.starts_with("< frame ")), ("what socketcand sends", EXPORT_ADVICE)),
         (
             any(&|line| line.starts_with("Timestamp:") && line.contains(" DL:")),
             ("what python-can prints", "it is no log: let python-can write one with `can_logger -f NEW.log`"),
         ),
-        (any(&|line| is_kvaser(line)), ("a Kvaser log", EXPORT)),
-        (any(&|line| is_crtd(&words(line))), ("a CRTD log", EXPORT)),
-        (any(&is_canboat), ("a canboat log of NMEA 2000 messages", EXPORT)),
+        (any(&|line| is_kvaser(line)), ("a Kvaser log", EXPORT_ADVICE)),
+        (any(&|line| is_crtd(&words(line))), ("a CRTD log", EXPORT_ADVICE)),
+        (any(&is_canboat), ("a canboat log of NMEA 2000 messages", EXPORT_ADVICE)),
         (
             any(&|line| line.contains("]  ") && line.contains("  - '")),
             (

@@ -65,7 +65,7 @@ impl TimeChecks {
     }
 
     /// Returns the latest time so far, in ns since 1970.
-    pub(super) const fn latest(&self) -> u64 {
+    pub(super) const fn latest_ns(&self) -> u64 {
         self.latest
     }
 
@@ -75,7 +75,7 @@ impl TimeChecks {
     }
 
     /// Returns the remark on times that run backwards.
-    pub(super) fn backwards(&self) -> Option<String> {
+    pub(super) fn backwards_remark(&self) -> Option<String> {
         let (times, first) = self.backwards?;
         Some(format!("times run backwards {times} times, first at frame {first}; the order is kept"))
     }
@@ -114,7 +114,7 @@ mod tests {
     fn remarks(frames: &[(&str, u64)]) -> Vec<String> {
         let mut times = TimeChecks::default();
         frames.iter().for_each(|(bus, nanos)| times.check(bus, *nanos));
-        times.backwards().into_iter().chain(times.remarks()).collect()
+        times.backwards_remark().into_iter().chain(times.remarks()).collect()
     }
 
     #[test]

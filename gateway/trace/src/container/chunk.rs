@@ -10,11 +10,11 @@ use super::field::Fields;
 use super::{FormatError, MAX_RECORD_BYTES};
 
 /// The total size in bytes that the chunks of any file may decompress to, even if the file is short.
-const FREE_BYTES: u64 = 256 << 20;
+const BASE_LIMIT_BYTES: u64 = 256 << 20;
 /// The number of decompressed bytes that are allowed for each byte of the file, in addition to [`FREE_BYTES`].
 const MAX_EXPANSION: u64 = 1_000;
 /// The total number of records that the chunks of any file may hold, even if the file is short.
-const FREE_RECORDS: u64 = 1 << 17;
+const BASE_LIMIT_RECORDS: u64 = 1 << 17;
 /// The number of records that are allowed for each byte of the file, in addition to [`FREE_RECORDS`]. A real recording
 /// has an index entry of 16 bytes for each record.
 const MAX_RECORDS_PER_BYTE: u64 = 1;
@@ -54,7 +54,7 @@ impl Chunk {
     /// Returns [`FormatError`] if the chunk is invalid. It then has no records.
     pub fn unpack(&mut self, record: &[u8], read: u64) -> Result<(), FormatError> {
         self.rewind();
-        let unpacked = self.open(record, read);
+        let unpacked = self.decompress_and_check(record, read);
         if unpacked.is_err() {
             self.bytes.clear();
         }
@@ -89,7 +89,7 @@ impl Chunk {
         (self.at, self.body) = (0, 0);
     }
 
-    fn open(&mut self, record: &[u8], read: u64) -> Result<(), FormatError> {
+    fn decompress_and_check(&mut self, record: &[u8], read: u64) -> Result<(), FormatError> {
         let mut from = Fields::new("chunk", record);
         from.u64("start time")?;
         from.u64("end time")?;
@@ -105,7 +105,7 @@ impl Chunk {
                 limit: MAX_RECORD_BYTES,
             });
         }
-        let limit = FREE_BYTES.saturating_add(read.saturating_mul(MAX_EXPANSION));
+        let limit = BASE_LIMIT_BYTES.saturating_add(read.saturating_mul(MAX_EXPANSION));
         self.total_bytes = self.total_bytes.saturating_add(claimed);
         if self.total_bytes > limit {
             return Err(FormatError::Bomb { read, limit, what: "bytes" });
@@ -134,7 +134,7 @@ impl Chunk {
             rest = rest.get(rest.len() - leftover..).unwrap_or_default();
             self.total_records += 1;
         }
-        let limit = FREE_RECORDS.saturating_add(read.saturating_mul(MAX_RECORDS_PER_BYTE));
+        let limit = BASE_LIMIT_RECORDS.saturating_add(read.saturating_mul(MAX_RECORDS_PER_BYTE));
         if self.total_records > limit {
             return Err(FormatError::Bomb { read, limit, what: "records" });
         }
@@ -292,7 +292,7 @@ mod tests {
         let record = chunk(zeros.len() as u64 + 9, 0, "zstd", &packed);
         let mut chunk = Chunk::default();
         assert_eq!((chunk.unpack(&record, 0), chunk.unpack(&record, 0)), (Ok(()), Ok(())));
-        let bomb = FormatError::Bomb { read: 0, limit: FREE_BYTES, what: "bytes" };
+        let bomb = FormatError::Bomb { read: 0, limit: BASE_LIMIT_BYTES, what: "bytes" };
         assert_eq!(chunk.unpack(&record, 0), Err(bomb));
         assert_eq!(chunk.next(), None);
     }

@@ -120,7 +120,7 @@ impl NameBudget {
     /// The memory that a name takes in addition to its text, in bytes.
     pub const ENTRY_OVERHEAD: usize = 128;
     /// The maximum size of all names together, in bytes.
-    const LIMIT: usize = 32 << 20;
+    const LIMIT_BYTES: usize = 32 << 20;
 
     /// Counts a name of `bytes` bytes towards the limit.
     ///
@@ -128,7 +128,7 @@ impl NameBudget {
     /// Returns [`FormatError::Names`] if the limit is exceeded.
     pub fn add(&mut self, bytes: usize) -> Result<(), FormatError> {
         self.0 = self.0.saturating_add(bytes).saturating_add(Self::ENTRY_OVERHEAD);
-        if self.0 > Self::LIMIT { Err(FormatError::Names { limit: Self::LIMIT }) } else { Ok(()) }
+        if self.0 > Self::LIMIT_BYTES { Err(FormatError::Names { limit: Self::LIMIT_BYTES }) } else { Ok(()) }
     }
 }
 
@@ -145,12 +145,12 @@ impl<'a> Fields<'a> {
         Self { record, bytes: body.len(), rest: body }
     }
 
-    fn short(&self, field: &'static str) -> FormatError {
+    fn short_error(&self, field: &'static str) -> FormatError {
         FormatError::Short { record: self.record, bytes: self.bytes, field }
     }
 
     fn array<const N: usize>(&mut self, field: &'static str) -> Result<[u8; N], FormatError> {
-        let (head, rest) = self.rest.split_first_chunk().ok_or_else(|| self.short(field))?;
+        let (head, rest) = self.rest.split_first_chunk().ok_or_else(|| self.short_error(field))?;
         self.rest = rest;
         Ok(*head)
     }
@@ -173,7 +173,7 @@ impl<'a> Fields<'a> {
     /// Returns [`Damage::Short`] if the record has fewer.
     pub(super) fn bytes(&mut self, count: u64, field: &'static str) -> Result<&'a [u8], FormatError> {
         let split = usize::try_from(count).ok().and_then(|count| self.rest.split_at_checked(count));
-        let (bytes, rest) = split.ok_or_else(|| self.short(field))?;
+        let (bytes, rest) = split.ok_or_else(|| self.short_error(field))?;
         self.rest = rest;
         Ok(bytes)
     }

@@ -16,7 +16,7 @@ mod source;
 pub use chunk::Chunk;
 pub use field::{MetadataMap, NameBudget, Record, parse};
 pub use search::{RECORD_HEADER_BYTES, first_record, is_record, length_by_fields};
-pub use source::{Framed, RecordReader, seek_record};
+pub use source::{FramedRecord, RecordReader, seek_record};
 
 use std::io::{self, Read};
 

@@ -5,7 +5,9 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::{Record, attachment_name, parse};
-use super::search::{RECORD_HEADER_BYTES, has_records, is_disguised, is_known, is_plain, length_by_fields};
+use super::search::{
+    RECORD_HEADER_BYTES, has_records, has_wrong_opcode, is_known, is_uncompressed, length_by_fields,
+};
 use super::{FormatError, MAGIC, MAX_RECORD_BYTES, read_uninterrupted};
 
 /// The maximum number of bytes stored of a record that is too long for memory or that no reader needs.
@@ -14,11 +16,11 @@ const KEPT_PREFIX_BYTES: u64 = 64 << 10;
 const KEPT_INDEX_BYTES: u64 = 64;
 
 /// The number of bytes at the beginning of a footer that its checksum covers.
-const FOOTER_CHECKED: usize = 16;
+const FOOTER_CHECKED_BYTES: usize = 16;
 
 /// A record of the file, or the reason why there is no further record.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Framed {
+pub enum FramedRecord {
     /// A record with this operation code, whose contents are in [`RecordReader::body`].
     Record(u8),
     /// A skipped record with this operation code and length: an index, statistics, or a record of an application. Its
@@ -83,7 +85,7 @@ impl<R: Read> RecordReader<R> {
     }
 
     /// Creates a reader that continues at the offset `read` of a file.
-    pub fn at(read: u64, input: R, attachments: u64) -> Self {
+    pub fn resume_at(read: u64, input: R, attachments: u64) -> Self {
         Self { read, checksum: None, ..Self::new(input, attachments) }
     }
 
@@ -91,10 +93,10 @@ impl<R: Read> RecordReader<R> {
     ///
     /// # Errors
     /// Returns an error if the input fails.
-    pub fn magic(&mut self) -> io::Result<bool> {
+    pub fn read_magic(&mut self) -> io::Result<bool> {
         self.body.clear();
         self.read_into_body(MAGIC.len() as u64)?;
-        self.update();
+        self.update_checksum();
         Ok(self.body == MAGIC)
     }
 
@@ -106,13 +108,13 @@ impl<R: Read> RecordReader<R> {
 
     /// Returns the number of bytes read so far.
     #[must_use]
-    pub const fn read(&self) -> u64 {
+    pub const fn bytes_read(&self) -> u64 {
         self.read
     }
 
     /// Returns the offset of the last record.
     #[must_use]
-    pub const fn began(&self) -> u64 {
+    pub const fn record_offset(&self) -> u64 {
         self.began
     }
 
@@ -131,8 +133,9 @@ impl<R: Read> RecordReader<R> {
     /// Returns the length of the last record, computed from its fields, if it is an uncompressed chunk. Anything in
     /// that range that looks like a record belongs to the chunk.
     #[must_use]
-    pub fn plain_chunk(&self) -> Option<u64> {
-        length_by_fields(op::CHUNK, &self.body).filter(|_| self.code == op::CHUNK && is_plain(&self.body))
+    pub fn uncompressed_chunk_length(&self) -> Option<u64> {
+        length_by_fields(op::CHUNK, &self.body)
+            .filter(|_| self.code == op::CHUNK && is_uncompressed(&self.body))
     }
 
     /// Checks the record that was read last: its length against its own fields, and its operation code against its
@@ -140,14 +143,14 @@ impl<R: Read> RecordReader<R> {
     ///
     /// # Errors
     /// Returns [`FormatError`] if the operation code or the length is wrong.
-    pub fn check(&self, framed: Framed) -> Result<(), FormatError> {
+    pub fn check(&self, framed: FramedRecord) -> Result<(), FormatError> {
         let (code, bytes) = match framed {
-            Framed::Unknown(code, _) => return Err(FormatError::Unknown(code)),
-            Framed::End(_) => return Ok(()),
-            Framed::Record(code) => (code, self.body.len() as u64),
-            Framed::Skipped(code, bytes)
-            | Framed::Oversized(code, bytes)
-            | Framed::Truncated(code, bytes) => (code, bytes),
+            FramedRecord::Unknown(code, _) => return Err(FormatError::Unknown(code)),
+            FramedRecord::End(_) => return Ok(()),
+            FramedRecord::Record(code) => (code, self.body.len() as u64),
+            FramedRecord::Skipped(code, bytes)
+            | FramedRecord::Oversized(code, bytes)
+            | FramedRecord::Truncated(code, bytes) => (code, bytes),
         };
         let is_index = matches!(
             code,
@@ -159,7 +162,7 @@ impl<R: Read> RecordReader<R> {
         let is_of = |kind| length_by_fields(kind, &self.body) == Some(bytes);
         let is_other = code == op::MESSAGE
             && (is_of(op::SCHEMA) || is_of(op::CHANNEL) || (self.has_chunks && is_of(op::MESSAGE_INDEX)));
-        if is_elsewhere || is_other || (code >= 0x80 && is_disguised(&self.body, bytes)) {
+        if is_elsewhere || is_other || (code >= 0x80 && has_wrong_opcode(&self.body, bytes)) {
             return Err(FormatError::Code(code));
         }
         match length_by_fields(code, &self.body) {
@@ -212,19 +215,19 @@ impl<R: Read> RecordReader<R> {
         clippy::should_implement_trait,
         reason = "a record borrows from the source; an iterator's cannot"
     )]
-    pub fn next(&mut self) -> io::Result<Framed> {
+    pub fn next(&mut self) -> io::Result<FramedRecord> {
         self.message_before = (self.code == op::MESSAGE).then_some(self.began);
         (self.began, self.code) = (self.read, 0);
         self.body.clear();
         self.read_into_body(9)?;
         let Some(&[opcode, ref length @ ..]) = self.body.first_chunk::<9>() else {
-            return Ok(Framed::End(self.read - self.began));
+            return Ok(FramedRecord::End(self.read - self.began));
         };
         self.code = opcode;
         self.has_chunks |= opcode == op::CHUNK;
         let length = u64::from_le_bytes(*length);
         if opcode != op::DATA_END {
-            self.update();
+            self.update_checksum();
         }
         self.body.clear();
         let (limit, beginning) = match opcode {
@@ -245,18 +248,18 @@ impl<R: Read> RecordReader<R> {
         let mut there = self.read_into_body(kept)? == kept;
         match opcode {
             op::DATA_END => {}
-            op::FOOTER => self.update_to(FOOTER_CHECKED),
-            _ => self.update(),
+            op::FOOTER => self.update_checksum_to(FOOTER_CHECKED_BYTES),
+            _ => self.update_checksum(),
         }
         if is_long && there {
             there = self.skip(length - kept)?;
         }
         Ok(match limit {
-            _ if !is_known(opcode) => Framed::Unknown(opcode, length),
-            _ if !there => Framed::Truncated(opcode, length),
-            0 if opcode != op::ATTACHMENT => Framed::Skipped(opcode, length),
-            _ if is_long => Framed::Oversized(opcode, length),
-            _ => Framed::Record(opcode),
+            _ if !is_known(opcode) => FramedRecord::Unknown(opcode, length),
+            _ if !there => FramedRecord::Truncated(opcode, length),
+            0 if opcode != op::ATTACHMENT => FramedRecord::Skipped(opcode, length),
+            _ if is_long => FramedRecord::Oversized(opcode, length),
+            _ => FramedRecord::Record(opcode),
         })
     }
 
@@ -270,11 +273,11 @@ impl<R: Read> RecordReader<R> {
         Ok(came as u64)
     }
 
-    fn update(&mut self) {
-        self.update_to(usize::MAX);
+    fn update_checksum(&mut self) {
+        self.update_checksum_to(usize::MAX);
     }
 
-    fn update_to(&mut self, bytes: usize) {
+    fn update_checksum_to(&mut self, bytes: usize) {
         if let Some(checksum) = &mut self.checksum {
             checksum.update(self.body.get(..bytes).unwrap_or(&self.body));
         }
@@ -334,7 +337,7 @@ impl<R: Read + Seek> RecordReader<R> {
     ///
     /// # Errors
     /// Returns an error if the input fails.
-    pub fn read_as(&mut self, began: u64, length: u64) -> io::Result<bool> {
+    pub fn read_with_length(&mut self, began: u64, length: u64) -> io::Result<bool> {
         self.seek(began + RECORD_HEADER_BYTES as u64)?;
         self.began = began;
         self.body.clear();

@@ -10,8 +10,8 @@ use protocol::stop::InterruptibleWriter;
 use rustix::fs::{Access, access};
 
 use super::target::{
-    OutputTarget, identity, is_still, lock_exclusively, open_stream, open_unfollowed, suffixed, sync_folder,
-    temporary_name, with_exists_hint, with_hint, write_all_with_retries,
+    OutputTarget, device_and_inode, lock_exclusively, open_no_follow, open_stream, still_names_file,
+    suffixed, sync_folder, temporary_name, with_exists_hint, with_hint, write_all_with_retries,
 };
 
 /// A log file. It has its name from the start and is locked against other writers. It always ends with a complete line.
@@ -48,7 +48,7 @@ impl LogFile {
             Ok(OutputTarget::New) => LogTarget::Opened(create_locked(path)?),
             Ok(OutputTarget::Existing) => {
                 // If the file was replaced by a symlink meanwhile, the link is not followed.
-                let old = open_unfollowed(path).map_err(with_hint)?;
+                let old = open_no_follow(path).map_err(with_hint)?;
                 lock_log(&old)?;
                 // Missing write access to the folder is reported now, not when the first line is written.
                 let writes = access(parent_folder(path), Access::WRITE_OK | Access::EXEC_OK);
@@ -138,12 +138,12 @@ impl LogFile {
     ///
     /// # Errors
     /// Returns an error if another program has renamed, removed, truncated or written it.
-    pub fn check(&self) -> io::Result<()> {
+    pub fn check_unchanged(&self) -> io::Result<()> {
         let LogTarget::Opened(file) = &self.state else { return Ok(()) };
         // If the file cannot be queried, it is not known to have changed.
         let Ok(about) = file.metadata() else { return Ok(()) };
         let (bytes, written) = (about.len(), self.bytes);
-        let why = if is_still(&self.path, identity(&about)) == Some(false) {
+        let why = if still_names_file(&self.path, device_and_inode(&about)) == Some(false) {
             "another program renamed, removed or replaced it while it was written; what comes goes on to the file \
              that was opened"
                 .to_owned()
@@ -161,9 +161,9 @@ impl LogFile {
     ///
     /// # Errors
     /// Returns an error if the file cannot be read.
-    pub fn lines(&self, begin: &str) -> io::Result<Option<u64>> {
+    pub fn count_lines_with_prefix(&self, begin: &str) -> io::Result<Option<u64>> {
         let LogTarget::Opened(file) = &self.state else { return Ok(None) };
-        let there = open_unfollowed(&self.path);
+        let there = open_no_follow(&self.path);
         let Some(there) = there.ok().filter(|there| is_same(there, file)) else { return Ok(None) };
         let mut lines = 0;
         for line in BufReader::new(there).split(b'\n') {
@@ -204,8 +204,9 @@ impl Drop for LogFile {
     /// Removes the file if nothing was written and [`LogFile::finish`] was not called.
     fn drop(&mut self) {
         let LogTarget::Opened(file) = &self.state else { return };
-        let is_there =
-            file.metadata().is_ok_and(|about| is_still(&self.path, identity(&about)) == Some(true));
+        let is_there = file
+            .metadata()
+            .is_ok_and(|about| still_names_file(&self.path, device_and_inode(&about)) == Some(true));
         if !self.ended && self.bytes == 0 && is_there {
             // An error of removing the file cannot be handled here.
             let _ = fs::remove_file(&self.path);
@@ -214,7 +215,7 @@ impl Drop for LogFile {
 }
 
 fn is_same(one: &File, other: &File) -> bool {
-    let of = |file: &File| file.metadata().ok().map(|about| identity(&about));
+    let of = |file: &File| file.metadata().ok().map(|about| device_and_inode(&about));
     of(one).is_some_and(|is| Some(is) == of(other))
 }
 

@@ -1,6 +1,6 @@
 //! Output files of commands. An existing file is overwritten only on request. A symlink to a file is never followed.
 //!
-//! - [`WholeFile`]: a result file, which appears under its name only when it is complete.
+//! - [`AtomicFile`]: a result file, which appears under its name only when it is complete.
 //! - [`LogFile`]: a log file, which exists from its first line on and grows.
 
 pub mod log;
@@ -16,7 +16,8 @@ pub use protocol::input::parent_folder;
 use target::{OutputTarget, open_stream, temporary_name, with_exists_hint};
 pub use target::{STANDARD_OUTPUT, check, check_regular, rename, suffixed, sync_folder, with_hint};
 pub(crate) use target::{
-    identity, is_still, link, lock_exclusively, nameless, open_unfollowed, write_with_retries,
+    create_unnamed_file, device_and_inode, link, lock_exclusively, open_no_follow, still_names_file,
+    write_with_retries,
 };
 
 /// A file that gets its name only when it is complete. Until then it is unnamed, and so disappears if the program is
@@ -26,7 +27,7 @@ pub(crate) use target::{
 /// Existing targets that are not regular files (a FIFO, a terminal, `/dev/stdout`), and `-`, standard output, are
 /// written directly.
 #[derive(Debug)]
-pub struct WholeFile {
+pub struct AtomicFile {
     path: PathBuf,
     force: bool,
     /// The open file; `None` if the target is written directly.
@@ -35,7 +36,7 @@ pub struct WholeFile {
     is_part: bool,
 }
 
-impl WholeFile {
+impl AtomicFile {
     /// Opens a file before there is anything to write, so that errors are reported early. An existing file is
     /// overwritten if `force` is true, and is an error otherwise.
     ///
@@ -45,7 +46,7 @@ impl WholeFile {
         Self::create_unless(path, force, &AtomicBool::new(false))
     }
 
-    /// Opens a file like [`WholeFile::create`]. If it is a FIFO, waits until it has a reader or `stopped` is set.
+    /// Opens a file like [`AtomicFile::create`]. If it is a FIFO, waits until it has a reader or `stopped` is set.
     ///
     /// # Errors
     /// Returns an error, with advice to the user, if the file cannot be written.
@@ -55,7 +56,7 @@ impl WholeFile {
             let file = open_stream(path, stopped).map_err(with_hint)?;
             return Ok((begun(None, false), file));
         }
-        if let Ok(file) = nameless(parent_folder(path), 0o666) {
+        if let Ok(file) = create_unnamed_file(parent_folder(path), 0o666) {
             return Ok((begun(Some(file.try_clone()?), false), file));
         }
         let part = OpenOptions::new().write(true).create_new(true).open(temporary_name(path));
@@ -98,7 +99,7 @@ impl WholeFile {
     }
 }
 
-impl Drop for WholeFile {
+impl Drop for AtomicFile {
     fn drop(&mut self) {
         if self.is_part {
             // An error of removing the file cannot be handled here.
@@ -107,12 +108,12 @@ impl Drop for WholeFile {
     }
 }
 
-/// Writes a text to a file that appears under its name only when it is complete, as [`WholeFile`] does.
+/// Writes a text to a file that appears under its name only when it is complete, as [`AtomicFile`] does.
 ///
 /// # Errors
 /// Returns an error, with advice to the user, if the file cannot be written.
-pub fn write_whole(path: &Path, text: &str, force: bool) -> io::Result<()> {
-    let (whole, mut file) = WholeFile::create(path, force)?;
+pub fn write_atomically(path: &Path, text: &str, force: bool) -> io::Result<()> {
+    let (whole, mut file) = AtomicFile::create(path, force)?;
     file.write_all(text.as_bytes())?;
     whole.finish()
 }

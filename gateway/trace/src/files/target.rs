@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use protocol::input::{own_descriptor, parent_folder};
+use protocol::input::{descriptor_of_path, parent_folder};
 use rustix::fs::{
     AtFlags, CWD, FlockOperation, Mode, OFlags, RenameFlags, fcntl_getfl, fcntl_setfl, flock, linkat, open,
     renameat_with,
@@ -49,7 +49,7 @@ impl OutputTarget {
         };
         if kind.is_symlink() {
             let streams = fs::metadata(path).is_ok_and(|about| is_stream(about.file_type()));
-            return if streams || own_descriptor(path).is_some() {
+            return if streams || descriptor_of_path(path).is_some() {
                 Ok(Self::Stream)
             } else {
                 let itself = if !force && path.exists() { " and add --overwrite" } else { "" };
@@ -110,7 +110,7 @@ fn is_stream(kind: FileType) -> bool {
 
 /// Opens a FIFO, terminal or other stream. A FIFO is awaited until it has a reader or `stopped` is set.
 pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File> {
-    let descriptor = if path == Path::new(STANDARD_OUTPUT) { Some(1) } else { own_descriptor(path) };
+    let descriptor = if path == Path::new(STANDARD_OUTPUT) { Some(1) } else { descriptor_of_path(path) };
     let own: Option<OwnedFd> = match descriptor {
         Some(1) => Some(io::stdout().as_fd().try_clone_to_owned()?),
         Some(2) => Some(io::stderr().as_fd().try_clone_to_owned()?),
@@ -134,7 +134,7 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
             opened => break opened?,
         }
     };
-    if !is_stream(file.metadata()?.file_type()) && own_descriptor(path).is_none() {
+    if !is_stream(file.metadata()?.file_type()) && descriptor_of_path(path).is_none() {
         return Err(exists_error());
     }
     fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
@@ -157,7 +157,7 @@ pub fn suffixed(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf 
 ///
 /// # Errors
 /// Returns an error if the folder cannot be written, or if the file system does not support unnamed files.
-pub(crate) fn nameless(folder: &Path, mode: u32) -> io::Result<File> {
+pub(crate) fn create_unnamed_file(folder: &Path, mode: u32) -> io::Result<File> {
     let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
     Ok(open(folder, flags, Mode::from_raw_mode(mode))?.into())
 }
@@ -175,7 +175,7 @@ pub(crate) fn link(file: &File, path: &Path) -> io::Result<()> {
 ///
 /// # Errors
 /// Returns an error if the file cannot be opened.
-pub(crate) fn open_unfollowed(path: &Path) -> io::Result<File> {
+pub(crate) fn open_no_follow(path: &Path) -> io::Result<File> {
     let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY).bits().cast_signed();
     OpenOptions::new().read(true).custom_flags(flags).open(path)
 }
@@ -190,15 +190,15 @@ pub(crate) fn lock_exclusively(file: &File) -> io::Result<()> {
 }
 
 /// Returns the device and the inode of a file, which identify it under any name.
-pub(crate) fn identity(about: &fs::Metadata) -> (u64, u64) {
+pub(crate) fn device_and_inode(about: &fs::Metadata) -> (u64, u64) {
     (about.dev(), about.ino())
 }
 
 /// Returns true if `path` is a name of the file with the identity `is`, and not a symlink to it. Returns `None` if the
 /// name cannot be queried.
-pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> Option<bool> {
+pub(crate) fn still_names_file(path: &Path, is: (u64, u64)) -> Option<bool> {
     match fs::symlink_metadata(path) {
-        Ok(about) => Some(identity(&about) == is),
+        Ok(about) => Some(device_and_inode(&about) == is),
         Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
             Some(false)
         }

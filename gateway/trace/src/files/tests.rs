@@ -18,7 +18,7 @@ fn log(path: &Path, force: bool) -> io::Result<LogFile> {
 
 /// Creates a log and a result file under the same name, and returns the error message of each.
 fn refusals(path: &Path, force: bool) -> [String; 2] {
-    let [whole, log] = [WholeFile::create(path, force).map(drop), log(path, force).map(drop)];
+    let [whole, log] = [AtomicFile::create(path, force).map(drop), log(path, force).map(drop)];
     [whole, log].map(|refused| refused.unwrap_err().to_string())
 }
 
@@ -28,9 +28,9 @@ fn a_file_has_its_name_when_it_is_whole_and_leaves_nothing_when_it_never_is() {
     let path = folder.path().join("run.json");
     for (force, text) in [(false, "first"), (true, "second")] {
         let before = names(folder.path());
-        drop(WholeFile::create(&path, force).unwrap());
+        drop(AtomicFile::create(&path, force).unwrap());
         assert_eq!(names(folder.path()), before);
-        let (whole, mut file) = WholeFile::create(&path, force).unwrap();
+        let (whole, mut file) = AtomicFile::create(&path, force).unwrap();
         file.write_all(text.as_bytes()).unwrap();
         assert_eq!(names(folder.path()), before);
         whole.finish().unwrap();
@@ -96,7 +96,7 @@ fn a_name_that_another_program_took_meanwhile_is_left_to_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.json");
     let begun = || {
-        let (whole, mut file) = WholeFile::create(&path, false).unwrap();
+        let (whole, mut file) = AtomicFile::create(&path, false).unwrap();
         file.write_all(b"mine").unwrap();
         whole
     };
@@ -117,7 +117,7 @@ fn a_name_that_another_program_took_meanwhile_is_left_to_it() {
 #[test]
 fn a_device_is_written_to_as_it_is() {
     for path in ["/dev/null", "/dev/../dev/null"] {
-        let (whole, mut file) = WholeFile::create(Path::new(path), false).unwrap();
+        let (whole, mut file) = AtomicFile::create(Path::new(path), false).unwrap();
         file.write_all(b"new").unwrap();
         whole.finish().unwrap();
         let mut log = log(Path::new(path), true).unwrap();
@@ -277,8 +277,8 @@ fn a_name_that_cannot_be_looked_at_is_neither_a_files_own_nor_anothers() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.log");
     fs::write(&path, "").unwrap();
-    let is = identity(&fs::metadata(&path).unwrap());
-    assert_eq!(is_still(&path, is), Some(true));
-    assert_eq!(is_still(&folder.path().join("other"), is), Some(false));
-    assert_eq!(is_still(&folder.path().join("n".repeat(300)), is), None);
+    let is = device_and_inode(&fs::metadata(&path).unwrap());
+    assert_eq!(still_names_file(&path, is), Some(true));
+    assert_eq!(still_names_file(&folder.path().join("other"), is), Some(false));
+    assert_eq!(still_names_file(&folder.path().join("n".repeat(300)), is), None);
 }

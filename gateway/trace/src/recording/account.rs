@@ -31,11 +31,11 @@ pub struct MessageCount {
 
 impl MessageCount {
     /// The count of a single frame.
-    pub const FRAME: Self = Self { frames: 1, others: 0 };
+    pub const ONE_FRAME: Self = Self { frames: 1, others: 0 };
 
     /// Returns the count of `others` messages that are not frames.
     #[must_use]
-    pub const fn others(others: u64) -> Self {
+    pub const fn other_messages(others: u64) -> Self {
         Self { frames: 0, others }
     }
 
@@ -45,7 +45,7 @@ impl MessageCount {
     }
 
     /// Returns the entry for a file of `bytes` bytes that holds these messages.
-    pub(super) fn in_file(self, path: &Path, bytes: u64) -> WrittenFile {
+    pub(super) fn into_written_file(self, path: &Path, bytes: u64) -> WrittenFile {
         let Self { frames, others } = self;
         WrittenFile {
             path: path.display().to_string(),

@@ -18,7 +18,7 @@ use protocol::candump::Record as Frame;
 
 use super::BUS_TOPIC_PREFIX;
 use super::output::SharedOutput;
-use crate::container::{Framed, Record, RecordReader, parse};
+use crate::container::{FramedRecord, Record, RecordReader, parse};
 use crate::ros2::Message;
 
 /// The size of a chunk in bytes before compression. Compressing a larger chunk would block the writer for so long that
@@ -70,7 +70,7 @@ fn identity(about: &fs::Metadata) -> BTreeMap<String, String> {
 /// # Errors
 /// Returns no error in practice, because it writes to memory.
 pub fn file_prefix(about: &fs::Metadata) -> io::Result<Vec<u8>> {
-    let mut writer = FileWriter::in_file(Vec::new(), about)?;
+    let mut writer = FileWriter::with_file_identity(Vec::new(), about)?;
     writer.flush()?;
     Ok(writer.into_inner())
 }
@@ -84,12 +84,12 @@ pub fn has_own_identity(file: &mut File) -> io::Result<bool> {
     let target = identity(&file.metadata()?);
     file.rewind()?;
     let mut from = RecordReader::new(file, 0);
-    if !from.magic()? || from.next()? != Framed::Record(op::HEADER) {
+    if !from.read_magic()? || from.next()? != FramedRecord::Record(op::HEADER) {
         return Ok(false);
     }
     let header = parse(op::HEADER, from.body());
     let is_ours = matches!(header, Ok(Record::Header { library, .. }) if library.starts_with(PROGRAM));
-    if !is_ours || from.next()? != Framed::Record(op::METADATA) {
+    if !is_ours || from.next()? != FramedRecord::Record(op::METADATA) {
         return Ok(false);
     }
     let Ok(Record::Metadata { name, facts }) = parse(op::METADATA, from.body()) else { return Ok(false) };
@@ -127,7 +127,7 @@ impl Channel {
 
 /// Returns true if a channel with this topic and type holds frames of a bus.
 #[must_use]
-pub(super) fn is_frames(topic: &str, schema: &str) -> bool {
+pub(super) fn is_frame_channel(topic: &str, schema: &str) -> bool {
     schema == Frame::TYPE && topic.starts_with(BUS_TOPIC_PREFIX)
 }
 
@@ -187,9 +187,9 @@ impl<W: Write> FileWriter<W> {
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
-    pub fn in_file(out: W, about: &fs::Metadata) -> io::Result<Self> {
+    pub fn with_file_identity(out: W, about: &fs::Metadata) -> io::Result<Self> {
         let mut writer = Self::new(out)?;
-        writer.metadata(IDENTITY_METADATA, &identity(about))?;
+        writer.write_metadata(IDENTITY_METADATA, &identity(about))?;
         Ok(writer)
     }
 
@@ -197,7 +197,7 @@ impl<W: Write> FileWriter<W> {
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
-    pub fn metadata(&mut self, name: &str, facts: &BTreeMap<String, String>) -> io::Result<()> {
+    pub fn write_metadata(&mut self, name: &str, facts: &BTreeMap<String, String>) -> io::Result<()> {
         self.end_chunk()?;
         let record = Metadata { name: name.to_owned(), metadata: facts.clone() };
         self.writer.write_metadata(&record).map_err(io_error)
@@ -238,11 +238,11 @@ impl<W: Write> FileWriter<W> {
         self.describe_schema(schema, (M::TYPE, "ros2msg"), definition);
         let id = self.writer.add_channel(schema, topic, "cdr", &facts).map_err(io_error)?;
         self.describe_channel((id, schema), (topic, "cdr"), &facts);
-        Ok(Channel { id, sequence: 0, is_frames: is_frames(topic, M::TYPE) })
+        Ok(Channel { id, sequence: 0, is_frames: is_frame_channel(topic, M::TYPE) })
     }
 
     /// Adds a schema under a given number, as in a file that is copied.
-    pub(super) fn schema_as(
+    pub(super) fn add_schema_with_id(
         &mut self,
         id: u16,
         (name, encoding): (&str, &str),
@@ -254,7 +254,7 @@ impl<W: Write> FileWriter<W> {
     }
 
     /// Adds a channel under a given number, for the schema with a given number.
-    pub(super) fn channel_as(
+    pub(super) fn add_channel_with_id(
         &mut self,
         (id, schema): (u16, u16),
         (topic, encoding): (&str, &str),
@@ -275,7 +275,7 @@ impl<W: Write> FileWriter<W> {
             &length_prefixed(encoding.as_bytes()),
             &length_prefixed(data),
         ];
-        self.describe(op::SCHEMA, &body.concat());
+        self.add_description(op::SCHEMA, &body.concat());
     }
 
     fn describe_channel(
@@ -293,10 +293,10 @@ impl<W: Write> FileWriter<W> {
         let facts = length_prefixed(&facts.collect::<Vec<_>>().concat());
         let (topic, encoding) = (length_prefixed(topic.as_bytes()), length_prefixed(encoding.as_bytes()));
         let body = [&id.to_le_bytes()[..], &schema.to_le_bytes(), &topic, &encoding, &facts];
-        self.describe(op::CHANNEL, &body.concat());
+        self.add_description(op::CHANNEL, &body.concat());
     }
 
-    fn describe(&mut self, opcode: u8, body: &[u8]) {
+    fn add_description(&mut self, opcode: u8, body: &[u8]) {
         // The crate writes the schema and the channel into the chunk too, so the chunk grows by them.
         self.open_bytes += (RECORD_HEADER_BYTES + body.len()) as u64;
         self.descriptions.push(opcode);

@@ -3,7 +3,7 @@
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
-use model::central::Central;
+use model::central::CentralComputation;
 use robots::{UniqueNames, chain_prefixes, sanitized};
 
 use super::robot::RecordedRobot;
@@ -43,7 +43,7 @@ pub struct Layout {
     /// By bus: for each joint of the bus's chain, its index among the joints of the robot.
     chains: Vec<Vec<usize>>,
     /// By bus: the computation of forces from sensor values, and the positions of the bus's cells.
-    pub central: Vec<Central>,
+    pub central: Vec<CentralComputation>,
     /// The number of epochs between two point clouds of a patch.
     pub epochs_per_cloud: u64,
     /// The duration of a tick, in ns.
@@ -90,7 +90,9 @@ impl Layout {
         )]
         let epochs_per_cloud = (skin.timing.broadcast_hz() / MAX_CLOUD_HZ).ceil().max(1.0) as u64;
         Self {
-            central: (0..buses.len()).map(|bus| Central::new(&skin.with_cells_of_bus(bus))).collect(),
+            central: (0..buses.len())
+                .map(|bus| CentralComputation::new(&skin.with_cells_of_bus(bus)))
+                .collect(),
             buses,
             arm: if skin.robot.name.is_empty() { "robot".to_owned() } else { sanitized(&skin.robot.name) },
             joints: skin.robot.joints.iter().map(|joint| joint.name.clone()).collect(),

@@ -19,8 +19,8 @@ use thiserror::Error;
 
 use super::file;
 use crate::files::{
-    identity, is_still, link, lock_exclusively, nameless, open_unfollowed, parent_folder, rename, suffixed,
-    with_hint,
+    create_unnamed_file, device_and_inode, link, lock_exclusively, open_no_follow, parent_folder, rename,
+    still_names_file, suffixed, with_hint,
 };
 
 /// The extension of a file that is not complete yet.
@@ -51,7 +51,7 @@ pub fn final_name(part: &Path) -> PathBuf {
 
 /// Returns the name of a file of a recording: `run.mcap` for number 0, `run-1.mcap` for number 1, and so on.
 #[must_use]
-pub fn numbered(path: &Path, number: u32) -> PathBuf {
+pub fn numbered_path(path: &Path, number: u32) -> PathBuf {
     if number == 0 { path.to_owned() } else { suffixed(path, format!("-{number}"), MCAP_EXTENSION.as_ref()) }
 }
 
@@ -59,7 +59,7 @@ pub fn numbered(path: &Path, number: u32) -> PathBuf {
 #[must_use]
 pub fn recovered_name(goal: &Path) -> PathBuf {
     let first = suffixed(goal, "-recovered", MCAP_EXTENSION.as_ref());
-    (0..).map(|number| numbered(&first, number)).find(|path| !exists(path)).unwrap_or_default()
+    (0..).map(|number| numbered_path(&first, number)).find(|path| !exists(path)).unwrap_or_default()
 }
 
 fn exists(path: &Path) -> bool {
@@ -97,7 +97,7 @@ pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
 #[must_use]
 pub fn existing_files(path: &Path) -> Vec<PathBuf> {
     let from = |first: u32| -> Vec<_> {
-        (first..).map(|number| numbered(path, number)).take_while(|path| exists(path)).collect()
+        (first..).map(|number| numbered_path(path, number)).take_while(|path| exists(path)).collect()
     };
     let all = from(0);
     // The first file may have been removed while the numbered ones remain.
@@ -116,12 +116,12 @@ impl PartFile {
         let path = goal.with_file_name(name);
         let taken = |error: io::Error| {
             if error.kind() == io::ErrorKind::AlreadyExists {
-                return io::Error::new(io::ErrorKind::AlreadyExists, why_taken(&path));
+                return io::Error::new(io::ErrorKind::AlreadyExists, name_in_use_message(&path));
             }
             with_hint(error)
         };
-        let file = unnamed(&path).unwrap_or_else(|| named(&path)).map_err(taken)?;
-        let is = identity(&file.metadata()?);
+        let file = create_linked(&path).unwrap_or_else(|| create_exclusive(&path)).map_err(taken)?;
+        let is = device_and_inode(&file.metadata()?);
         Ok((Self { path, goal, identity: is }, file))
     }
 
@@ -130,7 +130,7 @@ impl PartFile {
     /// # Errors
     /// Returns an error if the file cannot be renamed.
     pub fn finish(&self, force: bool) -> io::Result<()> {
-        if !self.is_there() {
+        if !self.has_temporary_name() {
             return Err(io::Error::other(format!("{} is another file now", self.path.display())));
         }
         rename(&self.path, &self.goal, force)
@@ -138,13 +138,13 @@ impl PartFile {
 
     /// Returns true if the file still has its temporary name, or if that cannot be queried.
     #[must_use]
-    pub fn is_there(&self) -> bool {
-        is_still(&self.path, self.identity) != Some(false)
+    pub fn has_temporary_name(&self) -> bool {
+        still_names_file(&self.path, self.identity) != Some(false)
     }
 
     /// Removes the file, if it still has its temporary name.
     pub fn remove(&self) {
-        if is_still(&self.path, self.identity) == Some(true) {
+        if still_names_file(&self.path, self.identity) == Some(true) {
             // If this fails, the next run removes the file.
             let _ = fs::remove_file(&self.path);
         }
@@ -155,8 +155,8 @@ impl PartFile {
     /// # Errors
     /// Returns an error if the file cannot be opened, or if its name belongs to another file now.
     pub fn open(&self) -> io::Result<File> {
-        let file = open_unfollowed(&self.path)?;
-        if identity(&file.metadata()?) != self.identity {
+        let file = open_no_follow(&self.path)?;
+        if device_and_inode(&file.metadata()?) != self.identity {
             return Err(io::Error::other("it is another file now"));
         }
         Ok(file)
@@ -164,18 +164,18 @@ impl PartFile {
 }
 
 /// Returns the error message for a recording whose name another program took while it was written.
-pub(super) fn taken_meanwhile(goal: &Path) -> String {
+pub(super) fn name_conflict_message(goal: &Path) -> String {
     format!("{}: another program made a file of this name meanwhile", goal.display())
 }
 
 /// Returns the error message for a recording whose name is already in use.
-fn why_taken(path: &Path) -> String {
+fn name_in_use_message(path: &Path) -> String {
     let name = path.display();
     // A pipe is not opened, because a program at its other end would take this program for a reader.
     if fs::symlink_metadata(path).is_ok_and(|about| !about.is_file()) {
         return format!("{name} exists and is not a regular file: move it away, or record to another name");
     }
-    match open_unfollowed(path) {
+    match open_no_follow(path) {
         Ok(file) if !is_locked(&file) => format!(
             "{name} exists, but was not left by a killed run: move it away, or record to another name"
         ),
@@ -185,18 +185,18 @@ fn why_taken(path: &Path) -> String {
 
 /// Creates a file that gets its name only after it is locked and holds its identity. Returns `None` if the file system
 /// does not support files without a name.
-fn unnamed(path: &Path) -> Option<io::Result<File>> {
-    let mut file = nameless(parent_folder(path), 0o666).ok()?;
-    claim(&mut file).ok()?;
+fn create_linked(path: &Path) -> Option<io::Result<File>> {
+    let mut file = create_unnamed_file(parent_folder(path), 0o666).ok()?;
+    lock_and_mark(&mut file).ok()?;
     match link(&file, path) {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists => None,
         linked => Some(linked.map(|()| file)),
     }
 }
 
-fn named(path: &Path) -> io::Result<File> {
+fn create_exclusive(path: &Path) -> io::Result<File> {
     let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
-    claim(&mut file).inspect_err(|_| {
+    lock_and_mark(&mut file).inspect_err(|_| {
         // A file without an identity could never be recognised as an orphan.
         let _ = fs::remove_file(path);
     })?;
@@ -204,7 +204,7 @@ fn named(path: &Path) -> io::Result<File> {
 }
 
 /// Locks a file and writes its identity into it.
-fn claim(file: &mut File) -> io::Result<()> {
+fn lock_and_mark(file: &mut File) -> io::Result<()> {
     lock_exclusively(file)?;
     let about = file.metadata()?;
     file.write_all(&file::file_prefix(&about)?)
@@ -260,13 +260,13 @@ impl PartFileError {
 }
 
 /// A file left by a run that was killed, now locked by this process; or the reason why it is left alone.
-pub type Orphan = Result<File, PartFileError>;
+pub type OrphanClaim = Result<File, PartFileError>;
 
 /// Returns the `.part` files in the folder of a recording, each with the file or the reason why it is left alone.
 ///
 /// # Errors
 /// Returns an error if the folder cannot be read.
-pub fn find_part_files(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
+pub fn find_part_files(path: &Path) -> io::Result<Vec<(PathBuf, OrphanClaim)>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(parent_folder(path))? {
         let path = path.with_file_name(entry?.file_name());
@@ -282,7 +282,7 @@ pub fn find_part_files(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
 }
 
 /// Opens and locks a `.part` file, if the process that wrote it has ended.
-fn claim_orphan(path: &Path) -> Orphan {
+fn claim_orphan(path: &Path) -> OrphanClaim {
     // Opening anything but a regular file may have side effects.
     let kind = fs::symlink_metadata(path)?.file_type();
     if kind.is_symlink() {
@@ -291,7 +291,7 @@ fn claim_orphan(path: &Path) -> Orphan {
     if !kind.is_file() {
         return Err(PartFileError::Irregular);
     }
-    let mut file = open_unfollowed(path).map_err(PartFileError::Unreadable)?;
+    let mut file = open_no_follow(path).map_err(PartFileError::Unreadable)?;
     let about = file.metadata()?;
     let (owner, me) = (about.uid(), rustix::process::geteuid().as_raw());
     if !about.is_file() {
@@ -324,7 +324,7 @@ pub fn remove(path: &Path, file: &File) -> io::Result<()> {
 
 /// Checks that a name is still that of the given file.
 fn check_identity(path: &Path, file: &File) -> io::Result<()> {
-    if is_still(path, identity(&file.metadata()?)) == Some(true) {
+    if still_names_file(path, device_and_inode(&file.metadata()?)) == Some(true) {
         return Ok(());
     }
     Err(io::Error::other("another file has its name now, and stays"))
@@ -334,14 +334,14 @@ fn check_identity(path: &Path, file: &File) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    fn orphans(path: &Path) -> Vec<(PathBuf, Orphan)> {
+    fn orphans(path: &Path) -> Vec<(PathBuf, OrphanClaim)> {
         let found = find_part_files(path).unwrap().into_iter();
         found.filter(|(_, found)| found.is_ok()).collect()
     }
 
     #[test]
     fn files_are_numbered_from_the_second_on() {
-        let name = |number| numbered(Path::new("there/run.mcap"), number).display().to_string();
+        let name = |number| numbered_path(Path::new("there/run.mcap"), number).display().to_string();
         assert_eq!([0, 1, 12].map(name), ["there/run.mcap", "there/run-1.mcap", "there/run-12.mcap"]);
         assert_eq!(final_name(Path::new("a/run-1.mcap.part")), Path::new("a/run-1.mcap"));
         assert_eq!(final_name(Path::new("a/run.mcap")), Path::new("a/run.mcap"));
@@ -378,7 +378,7 @@ mod tests {
         fs::write(folder.path().join("run-recovered.mcap"), "").unwrap();
         assert_eq!(recovered_name(&goal), folder.path().join("run-recovered-1.mcap"));
         for number in 1..3 {
-            fs::write(numbered(&goal, number), "").unwrap();
+            fs::write(numbered_path(&goal, number), "").unwrap();
         }
         assert_eq!(existing_files(&goal).len(), 3);
         fs::remove_file(&goal).unwrap();

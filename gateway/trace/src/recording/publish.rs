@@ -72,7 +72,7 @@ impl<T: Send + 'static> Publisher<T> {
     }
 
     /// Returns the files that were renamed since the last call.
-    pub(super) fn done(&self) -> impl Iterator<Item = PublishedFile<T>> {
+    pub(super) fn drain_published(&self) -> impl Iterator<Item = PublishedFile<T>> {
         self.published.try_iter()
     }
 
@@ -97,7 +97,7 @@ fn publish<T>(CompleteFile { file, part, about }: CompleteFile<T>, force: bool) 
         }
         Err(error) => {
             let (goal, there) = (part.goal.display(), part.path.display());
-            if !part.is_there() {
+            if !part.has_temporary_name() {
                 let error = format!(
                     "{there}: another program renamed, removed or replaced it while it was written; it is whole \
                      wherever it is now, and what is in it counts as lost"
@@ -105,7 +105,7 @@ fn publish<T>(CompleteFile { file, part, about }: CompleteFile<T>, force: bool) 
                 return PublishedFile { path: None, about, error: Some(error) };
             }
             let error = if error.kind() == io::ErrorKind::AlreadyExists {
-                names::taken_meanwhile(&part.goal)
+                names::name_conflict_message(&part.goal)
             } else {
                 format!("{goal}: {error}")
             };

@@ -21,7 +21,7 @@ use thiserror::Error;
 
 use self::survey::{FileSurvey, IntactRange};
 use super::file::FileWriter;
-use crate::container::{Chunk, FormatError, Framed, Record, RecordReader, parse};
+use crate::container::{Chunk, FormatError, FramedRecord, Record, RecordReader, parse};
 
 /// The longest attachment that is copied, in bytes.
 const MAX_ATTACHMENT_BYTES: u64 = 1 << 30;
@@ -156,16 +156,16 @@ pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<RecoveryRe
         match piece {
             IntactRange::Records { from, to } => {
                 source.seek(from).map_err(RecoverError::Read)?;
-                while source.read() < to {
+                while source.bytes_read() < to {
                     let framed = source.next().map_err(RecoverError::Read)?;
-                    if let Framed::Record(code) = framed {
-                        copy.copy_record(&mut chunk, code, source.body(), source.read())?;
+                    if let FramedRecord::Record(code) = framed {
+                        copy.copy_record(&mut chunk, code, source.body(), source.bytes_read())?;
                     }
                 }
             }
             IntactRange::Record { at, code, length } => {
-                source.read_as(at, length).map_err(RecoverError::Read)?;
-                copy.copy_record(&mut chunk, code, source.body(), source.read())?;
+                source.read_with_length(at, length).map_err(RecoverError::Read)?;
+                copy.copy_record(&mut chunk, code, source.body(), source.bytes_read())?;
             }
         }
     }
@@ -190,19 +190,19 @@ impl<W: Write> RecordCopier<W> {
         read: u64,
     ) -> Result<(), RecoverError> {
         if code != op::CHUNK {
-            return self.record(code, body).map_err(RecoverError::Write);
+            return self.write_record(code, body).map_err(RecoverError::Write);
         }
-        chunk.unpack(body, read).map_err(changed)?;
+        chunk.unpack(body, read).map_err(changed_input_error)?;
         while let Some((code, body)) = chunk.next() {
             // Schemas and channels are already written, and chunks hold no other records.
             if code == op::MESSAGE {
-                self.record(code, body).map_err(RecoverError::Write)?;
+                self.write_record(code, body).map_err(RecoverError::Write)?;
             }
         }
         Ok(())
     }
 
-    fn record(&mut self, code: u8, body: &[u8]) -> io::Result<()> {
+    fn write_record(&mut self, code: u8, body: &[u8]) -> io::Result<()> {
         match parse(code, body).map_err(io::Error::other)? {
             Record::Message { channel, sequence, log_time, publish_time, data } => {
                 let Some(is_frame) = self.topics.get(&channel) else {
@@ -219,7 +219,7 @@ impl<W: Write> RecordCopier<W> {
             Record::Attachment { log_time, create_time, name, media_type, data } => {
                 self.writer.attach_at(name, media_type, (log_time, create_time), data)
             }
-            Record::Metadata { name, facts } => self.writer.metadata(name, &facts.into()),
+            Record::Metadata { name, facts } => self.writer.write_metadata(name, &facts.into()),
             // These records are already written, are generated for the new file, or do not occur in a recording of
             // skinbus.
             Record::Schema { .. }
@@ -233,6 +233,6 @@ impl<W: Write> RecordCopier<W> {
 }
 
 /// Returns the error for an input that was changed between the survey and the copy.
-fn changed(damage: FormatError) -> RecoverError {
+fn changed_input_error(damage: FormatError) -> RecoverError {
     RecoverError::Read(io::Error::other(format!("it was changed meanwhile: {damage}")))
 }

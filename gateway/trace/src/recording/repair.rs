@@ -9,15 +9,15 @@ use rustix::fs::{Gid, fchown};
 
 use super::names::{self, PartFile};
 use super::recover::{RecoverError, RecoveryResult, recover};
-use super::sink::is_full;
-use crate::files::{WholeFile, nameless, parent_folder};
+use super::sink::is_disk_full;
+use crate::files::{AtomicFile, create_unnamed_file, parent_folder};
 
 /// The maximum number of names to try for a new file if other programs create files of the same names.
 const MAX_ATTEMPTS: u32 = 100;
 
 /// The result of repairing a recording.
 #[derive(Clone, Debug)]
-pub struct Repaired {
+pub struct RepairResult {
     /// The result of the recovery.
     pub recovered: RecoveryResult,
     /// The new file and its length in bytes; `None` if the old one held no messages.
@@ -37,7 +37,7 @@ pub fn repair(
     from: &File,
     mut goal: impl FnMut() -> PathBuf,
     force: bool,
-) -> Result<Repaired, RecoverError> {
+) -> Result<RepairResult, RecoverError> {
     let something = |recovered: &RecoveryResult| {
         let RecoveryResult {
             messages,
@@ -57,7 +57,7 @@ pub fn repair(
                 if error.kind() == io::ErrorKind::AlreadyExists && attempts < MAX_ATTEMPTS => {}
             copied => {
                 let (recovered, bytes) = copied?;
-                break Repaired { recovered, new: bytes.map(|bytes| (path, bytes)), original: None };
+                break RepairResult { recovered, new: bytes.map(|bytes| (path, bytes)), original: None };
             }
         }
     };
@@ -66,7 +66,7 @@ pub fn repair(
         return Ok(repaired);
     }
     let original = Some(names::keep_damaged(part, from).map_err(RecoverError::Write)?);
-    Ok(Repaired { original, ..repaired })
+    Ok(RepairResult { original, ..repaired })
 }
 
 /// Returns the error message for a file that was not finished and cannot be repaired.
@@ -74,11 +74,11 @@ pub(super) fn unrepaired(PartFile { path, goal, .. }: &PartFile, error: &Recover
     let path = path.display();
     let is = |kind: fn(&io::Error) -> bool| matches!(error, RecoverError::Write(error) if kind(error));
     let why = if is(|error| error.kind() == io::ErrorKind::AlreadyExists) {
-        names::taken_meanwhile(goal)
+        names::name_conflict_message(goal)
     } else {
         format!("{path}: {error}")
     };
-    let more = if is(is_full) { " -o FILE`, a file on another disk" } else { "`" };
+    let more = if is(is_disk_full) { " -o FILE`, a file on another disk" } else { "`" };
     format!("{why}; what was recorded is in {path}: repair it with `skinbus recover {path}{more}")
 }
 
@@ -101,8 +101,8 @@ fn copy(
     force: bool,
     is_worth_it: impl FnOnce(&RecoveryResult) -> bool,
 ) -> Result<(RecoveryResult, Option<u64>), RecoverError> {
-    let (whole, file) = WholeFile::create(to, force).map_err(RecoverError::Write)?;
-    as_private(from, &file).map_err(RecoverError::Write)?;
+    let (whole, file) = AtomicFile::create(to, force).map_err(RecoverError::Write)?;
+    restrict_permissions(from, &file).map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
     let mut from = from;
     // The file is read twice. A pipe can be read only once, so it is copied first.
@@ -125,14 +125,14 @@ fn copy(
 
 /// Copies the rest of a pipe into an unnamed file.
 fn buffered_pipe(mut from: &File, folder: &Path) -> io::Result<File> {
-    let mut file = nameless(folder, 0o600)?;
+    let mut file = create_unnamed_file(folder, 0o600)?;
     io::copy(&mut from, &mut file)?;
     file.rewind()?;
     Ok(file)
 }
 
 /// Gives a copy no more permissions than the original has.
-fn as_private(from: &File, copy: &File) -> io::Result<()> {
+fn restrict_permissions(from: &File, copy: &File) -> io::Result<()> {
     let (original, about) = (from.metadata()?, copy.metadata()?);
     if !original.is_file() || !about.is_file() {
         return Ok(());
@@ -165,12 +165,12 @@ pub fn repair_orphans(path: &Path, mut say: impl FnMut(&str)) {
         };
         let leftover = "was left by a run that was killed";
         match repair(&part, &held, || names::recovered_name(&names::final_name(&part)), false) {
-            Ok(Repaired { recovered, new: Some((path, _)), original }) => {
+            Ok(RepairResult { recovered, new: Some((path, _)), original }) => {
                 let kept = original.map(|path| format!("; the damaged original is {}", path.display()));
                 let kept = kept.unwrap_or_default();
                 say(&format!("{name} {leftover}; repaired, it is {}: {recovered}{kept}", path.display()));
             }
-            Ok(Repaired { new: None, .. }) => {
+            Ok(RepairResult { new: None, .. }) => {
                 say(&format!("{name} {leftover}; it held no messages and was removed"));
             }
             Err(error) => say(&format!("{name} {leftover} and cannot be repaired: {error}")),

@@ -114,7 +114,8 @@ impl LinkedUrdf {
             joints.map(|joint| step.clamp(joint.limits[0], joint.limits[1])).collect()
         };
         let row = usize::from(cell.row);
-        let [one, other] = [0.0, COMPARISON_STEP].map(|step| self.row_on(link, chain, row, &near(step)));
+        let [one, other] =
+            [0.0, COMPARISON_STEP].map(|step| self.row_pose_on_link(link, chain, row, &near(step)));
         let apart = (one.translation.vector - other.translation.vector).norm()
             + one.rotation.angle_to(&other.rotation);
         if apart.is_nan() || apart > TOLERANCE_M {
@@ -133,7 +134,7 @@ impl LinkedUrdf {
     }
 
     /// Returns the pose of a row's frame relative to a link, for the joint positions `q`.
-    fn row_on(&self, link: &str, chain: &Chain, row: usize, q: &[f64]) -> Isometry3<f64> {
+    fn row_pose_on_link(&self, link: &str, chain: &Chain, row: usize, q: &[f64]) -> Isometry3<f64> {
         let of_chain: Vec<_> =
             chain.joints.iter().map(|joint| q.get(*joint).copied().unwrap_or_default()).collect();
         let rows: Vec<_> = chain.rows.iter().map(DhRow::from).collect();

@@ -18,18 +18,18 @@ use super::file::FileWriter;
 use super::names::{self, PartFile};
 use super::publish::{CompleteFile, PublishedFile, Publisher};
 use super::recover::RecoverError;
-use super::repair::{self, Repaired};
+use super::repair::{self, RepairResult};
 use super::sink::{FileGauge, ReservedFile};
 use super::window::ReorderWindow;
 use crate::files::parent_folder;
 
 /// The size of the write buffer in bytes. Chunks are larger and are written without it.
-const BUFFER: usize = 64 << 10;
+const WRITE_BUFFER_BYTES: usize = 64 << 10;
 /// The interval between two attempts to begin a file after an error.
 const RETRY_INTERVAL: Duration = Duration::from_secs(5);
 /// The maximum time for which an incomplete packet delays the end of a file. The time is limited because any traffic
 /// may look like a segment.
-const MAX_HOLD: Duration = Duration::from_millis(500);
+const MAX_PACKET_HOLD: Duration = Duration::from_millis(500);
 /// The interval between two checks that a file still has its name.
 const NAME_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// The free space in bytes that a disk must have before recording continues after the disk was full.
@@ -79,10 +79,10 @@ pub struct FileHead {
 impl FileHead {
     fn write(&self, writer: &mut Writer, number: u32) -> io::Result<()> {
         for (name, facts) in &self.metadata {
-            writer.metadata(name, facts)?;
+            writer.write_metadata(name, facts)?;
         }
         let place = [("number".to_owned(), number.to_string())];
-        writer.metadata("part", &BTreeMap::from(place))?;
+        writer.write_metadata("part", &BTreeMap::from(place))?;
         for AttachedFile { name, media_type, bytes } in &self.attachments {
             writer.attach(name, media_type, self.nanos, bytes)?;
         }
@@ -143,9 +143,9 @@ struct OpenFile<T> {
 
 impl<T> OpenFile<T> {
     /// Writes the waiting messages that have waited long enough, or all of them if `all` is true.
-    fn release(&mut self, window: &mut ReorderWindow, all: bool) -> io::Result<()> {
+    fn write_waiting_to_file(&mut self, window: &mut ReorderWindow, all: bool) -> io::Result<()> {
         let Self { writer, written, .. } = self;
-        written.add(if all { window.release_all(writer) } else { window.release(writer) }?);
+        written.add(if all { window.write_all(writer) } else { window.write_due(writer) }?);
         Ok(())
     }
 }
@@ -234,10 +234,10 @@ impl<T> SplitRecording<T> {
 
     /// Adds a metadata record to the open file and to all later ones.
     pub fn add_metadata(&mut self, name: &'static str, facts: BTreeMap<String, String>) {
-        let written = self.open.as_mut().map_or(Ok(()), |open| open.writer.metadata(name, &facts));
+        let written = self.open.as_mut().map_or(Ok(()), |open| open.writer.write_metadata(name, &facts));
         self.head.metadata.push((name, facts));
         if let Err(error) = written {
-            self.break_off(&error);
+            self.close_broken_file(&error);
         }
     }
 
@@ -250,7 +250,8 @@ impl<T> SplitRecording<T> {
         let begin = || {
             let about = file.metadata()?;
             let (sink, gauge) = ReservedFile::new(file, parent_folder(&part.path))?;
-            let mut writer = Writer::in_file(BufWriter::with_capacity(BUFFER, sink), &about)?;
+            let mut writer =
+                Writer::with_file_identity(BufWriter::with_capacity(WRITE_BUFFER_BYTES, sink), &about)?;
             self.head.write(&mut writer, self.number)?;
             let topics = topics(&mut writer)?;
             writer.flush()?;
@@ -284,27 +285,29 @@ impl<T> SplitRecording<T> {
         let Some(OpenFile { writer, written, .. }) = &mut self.open else { return };
         match self.window.set_time(now, writer) {
             Ok(count) => written.add(count),
-            Err(error) => self.break_off(&error),
+            Err(error) => self.close_broken_file(&error),
         }
     }
 
     /// Adds `count` messages to the open file by calling `write`. If no file is open, they are counted as lost.
-    pub fn put(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut T)) {
+    pub fn add_messages(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut T)) {
         let Some(open) = &mut self.open else { return self.lost.add(count) };
         write(&mut self.window, &mut open.topics);
         if self.window.is_full() {
-            self.release(false);
+            self.write_waiting_messages(false);
         }
     }
 
     /// Writes all waiting messages to the open file. Messages that are added later stand after them.
     pub fn write_waiting(&mut self) {
-        self.release(true);
+        self.write_waiting_messages(true);
     }
 
-    fn release(&mut self, all: bool) {
-        if let Some(Err(error)) = self.open.as_mut().map(|open| open.release(&mut self.window, all)) {
-            self.break_off(&error);
+    fn write_waiting_messages(&mut self, all: bool) {
+        if let Some(Err(error)) =
+            self.open.as_mut().map(|open| open.write_waiting_to_file(&mut self.window, all))
+        {
+            self.close_broken_file(&error);
         }
     }
 
@@ -318,30 +321,32 @@ impl<T> SplitRecording<T> {
             let prompt = std::mem::replace(&mut self.immediate_retry.1, false);
             return (due || prompt) && has_room(&self.path);
         };
-        if let Err(error) = open.release(&mut self.window, false).and_then(|()| open.writer.flush()) {
-            self.break_off(&error);
+        if let Err(error) =
+            open.write_waiting_to_file(&mut self.window, false).and_then(|()| open.writer.flush())
+        {
+            self.close_broken_file(&error);
             return false;
         }
         open.kept.add(std::mem::take(&mut open.written));
         if open.name_checked.elapsed() >= NAME_CHECK_INTERVAL {
             open.name_checked = Instant::now();
-            if !open.part.is_there() {
-                self.end();
+            if !open.part.has_temporary_name() {
+                self.end_file();
                 return true;
             }
         }
-        open.gauge.reserve_for(open.writer.chunks());
+        open.gauge.extend_reserve(open.writer.chunks());
         if open.gauge.is_full() {
-            self.end();
+            self.end_file();
             self.fail(&rustix::io::Errno::NOSPC.into());
             return false;
         }
         let enough =
             open.gauge.bytes() >= self.split.bytes + open.head || open.began.elapsed() >= self.split.age;
         let since = enough.then(|| *open.due_since.get_or_insert_with(Instant::now));
-        let enough = since.is_some_and(|since| !holds || since.elapsed() >= MAX_HOLD);
+        let enough = since.is_some_and(|since| !holds || since.elapsed() >= MAX_PACKET_HOLD);
         if enough {
-            self.end();
+            self.end_file();
         }
         enough
     }
@@ -349,7 +354,7 @@ impl<T> SplitRecording<T> {
     /// Begins another file. `topics` creates its channels. Returns true on success.
     pub fn begin_next(&mut self, topics: impl FnOnce(&mut Writer) -> io::Result<T>) -> bool {
         let number = self.number + 1;
-        let goal = names::numbered(&self.path, number);
+        let goal = names::numbered_path(&self.path, number);
         let failed_before = self.failed;
         let before = std::mem::replace(&mut self.number, number);
         match PartFile::create(goal).and_then(|(part, file)| self.start(part, file, topics)) {
@@ -383,8 +388,8 @@ impl<T> SplitRecording<T> {
 
     /// Returns the number of messages that arrived after messages of later times had been written.
     #[must_use]
-    pub const fn late(&self) -> u64 {
-        self.window.late()
+    pub const fn late_messages(&self) -> u64 {
+        self.window.late_messages()
     }
 
     /// Returns the size of the open file in bytes.
@@ -399,11 +404,13 @@ impl<T> SplitRecording<T> {
     }
 
     /// Ends the open file, and passes it on to be renamed.
-    fn end(&mut self) {
+    fn end_file(&mut self) {
         let Some(mut open) = self.open.take() else { return };
-        if let Err(error) = open.release(&mut self.window, true).and_then(|()| open.writer.finish()) {
+        if let Err(error) =
+            open.write_waiting_to_file(&mut self.window, true).and_then(|()| open.writer.finish())
+        {
             self.open = Some(open);
-            return self.break_off(&error);
+            return self.close_broken_file(&error);
         }
         open.kept.add(open.written);
         let (sink, _) = open.writer.into_inner().into_parts();
@@ -413,10 +420,10 @@ impl<T> SplitRecording<T> {
 
     /// Adds the files that were renamed since the last call to those of the recording.
     fn collect_published(&mut self) {
-        for PublishedFile { path, about: (kept, bytes), error } in self.publisher.done() {
+        for PublishedFile { path, about: (kept, bytes), error } in self.publisher.drain_published() {
             self.said.extend(error.map(RecordingEvent::Other));
             match path {
-                Some(path) => self.written.push(kept.in_file(&path, bytes)),
+                Some(path) => self.written.push(kept.into_written_file(&path, bytes)),
                 // The file is complete, but its name is unknown.
                 None => self.lost.add(kept),
             }
@@ -424,7 +431,7 @@ impl<T> SplitRecording<T> {
     }
 
     /// Closes the open file after an error.
-    fn break_off(&mut self, error: &io::Error) {
+    fn close_broken_file(&mut self, error: &io::Error) {
         let Some(open) = self.open.take() else { return };
         self.lost.add(open.written);
         self.lost.add(self.window.count());
@@ -441,7 +448,7 @@ impl<T> SplitRecording<T> {
             (*last, *prompt) = (Some(Instant::now()), true);
         }
         if self.failed.replace(Instant::now()).is_none() {
-            let path = names::numbered(&self.path, self.number);
+            let path = names::numbered_path(&self.path, self.number);
             self.said.push(RecordingEvent::BrokeOff(format!("{}: {error}", path.display())));
         }
     }
@@ -456,26 +463,27 @@ impl<T> SplitRecording<T> {
 
     /// Ends the recording. Returns its files, and the number of lost messages.
     pub fn finish(&mut self) -> (Vec<WrittenFile>, MessageCount) {
-        self.end();
+        self.end_file();
         self.publisher.finish();
         self.collect_published();
         for BrokenFile { part, file, kept } in std::mem::take(&mut self.broken) {
             let from = part.open().map_err(RecoverError::Read);
             let goal = || part.goal.clone();
             match from.and_then(|from| repair::repair(&part.path, &from, goal, self.force)) {
-                Ok(Repaired { recovered, new: Some((goal, bytes)), .. }) => {
+                Ok(RepairResult { recovered, new: Some((goal, bytes)), .. }) => {
                     // The number of messages on the disk may differ from the counted one, so the recovered ones decide.
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
                     let others = recovered.messages - recovered.frames;
                     self.lost.others = (self.lost.others + kept.others).saturating_sub(others);
-                    self.written
-                        .push(MessageCount { frames: recovered.frames, others }.in_file(&goal, bytes));
+                    self.written.push(
+                        MessageCount { frames: recovered.frames, others }.into_written_file(&goal, bytes),
+                    );
                 }
-                Ok(Repaired { new: None, .. }) => self.lost.add(kept),
+                Ok(RepairResult { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
                     self.said.push(RecordingEvent::Other(repair::unrepaired(&part, &error)));
                     let bytes = file.metadata().map_or(0, |about| about.len());
-                    self.written.push(kept.in_file(&part.path, bytes));
+                    self.written.push(kept.into_written_file(&part.path, bytes));
                 }
             }
         }

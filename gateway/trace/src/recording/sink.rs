@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rustix::fs::{FallocateFlags, fallocate};
 
-use crate::files::{nameless, write_with_retries};
+use crate::files::{create_unnamed_file, write_with_retries};
 
 /// The space in bytes that is reserved for the end of a file without chunks; half of it is for one pending chunk.
 const RESERVE_BYTES: u64 = 512 << 10;
@@ -21,12 +21,12 @@ const RESERVE_BYTES_PER_CHUNK: u64 = 400;
 pub struct FileGauge {
     bytes: AtomicU64,
     full: AtomicBool,
-    reserve: Mutex<Option<Reserve>>,
+    reserve: Mutex<Option<ReservedSpace>>,
 }
 
 /// Disk space that an unnamed file occupies until it is needed.
 #[derive(Debug)]
-struct Reserve {
+struct ReservedSpace {
     file: File,
     bytes: u64,
 }
@@ -45,7 +45,7 @@ impl FileGauge {
     }
 
     /// Extends the reserve to the end of a file with `chunks` chunks.
-    pub fn reserve_for(&self, chunks: u64) {
+    pub fn extend_reserve(&self, chunks: u64) {
         let mut held = self.reserve.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(reserve) = held.as_mut() else { return };
         // Half of the reserve is for the pending chunk.
@@ -61,7 +61,7 @@ impl FileGauge {
     }
 
     /// Releases the reserved space. Returns true if there was any.
-    fn use_reserve(&self) -> bool {
+    fn release_reserve(&self) -> bool {
         self.full.store(true, Ordering::Relaxed);
         self.reserve.lock().unwrap_or_else(PoisonError::into_inner).take().is_some()
     }
@@ -97,15 +97,15 @@ impl ReservedFile {
 }
 
 /// Reserves disk space. Returns `None` if the file system does not support unnamed files or preallocation.
-fn reserve(folder: &Path) -> Option<Reserve> {
-    let file = nameless(folder, 0o600).ok()?;
+fn reserve(folder: &Path) -> Option<ReservedSpace> {
+    let file = create_unnamed_file(folder, 0o600).ok()?;
     fallocate(&file, FallocateFlags::empty(), 0, RESERVE_BYTES).ok()?;
-    Some(Reserve { file, bytes: RESERVE_BYTES })
+    Some(ReservedSpace { file, bytes: RESERVE_BYTES })
 }
 
 /// Returns true for errors that report a full disk or an exceeded quota.
 #[must_use]
-pub fn is_full(error: &io::Error) -> bool {
+pub fn is_disk_full(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }
 
@@ -118,7 +118,7 @@ impl Write for ReservedFile {
             return Ok(there);
         }
         let written = match write_with_retries(&mut self.file, bytes) {
-            Err(error) if is_full(&error) && self.gauge.use_reserve() => {
+            Err(error) if is_disk_full(&error) && self.gauge.release_reserve() => {
                 write_with_retries(&mut self.file, bytes)
             }
             written => written,

@@ -125,7 +125,7 @@ impl ReorderWindow {
 
     /// Returns the latest position in time of a channel's messages, in ns since 1970; 0 without messages.
     #[must_use]
-    pub fn latest(&self, channel: &Channel) -> u64 {
+    pub fn latest_ns(&self, channel: &Channel) -> u64 {
         self.latest.get(usize::from(channel.id())).copied().unwrap_or_default()
     }
 
@@ -137,7 +137,7 @@ impl ReorderWindow {
 
     /// Returns the number of messages that arrived after messages of later times had been written.
     #[must_use]
-    pub const fn late(&self) -> u64 {
+    pub const fn late_messages(&self) -> u64 {
         self.late
     }
 
@@ -148,7 +148,7 @@ impl ReorderWindow {
     /// Returns an error if the file cannot be written, as all methods below do.
     pub fn set_time<W: Write>(&mut self, now: u64, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         let written = if now < self.now {
-            let written = self.release_all(file)?;
+            let written = self.write_all(file)?;
             self.latest.clear();
             self.released = 0;
             written
@@ -164,7 +164,7 @@ impl ReorderWindow {
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
-    pub fn release<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
+    pub fn write_due<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         self.sort();
         let until = self.now.saturating_sub(WINDOW_NS);
         let due = self.waiting.partition_point(|it| it.log_nanos <= until);
@@ -182,7 +182,7 @@ impl ReorderWindow {
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
-    pub fn release_all<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
+    pub fn write_all<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         self.sort();
         self.write_out(self.waiting.len(), file)
     }

@@ -10,7 +10,7 @@ use protocol::can::IdentifierError;
 use thiserror::Error;
 
 /// The encapsulation header: "plain CDR, little endian", and two option bytes.
-const HEAD: [u8; 4] = [0, 1, 0, 0];
+const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
 /// The maximum number of elements in a decoded sequence.
 const MAX_ELEMENTS: u32 = 64;
 
@@ -33,7 +33,7 @@ macro_rules! numbers {
     ($($number:ty: $what:literal),+) => {$(
         impl Encode for $number {
             fn encode(&self, out: &mut CdrWriter<'_>) {
-                out.number(self.to_le_bytes());
+                out.put_number(self.to_le_bytes());
             }
         }
 
@@ -79,7 +79,7 @@ impl<'a> Decode<'a> for &'a str {
         let bytes = from.bytes()?;
         let wrong = CdrError::Text { at: from.at - bytes.len() };
         let text = match bytes {
-            _ if from.form == Form::Ros1 => bytes,
+            _ if from.form == CdrEncoding::Ros1 => bytes,
             // Some programs write an empty text without its NUL.
             [] => bytes,
             [text @ .., 0] => text,
@@ -134,7 +134,7 @@ impl<'a> CdrWriter<'a> {
     /// Begins a message in the buffer, whose former contents are removed.
     pub fn new(out: &'a mut Vec<u8>) -> Self {
         out.clear();
-        out.extend_from_slice(&HEAD);
+        out.extend_from_slice(&CDR_HEADER);
         Self { out }
     }
 
@@ -152,7 +152,7 @@ impl<'a> CdrWriter<'a> {
     }
 
     /// Appends a sequence of bytes.
-    pub fn bytes(&mut self, bytes: &[u8]) {
+    pub fn put_bytes(&mut self, bytes: &[u8]) {
         self.put_count(bytes.len());
         self.out.extend_from_slice(bytes);
     }
@@ -164,8 +164,8 @@ impl<'a> CdrWriter<'a> {
     }
 
     /// Appends a number after the padding that aligns it.
-    fn number<const N: usize>(&mut self, bytes: [u8; N]) {
-        let over = (self.out.len() - HEAD.len()) % N;
+    fn put_number<const N: usize>(&mut self, bytes: [u8; N]) {
+        let over = (self.out.len() - CDR_HEADER.len()) % N;
         if over != 0 {
             self.out.resize(self.out.len() + N - over, 0);
         }
@@ -224,7 +224,7 @@ pub enum CdrError {
 
 /// The encoding in which a message is stored.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Form {
+enum CdrEncoding {
     /// The encoding of ROS 2.
     Cdr,
     /// The encoding of ROS 1: without a header and padding, and texts without a NUL.
@@ -236,7 +236,7 @@ enum Form {
 pub struct CdrReader<'a> {
     bytes: &'a [u8],
     at: usize,
-    form: Form,
+    form: CdrEncoding,
 }
 
 impl<'a> CdrReader<'a> {
@@ -246,7 +246,7 @@ impl<'a> CdrReader<'a> {
     /// Returns [`CdrError::Encoding`] if the message is not little-endian CDR.
     pub fn new(bytes: &'a [u8]) -> Result<Self, CdrError> {
         match bytes {
-            [0, 1, _, _, ..] => Ok(Self { bytes, at: HEAD.len(), form: Form::Cdr }),
+            [0, 1, _, _, ..] => Ok(Self { bytes, at: CDR_HEADER.len(), form: CdrEncoding::Cdr }),
             [first, second, ..] => Err(CdrError::Encoding { got: [*first, *second] }),
             _ => Err(CdrError::Encoding { got: [0; 2] }),
         }
@@ -255,7 +255,7 @@ impl<'a> CdrReader<'a> {
     /// Begins at the first field of a ROS 1 message.
     #[must_use]
     pub const fn ros1(bytes: &'a [u8]) -> Self {
-        Self { bytes, at: 0, form: Form::Ros1 }
+        Self { bytes, at: 0, form: CdrEncoding::Ros1 }
     }
 
     /// Decodes a number, a text, or another part of a message.
@@ -277,8 +277,8 @@ impl<'a> CdrReader<'a> {
 
     fn number<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], CdrError> {
         let over = match self.form {
-            Form::Cdr => (self.at - HEAD.len()) % N,
-            Form::Ros1 => 0,
+            CdrEncoding::Cdr => (self.at - CDR_HEADER.len()) % N,
+            CdrEncoding::Ros1 => 0,
         };
         if over != 0 {
             self.at += N - over;
@@ -343,7 +343,7 @@ mod tests {
         out.put(value.short);
         out.put(value.text.as_str());
         out.put(value.signed);
-        out.bytes(&value.bytes);
+        out.put_bytes(&value.bytes);
         out.put(value.long);
         out.sequence(value.singles.iter());
         out.sequence(value.doubles.iter());
@@ -405,7 +405,7 @@ mod tests {
         fn another_program_writes_the_same_bytes_and_both_read_them(value in everything()) {
             let bytes = ours(&value);
             let (head, body) = bytes.split_at(4);
-            prop_assert_eq!(head, HEAD);
+            prop_assert_eq!(head, CDR_HEADER);
             let theirs = cdr_encoding::to_vec::<_, LittleEndian>(&value).unwrap();
             prop_assert_eq!(body, &theirs[..]);
             prop_assert_eq!(read(&bytes), Ok(value.clone()));

@@ -8,7 +8,7 @@ use protocol::candump::{Direction, Record, Timestamp};
 
 use super::cdr::{CdrError, CdrReader, CdrWriter, Encode};
 use super::{Header, Message, definition};
-use crate::note::{Note, NoteKind};
+use crate::note::{CaptureNote, NoteKind};
 
 /// Encodes a frame of a bus as a message.
 impl Message for Record<'_> {
@@ -33,7 +33,7 @@ impl Encode for Record<'_> {
         for number in [frame.flags(), frame.len(), frame.raw_dlc(), direction] {
             out.put(number);
         }
-        out.bytes(frame.data());
+        out.put_bytes(frame.data());
     }
 }
 
@@ -64,22 +64,22 @@ pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
         0 => None,
         1 => Some(Direction::Received),
         2 => Some(Direction::Sent),
-        got => return Err(value("direction", got, "0, 1 or 2")),
+        got => return Err(value_error("direction", got, "0, 1 or 2")),
     };
     let is_remote = id & REMOTE != 0;
     if is_remote && format == Format::Fd {
-        return Err(value("is_rtr", 1, "0 in an FD frame"));
+        return Err(value_error("is_rtr", 1, "0 in an FD frame"));
     }
     let most_flags = if format == Format::Fd { 15 } else { 0 };
     if flags > most_flags {
-        return Err(value("flags", flags, "0 to 15 in an FD frame, 0 in a classic one"));
+        return Err(value_error("flags", flags, "0 to 15 in an FD frame, 0 in a classic one"));
     }
     let is_raw = format == Format::Classic && length == 8;
     if !(raw_dlc == 0 || is_raw && matches!(raw_dlc, 9..=15)) {
-        return Err(value("raw_dlc", raw_dlc, "0; 9 to 15 in a classic frame of 8 bytes"));
+        return Err(value_error("raw_dlc", raw_dlc, "0; 9 to 15 in a classic frame of 8 bytes"));
     }
     let data = from.bytes()?;
-    let wrong = value(
+    let wrong = value_error(
         "length",
         length,
         "that of the data, which a remote frame does not have; 8 in a classic frame, 64 in an FD one",
@@ -93,18 +93,18 @@ pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
     Ok(Record { time, interface, frame, direction })
 }
 
-fn value(what: &'static str, got: u8, allowed: &'static str) -> CdrError {
+fn value_error(what: &'static str, got: u8, allowed: &'static str) -> CdrError {
     CdrError::Value { what, got: got.into(), allowed }
 }
 
 /// Encodes a note (a comment, lost frames, or a line that is not a frame) as a message.
-impl Message for Note<'_> {
+impl Message for CaptureNote<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/CaptureNote";
     const DEFINITION: &'static str =
         definition!("skinbus_msgs/CaptureNote", "std_msgs/Header", "builtin_interfaces/Time");
 }
 
-impl Encode for Note<'_> {
+impl Encode for CaptureNote<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
         // Some readers end a CDR text at its first NUL, so a text with a NUL is stored as bytes.
         let same = || str::from_utf8(self.text).ok().filter(|text| !text.contains('\0'));
@@ -122,7 +122,7 @@ impl Encode for Note<'_> {
             (NoteKind::Unreadable(why), None) => out.put(why.replace('\0', "?").as_str()),
             (_, None) => out.put(String::from_utf8_lossy(self.text).replace('\0', "?").as_str()),
         }
-        out.bytes(if same.is_some() { &[] } else { self.text });
+        out.put_bytes(if same.is_some() { &[] } else { self.text });
     }
 }
 
@@ -130,7 +130,7 @@ impl Encode for Note<'_> {
 ///
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not a message of this type.
-pub fn note(message: &[u8], nanos: u64) -> Result<Note<'_>, CdrError> {
+pub fn note(message: &[u8], nanos: u64) -> Result<CaptureNote<'_>, CdrError> {
     let mut from = CdrReader::new(message)?;
     let (Header { frame_id: interface, .. }, kind) = (from.get()?, from.get::<u8>()?);
     let [frames, line]: [u64; 2] = from.get()?;
@@ -143,13 +143,13 @@ pub fn note(message: &[u8], nanos: u64) -> Result<Note<'_>, CdrError> {
         3 => (NoteKind::Unreadable(words.to_owned()), bytes),
         got => return Err(CdrError::Value { what: "kind", got: got.into(), allowed: "0 to 3" }),
     };
-    Ok(Note { kind, nanos, interface, line, text })
+    Ok(CaptureNote { kind, nanos, interface, line, text })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ros2::NANOS;
+    use crate::ros2::NANOS_PER_SECOND;
     use proptest::prelude::*;
     use protocol::can::{EXTENDED_MASK, STANDARD_MASK};
 
@@ -164,7 +164,7 @@ mod tests {
     #[test]
     fn a_frame_stands_byte_for_byte_where_the_definition_says() {
         let frame = Frame::fd(0x22C, 1, &[0xAA, 0xBB]).unwrap();
-        let time = Timestamp::nine_digits(5 * NANOS + 7);
+        let time = Timestamp::with_nine_digits(5 * NANOS_PER_SECOND + 7);
         let record = Record { time, interface: "vcan0", frame, direction: Some(Direction::Sent) };
         let mut buffer = Vec::new();
         record.encode_into(&mut buffer);
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn a_message_that_is_no_frame_is_refused() {
-        let time = Timestamp::nine_digits(0);
+        let time = Timestamp::with_nine_digits(0);
         let record = Record { time, interface: "", frame: Frame::EMPTY, direction: None };
         let mut buffer = Vec::new();
         record.encode_into(&mut buffer);
@@ -207,11 +207,11 @@ mod tests {
     fn back_from_1969(message: &[u8]) -> String {
         let mut bytes = message.to_vec();
         bytes[4..8].copy_from_slice(&(-1_i32).to_le_bytes());
-        frame(&bytes, Timestamp::nine_digits(0)).map(|_| ()).unwrap_err().to_string()
+        frame(&bytes, Timestamp::with_nine_digits(0)).map(|_| ()).unwrap_err().to_string()
     }
 
-    fn note(kind: NoteKind, text: &[u8]) -> Note<'_> {
-        Note { kind, nanos: 42, interface: "can0", line: 7, text }
+    fn note(kind: NoteKind, text: &[u8]) -> CaptureNote<'_> {
+        CaptureNote { kind, nanos: 42, interface: "can0", line: 7, text }
     }
 
     #[test]
@@ -248,14 +248,14 @@ mod tests {
             }.unwrap();
             let frame = if kind < 4 && frame.len() == 8 { frame.with_raw_dlc(dlc) } else { frame };
             let direction = [None, Some(Direction::Sent), Some(Direction::Received)][way];
-            let time = Timestamp { nine_digits, ..Timestamp::six_digits(nanos) };
+            let time = Timestamp { nine_digits, ..Timestamp::with_six_digits(nanos) };
             let record = Record { time, interface: &interface, frame, direction };
             prop_assert_eq!(back_and_forth(record), Ok(record));
         }
 
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(0_u8..4, 0..80)) {
-            let _ = frame(&bytes, Timestamp::nine_digits(0));
+            let _ = frame(&bytes, Timestamp::with_nine_digits(0));
             let _ = super::note(&bytes, 0);
         }
     }

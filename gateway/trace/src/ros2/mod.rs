@@ -59,7 +59,7 @@ macro_rules! definition {
 }
 use definition;
 
-const NANOS: u64 = 1_000_000_000;
+const NANOS_PER_SECOND: u64 = 1_000_000_000;
 
 /// The header of a message: `std_msgs/Header`.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -73,8 +73,8 @@ pub struct Header<'a> {
 
 impl Encode for Header<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
-        out.put(i32::try_from(self.nanos / NANOS).unwrap_or(i32::MAX));
-        out.put(u32::try_from(self.nanos % NANOS).unwrap_or(0));
+        out.put(i32::try_from(self.nanos / NANOS_PER_SECOND).unwrap_or(i32::MAX));
+        out.put(u32::try_from(self.nanos % NANOS_PER_SECOND).unwrap_or(0));
         out.put(self.frame_id);
     }
 }
@@ -91,7 +91,7 @@ impl<'a> Decode<'a> for Header<'a> {
 /// # Errors
 /// Returns [`CdrError::Time`] if the time is before 1970, or if `nanosec` is a second or more.
 pub fn nanos(sec: i64, nanosec: u32) -> Result<u64, CdrError> {
-    let whole = u64::try_from(sec).ok().filter(|_| u64::from(nanosec) < NANOS);
-    let nanos = whole.and_then(|sec| sec.checked_mul(NANOS)?.checked_add(nanosec.into()));
+    let whole = u64::try_from(sec).ok().filter(|_| u64::from(nanosec) < NANOS_PER_SECOND);
+    let nanos = whole.and_then(|sec| sec.checked_mul(NANOS_PER_SECOND)?.checked_add(nanosec.into()));
     nanos.ok_or(CdrError::Time { sec, nanosec })
 }

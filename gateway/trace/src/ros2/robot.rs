@@ -40,14 +40,14 @@ impl Message for Transforms<'_> {
 
 impl Encode for Transforms<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
-        out.sequence(self.transforms.iter().map(|transform| Stamped(self.nanos, transform)));
+        out.sequence(self.transforms.iter().map(|transform| StampedTransform(self.nanos, transform)));
     }
 }
 
 /// `geometry_msgs/TransformStamped`.
-struct Stamped<'a>(u64, &'a Transform<'a>);
+struct StampedTransform<'a>(u64, &'a Transform<'a>);
 
-impl Encode for Stamped<'_> {
+impl Encode for StampedTransform<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
         let Self(nanos, Transform { parent, child, translation, rotation }) = self;
         out.put(Header { nanos: *nanos, frame_id: parent });
@@ -58,14 +58,14 @@ impl Encode for Stamped<'_> {
 
 /// `std_msgs/String`.
 #[derive(Clone, Copy, Debug)]
-pub struct Text<'a>(pub &'a str);
+pub struct StringMessage<'a>(pub &'a str);
 
-impl Message for Text<'_> {
+impl Message for StringMessage<'_> {
     const TYPE: &'static str = "std_msgs/msg/String";
     const DEFINITION: &'static str = definition!("std_msgs/String");
 }
 
-impl Encode for Text<'_> {
+impl Encode for StringMessage<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(self.0);
     }

@@ -56,7 +56,7 @@ pub struct PointCloud<'a> {
 
 impl PointCloud<'_> {
     /// The size of an encoded point, in bytes.
-    const STEP: u32 = 16;
+    const POINT_STEP_BYTES: u32 = 16;
     /// The `PointField` constant for single precision.
     const FLOAT32: u8 = 7;
 }
@@ -79,8 +79,8 @@ impl Encode for PointCloud<'_> {
         let fields = [("x", 0_u32), ("y", 4), ("z", 8), ("force", 12)].into_iter();
         out.sequence(fields.map(|field| (field, (Self::FLOAT32, 1_u32))));
         out.put(false);
-        out.put((Self::STEP, Self::STEP * width));
-        out.put_count(self.points.len() * Self::STEP as usize);
+        out.put((Self::POINT_STEP_BYTES, Self::POINT_STEP_BYTES * width));
+        out.put_count(self.points.len() * Self::POINT_STEP_BYTES as usize);
         for &Point { position: [x, y, z], force } in self.points {
             for value in [x, y, z, force] {
                 out.put(value);
@@ -93,7 +93,7 @@ impl Encode for PointCloud<'_> {
 /// The level of a diagnosis.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 #[repr(u8)]
-pub enum Level {
+pub enum DiagnosisLevel {
     /// Normal operation.
     Ok = 0,
     /// A working component that needs attention.
@@ -106,7 +106,7 @@ pub enum Level {
 #[derive(Clone, Debug)]
 pub struct Diagnosis {
     /// The level.
-    pub level: Level,
+    pub level: DiagnosisLevel,
     /// The name of the component.
     pub name: String,
     /// A description.

@@ -7,8 +7,8 @@ use std::fmt::Write as _;
 use std::io::Cursor;
 
 use crate::capture::convert::{CaptureWriter, ConversionCounts, convert};
-use crate::capture::log::{MAX_LINE_BYTES, Style};
-use crate::capture::{CaptureError, CaptureFormat, Entry, Note, NoteKind, Reader};
+use crate::capture::log::{LogStyle, MAX_LINE_BYTES};
+use crate::capture::{CaptureEntry, CaptureError, CaptureFormat, CaptureNote, NoteKind, Reader};
 use crate::recording::file::FileWriter;
 use proptest::prelude::*;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
@@ -24,7 +24,7 @@ fn reader(bytes: &[u8]) -> Reader {
 fn converted(bytes: &[u8], format: CaptureFormat) -> (Vec<u8>, ConversionCounts) {
     let mut out = Vec::new();
     let mut from = reader(bytes);
-    let style = Style { directions: from.is_from_log(), ..Style::default() };
+    let style = LogStyle { directions: from.is_from_log(), ..LogStyle::default() };
     let mut to = CaptureWriter::new(&mut out, format, style).unwrap();
     let done = convert(&mut from, &mut to, |_, _| Ok(())).unwrap();
     to.finish().unwrap();
@@ -83,7 +83,7 @@ fn line() -> impl Strategy<Value = Vec<u8>> {
         |(name, frame, nanos, nine, way, pad)| {
             let min_digits = [1, 3, 10][pad];
             let nanos = if nine { nanos } else { nanos / 1_000 * 1_000 };
-            let time = Timestamp { nine_digits: nine, min_digits, ..Timestamp::six_digits(nanos) };
+            let time = Timestamp { nine_digits: nine, min_digits, ..Timestamp::with_six_digits(nanos) };
             let mut line = String::new();
             write_record(&mut line, &Record { time, interface: &name, frame, direction: None }).unwrap();
             line + ["", " T", " R"][way]
@@ -127,7 +127,7 @@ proptest! {
         for (frame, micros, interface, nine_digits) in &frames {
             let time = Timestamp {
                 nine_digits: *nine_digits,
-                ..Timestamp::six_digits(micros * 1_000 + u64::from(*nine_digits))
+                ..Timestamp::with_six_digits(micros * 1_000 + u64::from(*nine_digits))
             };
             write_record(&mut log, &Record { time, interface, frame: *frame, direction: None }).unwrap();
             log.push('\n');
@@ -235,8 +235,10 @@ fn frames(bytes: &[u8]) -> (Vec<(u64, Vec<u8>)>, End) {
     let mut frames = Vec::new();
     loop {
         match reader.next() {
-            Ok(Some(Entry::Frame(record))) => frames.push((record.time.nanos, record.frame.data().to_vec())),
-            Ok(Some(Entry::Note(note))) => panic!("{note:?}"),
+            Ok(Some(CaptureEntry::Frame(record))) => {
+                frames.push((record.time.nanos, record.frame.data().to_vec()))
+            }
+            Ok(Some(CaptureEntry::Note(note))) => panic!("{note:?}"),
             Ok(None) => return (frames, Ok(reader.extras().unfinished.clone())),
             Err(error) => return (frames, Err(error)),
         }
@@ -290,15 +292,16 @@ fn of<'a>(topics: &'a [crate::capture::Topic], name: &str) -> Option<&'a crate::
 fn what_else_a_recording_has_is_named_and_counted() {
     let mut bytes = Vec::new();
     let mut file = FileWriter::new(&mut bytes).unwrap();
-    file.metadata("run", &BTreeMap::from([("git".to_owned(), "abc".to_owned())])).unwrap();
+    file.write_metadata("run", &BTreeMap::from([("git".to_owned(), "abc".to_owned())])).unwrap();
     file.attach("skin.toml", "application/toml", NANOS, b"version = 1").unwrap();
-    let time = Timestamp::nine_digits(NANOS);
+    let time = Timestamp::with_nine_digits(NANOS);
     let frame = Frame::classic(0x123, &[1]).unwrap();
     let record = Record { time, interface: "can0", frame, direction: Some(Direction::Received) };
     let mut state = file.channel::<Record<'_>>("/state/can0", &[]).unwrap();
     let mut can = file.channel::<Record<'_>>("/can/can0", &[("time_digits", "9")]).unwrap();
-    let mut notes = file.channel::<Note<'_>>("/can/notes", &[]).unwrap();
-    let note = Note { kind: NoteKind::Dropped(2), nanos: NANOS, interface: "can0", line: 0, text: b"" };
+    let mut notes = file.channel::<CaptureNote<'_>>("/can/notes", &[]).unwrap();
+    let note =
+        CaptureNote { kind: NoteKind::Dropped(2), nanos: NANOS, interface: "can0", line: 0, text: b"" };
     file.write(&mut state, NANOS, &record).unwrap();
     file.write(&mut can, NANOS, &record).unwrap();
     file.write(&mut notes, NANOS, &note).unwrap();

@@ -2,9 +2,9 @@
 
 use analysis::fit::rates::RequestedRates;
 use bench::view::CellView;
-use model::central::Central;
+use model::central::CentralComputation;
 use model::decode::wire_message;
-use model::table::{CellState, CellStatus, Table};
+use model::table::{BusTable, CellState, CellStatus};
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::id::CellId;
@@ -13,7 +13,7 @@ use protocol::packet::{Epoch, Words};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
-use protocol::wire_time::{BitRates, Bits};
+use protocol::wire_time::{BitRates, FrameBits};
 
 use super::flag;
 
@@ -39,8 +39,8 @@ struct Load {
 #[derive(Clone, Debug)]
 pub(super) struct LiveBus {
     pub(super) name: String,
-    pub(super) table: Table,
-    pub(super) central: Central,
+    pub(super) table: BusTable,
+    pub(super) central: CentralComputation,
     pub(super) torque_format: TorqueFormat,
     pub(super) sums: bool,
     /// The joint positions of the current epoch; `before` has those of the previous one.
@@ -62,13 +62,13 @@ pub(super) struct LiveBus {
 
 impl LiveBus {
     pub(super) fn new(skin: &Skin, bus: usize) -> Self {
-        let mut table = Table::new(skin, bus);
+        let mut table = BusTable::new(skin, bus);
         table.set_comparing(true);
         let described = skin.buses.get(bus);
         let cells = table.cells().len();
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
-            central: Central::new(&skin.with_cells_of_bus(bus)),
+            central: CentralComputation::new(&skin.with_cells_of_bus(bus)),
             torque_format: described.map(|bus| bus.torque_format).unwrap_or_default(),
             sums: described.is_some_and(|bus| bus.reply != SkinReply::Torque),
             current: None,
@@ -93,7 +93,7 @@ impl LiveBus {
         if wire_message(frame).is_none() && !matches!(message, Some(Message::Stimulus { .. })) {
             // On a bench, wire states and stimuli are frames of the same bus, but a real bus would not carry them.
             let busy =
-                self.rates.zip(Bits::from_frame(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
+                self.rates.zip(FrameBits::from_frame(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
             self.load.busy_s += busy;
         }
         let mut joints = false;
@@ -120,8 +120,8 @@ impl LiveBus {
     }
 
     /// Restarts all counters.
-    pub(super) fn begin_accounts(&mut self) {
-        self.table.begin_accounts();
+    pub(super) fn restart_counters(&mut self) {
+        self.table.reset_counts();
     }
 
     /// Returns the number of all losses so far, of any kind.
@@ -137,7 +137,7 @@ impl LiveBus {
         let frames = self.central.frames(&heard.positions);
         let cells = self.table.cells().iter();
         let sensors: Vec<_> = cells.map(|cell| cell.presumed_sensors().unwrap_or_default()).collect();
-        let central = self.central.total(&frames, &sensors).torque;
+        let central = self.central.total_torque(&frames, &sensors).torque;
         let distributed = self.table.snapshot().sums.torque;
         for ((torque, distributed), central) in self.torques.iter_mut().zip(distributed).zip(central) {
             *torque = (distributed, central);
@@ -164,7 +164,7 @@ impl LiveBus {
         }
     }
 
-    pub(super) const fn set_up(&mut self, is_up: bool, dropped: u64) {
+    pub(super) const fn set_state(&mut self, is_up: bool, dropped: u64) {
         (self.is_up, self.dropped) = (is_up, dropped);
     }
 
@@ -204,7 +204,7 @@ impl LiveBus {
             let flags = [
                 (view.unconfigured, flag::UNCONFIGURED),
                 (view.seen && view.other_configuration, flag::OTHER_CONFIGURATION),
-                (view.measures, flag::MEASURES),
+                (view.measures, flag::MEASURING),
                 (view.halted, flag::HALTED),
                 (cell.is_stuck(), flag::STUCK),
             ];

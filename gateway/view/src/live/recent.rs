@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 
 use analysis::explain::{CellExplained, JointsWatcher, RequestedJoints, explain};
-use model::decode::settle::Settler;
+use model::decode::settle::OrderedDecoder;
 use model::decode::{Decoded, Decoder};
-use model::latched::{LatchedPackets, ReceivedFrame};
+use model::latched::{LatchedFrame, LatchedPackets};
 use protocol::can::Frame;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::Message;
@@ -96,7 +96,7 @@ impl RecentFrames {
     fn drop_first(&mut self) {
         let Some(RecentFrame { at, bus, frame }) = self.frames.pop_front() else { return };
         if let Some(latched) = self.latched.get_mut(bus) {
-            latched.receive(ReceivedFrame { at_nanos: at.0 * 1_000, from_gateway: false, frame });
+            latched.receive(LatchedFrame { at_nanos: at.0 * 1_000, from_gateway: false, frame });
         }
     }
 
@@ -109,7 +109,7 @@ impl RecentFrames {
         seconds: impl Fn(Micros) -> f64,
     ) -> Vec<DecodedFrame> {
         let format = skin.buses.get(bus).map(|bus| bus.format);
-        let mut settler = Settler::new(format);
+        let mut settler = OrderedDecoder::new(format);
         for (number, kept) in (self.first_number()..).zip(&self.frames).filter(|(_, kept)| kept.bus == bus) {
             let Ok(id) = data_id(&kept.frame) else { continue };
             // The frame of a command is needed too, because the length of a torque depends on earlier commands.

@@ -4,16 +4,16 @@ use bench::remote::BenchState;
 use model::table::{CellStatus, Event};
 use protocol::fixed::is_saturated;
 use protocol::id::{CellId, Id, Kind};
-use protocol::message::{Readings, SensorPage};
+use protocol::message::{SensorPage, SensorReadings};
 use protocol::parameters::Contact;
 use protocol::schema::{FieldFormat, PacketSchema};
 use protocol::time::Micros;
 use serde::Serialize;
 
 use super::bus::LiveBus;
-use super::{DecodedFrame, Live, TorqueExplanation};
+use super::{DecodedFrame, LiveState, TorqueExplanation};
 use crate::command::SelectedCell;
-use crate::player::Playback;
+use crate::player::PlayerStatus;
 
 /// The maximum number of dead cells that are listed by name.
 const MAX_LISTED_DEAD_CELLS: usize = 20;
@@ -36,7 +36,7 @@ pub struct StatusMessage {
     /// The details of the cell that the page has selected.
     pub detail: Option<CellDetail>,
     /// The state of the playback; null for a live view.
-    pub playback: Option<Playback>,
+    pub playback: Option<PlayerStatus>,
     /// The state that the bench reports. Of its processes, only that of the selected cell is listed.
     pub bench: Option<BenchState>,
 }
@@ -114,7 +114,7 @@ pub struct CellDetail {
     /// The gains and thresholds of the cell, from the skin.
     pub gains: Gains,
     /// The fields of its sensors pages.
-    pub readings: Vec<Reading>,
+    pub readings: Vec<SensorReading>,
     /// Its force by Algorithm 1, in N.
     pub force_n: f64,
     /// The last torque that the cell sent.
@@ -133,7 +133,7 @@ pub struct CellDetail {
 
 /// A field of a sensors page, by the schema.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Reading {
+pub struct SensorReading {
     /// The name, without the unit.
     pub name: &'static str,
     /// The unit.
@@ -144,7 +144,7 @@ pub struct Reading {
     pub values: Vec<f64>,
 }
 
-impl Reading {
+impl SensorReading {
     /// Returns the fields of a page. The total of a skin's page is left out: the force is shown by Algorithm 1.
     fn from_page(page: SensorPage) -> impl Iterator<Item = Self> {
         let bytes = page.words().map(i16::to_le_bytes);
@@ -157,7 +157,7 @@ impl Reading {
                 unit: &field.unit,
                 decimals: layout.decimals(field),
                 values: (0..field.elements())
-                    .map(|element| field.real(field.raw(bytes.as_flattened(), element)))
+                    .map(|element| field.raw_to_real(field.raw_value(bytes.as_flattened(), element)))
                     .collect(),
             })
         })
@@ -201,7 +201,7 @@ pub struct TorqueReply {
     pub saturated: bool,
 }
 
-impl Live {
+impl LiveState {
     /// Returns the status that all pages get, without the details of a cell.
     #[must_use]
     pub fn status_message(&self, now: Micros) -> StatusMessage {
@@ -270,10 +270,10 @@ impl Live {
                 Some(hash(cell.configuration)),
             ],
             gains: Gains::from_contact(skin_cell.contact),
-            readings: Readings { skin: sensors, ..cell.readings() }
+            readings: SensorReadings { skin: sensors, ..cell.readings() }
                 .pages()
                 .into_iter()
-                .flat_map(Reading::from_page)
+                .flat_map(SensorReading::from_page)
                 .collect(),
             force_n,
             torque,

@@ -5,7 +5,9 @@ use crate::command::SelectedCell;
 use model::generate::{Reply, SkinRequest, generate};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
-use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, State, Tree};
+use protocol::message::{
+    Heartbeat, Joints, Message, NetworkPage, SensorPage, State, StimulusStart, TreePage,
+};
 use protocol::packet::{Epoch, Packet};
 
 fn skin() -> Skin {
@@ -14,7 +16,7 @@ fn skin() -> Skin {
 
 /// The state of the example skin, whose frames are generated at 62.5 Hz.
 struct Bench {
-    live: Live,
+    live: LiveState,
     now: Micros,
     /// The index of the bus on which messages are sent.
     bus: usize,
@@ -22,7 +24,7 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        Self { live: Live::new(skin()), now: Micros(1_000_000), bus: 0 }
+        Self { live: LiveState::new(skin()), now: Micros(1_000_000), bus: 0 }
     }
 
     fn say(&mut self, message: &Message) {
@@ -73,7 +75,7 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     bench.joints(1, Q);
     let node = CellId::new(5).unwrap();
     let page = SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() });
-    bench.say(&Message::Stimulus { to: Node::Cell(node), from: AppliesFrom::Next, page });
+    bench.say(&Message::Stimulus { to: Node::Cell(node), from: StimulusStart::Next, page });
     bench.joints(2, Q);
     let words = [100_i16, -200, 0, 0, 0, 0];
     bench.say(&Message::Torque { from: node, epoch: Epoch(2), torque: words.into() });
@@ -156,7 +158,7 @@ fn ten_thousand_cells_on_forty_buses_are_shown() {
     let (buses, each) = (40, 250);
     let target = SkinRequest { cells: buses * each, buses, broadcast_hz: 20.0, ..SkinRequest::default() };
     let skin = Skin::parse("large", &generate(&target).unwrap()).unwrap();
-    let mut bench = Bench { live: Live::new(skin), now: Micros(1_000_000), bus: 0 };
+    let mut bench = Bench { live: LiveState::new(skin), now: Micros(1_000_000), bus: 0 };
     for bus in 0..buses {
         bench.bus = bus;
         bench.joints(1, Q);
@@ -178,7 +180,7 @@ fn ten_thousand_cells_on_forty_buses_are_shown() {
     let (bus, node) = (buses - 1, CellId::new(250).unwrap());
     let page = SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() });
     bench.heartbeat(250, 0);
-    bench.say(&Message::Stimulus { to: Node::Cell(node), from: AppliesFrom::Next, page });
+    bench.say(&Message::Stimulus { to: Node::Cell(node), from: StimulusStart::Next, page });
     bench.joints(3, Q);
     let bytes = bench.snapshot();
     let pressed: Vec<_> =
@@ -192,13 +194,17 @@ fn ten_thousand_cells_on_forty_buses_are_shown() {
 fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
     let target = SkinRequest { cells: 4, reply: Reply::Sum, ..SkinRequest::default() };
     let skin = Skin::parse("sums", &generate(&target).unwrap()).unwrap();
-    let mut bench = Bench { live: Live::new(skin), now: Micros(1_000_000), bus: 0 };
+    let mut bench = Bench { live: LiveState::new(skin), now: Micros(1_000_000), bus: 0 };
     let places = |bench: &Bench| bench.live.status_message(bench.now).buses[0].tree.clone().unwrap();
     bench.joints(1, Q);
     for (node, parent) in [(1, Some(0)), (2, Some(1)), (3, None)] {
         bench.heartbeat(node, 0);
-        let page =
-            NetworkPage::Tree(Tree { parent, parent_port: 0, working_ports: 0b0101, ..Tree::default() });
+        let page = NetworkPage::Tree(TreePage {
+            parent,
+            parent_port: 0,
+            working_ports: 0b0101,
+            ..TreePage::default()
+        });
         bench.say(&Message::Network {
             from: Node::Cell(CellId::new(node.into()).unwrap()),
             epoch: Epoch(1),

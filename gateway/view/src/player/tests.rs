@@ -13,7 +13,7 @@ use protocol::candump::{Record, Timestamp};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State,
+    Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State, StimulusStart,
 };
 use protocol::packet::Epoch;
 
@@ -35,7 +35,7 @@ fn log(skin: &Skin) -> Vec<u8> {
     let mut out = Vec::new();
     let mut say = |ms: u64, micros: u64, message: &Message| {
         for frame in message.encode().frames(Format::Fd) {
-            let time = Timestamp::six_digits(BEGAN + ms * MS + micros * 1_000);
+            let time = Timestamp::with_six_digits(BEGAN + ms * MS + micros * 1_000);
             let record = Record { time, interface: "vcan0", frame, direction: None };
             writeln!(out, "{record}").unwrap();
         }
@@ -59,7 +59,7 @@ fn log(skin: &Skin) -> Vec<u8> {
             let sensors = SkinSensors { contact: [Q5_10::nearest(n); 3], ..SkinSensors::default() };
             Message::Stimulus {
                 to: Node::Cell(cell(5)),
-                from: AppliesFrom::Next,
+                from: StimulusStart::Next,
                 page: SensorPage::Skin(sensors),
             }
         };
@@ -88,7 +88,7 @@ fn log(skin: &Skin) -> Vec<u8> {
 }
 
 /// Returns the snapshot without its number, and the status.
-fn shown(tape: &mut Live, now: Micros) -> (Vec<u8>, String) {
+fn shown(tape: &mut LiveState, now: Micros) -> (Vec<u8>, String) {
     let detail = tape.detail(SelectedCell { bus: 0, node: 5, frame: None }, now);
     let said = StatusMessage { detail, ..tape.status_message(now) };
     (tape.snapshot(now, &TouchRegistry::default()).split_off(4), serde_json::to_string(&said).unwrap())
@@ -97,12 +97,12 @@ fn shown(tape: &mut Live, now: Micros) -> (Vec<u8>, String) {
 /// Returns the same as [`shown`] after reading the recording from its beginning up to `until`.
 fn straight(bytes: &[u8], skin: &Skin, until: u64) -> (Vec<u8>, String) {
     let mut reader = Reader::from_read("log", std::io::Cursor::new(bytes.to_vec())).unwrap();
-    let mut tape = Tape::new(skin.clone(), BEGAN + 10_000);
+    let mut tape = PlaybackState::new(skin.clone(), BEGAN + 10_000);
     loop {
         match tape.step(until) {
-            TapeStep::NeedsEntries => tape.feed(&mut reader).unwrap(),
-            TapeStep::Reached | TapeStep::Over => break,
-            TapeStep::Updated | TapeStep::Applied { .. } => {}
+            PlaybackStep::NeedsEntries => tape.read_entry(&mut reader).unwrap(),
+            PlaybackStep::Reached | PlaybackStep::Over => break,
+            PlaybackStep::Updated | PlaybackStep::Applied { .. } => {}
         }
     }
     shown(tape.live_mut(), Micros(until / 1_000))
@@ -133,7 +133,12 @@ impl Bench {
 
     fn build(&self, player: &Player) {
         let reader = Reader::open_all(&self.paths).unwrap();
-        player.index().build(reader, self.skin.clone(), (player.first(), player.zero()), &false.into());
+        player.index().build(
+            reader,
+            self.skin.clone(),
+            (player.first_frame_ns(), player.time_origin_ns()),
+            &false.into(),
+        );
     }
 }
 
@@ -144,7 +149,7 @@ fn events_are_found_and_gone_to() {
     bench.build(&player);
     let mut at = |kind, forward| {
         assert!(player.jump(kind, forward).unwrap(), "{kind:?}");
-        player.playback().at_s
+        player.status().at_s
     };
     let near = |found: f64, expected: f64| (expected..expected + 0.06).contains(&found);
     assert!(near(at(EventKind::Touch, true), 6.0));
@@ -154,8 +159,8 @@ fn events_are_found_and_gone_to() {
     let silent = at(EventKind::Silence, false);
     assert!((20.3..20.8).contains(&silent), "{silent}");
     assert!(!player.jump(EventKind::Silence, true).unwrap(), "only one cell falls silent");
-    assert_eq!(player.marks(EventKind::Touch, 100), [15, 75]);
-    let said = player.playback();
+    assert_eq!(player.parts_with_events(EventKind::Touch, 100), [15, 75]);
+    let said = player.status();
     assert!((39.9..40.1).contains(&said.of_s) && said.read == 1.0 && said.others == 0);
 }
 
@@ -167,18 +172,18 @@ fn an_epoch_forth_and_back_is_where_it_began() {
     player.seek(7.0).unwrap();
     player.play(1.0);
     player.step(true).unwrap();
-    let first = player.playback();
+    let first = player.status();
     assert!(!first.playing && (first.at_s - 7.008).abs() < 1e-4, "{}", first.at_s);
     player.step(true).unwrap();
-    assert!((player.playback().at_s - 7.024).abs() < 1e-4);
+    assert!((player.status().at_s - 7.024).abs() < 1e-4);
     player.step(false).unwrap();
-    assert_eq!(player.playback().at_s, first.at_s);
+    assert_eq!(player.status().at_s, first.at_s);
     player.seek(0.0).unwrap();
     player.step(false).unwrap();
-    assert!(player.playback().at_s < 0.001);
+    assert!(player.status().at_s < 0.001);
     player.seek(1e300).unwrap();
     player.step(true).unwrap();
-    assert!(player.playback().at_s >= 39.9);
+    assert!(player.status().at_s >= 39.9);
 }
 
 #[test]
@@ -188,13 +193,13 @@ fn time_passes_at_its_speed_and_ends_with_the_recording() {
     bench.build(&player);
     player.play(2.0);
     assert!(player.advance_time(Duration::from_millis(500)).unwrap());
-    assert!((player.playback().at_s - 1.0).abs() < 1e-6);
+    assert!((player.status().at_s - 1.0).abs() < 1e-6);
     player.play(f64::NAN);
-    assert_eq!(player.playback().speed, 1.0);
+    assert_eq!(player.status().speed, 1.0);
     player.play(1e9);
-    assert_eq!(player.playback().speed, 100.0);
+    assert_eq!(player.status().speed, 100.0);
     player.advance_time(Duration::from_secs(1)).unwrap();
-    assert!(!player.playback().playing, "it is over");
+    assert!(!player.status().playing, "it is over");
     assert!(!player.advance_time(Duration::from_secs(1)).unwrap());
     let history = player.history();
     let moments = u32::from_le_bytes(history[8..12].try_into().unwrap()) as usize;
@@ -207,12 +212,12 @@ fn what_is_not_known_yet_is_said_and_is_exact_later() {
     let bench = Bench::new();
     let mut player = bench.player();
     player.seek(35.0).unwrap();
-    assert!(!player.playback().exact);
+    assert!(!player.status().exact);
     let now = player.now();
     let glance = player.live().status_message(now);
     assert!(glance.contacts <= 1 && glance.buses[0].epochs_due < 250, "the last seconds");
     bench.build(&player);
-    assert!(player.advance_time(Duration::ZERO).unwrap() && player.playback().exact);
+    assert!(player.advance_time(Duration::ZERO).unwrap() && player.status().exact);
     let (now, until) = (player.now(), BEGAN + 10_000 + 35_000 * MS);
     assert_eq!(shown(player.live(), now), straight(&bench.bytes, &bench.skin, until));
 }
@@ -239,7 +244,7 @@ proptest! {
     fn frames_of_any_time_are_played_to_the_end(times in times(), seeks in proptest::collection::vec(0.0..2e10, 3)) {
         let mut log = Vec::new();
         for nanos in times {
-            let time = Timestamp::nine_digits(nanos);
+            let time = Timestamp::with_nine_digits(nanos);
             for frame in Message::Halt.encode().frames(Format::Fd) {
                 writeln!(log, "{}", Record { time, interface: "vcan0", frame, direction: None }).unwrap();
             }
@@ -255,7 +260,7 @@ proptest! {
             player.play(1e9);
             player.advance_time(Duration::from_secs(3)).unwrap();
             let now = player.now();
-            prop_assert!(player.playback().at_s >= 0.0 && !player.history().is_empty());
+            prop_assert!(player.status().at_s >= 0.0 && !player.history().is_empty());
             shown(player.live(), now);
         }
     }

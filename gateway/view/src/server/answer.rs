@@ -2,7 +2,7 @@
 
 use std::sync::atomic::Ordering;
 
-use super::Shared;
+use super::ServerState;
 use super::request::Request;
 use crate::web;
 
@@ -12,7 +12,7 @@ const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; st
 
 /// A complete HTTP answer.
 #[derive(Debug)]
-pub(super) struct Answer {
+pub(super) struct HttpResponse {
     pub(super) bytes: Vec<u8>,
     /// True if the client has sent the token, or if none is needed.
     pub(super) is_known: bool,
@@ -71,7 +71,7 @@ impl Refusal {
     }
 }
 
-impl Answer {
+impl HttpResponse {
     /// Returns the answer for a request that is refused.
     pub(super) fn refusal(why: Refusal) -> Self {
         let (status, words) = why.status_and_advice();
@@ -97,19 +97,19 @@ impl Answer {
 ///
 /// Scripts and styles need no token, because the page requests them by links without one. They are the same for every
 /// client and reveal nothing about the bench.
-pub(super) fn answer(head: &[u8], shared: &Shared) -> Option<Answer> {
+pub(super) fn answer(head: &[u8], shared: &ServerState) -> Option<HttpResponse> {
     let turned = |why| {
         shared.refused.fetch_add(1, Ordering::Relaxed);
-        Some(Answer::refusal(why))
+        Some(HttpResponse::refusal(why))
     };
     let Some(request) = str::from_utf8(head).ok().and_then(Request::parse) else {
         return turned(Refusal::Malformed);
     };
-    if !request.is_for(shared.address) {
+    if !request.is_addressed_to(shared.address) {
         return turned(Refusal::Elsewhere);
     }
     let is_known = request.has_token(shared.access.token.as_ref());
-    let is_code = web::is_code(&request.path);
+    let is_code = web::is_script_or_style(&request.path);
     if !is_known && !is_code {
         return turned(Refusal::Unknown);
     }
@@ -117,10 +117,12 @@ pub(super) fn answer(head: &[u8], shared: &Shared) -> Option<Answer> {
         "/live" if request.is_upgrade => None,
         "/live" if shared.pages.load(Ordering::Relaxed) >= super::MAX_PAGES => turned(Refusal::Full),
         "/live" => turned(Refusal::NoPage),
-        "/surface" => Some(Answer::new("200 OK", "application/octet-stream", &shared.surface, is_known)),
-        path => match web::file(path) {
+        "/surface" => {
+            Some(HttpResponse::new("200 OK", "application/octet-stream", &shared.surface, is_known))
+        }
+        path => match web::media_type_and_contents(path) {
             // A request for a script does not show that the client knows the token.
-            Some((kind, bytes)) => Some(Answer::new("200 OK", kind, bytes, is_known && !is_code)),
+            Some((kind, bytes)) => Some(HttpResponse::new("200 OK", kind, bytes, is_known && !is_code)),
             None => turned(Refusal::NoFile),
         },
     }

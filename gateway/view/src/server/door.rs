@@ -16,19 +16,19 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, getrlimit, setpriority_process};
 
-use super::answer::{Answer, Refusal, answer};
+use super::answer::{HttpResponse, Refusal, answer};
 use super::page::{self, PrefixedStream};
 use super::request::MAX_HEAD_BYTES;
-use super::{MAX_PAGES, Shared};
+use super::{MAX_PAGES, ServerState};
 
 /// The time within which a client must send the head of its request, and must receive the answer.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 /// The time within which a client with the token must receive each piece of an answer.
-const PIECE_TIMEOUT: Duration = Duration::from_secs(5);
+const ANSWER_PIECE_TIMEOUT: Duration = Duration::from_secs(5);
 /// The maximum number of clients that are neither answered yet nor pages.
-const MAX_VISITORS: usize = 256;
+const MAX_PENDING_CLIENTS: usize = 256;
 /// The number of file descriptors that are kept free for buses and pages.
-const RESERVED_FILES: u64 = 64;
+const RESERVED_FILE_DESCRIPTORS: u64 = 64;
 /// The maximum number of connections that are accepted before the clients that wait are served.
 const MAX_ACCEPTED_AT_ONCE: usize = 32;
 /// The interval at which the server checks whether it has to stop.
@@ -36,24 +36,24 @@ const POLL_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
 /// The time for which no connection is accepted after accepting has failed.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// The niceness of the thread, so that many connections do not take processor time from the bench.
-const NICE: i32 = 10;
+const THREAD_NICENESS: i32 = 10;
 /// The maximum number of bytes that are read at once.
 const READ_SIZE: usize = 4 * 1024;
 
 /// A client that has not received its answer yet.
 #[derive(Debug)]
-struct Visitor {
+struct PendingClient {
     stream: TcpStream,
     head: Vec<u8>,
     /// The answer and the number of its bytes that were already sent; `None` until the request is complete.
-    answer: Option<(Answer, usize)>,
+    answer: Option<(HttpResponse, usize)>,
     until: Instant,
 }
 
 /// The next step for a visitor after its data was read and written.
 enum NextStep {
     /// The visitor stays, because its request or answer is not complete.
-    Stays(Visitor),
+    Stays(PendingClient),
     /// The visitor becomes a page with a WebSocket.
     Page(PrefixedStream),
     /// The visitor has received its answer, or has disconnected.
@@ -61,15 +61,15 @@ enum NextStep {
 }
 
 /// Serves clients until the server stops. Passes clients that become pages to `pages`.
-pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<PrefixedStream>) {
+pub(super) fn serve(listener: &TcpListener, shared: &ServerState, pages: &Sender<PrefixedStream>) {
     // On Linux, niceness applies to the thread alone. If it cannot be set, the door works without it.
-    let _ = setpriority_process(None, NICE);
-    let room = visitor_limit();
-    let mut visitors = Vec::<Visitor>::new();
+    let _ = setpriority_process(None, THREAD_NICENESS);
+    let room = pending_client_limit();
+    let mut visitors = Vec::<PendingClient>::new();
     let mut resting = None::<Instant>;
     while !shared.stop.load(Ordering::Relaxed) {
         resting = resting.filter(|end| Instant::now() < *end);
-        let ready = wait(listener, resting.is_none(), &visitors);
+        let ready = wait_until_ready(listener, resting.is_none(), &visitors);
         let [listener_is_ready, rest @ ..] = ready.as_slice() else { continue };
         let now = Instant::now();
         // Clients whose data has arrived are served before new clients can push them out.
@@ -79,10 +79,10 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Pref
                 // Browsers open connections before they need them, and would take this text for the answer to a later
                 // request.
                 if !visitor.head.is_empty() {
-                    visitor.turn_away(Refusal::Late);
+                    visitor.refuse(Refusal::Late);
                 }
             } else if *is_ready {
-                enter(visitor.advance(shared), &mut visitors, pages);
+                apply_next_step(visitor.advance(shared), &mut visitors, pages);
             } else {
                 visitors.push(visitor);
             }
@@ -96,10 +96,10 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Pref
                     if stream.set_nonblocking(true).is_err() {
                         continue;
                     }
-                    let visitor = Visitor::new(stream);
-                    enter(visitor.advance(shared), &mut visitors, pages);
+                    let visitor = PendingClient::new(stream);
+                    apply_next_step(visitor.advance(shared), &mut visitors, pages);
                     if visitors.len() > room {
-                        turn_oldest_away(&mut visitors, shared);
+                        refuse_oldest_client(&mut visitors, shared);
                     }
                 }
                 Err(error) if error.kind() == ErrorKind::WouldBlock => break,
@@ -107,7 +107,7 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Pref
                     if matches!(error.kind(), ErrorKind::Interrupted | ErrorKind::ConnectionAborted) => {}
                 Err(_) => {
                     // No file descriptor is free. This lasts until one is closed, so one client is disconnected.
-                    turn_oldest_away(&mut visitors, shared);
+                    refuse_oldest_client(&mut visitors, shared);
                     resting = Some(Instant::now() + ACCEPT_PAUSE);
                     break;
                 }
@@ -117,14 +117,16 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Pref
 }
 
 /// Returns the maximum number of visitors for which file descriptors are left beside those of buses and pages.
-fn visitor_limit() -> usize {
+fn pending_client_limit() -> usize {
     let files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
-    usize::try_from(files.saturating_sub(RESERVED_FILES) / 2).unwrap_or(MAX_VISITORS).clamp(4, MAX_VISITORS)
+    usize::try_from(files.saturating_sub(RESERVED_FILE_DESCRIPTORS) / 2)
+        .unwrap_or(MAX_PENDING_CLIENTS)
+        .clamp(4, MAX_PENDING_CLIENTS)
 }
 
 /// Waits until a client connects or the socket of a visitor is ready. Returns a flag for the listener and each
 /// visitor: true if it is ready.
-fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool> {
+fn wait_until_ready(listener: &TcpListener, accepts: bool, visitors: &[PendingClient]) -> Vec<bool> {
     // While accepting fails, the listener is always ready, so it is not polled during the pause.
     let listened = if accepts { PollFlags::IN } else { PollFlags::empty() };
     let mut files = vec![PollFd::new(listener, listened)];
@@ -140,7 +142,7 @@ fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool
 }
 
 /// Keeps a visitor, passes it on as a page, or drops it.
-fn enter(next: NextStep, visitors: &mut Vec<Visitor>, pages: &Sender<PrefixedStream>) {
+fn apply_next_step(next: NextStep, visitors: &mut Vec<PendingClient>, pages: &Sender<PrefixedStream>) {
     match next {
         NextStep::Stays(visitor) => visitors.push(visitor),
         NextStep::Done => {}
@@ -150,12 +152,12 @@ fn enter(next: NextStep, visitors: &mut Vec<Visitor>, pages: &Sender<PrefixedStr
 }
 
 /// Starts a thread for each new page, up to the maximum number. These threads have normal priority.
-pub(super) fn open(pages: Receiver<PrefixedStream>, shared: &Arc<Shared>) {
+pub(super) fn start_page_threads(pages: Receiver<PrefixedStream>, shared: &Arc<ServerState>) {
     for (page, begun) in (1..).zip(pages) {
         if shared.pages.fetch_add(1, Ordering::Relaxed) >= MAX_PAGES {
             shared.pages.fetch_sub(1, Ordering::Relaxed);
             shared.refused.fetch_add(1, Ordering::Relaxed);
-            Visitor::new(begun.into_stream()).turn_away(Refusal::Full);
+            PendingClient::new(begun.into_stream()).refuse(Refusal::Full);
             continue;
         }
         let of_thread = Arc::clone(shared);
@@ -171,8 +173,9 @@ pub(super) fn open(pages: Receiver<PrefixedStream>, shared: &Arc<Shared>) {
 }
 
 /// Refuses the visitor that has waited longest. Visitors that have sent the token are spared as long as possible.
-fn turn_oldest_away(visitors: &mut Vec<Visitor>, shared: &Shared) {
-    let is_known = |visitor: &Visitor| visitor.answer.as_ref().is_some_and(|(answer, _)| answer.is_known);
+fn refuse_oldest_client(visitors: &mut Vec<PendingClient>, shared: &ServerState) {
+    let is_known =
+        |visitor: &PendingClient| visitor.answer.as_ref().is_some_and(|(answer, _)| answer.is_known);
     let at = visitors.iter().position(|visitor| !is_known(visitor)).unwrap_or(0);
     if visitors.is_empty() {
         return;
@@ -180,17 +183,17 @@ fn turn_oldest_away(visitors: &mut Vec<Visitor>, shared: &Shared) {
     let oldest = visitors.remove(at);
     shared.refused.fetch_add(1, Ordering::Relaxed);
     if oldest.answer.is_none() {
-        oldest.turn_away(Refusal::Crowded);
+        oldest.refuse(Refusal::Crowded);
     }
 }
 
-impl Visitor {
+impl PendingClient {
     fn new(stream: TcpStream) -> Self {
         Self { stream, head: Vec::new(), answer: None, until: Instant::now() + HEAD_TIMEOUT }
     }
 
     /// Reads the data that has arrived from a visitor, and sends as much of the answer as the socket accepts.
-    fn advance(mut self, shared: &Shared) -> NextStep {
+    fn advance(mut self, shared: &ServerState) -> NextStep {
         while self.answer.is_none() {
             let mut piece = [0; READ_SIZE];
             // The empty line that ends the head may begin in the last three bytes that were read before.
@@ -206,7 +209,7 @@ impl Visitor {
             let end = new.windows(4).position(|end| end == b"\r\n\r\n").map(|at| seen + at + 4);
             if self.head.len() > MAX_HEAD_BYTES {
                 shared.refused.fetch_add(1, Ordering::Relaxed);
-                self.answer = Some((Answer::refusal(Refusal::Long), 0));
+                self.answer = Some((HttpResponse::refusal(Refusal::Long), 0));
             } else if let Some(head) = end.and_then(|end| self.head.get(..end)) {
                 match answer(head, shared) {
                     Some(answer) => self.answer = Some((answer, 0)),
@@ -214,10 +217,10 @@ impl Visitor {
                 }
             }
         }
-        self.write()
+        self.send_answer()
     }
 
-    fn write(mut self) -> NextStep {
+    fn send_answer(mut self) -> NextStep {
         while let Some((answer, sent)) = &mut self.answer {
             let rest = answer.bytes.get(*sent..).unwrap_or_default();
             if rest.is_empty() {
@@ -229,7 +232,7 @@ impl Visitor {
                 Ok(written) => {
                     *sent += written;
                     if answer.is_known {
-                        self.until = Instant::now() + PIECE_TIMEOUT;
+                        self.until = Instant::now() + ANSWER_PIECE_TIMEOUT;
                     }
                 }
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
@@ -241,9 +244,9 @@ impl Visitor {
     }
 
     /// Refuses the visitor. Sends the reason only as far as the socket accepts it at once.
-    fn turn_away(mut self, why: Refusal) {
+    fn refuse(mut self, why: Refusal) {
         if self.answer.is_none() {
-            let _ = self.stream.write(&Answer::refusal(why).bytes);
+            let _ = self.stream.write(&HttpResponse::refusal(why).bytes);
         }
         self.close();
     }

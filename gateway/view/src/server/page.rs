@@ -8,12 +8,12 @@ use std::time::Duration;
 use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Error, Message, WebSocket, accept_with_config};
 
-use super::Shared;
+use super::ServerState;
 use crate::command::{self, Command};
 use crate::locked;
 
 /// The time within which a page must receive each piece of a message.
-const TIMEOUT: Duration = Duration::from_secs(5);
+const MESSAGE_TIMEOUT: Duration = Duration::from_secs(5);
 /// The time for which the thread waits for a message from the page before it checks for a new snapshot.
 const POLL_INTERVAL: Duration = Duration::from_millis(15);
 /// The maximum number of messages that are read from the page before the next snapshot.
@@ -56,16 +56,16 @@ impl Write for PrefixedStream {
 }
 
 /// Serves a page until it disconnects, or receives messages too slowly.
-pub(super) fn serve(begun: PrefixedStream, page: u64, shared: &Shared) {
-    let _ = live(begun, page, shared);
+pub(super) fn serve(begun: PrefixedStream, page: u64, shared: &ServerState) {
+    let _ = serve_websocket(begun, page, shared);
 }
 
-fn live(begun: PrefixedStream, page: u64, shared: &Shared) -> io::Result<()> {
+fn serve_websocket(begun: PrefixedStream, page: u64, shared: &ServerState) -> io::Result<()> {
     let stream = &begun.stream;
     stream.set_nonblocking(false)?;
     stream.set_nodelay(true)?;
-    stream.set_read_timeout(Some(TIMEOUT))?;
-    stream.set_write_timeout(Some(TIMEOUT))?;
+    stream.set_read_timeout(Some(MESSAGE_TIMEOUT))?;
+    stream.set_write_timeout(Some(MESSAGE_TIMEOUT))?;
     let config = WebSocketConfig::default()
         .max_message_size(Some(command::MAX_MESSAGE_BYTES))
         .max_frame_size(Some(command::MAX_MESSAGE_BYTES))
@@ -90,7 +90,7 @@ fn live(begun: PrefixedStream, page: u64, shared: &Shared) -> io::Result<()> {
 fn exchange_messages(
     socket: &mut WebSocket<PrefixedStream>,
     page: u64,
-    shared: &Shared,
+    shared: &ServerState,
 ) -> Result<(), Error> {
     socket.send(Message::text(shared.scene.as_str()))?;
     socket.get_ref().stream.set_read_timeout(Some(POLL_INTERVAL))?;
@@ -134,7 +134,7 @@ fn exchange_messages(
 }
 
 /// Handles a message that a page has sent.
-fn handle_message(text: &str, page: u64, shared: &Shared) {
+fn handle_message(text: &str, page: u64, shared: &ServerState) {
     let ignore = || _ = shared.ignored.fetch_add(1, Ordering::Relaxed);
     match Command::parse(text) {
         None => ignore(),

@@ -47,7 +47,7 @@ impl Request {
 
     /// Returns true if the request is addressed to this server by one of its own addresses and does not come from a
     /// page of another site.
-    pub(super) fn is_for(&self, address: SocketAddr) -> bool {
+    pub(super) fn is_addressed_to(&self, address: SocketAddr) -> bool {
         let Some(host) = self.host.as_deref().and_then(Authority::parse) else { return false };
         // Browsers send an origin with every WebSocket; other programs may omit it.
         let is_origin = self.origin.as_ref().is_none_or(|origin| {
@@ -110,7 +110,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn is_for(head: &str, address: &str) -> bool {
-        Request::parse(head).is_some_and(|request| request.is_for(address.parse().unwrap()))
+        Request::parse(head).is_some_and(|request| request.is_addressed_to(address.parse().unwrap()))
     }
 
     #[test]

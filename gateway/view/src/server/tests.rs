@@ -14,7 +14,7 @@ const TIMEOUT: Duration = Duration::from_secs(40);
 fn served(token: Option<&str>) -> Server {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let token = token.map(|token| Token::parse(token).unwrap());
-    let access = Access { may_act: true, may_play: false, token };
+    let access = PageAccess { may_act: true, may_play: false, token };
     Server::start(listener, access, "{}".to_owned(), vec![1, 2, 3]).unwrap()
 }
 

@@ -6,7 +6,7 @@ use protocol::id::CellId;
 use protocol::time::Micros;
 use serde::{Deserialize, Serialize};
 
-use crate::live::Live;
+use crate::live::LiveState;
 
 /// The maximum time in ns between two losses on a bus that count as one event.
 const LOSS_MERGE_NS: u64 = 200_000_000;
@@ -52,7 +52,7 @@ pub struct EventDetector {
 
 impl EventDetector {
     /// Returns the events that have happened since the last call.
-    pub fn detect(&mut self, at: u64, live: &Live) -> Vec<Event> {
+    pub fn detect(&mut self, at: u64, live: &LiveState) -> Vec<Event> {
         let mut events = Vec::new();
         for (bus, (losses, halted)) in live.losses().enumerate() {
             if self.buses.len() <= bus {
@@ -70,7 +70,7 @@ impl EventDetector {
             }
             (*before, *was_halted) = (losses, halted);
         }
-        for (bus, node, now) in live.touched(Micros(at / 1_000)) {
+        for (bus, node, now) in live.touched_and_dead(Micros(at / 1_000)) {
             let before = self.cells.insert((bus, node), now).unwrap_or_default();
             for (kind, (now, before)) in
                 [EventKind::Touch, EventKind::Silence].into_iter().zip(now.into_iter().zip(before))

@@ -10,10 +10,10 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, sockopt};
 use socketcan::{CanFdSocket, SocketOptions};
 
-use super::{ClientHello, FilterPart, HelloReply, OWN_BYTE, VERSION, decode_dropped};
+use super::{ClientHello, FilterPart, HelloReply, OWN_FRAME_BYTE, VERSION, decode_dropped};
 use super::{address, default_directory, open_directory};
 use crate::bus::batch::{self, Datagram};
-use crate::bus::carrier::Carrier;
+use crate::bus::carrier::BusBackend;
 use crate::bus::{Bus, BusError, BusOptions, Filter};
 
 /// Maximum time to wait for a server, which answers at once unless it is stopped.
@@ -21,12 +21,12 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum time until a server that is ending resets a new connection.
 const RESET_TIMEOUT: Duration = Duration::from_millis(50);
 /// Size of the send buffer in bytes: room for some 700 FD frames, the answers of a whole skin to one message.
-const SEND_BUFFER: usize = 1 << 18;
+const SEND_BUFFER_BYTES: usize = 1 << 18;
 
 /// The embedded bus: served by another process of this user.
-pub(in crate::bus) struct Embedded;
+pub(in crate::bus) struct EmbeddedBackend;
 
-impl Carrier for Embedded {
+impl BusBackend for EmbeddedBackend {
     fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError> {
         let failed = |errno: Errno| BusError::open_error(name, "connect to", errno);
         let gone = |errno| match errno {
@@ -82,10 +82,10 @@ impl Carrier for Embedded {
     }
 
     fn is_own(&self, frame: Datagram<'_>) -> bool {
-        frame.bytes().and_then(|bytes| bytes.get(OWN_BYTE)) == Some(&1)
+        frame.bytes().and_then(|bytes| bytes.get(OWN_FRAME_BYTE)) == Some(&1)
     }
 
-    fn dropped(&self, notice: &[u8]) -> Option<u32> {
+    fn decode_drop_notice(&self, notice: &[u8]) -> Option<u32> {
         decode_dropped(notice)
     }
 
@@ -128,7 +128,7 @@ fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
     let socket = seqpacket(SocketFlags::empty()).map_err(failed)?;
     // `connect` blocks while the server's queue of new clients is full; the timeout limits that.
     sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(ANSWER_TIMEOUT)).map_err(failed)?;
-    sockopt::set_socket_send_buffer_size(&socket, SEND_BUFFER).map_err(failed)?;
+    sockopt::set_socket_send_buffer_size(&socket, SEND_BUFFER_BYTES).map_err(failed)?;
     match rustix::net::connect(&socket, &address) {
         Ok(()) => Ok(socket),
         Err(Errno::NOENT | Errno::CONNREFUSED) => Err(not_served()),

@@ -41,7 +41,7 @@ fn describe_allowed(path: &str, message: &str) -> Option<String> {
         "a sequence" if got == "map" => format!("it is a list of tables: write [[{path}]]"),
         "f64" => "a number is needed".to_owned(),
         "i64" | "u64" | "u32" | "u8" if got.starts_with("integer ") => "the number is too large".to_owned(),
-        "i64" | "u64" | "u32" | "u8" => match cell_of_bus(got) {
+        "i64" | "u64" | "u32" | "u8" => match parse_cell_name(got) {
             Some(CellName { bus: Some(bus), node }) => {
                 format!("a whole number is needed: write {node}, and bus = \"{bus}\" as a key of its own")
             }
@@ -60,7 +60,7 @@ fn describe_allowed(path: &str, message: &str) -> Option<String> {
 }
 
 /// Parses the name of a cell that the user has copied from the command line: `string "BUS:NODE"`.
-fn cell_of_bus(got: &str) -> Option<CellName> {
+fn parse_cell_name(got: &str) -> Option<CellName> {
     got.strip_prefix("string \"")?.strip_suffix('"')?.parse().ok()
 }
 

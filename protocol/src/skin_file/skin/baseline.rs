@@ -19,20 +19,20 @@ pub(super) fn skin_baseline(raw: Option<raw::RawBaseline>) -> Result<Baseline, D
     let Some(raw) = raw else { return Ok(Baseline::Off) };
     let at = KeyPath::top_level_key("baseline");
     let modes = [("off", None), ("hold", Some(false)), ("follow", Some(true))];
-    let follows = at.key("mode").choose(raw.mode.as_deref().unwrap_or("follow"), &modes)?;
+    let follows = at.key("mode").parse_choice(raw.mode.as_deref().unwrap_or("follow"), &modes)?;
     let mut to = DEFAULT;
-    at.key("threshold_n").set_word(raw.threshold_n, &mut to.threshold, Q5_10::try_at_least)?;
+    at.key("threshold_n").set_fixed_if_given(raw.threshold_n, &mut to.threshold, Q5_10::try_round_up)?;
     if let Some(got) = raw.threshold_n.filter(|_| to.threshold <= Q5_10::ZERO) {
         return Err(at.key("threshold_n").fault(got, "must be above 0"));
     }
-    at.key("hysteresis").set_word(raw.hysteresis, &mut to.hysteresis, Q1_14::try_nearest)?;
+    at.key("hysteresis").set_fixed_if_given(raw.hysteresis, &mut to.hysteresis, Q1_14::try_nearest)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
         return Err(at.key("hysteresis").fault(got, "a part of the threshold: 0 to 1 is possible"));
     }
-    at.key("limit_n").set_word(raw.limit_n, &mut to.limit, Q5_10::try_nearest)?;
-    set_slope(&at.key("n_per_c"), raw.n_per_c, &mut to)?;
+    at.key("limit_n").set_fixed_if_given(raw.limit_n, &mut to.limit, Q5_10::try_nearest)?;
+    set_temperature_slope(&at.key("n_per_c"), raw.n_per_c, &mut to)?;
     if let Some(got) = raw.rate_n_per_s {
-        to.rate_un_per_s = rate(got)
+        to.rate_un_per_s = to_micronewtons_per_s(got)
             .ok_or_else(|| at.key("rate_n_per_s").fault(got, "1e-6 to 0.065535 N/s are possible"))?;
     }
     Ok(match follows {
@@ -55,13 +55,17 @@ pub(super) fn cell_baseline(
             Err(at.key(key).fault(value, "the skin has no [baseline], or its mode is \"off\""))
         });
     };
-    at.key("baseline_limit_n").set_word(raw.baseline_limit_n, &mut to.limit, Q5_10::try_nearest)?;
-    set_slope(&at.key("baseline_n_per_c"), raw.baseline_n_per_c, &mut to)?;
+    at.key("baseline_limit_n").set_fixed_if_given(raw.baseline_limit_n, &mut to.limit, Q5_10::try_nearest)?;
+    set_temperature_slope(&at.key("baseline_n_per_c"), raw.baseline_n_per_c, &mut to)?;
     Ok(Baseline::On(to))
 }
 
 /// Sets the drift of the zero with temperature, which may be negative, in N/°C.
-fn set_slope(at: &KeyPath, given: Option<f64>, to: &mut BaselineSettings) -> Result<(), DocumentFault> {
+fn set_temperature_slope(
+    at: &KeyPath,
+    given: Option<f64>,
+    to: &mut BaselineSettings,
+) -> Result<(), DocumentFault> {
     if let Some(given) = given {
         to.n_per_c = at.to_fixed(given, Q1_14::try_nearest)?;
     }
@@ -69,7 +73,7 @@ fn set_slope(at: &KeyPath, given: Option<f64>, to: &mut BaselineSettings) -> Res
 }
 
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within 1 to 65535")]
-fn rate(n_per_s: f64) -> Option<u16> {
+fn to_micronewtons_per_s(n_per_s: f64) -> Option<u16> {
     let rate = (n_per_s * 1e6).round();
     (1.0..=65_535.0).contains(&rate).then_some(rate as u16)
 }

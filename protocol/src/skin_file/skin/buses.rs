@@ -31,10 +31,11 @@ pub(super) fn buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>>
             return Err(at.key("name").fault(format_args!("{name:?}"), "this bus is named twice"));
         }
         let reply = reply(&at, bus)?;
-        let format =
-            at.key("format").choose(&bus.format, &[("fd", Format::Fd), ("classic", Format::Classic)])?;
+        let format = at
+            .key("format")
+            .parse_choice(&bus.format, &[("fd", Format::Fd), ("classic", Format::Classic)])?;
         let (bitrate, data_bitrate) = bit_rates(&at, bus, format)?;
-        let chain = chain(&at, bus, robot)?;
+        let chain = chain_index(&at, bus, robot)?;
         let torque_format = torque_format(&at, bus, robot, chain)?;
         let sensing = sensing::bus_sensing(&at, bus)?;
         Ok(SkinBus { name, reply, format, chain, torque_format, bitrate, data_bitrate, sensing })
@@ -43,7 +44,7 @@ pub(super) fn buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>>
 }
 
 /// Returns the index of the chain that carries a bus. The file may omit the name if there is only one chain.
-fn chain(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize> {
+fn chain_index(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize> {
     let names =
         || robot.chains.iter().map(|chain| format!("{:?}", chain.name)).collect::<Vec<_>>().join(", ");
     let at = at.key("chain");
@@ -61,7 +62,7 @@ fn chain(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize> {
 fn torque_format(at: &KeyPath, bus: &raw::RawBus, robot: &Robot, chain: usize) -> Checked<TorqueFormat> {
     if let Some(name) = &bus.torque_format {
         let formats = TorqueFormat::ALL.map(|format| (format.name(), format));
-        return at.key("torque_format").choose(name, &formats);
+        return at.key("torque_format").parse_choice(name, &formats);
     }
     let joints = robot.chains.get(chain).map_or(&[][..], |chain| &chain.joints);
     let slides = |&joint: &usize| robot.joints.get(joint).is_some_and(|it| it.kind == JointKind::Prismatic);
@@ -70,7 +71,7 @@ fn torque_format(at: &KeyPath, bus: &raw::RawBus, robot: &Robot, chain: usize) -
 
 /// Checks the reply of the cells of a bus to joints.
 fn reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
-    let sums = at.key("reply").choose(&bus.reply, &[("torque", false), ("sum", true)])?;
+    let sums = at.key("reply").parse_choice(&bus.reply, &[("torque", false), ("sum", true)])?;
     let only_sum = "only with reply = \"sum\"";
     match (sums, bus.slot_us, bus.carry) {
         (false, None, None) => Ok(SkinReply::Torque),
@@ -87,7 +88,7 @@ fn reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
 /// Checks the nominal and data bit rates of a bus, which are optional and only needed for real hardware.
 fn bit_rates(at: &KeyPath, bus: &raw::RawBus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
     let within = |key, got, min, max| at.key(key).check_range(got, min..=max, " bit/s");
-    let (min, max) = (BitRates::MIN_NOMINAL, BitRates::MAX_NOMINAL);
+    let (min, max) = (BitRates::MIN_NOMINAL_BIT_RATE, BitRates::MAX_NOMINAL_BIT_RATE);
     let bitrate = bus.bitrate.map(|got| within("bitrate", got, min, max)).transpose()?;
     let data_bitrate = match (bus.data_bitrate, format, bitrate) {
         (None, _, _) => None,
@@ -97,7 +98,9 @@ fn bit_rates(at: &KeyPath, bus: &raw::RawBus, format: Format) -> Checked<(Option
         (Some(got), Format::Fd, None) => {
             return Err(at.key("data_bitrate").fault(got, "only together with bitrate"));
         }
-        (Some(got), Format::Fd, Some(min)) => Some(within("data_bitrate", got, min, BitRates::MAX_DATA)?),
+        (Some(got), Format::Fd, Some(min)) => {
+            Some(within("data_bitrate", got, min, BitRates::MAX_DATA_BIT_RATE)?)
+        }
     };
     Ok((bitrate, data_bitrate))
 }

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use super::chains::normalized;
-use super::reach::{MAX_REACH, reach};
+use super::reach::{MAX_REACH, max_frame_distance};
 use super::{Cell, Robot, SkinBus, baseline, raw};
 use crate::document::{Checked, KeyPath};
 use crate::fixed::Q;
@@ -96,7 +96,7 @@ fn cell(
     buses: &[SkinBus],
     base: CellDefaults,
 ) -> Checked<Cell> {
-    let bus = bus(at, raw, buses)?;
+    let bus = bus_index(at, raw, buses)?;
     let node = CellId::new(raw.node);
     let why = "a cell's node is 1 to 254; further cells need another bus";
     let node = node.map_err(|_| at.key("node").fault(raw.node, why))?;
@@ -106,7 +106,7 @@ fn cell(
     }
     let chain = buses.get(bus).and_then(|bus| robot.chains.get(bus.chain));
     let rows = chain.and_then(|chain| chain.rows.get(..usize::from(row))).unwrap_or_default();
-    let reach = reach(rows, raw.position);
+    let reach = max_frame_distance(rows, raw.position);
     if reach >= MAX_REACH {
         let [x, y, z] = raw.position;
         let why = format!(
@@ -130,7 +130,7 @@ fn cell(
         joint,
         row,
         position: raw.position,
-        normal: normal(at, raw)?,
+        normal: cell_normal(at, raw)?,
         orientation: raw
             .orientation
             .map(|it| normalized(&at.key("orientation"), "quaternion", it))
@@ -147,19 +147,23 @@ pub(super) fn contact(at: &KeyPath, raw: raw::RawContact, base: Contact) -> Chec
     let raw::RawContact { alpha_c, alpha_p, contact_threshold_n, proximity_threshold, force_threshold_n } =
         raw;
     let mut to = base;
-    at.key("alpha_c").set_word(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
-    at.key("alpha_p").set_word(alpha_p, &mut to.alpha_p, Q::try_nearest)?;
-    at.key("contact_threshold_n").set_word(
+    at.key("alpha_c").set_fixed_if_given(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
+    at.key("alpha_p").set_fixed_if_given(alpha_p, &mut to.alpha_p, Q::try_nearest)?;
+    at.key("contact_threshold_n").set_fixed_if_given(
         contact_threshold_n,
         &mut to.contact_threshold,
-        Q::try_at_least,
+        Q::try_round_up,
     )?;
-    at.key("proximity_threshold").set_word(
+    at.key("proximity_threshold").set_fixed_if_given(
         proximity_threshold,
         &mut to.proximity_threshold,
-        Q::try_at_least,
+        Q::try_round_up,
     )?;
-    at.key("force_threshold_n").set_word(force_threshold_n, &mut to.force_threshold, Q::try_at_least)?;
+    at.key("force_threshold_n").set_fixed_if_given(
+        force_threshold_n,
+        &mut to.force_threshold,
+        Q::try_round_up,
+    )?;
     Ok(to)
 }
 
@@ -195,7 +199,7 @@ fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) 
 }
 
 /// Returns the index of a cell's bus. The file may omit the name if there is only one bus.
-fn bus(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usize> {
+fn bus_index(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usize> {
     let names = || buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
     let at = at.key("bus");
     match &raw.bus {
@@ -208,7 +212,7 @@ fn bus(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usize> {
 }
 
 /// Returns the outward normal of a cell: the given one, or the z axis of the given orientation.
-fn normal(at: &KeyPath, raw: &raw::RawCell) -> Checked<[f64; 3]> {
+fn cell_normal(at: &KeyPath, raw: &raw::RawCell) -> Checked<[f64; 3]> {
     match (raw.orientation, raw.normal) {
         (Some(orientation), None) => {
             let [x, y, z, w] = normalized(&at.key("orientation"), "quaternion", orientation)?;

@@ -11,11 +11,11 @@ use crate::fixed::Q1_14;
 use crate::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 
 /// Maximum position of a prismatic joint in m: the range of a Q1.14 word, 2 m, less a margin for rounding.
-const MAX_PRISMATIC_POSITION: f64 = 2.0 - 1e-3;
+const MAX_PRISMATIC_POSITION_M: f64 = 2.0 - 1e-3;
 /// Maximum absolute coordinate of a chain's base relative to the robot's base, in m.
-const MAX_BASE_COORDINATE: f64 = 100.0;
+const MAX_BASE_COORDINATE_M: f64 = 100.0;
 /// Maximum deviation of the length of a unit vector or unit quaternion from one.
-const UNIT_TOLERANCE: f64 = 1e-3;
+const UNIT_LENGTH_TOLERANCE: f64 = 1e-3;
 
 /// Checks the joints and chains of the robot.
 pub(super) fn robot(raw: raw::RawRobot) -> Checked<Robot> {
@@ -62,7 +62,7 @@ fn serial_robot(
         check_row(&at.key("joints").element(index), row)?;
     }
     let all = limits.unwrap_or_else(|| vec![[-TAU, TAU]; count]);
-    check_length(&at.key("limits_rad"), all.len(), count)?;
+    check_joint_count(&at.key("limits_rad"), all.len(), count)?;
     for (index, &limits) in all.iter().enumerate() {
         check_limits(&at.key("limits_rad").element(index), limits, JointKind::Revolute)?;
     }
@@ -97,10 +97,10 @@ fn check_limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<
     if !(min.is_finite() && max.is_finite() && min < max) {
         return Err(at.fault(got, "the smaller position comes first"));
     }
-    if kind == JointKind::Prismatic && (min < -MAX_PRISMATIC_POSITION || max > MAX_PRISMATIC_POSITION) {
+    if kind == JointKind::Prismatic && (min < -MAX_PRISMATIC_POSITION_M || max > MAX_PRISMATIC_POSITION_M) {
         return Err(at.fault(
             got,
-            format_args!("a joint slides within -{MAX_PRISMATIC_POSITION} to {MAX_PRISMATIC_POSITION} m"),
+            format_args!("a joint slides within -{MAX_PRISMATIC_POSITION_M} to {MAX_PRISMATIC_POSITION_M} m"),
         ));
     }
     Ok([min, max])
@@ -120,7 +120,7 @@ fn joints(at: &KeyPath, raw: &[raw::RawJoint]) -> Checked<Vec<Joint>> {
             return Err(at.key("name").fault(format_args!("{:?}", raw.name), why));
         }
         let kinds = [JointKind::Revolute, JointKind::Prismatic].map(|kind| (kind.name(), kind));
-        let kind = at.key("kind").choose(&raw.kind, &kinds)?;
+        let kind = at.key("kind").parse_choice(&raw.kind, &kinds)?;
         let given = match (raw.limits, kind) {
             (Some(limits), _) => limits,
             (None, JointKind::Revolute) => [-TAU, TAU],
@@ -157,11 +157,11 @@ fn chains(at: &KeyPath, raw: &[raw::RawChain], joints: &[Joint]) -> Checked<Vec<
 
 fn check_base(at: &KeyPath, raw: &raw::RawBase) -> Checked<ChainBase> {
     if let Some((index, value)) =
-        raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > MAX_BASE_COORDINATE)
+        raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > MAX_BASE_COORDINATE_M)
     {
         return Err(at.key("position").element(index).fault(
             value,
-            format_args!("it must be within -{MAX_BASE_COORDINATE} to {MAX_BASE_COORDINATE} m"),
+            format_args!("it must be within -{MAX_BASE_COORDINATE_M} to {MAX_BASE_COORDINATE_M} m"),
         ));
     }
     let orientation = raw.orientation.map(|it| normalized(&at.key("orientation"), "quaternion", it));
@@ -205,10 +205,10 @@ fn chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> 
         }
         let [min, max] = joint.limits;
         if joint.kind == JointKind::Prismatic
-            && [min, max].iter().any(|q| (table.d + q).abs() > MAX_PRISMATIC_POSITION)
+            && [min, max].iter().any(|q| (table.d + q).abs() > MAX_PRISMATIC_POSITION_M)
         {
             let why = format!(
-                "d and its position together stay within -{MAX_PRISMATIC_POSITION} to {MAX_PRISMATIC_POSITION} m"
+                "d and its position together stay within -{MAX_PRISMATIC_POSITION_M} to {MAX_PRISMATIC_POSITION_M} m"
             );
             return Err(at.fault(format_args!("{name:?} from {min} to {max} with d = {}", table.d), why));
         }
@@ -223,7 +223,7 @@ fn chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> 
     Ok(chain)
 }
 
-pub(super) fn check_length(at: &KeyPath, got: usize, joints: usize) -> Checked<()> {
+pub(super) fn check_joint_count(at: &KeyPath, got: usize, joints: usize) -> Checked<()> {
     if got == joints {
         return Ok(());
     }
@@ -234,9 +234,9 @@ pub(super) fn check_length(at: &KeyPath, got: usize, joints: usize) -> Checked<(
 /// Normalises a vector or quaternion. Its length must be one, to within 1e-3.
 pub(super) fn normalized<const N: usize>(at: &KeyPath, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
     let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
-    if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
+    if length.is_nan() || (length - 1.0).abs() > UNIT_LENGTH_TOLERANCE {
         let got = parts.map(|part| part.to_string()).join(", ");
-        let why = format!("this {what} has length {length:.6}; it must be 1 within {UNIT_TOLERANCE}");
+        let why = format!("this {what} has length {length:.6}; it must be 1 within {UNIT_LENGTH_TOLERANCE}");
         return Err(at.fault(format_args!("[{got}]"), why));
     }
     Ok(parts.map(|part| part / length))

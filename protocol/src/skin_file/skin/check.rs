@@ -1,7 +1,9 @@
 //! Conversion of a skin file from raw values to checked types.
 
-use super::chains::{self, check_length};
-use super::{Cell, Controller, ControllerKind, LostBus, Safety, Skin, SkinBus, SkinReply, Timing};
+use super::chains::{self, check_joint_count};
+use super::{
+    Cell, Controller, ControllerKind, LostBusReaction, SafetyLimits, Skin, SkinBus, SkinReply, SkinTiming,
+};
 use super::{baseline, buses, cells, names, raw, sensing};
 use crate::document::{Checked, KeyPath, span_from_seconds};
 use crate::fixed::Q;
@@ -9,18 +11,18 @@ use crate::parameters::Contact;
 
 /// Checks a whole skin.
 pub(super) fn skin(raw: raw::RawSkin) -> Checked<Skin> {
-    names::check(&raw)?;
+    names::check_names(&raw)?;
     check_skin(raw, |_| true)
 }
 
 /// Checks a whole skin from a recording. Unprintable characters in names are escaped instead of rejected.
 pub(super) fn recorded_skin(mut raw: raw::RawSkin) -> Checked<Skin> {
-    names::escape(&mut raw);
+    names::escape_names(&mut raw);
     check_skin(raw, |_| true)
 }
 
 /// Checks a skin that contains the cells of one bus only.
-pub(super) fn skin_on(raw: raw::RawSkin, bus: &str) -> Checked<Skin> {
+pub(super) fn check_skin_of_bus(raw: raw::RawSkin, bus: &str) -> Checked<Skin> {
     let skin = check_skin(raw, |of| of.name == bus)?;
     let is_other = |cell: &Cell| skin.buses.get(cell.bus).is_some_and(|of| of.name != bus);
     match skin.cells.iter().position(is_other) {
@@ -103,7 +105,7 @@ fn check_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checke
     Err(at.key("slot_us").fault(slot_us, why))
 }
 
-fn timing(raw: &raw::RawTiming) -> Checked<Timing> {
+fn timing(raw: &raw::RawTiming) -> Checked<SkinTiming> {
     let at = KeyPath::top_level_key("timing");
     let control_hz = raw.control_hz;
     if !(1.0..=10_000.0).contains(&control_hz) {
@@ -121,14 +123,14 @@ fn timing(raw: &raw::RawTiming) -> Checked<Timing> {
         reason = "a positive whole number; absurd ones saturate"
     )]
     let ticks_per_broadcast = ratio as u32;
-    Ok(Timing { control_hz, ticks_per_broadcast })
+    Ok(SkinTiming { control_hz, ticks_per_broadcast })
 }
 
 fn controller(raw: raw::RawController, joints: usize) -> Checked<Controller> {
     let at = KeyPath::top_level_key("controller");
     let each_positive = |key, values: Vec<f64>| {
         let at = at.key(key);
-        check_length(&at, values.len(), joints)?;
+        check_joint_count(&at, values.len(), joints)?;
         for (index, &value) in values.iter().enumerate() {
             at.element(index).check_positive(value)?;
         }
@@ -137,7 +139,7 @@ fn controller(raw: raw::RawController, joints: usize) -> Checked<Controller> {
     let each_or = |key, values: Option<Vec<f64>>, usual| {
         values.map_or_else(|| Ok(vec![usual; joints]), |values| each_positive(key, values))
     };
-    let kind = if at.key("kind").choose(&raw.kind, &[("kinesthetic", true), ("external", false)])? {
+    let kind = if at.key("kind").parse_choice(&raw.kind, &[("kinesthetic", true), ("external", false)])? {
         let external = [("socket", raw.socket.is_some()), ("start_s", raw.start_s.is_some())];
         if let Some((key, _)) = external.into_iter().find(|(_, is_there)| *is_there) {
             return Err(at.key(key).fault("", "only with kind = \"external\""));
@@ -172,11 +174,12 @@ fn controller(raw: raw::RawController, joints: usize) -> Checked<Controller> {
     Ok(Controller { kind, max_speed })
 }
 
-fn safety(raw: &raw::RawSafety) -> Checked<Safety> {
+fn safety(raw: &raw::RawSafety) -> Checked<SafetyLimits> {
     let at = KeyPath::top_level_key("safety");
-    let lost_bus = [LostBus::Continue, LostBus::Halt].map(|lost_bus| (lost_bus.name(), lost_bus));
-    let lost_bus = at.key("lost_bus").choose(&raw.lost_bus, &lost_bus)?;
-    Ok(Safety {
+    let lost_bus =
+        [LostBusReaction::Continue, LostBusReaction::Halt].map(|lost_bus| (lost_bus.name(), lost_bus));
+    let lost_bus = at.key("lost_bus").parse_choice(&raw.lost_bus, &lost_bus)?;
+    Ok(SafetyLimits {
         hold_epochs: at.key("hold_epochs").check_range(raw.hold_epochs, 0..=10_000, "")?,
         decay_epochs: at.key("decay_epochs").check_range(raw.decay_epochs, 0..=10_000, "")?,
         bad_cycles: at.key("bad_cycles").check_range(raw.bad_cycles, 1..=10_000, "")?,

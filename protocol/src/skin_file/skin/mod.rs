@@ -29,7 +29,7 @@ use crate::parameters::{Baseline, Contact, Events, Parameters, Pose, Row, Sensin
 use crate::time::Span;
 
 pub use cell_name::{CellName, split_bus};
-pub use reach::{MAX_REACH, reach};
+pub use reach::{MAX_REACH, max_frame_distance};
 pub use robot::{Chain, ChainBase, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;
 
@@ -46,7 +46,7 @@ pub struct Skin {
     /// The robot that wears the skin.
     pub robot: Robot,
     /// The rates of the control loop and the joint broadcast.
-    pub timing: Timing,
+    pub timing: SkinTiming,
     /// The thresholds at which cells in event mode send measurements.
     pub events: Events,
     /// The buses, in the order of the file.
@@ -54,21 +54,21 @@ pub struct Skin {
     /// The controller that turns torques into motion.
     pub controller: Controller,
     /// Limits for holding the torques of missing cells and for halting the robot.
-    pub safety: Safety,
+    pub safety: SafetyLimits,
     /// The cells, in the order of the file.
     pub cells: Vec<Cell>,
 }
 
 /// The rates of the control loop and the joint broadcast.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Timing {
+pub struct SkinTiming {
     /// Frequency of the control loop in Hz.
     pub control_hz: f64,
     /// Number of control ticks per joint broadcast.
     pub ticks_per_broadcast: u32,
 }
 
-impl Timing {
+impl SkinTiming {
     /// Returns the duration of a tick in ns.
     #[must_use]
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "1 Hz to 10 kHz: checked")]
@@ -148,7 +148,7 @@ pub enum ControllerKind {
 
 /// Limits for holding the torques of missing cells and for halting the robot.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Safety {
+pub struct SafetyLimits {
     /// Number of epochs for which the last torque of a cell is held if the cell stops sending while in contact.
     pub hold_epochs: u32,
     /// Number of epochs over which the held torque then decays linearly to zero.
@@ -156,20 +156,20 @@ pub struct Safety {
     /// Number of consecutive bad cycles that halt the robot.
     pub bad_cycles: u32,
     /// The reaction to the loss of one of several buses.
-    pub lost_bus: LostBus,
+    pub lost_bus: LostBusReaction,
 }
 
 /// The reaction to the loss of one of several buses. If all buses are lost, the torque is always invalid.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum LostBus {
+pub enum LostBusReaction {
     /// The torques of a lost bus decay to zero like those of missing cells. The robot continues with the other buses.
     #[default]
     Continue,
-    /// The torque becomes invalid, so the robot halts after [`Safety::bad_cycles`] cycles.
+    /// The torque becomes invalid, so the robot halts after [`SafetyLimits::bad_cycles`] cycles.
     Halt,
 }
 
-impl LostBus {
+impl LostBusReaction {
     /// Returns the value of the key in a skin file.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -254,7 +254,7 @@ impl Skin {
     pub fn parse(path: &str, text: &str) -> Result<Self, DocumentError> {
         let what = "this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, check::skin)
-            .map_err(|error: DocumentError| error.or_wrong_kind(text, SCENARIO_KEYS, SKIN_KEYS, what))
+            .map_err(|error: DocumentError| error.detect_wrong_kind(text, SCENARIO_KEYS, SKIN_KEYS, what))
     }
 
     /// Parses and checks the text of a skin in a recording. `path` names the text in errors.

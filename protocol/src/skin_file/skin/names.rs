@@ -10,7 +10,7 @@ const MAX_CHARACTERS: usize = 200;
 
 /// Checks all names of a skin. Returns an error for a name that is empty, too long, or contains characters that control
 /// a terminal, change the direction of text, or are not allowed in XML.
-pub(super) fn check(skin: &raw::RawSkin) -> Checked<()> {
+pub(super) fn check_names(skin: &raw::RawSkin) -> Checked<()> {
     let robot = KeyPath::top_level_key("robot");
     for (at, given) in [(KeyPath::top_level_key("name"), &skin.name), (robot.key("name"), &skin.robot.name)] {
         if given.is_empty() {
@@ -42,7 +42,7 @@ fn check_name(at: &KeyPath, name: &str) -> Checked<()> {
 
 /// Escapes unprintable characters in names like `\u{1b}`, so that every recording can be read. Names that differ also
 /// differ after escaping.
-pub(super) fn escape(skin: &mut raw::RawSkin) {
+pub(super) fn escape_names(skin: &mut raw::RawSkin) {
     let robot = &mut skin.robot;
     let named = [&mut skin.name, &mut robot.name].into_iter();
     let joints = robot.joint.iter_mut().map(|joint| &mut joint.name);

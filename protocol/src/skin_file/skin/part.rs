@@ -7,12 +7,12 @@ use super::{DocumentError, Skin, check};
 use crate::document;
 
 impl Skin {
-    /// Reads a file with the cells of one bus only, like [`Skin::parse_on`].
+    /// Reads a file with the cells of one bus only, like [`Skin::parse_for_bus`].
     ///
     /// # Errors
     /// Returns an error if the file cannot be read, or the first error in it.
-    pub fn read_on(path: &Path, bus: &str) -> Result<Self, DocumentError> {
-        Self::parse_on(&path.display().to_string(), &document::read_text(path)?, bus)
+    pub fn read_for_bus(path: &Path, bus: &str) -> Result<Self, DocumentError> {
+        Self::parse_for_bus(&path.display().to_string(), &document::read_text(path)?, bus)
     }
 
     /// Like [`Skin::parse`], but with the cells of one bus only, as [`Skin::with_cells_of_bus`] returns them. If the skin has no
@@ -21,9 +21,9 @@ impl Skin {
     ///
     /// # Errors
     /// Returns the first error in the text.
-    pub fn parse_on(path: &str, text: &str, bus: &str) -> Result<Self, DocumentError> {
+    pub fn parse_for_bus(path: &str, text: &str, bus: &str) -> Result<Self, DocumentError> {
         if let Some(part) = without_other_cells(text, bus)
-            && let Ok(skin) = document::parse(path, &part, |raw| check::skin_on(raw, bus))
+            && let Ok(skin) = document::parse(path, &part, |raw| check::check_skin_of_bus(raw, bus))
         {
             return Ok(skin);
         }
@@ -90,16 +90,16 @@ mod tests {
             let whole = Skin::parse("skin.toml", &text).unwrap();
             for (index, bus) in ["vcan0", "vcan1"].into_iter().enumerate() {
                 assert_eq!(
-                    Skin::parse_on("skin.toml", &text, bus).unwrap(),
+                    Skin::parse_for_bus("skin.toml", &text, bus).unwrap(),
                     whole.with_cells_of_bus(index),
                     "{bus}"
                 );
                 let part = without_other_cells(&text, bus).unwrap();
                 assert_eq!((part.matches("[[cell]]").count(), part.matches("[[bus]]").count()), (2, 2));
             }
-            assert_eq!(Skin::parse_on("skin.toml", &text, "vcan2").unwrap(), whole, "of no bus, all");
+            assert_eq!(Skin::parse_for_bus("skin.toml", &text, "vcan2").unwrap(), whole, "of no bus, all");
         }
-        assert_eq!(Skin::parse_on("skin.toml", GOOD, "vcan0"), Skin::parse("skin.toml", GOOD));
+        assert_eq!(Skin::parse_for_bus("skin.toml", GOOD, "vcan0"), Skin::parse("skin.toml", GOOD));
     }
 
     #[test]
@@ -118,7 +118,7 @@ mod tests {
             let text = text.replace(from, to);
             for (index, bus) in ["vcan0", "vcan1"].into_iter().enumerate() {
                 assert_eq!(
-                    Skin::parse_on("skin.toml", &text, bus).unwrap(),
+                    Skin::parse_for_bus("skin.toml", &text, bus).unwrap(),
                     whole.with_cells_of_bus(index),
                     "{to}"
                 );
@@ -137,7 +137,7 @@ mod tests {
         ] {
             let text = text.replace(from, to);
             let whole = Skin::parse("skin.toml", &text);
-            let part = Skin::parse_on("skin.toml", &text, "vcan0");
+            let part = Skin::parse_for_bus("skin.toml", &text, "vcan0");
             assert!(whole.is_err());
             assert!(part == whole || to.contains("vcan7"), "{to}: {part:?}");
         }
@@ -146,7 +146,7 @@ mod tests {
     proptest::proptest! {
         #[test]
         fn no_text_panics(text in "(\\[\\[cell\\]\\]|\\[bus|bus = \"a|\"|\n|=|'| |é){0,40}") {
-            let _ = (without_other_cells(&text, "a"), Skin::parse_on("skin.toml", &text, "a"));
+            let _ = (without_other_cells(&text, "a"), Skin::parse_for_bus("skin.toml", &text, "a"));
         }
     }
 }

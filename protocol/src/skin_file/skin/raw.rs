@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use super::{DenavitHartenberg, JointKind, LostBus};
+use super::{DenavitHartenberg, JointKind, LostBusReaction};
 use crate::can::Format;
 
 #[derive(Debug, Deserialize)]
@@ -226,7 +226,7 @@ impl Default for RawSafety {
             hold_epochs: 2,
             decay_epochs: 4,
             bad_cycles: 25,
-            lost_bus: LostBus::Continue.name().to_owned(),
+            lost_bus: LostBusReaction::Continue.name().to_owned(),
         }
     }
 }

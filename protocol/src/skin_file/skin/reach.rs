@@ -27,7 +27,13 @@ fn dot([a, b, c]: Vector, [x, y, z]: Vector) -> f64 {
 
 /// Transforms a vector by `Rz(theta) Tz(d) Tx(a) Rx(alpha)`, from the frame of a row to the frame below. If `is_point`
 /// is false, the vector is a direction, which translations do not change.
-fn carry(row: &DenavitHartenberg, d: f64, theta: f64, [x, y, z]: Vector, is_point: bool) -> Vector {
+fn transform_vector(
+    row: &DenavitHartenberg,
+    d: f64,
+    theta: f64,
+    [x, y, z]: Vector,
+    is_point: bool,
+) -> Vector {
     let (sine, cosine) = row.alpha.sin_cos();
     let (a, d) = if is_point { (row.a, d) } else { (0.0, 0.0) };
     let [x, y, z] = [x + a, cosine * y - sine * z, sine * y + cosine * z + d];
@@ -36,9 +42,9 @@ fn carry(row: &DenavitHartenberg, d: f64, theta: f64, [x, y, z]: Vector, is_poin
 }
 
 impl Circle {
-    fn carry(self, row: &DenavitHartenberg, d: f64, theta: f64) -> Self {
-        let center = carry(row, d, theta, self.center, true);
-        Self { center, axis: carry(row, d, theta, self.axis, false), radius: self.radius }
+    fn transform_down(self, row: &DenavitHartenberg, d: f64, theta: f64) -> Self {
+        let center = transform_vector(row, d, theta, self.center, true);
+        Self { center, axis: transform_vector(row, d, theta, self.axis, false), radius: self.radius }
     }
 
     /// Returns the maximum distance of a point of the circle from the origin.
@@ -50,7 +56,7 @@ impl Circle {
 
     /// Returns the maximum distance of a point of the circle from the z axis, and the range of the points along that
     /// axis.
-    fn around_z(&self) -> (f64, [f64; 2]) {
+    fn extent_around_z(&self) -> (f64, [f64; 2]) {
         let [x, y, z] = self.center;
         let [ax, ay, _] = self.axis;
         let height = self.radius * ax.hypot(ay);
@@ -63,7 +69,7 @@ impl Circle {
 /// move within their limits; revolute joints turn freely. At the first revolute joint only the distance from its axis
 /// counts. No moment of a unit force at the point exceeds the bound.
 #[must_use]
-pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
+pub fn max_frame_distance(rows: &[ChainRow], position: [f64; 3]) -> f64 {
     let mut circles = vec![Circle { center: position, axis: [0.0, 0.0, 1.0], radius: 0.0 }];
     let farthest = |circles: &[Circle]| circles.iter().map(Circle::farthest_distance).fold(0.0, f64::max);
     let mut most = farthest(&circles);
@@ -75,7 +81,9 @@ pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
         let table = &row.table;
         let slides: &[f64] = if row.kind == RowKind::Prismatic { &[min, max] } else { &[0.0] };
         let carried = slides.iter().flat_map(|slide| {
-            circles.iter().map(move |circle| circle.carry(table, table.d + slide, table.theta_offset))
+            circles
+                .iter()
+                .map(move |circle| circle.transform_down(table, table.d + slide, table.theta_offset))
         });
         let carried: Vec<_> = carried.collect();
         // An offset along the first axis has no moment about it.
@@ -83,7 +91,7 @@ pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
         sphere += table.a.hypot(if index == first { 0.0 } else { along });
         circles = carried;
         if row.kind == RowKind::Revolute {
-            let spans = circles.iter().map(Circle::around_z);
+            let spans = circles.iter().map(Circle::extent_around_z);
             let start = (0.0, [f64::INFINITY, f64::NEG_INFINITY]);
             let (radius, [low, high]) = spans.fold(start, |(most, [low, high]), (radius, [from, to])| {
                 (f64::max(most, radius), [f64::min(low, from), f64::max(high, to)])
@@ -98,7 +106,7 @@ pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
                 .to_vec();
         }
         let from_here = if index == first {
-            circles.iter().map(|circle| circle.around_z().0).fold(0.0, f64::max)
+            circles.iter().map(|circle| circle.extent_around_z().0).fold(0.0, f64::max)
         } else {
             farthest(&circles)
         };
@@ -132,15 +140,15 @@ mod tests {
     #[test]
     fn a_stretched_arm_reaches_as_far_as_its_links_are_long() {
         let arm = [turning(0.5, 0.0, 0.3), turning(0.4, 0.0, 0.0)];
-        is_near(reach(&arm, [0.1, 0.0, 0.0]), 1.0);
+        is_near(max_frame_distance(&arm, [0.1, 0.0, 0.0]), 1.0);
     }
 
     #[test]
     fn rows_that_fold_back_do_not_count() {
         let arm = [turning(0.0, FRAC_PI_2, 0.0), fixed(0.9, 0.0, 0.0), fixed(-0.9, 0.0, 0.0)];
-        is_near(reach(&arm, [0.1, 0.0, 0.0]), 0.8);
+        is_near(max_frame_distance(&arm, [0.1, 0.0, 0.0]), 0.8);
         let there_and_back = [turning(0.2, 0.0, 0.0), fixed(0.0, 0.0, 0.8), fixed(0.0, 0.0, -0.8)];
-        is_near(reach(&there_and_back, [0.1, 0.0, 0.0]), (0.1_f64).hypot(0.8));
+        is_near(max_frame_distance(&there_and_back, [0.1, 0.0, 0.0]), (0.1_f64).hypot(0.8));
     }
 
     #[test]
@@ -148,22 +156,22 @@ mod tests {
         let slide =
             ChainRow { kind: RowKind::Prismatic, limits: [-0.1, 0.7], ..turning(0.0, FRAC_PI_2, 0.2) };
         let arm = [turning(0.0, 0.0, 0.0), slide];
-        is_near(reach(&arm, [0.3, 0.0, 0.0]), (0.3_f64).hypot(0.9));
-        is_near(reach(&[slide, turning(0.4, 0.0, 0.0)], [0.3, 0.0, 0.0]), 0.7);
-        is_near(reach(&[slide], [0.3, 0.0, 0.0]), 0.3);
+        is_near(max_frame_distance(&arm, [0.3, 0.0, 0.0]), (0.3_f64).hypot(0.9));
+        is_near(max_frame_distance(&[slide, turning(0.4, 0.0, 0.0)], [0.3, 0.0, 0.0]), 0.7);
+        is_near(max_frame_distance(&[slide], [0.3, 0.0, 0.0]), 0.3);
         let arm = [turning(0.0, FRAC_PI_2, 0.0), slide];
-        is_near(reach(&arm, [0.3, 0.0, 0.0]), (0.3_f64).hypot(0.9));
+        is_near(max_frame_distance(&arm, [0.3, 0.0, 0.0]), (0.3_f64).hypot(0.9));
     }
 
     #[test]
     fn a_point_is_carried_by_the_transform_of_its_row() {
         let row = DenavitHartenberg { a: 0.5, alpha: FRAC_PI_2, d: 9.0, theta_offset: 0.0 };
         // Rx takes y to z and z to -y; Tx and Tz follow; Rz takes x to y.
-        let carried = carry(&row, 0.25, FRAC_PI_2, [1.0, 2.0, 3.0], true);
+        let carried = transform_vector(&row, 0.25, FRAC_PI_2, [1.0, 2.0, 3.0], true);
         carried.iter().zip([3.0, 1.5, 2.25]).for_each(|(got, target)| is_near(*got, target));
         let tilted = DenavitHartenberg { alpha: FRAC_PI_2 / 2.0, ..row };
         let half = 0.5_f64.sqrt();
-        let carried = carry(&tilted, 0.0, 0.0, [0.0, 1.0, 2.0], false);
+        let carried = transform_vector(&tilted, 0.0, 0.0, [0.0, 1.0, 2.0], false);
         carried.iter().zip([0.0, -half, 3.0 * half]).for_each(|(got, target)| is_near(*got, target));
     }
 }

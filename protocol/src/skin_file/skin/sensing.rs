@@ -29,44 +29,56 @@ pub fn continuous_sensing(hz: f64) -> Result<Sensing, String> {
 pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, DocumentFault> {
     /// The values of the key `mode`.
     #[derive(Clone, Copy)]
-    enum Mode {
+    enum SensingModeName {
         Off,
         Continuous,
         Event,
     }
-    let words = [("off", Mode::Off), ("continuous", Mode::Continuous), ("event", Mode::Event)];
-    let mode = at.key("sensing").choose(bus.sensing.as_deref().unwrap_or("off"), &words)?;
+    let words = [
+        ("off", SensingModeName::Off),
+        ("continuous", SensingModeName::Continuous),
+        ("event", SensingModeName::Event),
+    ];
+    let mode = at.key("sensing").parse_choice(bus.sensing.as_deref().unwrap_or("off"), &words)?;
     match (mode, bus.sensing_hz) {
-        (Mode::Continuous, Some(hz)) => {
+        (SensingModeName::Continuous, Some(hz)) => {
             continuous_sensing(hz).map_err(|why| at.key("sensing_hz").fault(hz, why))
         }
-        (Mode::Continuous, None) => {
+        (SensingModeName::Continuous, None) => {
             Err(at.key("sensing").fault("\"continuous\"", "sensing_hz is needed with it"))
         }
-        (Mode::Off | Mode::Event, Some(hz)) => {
+        (SensingModeName::Off | SensingModeName::Event, Some(hz)) => {
             Err(at.key("sensing_hz").fault(hz, "only with sensing = \"continuous\""))
         }
-        (Mode::Off, None) => Ok(Sensing::Off),
-        (Mode::Event, None) => Ok(Sensing::Event),
+        (SensingModeName::Off, None) => Ok(Sensing::Off),
+        (SensingModeName::Event, None) => Ok(Sensing::Event),
     }
 }
 
 /// Checks the thresholds of event mode. An omitted value is the default of a cell.
 pub(super) fn events(raw: raw::RawEvents) -> Result<Events, DocumentFault> {
     /// Rounds a threshold to a word. An error gives 0 as the lower limit, because a threshold is not negative.
-    fn magnitude<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
+    fn round_threshold<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
         Q::try_nearest(value).map_err(|error| OutOfRange { min: 0.0, ..error })
     }
     let at = KeyPath::top_level_key("events");
     let mut events = Events::default();
-    at.key("hysteresis").set_word(raw.hysteresis, &mut events.hysteresis, magnitude)?;
+    at.key("hysteresis").set_fixed_if_given(raw.hysteresis, &mut events.hysteresis, round_threshold)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
         return Err(at.key("hysteresis").fault(got, "a part of a threshold: 0 to 1 is possible"));
     }
-    at.key("contact_n").set_word(raw.contact_n, &mut events.contact, magnitude)?;
-    at.key("proximity").set_word(raw.proximity, &mut events.proximity, magnitude)?;
-    at.key("temperature_c").set_word(raw.temperature_c, &mut events.temperature, magnitude)?;
-    at.key("acceleration_g").set_word(raw.acceleration_g, &mut events.acceleration, magnitude)?;
+    at.key("contact_n").set_fixed_if_given(raw.contact_n, &mut events.contact, round_threshold)?;
+    at.key("proximity").set_fixed_if_given(raw.proximity, &mut events.proximity, round_threshold)?;
+    at.key("temperature_c").set_fixed_if_given(
+        raw.temperature_c,
+        &mut events.temperature,
+        round_threshold,
+    )?;
+    at.key("acceleration_g").set_fixed_if_given(
+        raw.acceleration_g,
+        &mut events.acceleration,
+        round_threshold,
+    )?;
     Ok(events)
 }
 

@@ -62,17 +62,17 @@ impl Wires {
                     ports.find(names_us).map(|(port, _)| port)
                 });
                 if let Some(back) = back {
-                    wires.add((cell.node, port), Some((neighbor, back)));
+                    wires.add_wire((cell.node, port), Some((neighbor, back)));
                 }
             }
         }
         for cell in cells.iter().filter(|cell| cell.root) {
-            wires.add((cell.node, UPLINK), None);
+            wires.add_wire((cell.node, UPLINK), None);
         }
         wires
     }
 
-    fn add(&mut self, first: PortEnd, second: Option<PortEnd>) {
+    fn add_wire(&mut self, first: PortEnd, second: Option<PortEnd>) {
         let Ok(wire) = u16::try_from(self.ends.len()) else { return };
         self.ends.push((first, second));
         for (end, back) in [(Some(first), false), (second, true)] {

@@ -24,7 +24,7 @@ pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, XmlFault> {
         let text = String::from_utf16(&words).ok().filter(|_| bytes.len().is_multiple_of(2));
         let wrong =
             || "it begins like UTF-16 but is invalid: it is truncated or damaged; copy or download it again";
-        text.map(|text| Cow::Owned(redeclared(text)))
+        text.map(|text| Cow::Owned(declare_utf8(text)))
             .ok_or_else(|| XmlFault { line: None, what: wrong().to_owned() })
     };
     match bytes {
@@ -38,10 +38,10 @@ pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, XmlFault> {
         Ok(text) => return Ok(Cow::Borrowed(text)),
         Err(error) => error,
     };
-    let declared = declared(bytes);
+    let declared = declared_encoding(bytes);
     let single = |c1: fn(u8) -> char| {
         let letter = |byte: &u8| if (0x80..0xa0).contains(byte) { c1(*byte) } else { char::from(*byte) };
-        Ok(Cow::Owned(redeclared(bytes.iter().map(letter).collect())))
+        Ok(Cow::Owned(declare_utf8(bytes.iter().map(letter).collect())))
     };
     match declared.as_deref().unwrap_or_default() {
         "iso-8859-1" | "iso8859-1" | "iso_8859-1" | "latin1" | "latin-1" => single(char::from),
@@ -63,7 +63,7 @@ pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, XmlFault> {
 
 /// Returns the name that `iconv` uses for the encoding of a file in UTF-16; `None` for other encodings.
 #[must_use]
-pub fn utf16_name(bytes: &[u8]) -> Option<&'static str> {
+pub fn utf16_encoding_name(bytes: &[u8]) -> Option<&'static str> {
     match bytes {
         [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Some("utf-16"),
         [b'<', 0, b'?', 0, ..] => Some("utf-16le"),
@@ -73,7 +73,7 @@ pub fn utf16_name(bytes: &[u8]) -> Option<&'static str> {
 }
 
 /// Returns the encoding in the XML declaration, in lower case.
-fn declared(bytes: &[u8]) -> Option<String> {
+fn declared_encoding(bytes: &[u8]) -> Option<String> {
     let head = bytes.get(..bytes.len().min(1024)).unwrap_or_default();
     let head = String::from_utf8_lossy(head);
     let (begin, end) = encoding_range(&head)?;
@@ -91,7 +91,7 @@ fn encoding_range(text: &str) -> Option<(usize, usize)> {
     Some((name, name + text.get(name..)?.find(sign)?))
 }
 
-fn redeclared(mut text: String) -> String {
+fn declare_utf8(mut text: String) -> String {
     if let Some((begin, end)) = encoding_range(&text) {
         text.replace_range(begin..end, "UTF-8");
     }
@@ -124,11 +124,11 @@ mod tests {
             let big: Vec<_> = words.iter().flat_map(|word| word.to_be_bytes()).collect();
             assert_eq!(decode(&little).unwrap(), expected);
             assert_eq!(decode(&big).unwrap(), expected);
-            assert_eq!([&little, &big].map(|bytes| utf16_name(bytes).unwrap()), names);
+            assert_eq!([&little, &big].map(|bytes| utf16_encoding_name(bytes).unwrap()), names);
         }
         // Valid UTF-8 is not read as Latin-1, whatever the declaration.
         let both = WORDS.replace("ENC", "latin1");
-        assert_eq!(utf16_name(both.as_bytes()), None);
+        assert_eq!(utf16_encoding_name(both.as_bytes()), None);
         assert_eq!(decode(both.as_bytes()).unwrap(), both);
     }
 

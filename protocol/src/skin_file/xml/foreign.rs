@@ -11,7 +11,7 @@ pub struct ForeignFile {
     pub hint: &'static str,
 }
 
-const CONFLICT: &[u8] = b"<<<<<<< ";
+const CONFLICT_MARKER: &[u8] = b"<<<<<<< ";
 
 /// Detects a file that is in the place of the expected one: a Git LFS pointer, a saved web page, an archive, or a file
 /// with an unresolved merge conflict.
@@ -35,14 +35,14 @@ pub fn detect_foreign(bytes: &[u8]) -> Option<ForeignFile> {
             return whole(what, "unpack it first");
         }
     }
-    let conflict = bytes.split(|byte| *byte == b'\n').position(|line| line.starts_with(CONFLICT))?;
+    let conflict = bytes.split(|byte| *byte == b'\n').position(|line| line.starts_with(CONFLICT_MARKER))?;
     let hint = "keep one side, and delete the lines <<<<<<<, =======, >>>>>>> and the other side";
     Some(ForeignFile { line: Some(conflict + 1), what: "a merge conflict of git", hint })
 }
 
 /// Returns the file format whose root element has this name.
 #[must_use]
-pub fn kind_of_root(name: &str) -> Option<&'static str> {
+pub fn format_of_root_element(name: &str) -> Option<&'static str> {
     Some(match name {
         "sdf" | "gazebo" | "world" => "an SDF file, of Gazebo",
         "mujoco" => "an MJCF file, of MuJoCo",

@@ -15,9 +15,9 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::ops::Range;
 
-pub use encoding::{decode, utf16_name};
+pub use encoding::{decode, utf16_encoding_name};
 pub use escape::escaped;
-pub use foreign::{ForeignFile, detect_foreign, kind_of_root};
+pub use foreign::{ForeignFile, detect_foreign, format_of_root_element};
 use tags::{Tag, XmlPart, parts};
 
 /// Maximum number of attributes of an element. The limit exists because a parser compares each attribute with all
@@ -39,7 +39,7 @@ pub struct XmlFault {
 }
 
 impl XmlFault {
-    fn at(text: &str, offset: usize, what: impl Into<String>) -> Self {
+    fn at_offset(text: &str, offset: usize, what: impl Into<String>) -> Self {
         Self { line: Some(line_of(text.as_bytes(), offset)), what: what.into() }
     }
 }
@@ -61,7 +61,7 @@ fn line_of(text: &[u8], offset: usize) -> usize {
 
 /// A text that is ready for a parser.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Prepared<'a> {
+pub struct PreparedXml<'a> {
     /// The text from the first `<` of the file on, with the line breaks of the file.
     pub text: Cow<'a, str>,
     /// Number of lines of the file before the first `<`.
@@ -73,22 +73,24 @@ pub struct Prepared<'a> {
 /// # Errors
 /// Returns an error if the text has a document type with definitions, an element with more than
 /// [`MAX_ATTRIBUTES`] attributes, or content after the root element.
-pub fn prepare(file: &str) -> Result<Prepared<'_>, XmlFault> {
+pub fn prepare(file: &str) -> Result<PreparedXml<'_>, XmlFault> {
     let end = file.trim_end_matches(|letter: char| letter == '\0' || letter.is_whitespace()).len();
     let whole = file.get(..end).unwrap_or(file);
     let text = whole.trim_start_matches('\u{feff}').trim_start();
     let before = whole.len() - text.len();
-    let mut survey = Survey::default();
+    let mut survey = XmlSurvey::default();
     for part in parts(text) {
-        survey.visit(text, part).map_err(|(offset, what)| XmlFault::at(whole, before + offset, what))?;
+        survey
+            .visit(text, part)
+            .map_err(|(offset, what)| XmlFault::at_offset(whole, before + offset, what))?;
     }
     survey.check()?;
-    Ok(Prepared { text: survey.repaired(text), lines_before: line_of(whole.as_bytes(), before) - 1 })
+    Ok(PreparedXml { text: survey.repaired(text), lines_before: line_of(whole.as_bytes(), before) - 1 })
 }
 
 /// Prefixes and ranges found in one pass over a text, for the limits and the repairs.
 #[derive(Debug, Default)]
-struct Survey<'a> {
+struct XmlSurvey<'a> {
     /// Byte ranges of the comments and document types to be blanked.
     blanked: Vec<Range<usize>>,
     /// Prefixes that elements and attributes use.
@@ -105,7 +107,7 @@ struct Survey<'a> {
     is_over: bool,
 }
 
-impl<'a> Survey<'a> {
+impl<'a> XmlSurvey<'a> {
     /// Processes the next part of the text. An error consists of a byte offset and the reason.
     fn visit(&mut self, text: &str, part: XmlPart<'a>) -> Result<(), (usize, String)> {
         let of = |range: &Range<usize>| text.get(range.clone()).unwrap_or_default();
@@ -141,12 +143,12 @@ impl<'a> Survey<'a> {
                 self.depth = self.depth.saturating_sub(1);
                 self.is_over = self.depth == 0 && self.root.is_some();
             }
-            XmlPart::Open(tag) => self.open(&tag)?,
+            XmlPart::Open(tag) => self.visit_tag(&tag)?,
         }
         Ok(())
     }
 
-    fn open(&mut self, tag: &Tag<'a>) -> Result<(), (usize, String)> {
+    fn visit_tag(&mut self, tag: &Tag<'a>) -> Result<(), (usize, String)> {
         let count = tag.attributes.len();
         if count > MAX_ATTRIBUTES {
             let name = tag.name.chars().take(40).collect::<String>();

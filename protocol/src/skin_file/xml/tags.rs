@@ -32,14 +32,14 @@ pub(super) fn parts(text: &str) -> impl Iterator<Item = XmlPart<'_>> {
     let mut at = 0;
     core::iter::from_fn(move || {
         let rest = text.get(at..).filter(|rest| !rest.is_empty())?;
-        let (part, length) = part(rest, at);
+        let (part, length) = split_first_part(rest, at);
         at += length;
         Some(part)
     })
 }
 
 /// Returns the first part of `rest`, and its length in bytes.
-fn part(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
+fn split_first_part(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
     let until = |end: &str, from: usize| {
         let found = rest.get(from..).and_then(|rest| rest.find(end));
         found.map_or(rest.len(), |found| from + found + end.len())
@@ -66,7 +66,7 @@ fn part(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
         let length = doctype_length(rest);
         return (XmlPart::DocType(at..at + length), length);
     }
-    tag(rest, at)
+    parse_tag(rest, at)
 }
 
 /// Returns the length in bytes of a document type. Its definitions are in brackets; brackets and `>` in quotes do not
@@ -86,7 +86,7 @@ fn doctype_length(rest: &str) -> usize {
     rest.len()
 }
 
-fn tag(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
+fn parse_tag(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
     let bytes = rest.as_bytes();
     let ends_name = |byte: u8| byte.is_ascii_whitespace() || matches!(byte, b'>' | b'/' | b'=' | b'<');
     let skip = |from: usize, is: &dyn Fn(u8) -> bool| {
@@ -155,7 +155,7 @@ mod tests {
             let mut whole = text;
             let mut count = 0;
             while !whole.is_empty() {
-                let (_, length) = part(whole, 0);
+                let (_, length) = split_first_part(whole, 0);
                 assert!(length > 0, "{text}");
                 whole = &whole[length..];
                 count += 1;

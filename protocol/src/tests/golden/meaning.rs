@@ -6,15 +6,15 @@ use std::str::FromStr;
 use crate::fixed::{Q, TorqueFormat};
 use crate::id::{CellId, Kind, Node};
 use crate::message::{
-    Answer, AppliesFrom, BaselinePage, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState,
-    Ports, ReceivedCounts, RejectedCounts, Request, SensorPage, SkinSensors, State, Tree,
+    Answer, BaselinePage, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState, PortsPage,
+    ReceivedCounts, RejectedCounts, Request, SensorPage, SkinSensors, State, StimulusStart, TreePage,
 };
 use crate::packet::{Epoch, Length, MAX_WORDS, PacketError, WORDS, Words};
 use crate::parameters::{
     Baseline, BaselineSettings, Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind,
-    Sensing, Slots,
+    Sensing, SumSchedule,
 };
-use crate::port::{Hello, LinkId, PortMessage, Rank, Walk};
+use crate::port::{Hello, LinkId, NodeIdWalk, PortMessage, TreeRank};
 
 /// A comment: a word that names the message, and `key=value` fields, all of which a test must use.
 pub(crate) struct Meaning<'a> {
@@ -153,13 +153,13 @@ impl<'a> Meaning<'a> {
         }
     }
 
-    fn rank(&mut self) -> Option<Rank> {
+    fn rank(&mut self) -> Option<TreeRank> {
         let (round, depth) = self.take("label").split_once('/')?;
-        Some(Rank { round: round.parse().unwrap(), depth: depth.parse().unwrap() })
+        Some(TreeRank { round: round.parse().unwrap(), depth: depth.parse().unwrap() })
     }
 
-    fn walk(&mut self) -> Walk {
-        Walk { walk: self.number("walk"), first: self.number("first"), last: self.number("last") }
+    fn walk(&mut self) -> NodeIdWalk {
+        NodeIdWalk { walk: self.number("walk"), first: self.number("first"), last: self.number("last") }
     }
 
     pub(crate) fn wire(mut self) -> (LinkId, PortMessage) {
@@ -198,7 +198,7 @@ impl<'a> Meaning<'a> {
     fn reply(&mut self) -> Reply {
         match self.take("reply") {
             "torque" => Reply::Torque,
-            "sum" => Reply::Sum(Slots {
+            "sum" => Reply::Sum(SumSchedule {
                 slot_us: self.number("slot_us"),
                 deepest: self.number("deepest"),
                 carry: self.number::<u8>("carry") == 1,
@@ -314,7 +314,7 @@ impl<'a> Meaning<'a> {
                 stimuli_late: self.number("stimuli_late"),
                 torques: self.number("torques"),
             }),
-            "tree" => NetworkPage::Tree(Tree {
+            "tree" => NetworkPage::Tree(TreePage {
                 parent: match self.take("parent") {
                     "none" => None,
                     number => Some(number.parse().expect(self.text)),
@@ -328,7 +328,7 @@ impl<'a> Meaning<'a> {
                 accepted: self.number("taken"),
                 dropped: self.number("dropped"),
             }),
-            "ports" => NetworkPage::Ports(Ports {
+            "ports" => NetworkPage::Ports(PortsPage {
                 ports: ["port0", "port1", "port2", "port3"].map(|key| self.port(key)),
                 changes: self.number("changes"),
             }),
@@ -395,8 +395,8 @@ impl<'a> Meaning<'a> {
             "value" | "written" | "refusal" => self.configured(),
             "stimulus" => {
                 let from = match self.take("from") {
-                    "next" => AppliesFrom::Next,
-                    epoch => AppliesFrom::Epoch(Epoch(epoch.parse().expect(self.text))),
+                    "next" => StimulusStart::Next,
+                    epoch => StimulusStart::Epoch(Epoch(epoch.parse().expect(self.text))),
                 };
                 Message::Stimulus { to: self.node("to"), from, page: self.sensors() }
             }

@@ -6,7 +6,7 @@
 //! identifier.
 
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame};
-use crate::wire_time::{Bits, Coding, Shape};
+use crate::wire_time::{FrameBits, FrameCoding, FrameShape};
 
 /// Number of pairs of a run state and a value of the CRC register.
 const PAIRS: usize = 8 << 15;
@@ -135,7 +135,7 @@ fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
     let steps = Steps::all();
     let heads = [steps.heads(false), steps.heads(true)];
     let compare = |coding, extended, len: usize, bytes, [min, max]: [u32; 2]| {
-        let shape = Shape { coding, extended, len: u8::try_from(len).unwrap() };
+        let shape = FrameShape { coding, extended, len: u8::try_from(len).unwrap() };
         let plain = plain(extended, bytes);
         assert_eq!(
             (shape.min_bits().nominal, shape.max_bits().nominal),
@@ -147,12 +147,12 @@ fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
     let mut rest = of_the_crc();
     for ([remote, _], extended) in heads.iter().zip([false, true]) {
         for requested in 0..=8 {
-            compare(Coding::Remote, extended, requested, 0, steps.over_all(remote, requested, &rest));
+            compare(FrameCoding::Remote, extended, requested, 0, steps.over_all(remote, requested, &rest));
         }
     }
     for len in 0..=8 {
         for ([_, data], extended) in heads.iter().zip([false, true]) {
-            compare(Coding::Classic, extended, len, len, steps.over_all(data, len, &rest));
+            compare(FrameCoding::Classic, extended, len, len, steps.over_all(data, len, &rest));
         }
         for _ in 0..if len < 8 { 8 } else { 0 } {
             rest = steps.with_a_free_bit(&rest);
@@ -161,12 +161,12 @@ fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
 }
 
 /// Returns the minimum and the maximum of nominal and data bits over some frames.
-fn ends(frames: impl Iterator<Item = Frame>) -> (Bits, Bits) {
-    let start = (Bits { nominal: u32::MAX, data: u32::MAX }, Bits::default());
-    frames.map(|frame| Bits::from_frame(&frame).unwrap()).fold(start, |(best, worst), bits| {
+fn ends(frames: impl Iterator<Item = Frame>) -> (FrameBits, FrameBits) {
+    let start = (FrameBits { nominal: u32::MAX, data: u32::MAX }, FrameBits::default());
+    frames.map(|frame| FrameBits::from_frame(&frame).unwrap()).fold(start, |(best, worst), bits| {
         (
-            Bits { nominal: best.nominal.min(bits.nominal), data: best.data.min(bits.data) },
-            Bits { nominal: worst.nominal.max(bits.nominal), data: worst.data.max(bits.data) },
+            FrameBits { nominal: best.nominal.min(bits.nominal), data: best.data.min(bits.data) },
+            FrameBits { nominal: worst.nominal.max(bits.nominal), data: worst.data.max(bits.data) },
         )
     })
 }
@@ -177,14 +177,14 @@ fn short_frames_one_by_one_are_within_the_bounds_and_reach_them() {
     // Every identifier with every byte.
     let short = || (0..0x800_u32).flat_map(|id| (0..=u8::MAX).map(move |byte| (id, byte)));
     let classic = short().map(|(id, byte)| Frame::classic(id, &[byte]).unwrap());
-    let shape = Shape { coding: Coding::Classic, extended: false, len: 1 };
+    let shape = FrameShape { coding: FrameCoding::Classic, extended: false, len: 1 };
     assert_eq!(ends(classic), (shape.min_bits(), shape.max_bits()));
-    for (coding, flags) in [Coding::Fd, Coding::FdSwitched].into_iter().zip(flags) {
+    for (coding, flags) in [FrameCoding::Fd, FrameCoding::FdSwitched].into_iter().zip(flags) {
         // The bits after BRS do not depend on the identifier, so vary the identifier first, then the content.
         let ids = (0..0x800).flat_map(|id| flags.map(|flags| Frame::fd(id, flags, &[0x55]).unwrap()));
         let ids = ends(ids);
         let id = (0..0x800).find(|&id| {
-            let bits = Bits::from_frame(&Frame::fd(id, flags[0], &[0x55]).unwrap()).unwrap();
+            let bits = FrameBits::from_frame(&Frame::fd(id, flags[0], &[0x55]).unwrap()).unwrap();
             bits.nominal == ids.1.nominal
         });
         for len in 0..=2_u8 {
@@ -193,7 +193,7 @@ fn short_frames_one_by_one_are_within_the_bounds_and_reach_them() {
                 let bytes = word.to_be_bytes();
                 flags.map(|flags| Frame::fd(id.unwrap(), flags, &bytes[..usize::from(len)]).unwrap())
             });
-            let shape = Shape { coding, extended: false, len };
+            let shape = FrameShape { coding, extended: false, len };
             assert_eq!(ends(frames).1, shape.max_bits(), "{shape:?}");
         }
     }

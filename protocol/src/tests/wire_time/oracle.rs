@@ -1,7 +1,7 @@
 //! A second implementation of the bit count that writes a frame bit by bit.
 
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame};
-use crate::wire_time::Bits;
+use crate::wire_time::FrameBits;
 
 /// Appends the `count` lowest bits of a word, the most significant first.
 fn push(to: &mut Vec<bool>, word: u32, count: u32) {
@@ -32,7 +32,7 @@ fn stuff_bits(bits: &[bool]) -> Vec<usize> {
 }
 
 /// Counts the bits of a frame, including stuff bits and the intermission.
-pub(crate) fn bits(frame: &Frame) -> Bits {
+pub(crate) fn bits(frame: &Frame) -> FrameBits {
     let mut plain = Vec::new();
     let (fd, id) = (frame.format() == Format::Fd, frame.id());
     let remote = u32::from(frame.is_remote());
@@ -67,9 +67,9 @@ pub(crate) fn bits(frame: &Frame) -> Bits {
         // ACK, delimiter, end of frame, intermission.
         let (nominal, data) = (head + early + 1 + 1 + 7 + 3, plain.len() - head + late + check);
         return if switched {
-            Bits { nominal: count(nominal), data: count(data) }
+            FrameBits { nominal: count(nominal), data: count(data) }
         } else {
-            Bits { nominal: count(nominal + data), data: 0 }
+            FrameBits { nominal: count(nominal + data), data: 0 }
         };
     }
     push(&mut plain, remote, 1);
@@ -82,5 +82,5 @@ pub(crate) fn bits(frame: &Frame) -> Bits {
     push(&mut plain, crc, 15);
     // Delimiter, ACK, delimiter, end of frame, intermission.
     let bits = plain.len() + stuff_bits(&plain).len() + 1 + 1 + 1 + 7 + 3;
-    Bits { nominal: count(bits), data: 0 }
+    FrameBits { nominal: count(bits), data: 0 }
 }

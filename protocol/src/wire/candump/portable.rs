@@ -7,7 +7,7 @@
 //!   0          11     18 20   3 or 8 digits, # or ## and flags, whole bytes, the end of the line
 //! ```
 
-use super::read::{eight_digits, four_bytes, hex_value, is_blank};
+use super::read::{four_bytes, hex_value, is_blank, parse_leading_digits};
 use super::{Record, Timestamp};
 use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 
@@ -42,7 +42,7 @@ pub(super) fn parse_record(line: &[u8]) -> Option<Record<'_>> {
         _ => return None,
     };
     let min_digits = if time.get(1) == Some(&b'0') { 10 } else { 1 };
-    let time = Timestamp { min_digits, ..Timestamp::six_digits(nanos) };
+    let time = Timestamp { min_digits, ..Timestamp::with_six_digits(nanos) };
     Some(Record { time, interface, frame, direction: None })
 }
 
@@ -51,9 +51,9 @@ fn parse_nanos(time: &[u8; TIME_LEN]) -> Option<u64> {
     let &[b'(', a, b, c, d, e, f, g, h, i, j, b'.', k, l, m, n, o, p, q @ b')', r @ b' '] = time else {
         return None;
     };
-    let (high, eight) = eight_digits([a, b, c, d, e, f, g, h]);
+    let (high, eight) = parse_leading_digits([a, b, c, d, e, f, g, h]);
     let (i, j) = (i.wrapping_sub(b'0'), j.wrapping_sub(b'0'));
-    let (micros, six) = eight_digits([k, l, m, n, o, p, q, r]);
+    let (micros, six) = parse_leading_digits([k, l, m, n, o, p, q, r]);
     if eight != 8 || i > 9 || j > 9 || six != 6 {
         return None;
     }

@@ -1,6 +1,6 @@
 //! A cursor over the bytes of a line, and the parser of each field.
 
-use super::write::MAX_PAD;
+use super::write::MAX_SECOND_DIGITS;
 use super::{Direction, LineError, Timestamp};
 use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, check_identifier};
 
@@ -56,7 +56,7 @@ pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
 
 /// Returns the value of the decimal digits at the start of eight bytes, and their number.
 #[inline]
-pub(super) fn eight_digits(text: [u8; 8]) -> (u64, usize) {
+pub(super) fn parse_leading_digits(text: [u8; 8]) -> (u64, usize) {
     const ZEROS: u64 = 0x3030_3030_3030_3030;
     let text = u64::from_le_bytes(text);
     let digits = text ^ ZEROS;
@@ -129,7 +129,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Reads the interface name up to the next space or tab.
-    pub(super) fn interface(&mut self) -> Result<&'a str, LineError> {
+    pub(super) fn parse_interface(&mut self) -> Result<&'a str, LineError> {
         let rest = self.rest();
         let len = rest.iter().position(|&byte| is_blank(byte)).unwrap_or(rest.len());
         let word = rest.get(..len).and_then(|word| core::str::from_utf8(word).ok());
@@ -140,7 +140,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Reads decimal digits. Returns their value and their number.
-    fn digits(&mut self, expected: &'static str) -> Result<(u64, usize), LineError> {
+    fn parse_digits(&mut self, expected: &'static str) -> Result<(u64, usize), LineError> {
         let start = self.at;
         let mut value = 0_u64;
         while let Some(digit @ b'0'..=b'9') = self.peek() {
@@ -151,27 +151,31 @@ impl<'a> Cursor<'a> {
         if self.at == start { Err(self.error(expected)) } else { Ok((value, self.at - start)) }
     }
 
-    pub(super) fn time(&mut self) -> Result<Timestamp, LineError> {
+    pub(super) fn parse_time(&mut self) -> Result<Timestamp, LineError> {
         let padded = self.peek() == Some(b'0');
-        let (seconds, whole_digits) = self.digits("seconds since 1970")?;
-        let (nanos, digits) = if self.accept(b'.') { self.fraction()? } else { (0, 0) };
+        let (seconds, whole_digits) = self.parse_digits("seconds since 1970")?;
+        let (nanos, digits) = if self.accept(b'.') { self.parse_fraction()? } else { (0, 0) };
         let whole = seconds.checked_mul(1_000_000_000).and_then(|whole| whole.checked_add(nanos));
         let nanos = whole.ok_or_else(|| self.error("a time before the year 2554"))?;
-        let min_digits = if padded { u8::try_from(whole_digits).unwrap_or(MAX_PAD).min(MAX_PAD) } else { 1 };
+        let min_digits = if padded {
+            u8::try_from(whole_digits).unwrap_or(MAX_SECOND_DIGITS).min(MAX_SECOND_DIGITS)
+        } else {
+            1
+        };
         Ok(Timestamp { nanos, nine_digits: digits > 6, min_digits })
     }
 
     /// Reads the fraction of a second. Returns the nanoseconds and the number of digits.
-    fn fraction(&mut self) -> Result<(u64, usize), LineError> {
+    fn parse_fraction(&mut self) -> Result<(u64, usize), LineError> {
         let count = self.rest().iter().take_while(|byte| byte.is_ascii_digit()).count();
         let digits = self.rest().get(..count).unwrap_or_default();
-        let (nanos, digits) = fraction(digits).ok_or_else(|| self.error("digits of a second"))?;
+        let (nanos, digits) = fraction_to_nanos(digits).ok_or_else(|| self.error("digits of a second"))?;
         self.at += count;
         Ok((nanos, digits))
     }
 
     /// Reads a frame. Returns `None` for a CAN XL frame, whose text is skipped.
-    pub(super) fn frame(&mut self) -> Result<Option<Frame>, LineError> {
+    pub(super) fn parse_frame(&mut self) -> Result<Option<Frame>, LineError> {
         let expected = "an identifier of 3 or 8 hexadecimal digits";
         let start = self.at;
         let mut id = 0_u32;
@@ -195,14 +199,14 @@ impl<'a> Cursor<'a> {
             let flags = self.peek().and_then(nibble).ok_or_else(|| self.error("one digit of FD flags"))?;
             self.at += 1;
             // CAN FD has no remote frames.
-            return self.data(id & !REMOTE, Format::Fd, flags).map(Some);
+            return self.parse_data_frame(id & !REMOTE, Format::Fd, flags).map(Some);
         }
         if matches!(self.peek(), Some(b'R' | b'r')) {
             self.at += 1;
-            return self.remote(id).map(Some);
+            return self.parse_remote_frame(id).map(Some);
         }
         let column = self.at + 1;
-        let frame = self.data(id & !REMOTE, Format::Classic, 0)?;
+        let frame = self.parse_data_frame(id & !REMOTE, Format::Classic, 0)?;
         if id & REMOTE == 0 {
             return Ok(Some(frame));
         }
@@ -217,14 +221,14 @@ impl<'a> Cursor<'a> {
         Ok(Some(remote.with_raw_dlc(frame.raw_dlc())))
     }
 
-    fn remote(&mut self, id: u32) -> Result<Frame, LineError> {
+    fn parse_remote_frame(&mut self, id: u32) -> Result<Frame, LineError> {
         let length = self.peek().and_then(nibble);
         self.at += usize::from(length.is_some());
         let frame = Frame::remote(id, length.unwrap_or(0)).map_err(|_| self.error("a length of 0 to 8"))?;
-        self.raw_dlc(frame)
+        self.parse_raw_dlc(frame)
     }
 
-    fn data(&mut self, id: u32, format: Format, flags: u8) -> Result<Frame, LineError> {
+    fn parse_data_frame(&mut self, id: u32, format: Format, flags: u8) -> Result<Frame, LineError> {
         let mut data = [0; 64];
         let mut len = 0;
         loop {
@@ -240,10 +244,10 @@ impl<'a> Cursor<'a> {
         }
         let frame = Frame::with_buffer(id, format, flags, data, len);
         let frame = frame.map_err(|_| self.error("at most 8 bytes in a classic frame"))?;
-        self.raw_dlc(frame)
+        self.parse_raw_dlc(frame)
     }
 
-    fn raw_dlc(&mut self, frame: Frame) -> Result<Frame, LineError> {
+    fn parse_raw_dlc(&mut self, frame: Frame) -> Result<Frame, LineError> {
         if !self.accept(b'_') {
             return Ok(frame);
         }
@@ -257,7 +261,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Reads the direction after a frame, if any. Other words are ignored, but a further data byte is an error.
-    pub(super) fn direction(&mut self) -> Result<Option<Direction>, LineError> {
+    pub(super) fn parse_direction(&mut self) -> Result<Option<Direction>, LineError> {
         if self.is_at_end() {
             return Ok(None);
         }
@@ -283,7 +287,7 @@ pub(super) const fn is_blank(byte: u8) -> bool {
 /// Converts the digits after the decimal point of a second to nanoseconds. Returns the nanoseconds and the number of
 /// digits. Digits below a nanosecond are dropped. Returns `None` if `digits` is empty or contains other bytes.
 #[must_use]
-pub fn fraction(digits: &[u8]) -> Option<(u64, usize)> {
+pub fn fraction_to_nanos(digits: &[u8]) -> Option<(u64, usize)> {
     if digits.is_empty() || !digits.iter().all(u8::is_ascii_digit) {
         return None;
     }
@@ -334,7 +338,7 @@ mod tests {
                 text[at] = byte;
                 let count = if byte.is_ascii_digit() { 8 } else { at };
                 let value = str::from_utf8(&text[..count]).unwrap().parse().unwrap_or(0);
-                assert_eq!(eight_digits(text), (value, count), "{text:?}");
+                assert_eq!(parse_leading_digits(text), (value, count), "{text:?}");
             }
         }
     }
@@ -360,7 +364,7 @@ mod tests {
             }
             let count = text.iter().position(|byte| !byte.is_ascii_digit()).unwrap_or(8);
             let value = str::from_utf8(&text[..count]).unwrap().parse().unwrap_or(0);
-            prop_assert_eq!(eight_digits(text), (value, count));
+            prop_assert_eq!(parse_leading_digits(text), (value, count));
         }
     }
 }

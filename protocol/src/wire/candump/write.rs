@@ -22,9 +22,9 @@ const HEX: [[u8; 2]; 256] = {
 /// Maximum length in bytes of a frame: 8 digits of an identifier, `##`, flags, 64 data bytes and a raw DLC.
 const MAX_FRAME_LEN: usize = 8 + 2 + 1 + 128 + 2;
 /// Maximum number of digits to which seconds are padded.
-pub(super) const MAX_PAD: u8 = 20;
+pub(super) const MAX_SECOND_DIGITS: u8 = 20;
 /// Maximum length in bytes of a time: two parentheses, digits of seconds, a point, 9 digits and a space.
-const MAX_TIME_LEN: usize = 2 + MAX_PAD as usize + 1 + 9 + 1;
+const MAX_TIME_LEN: usize = 2 + MAX_SECOND_DIGITS as usize + 1 + 9 + 1;
 
 /// Writes one record without a line ending, with single spaces, in upper case and without the direction.
 ///
@@ -34,7 +34,7 @@ pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
     let mut time = TextBuffer::<MAX_TIME_LEN>::new();
     let (seconds, nanos) = (record.time.nanos / 1_000_000_000, record.time.nanos % 1_000_000_000);
     time.push(b'(');
-    time.push_decimal(seconds, usize::from(record.time.min_digits.clamp(1, MAX_PAD)));
+    time.push_decimal(seconds, usize::from(record.time.min_digits.clamp(1, MAX_SECOND_DIGITS)));
     time.push(b'.');
     if record.time.nine_digits {
         time.push_decimal(nanos, 9);

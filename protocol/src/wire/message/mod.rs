@@ -18,9 +18,9 @@ mod sensors;
 mod state;
 
 pub use network::{
-    Heartbeat, NetworkPage, NetworkPages, PortState, Ports, ReceivedCounts, RejectedCounts, Tree,
+    Heartbeat, NetworkPage, NetworkPages, PortState, PortsPage, ReceivedCounts, RejectedCounts, TreePage,
 };
-pub use sensors::{BaselinePage, Readings, SensorPage, SkinSensors};
+pub use sensors::{BaselinePage, SensorPage, SensorReadings, SkinSensors};
 pub use state::State;
 
 use core::ops::RangeInclusive;
@@ -36,7 +36,7 @@ use crate::parameters::MAX_JOINTS;
 pub const VERSION: u8 = 1;
 
 /// Bit in the count byte of a stimulus: the stimulus applies from the next joints on, whatever their epoch.
-pub(crate) const FROM_NEXT_FLAG: u8 = 0x80;
+pub(crate) const FROM_NEXT_JOINTS_FLAG: u8 = 0x80;
 /// Bit in the count byte of `configure` and `configured`: the request is a write, not a read.
 pub(crate) const WRITE_FLAG: u8 = 0x80;
 /// Value of the parameter number in a `configured` packet that refuses a request.
@@ -53,7 +53,7 @@ pub struct Joints {
 
 /// The time from which a stimulus applies.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum AppliesFrom {
+pub enum StimulusStart {
     /// From the joints of this epoch on.
     Epoch(Epoch),
     /// From the next joints on, whatever their epoch.
@@ -107,11 +107,11 @@ impl Answer {
     /// Reason of a refusal: the parameter does not exist.
     pub const UNKNOWN_PARAMETER: i16 = 18;
     /// Reason of a refusal: the words are invalid for this parameter, or `links_down` was written outside test mode.
-    pub const INVALID: i16 = 19;
+    pub const INVALID_WORDS: i16 = 19;
     /// Reason of a refusal: a tare was requested while the cell is touched, or before it has received joints.
-    pub const TOUCHED: i16 = 20;
+    pub const CELL_TOUCHED: i16 = 20;
     /// Reason of a refusal: the sensor value exceeds the limit of the baseline.
-    pub const BEYOND_LIMIT: i16 = 21;
+    pub const ABOVE_BASELINE_LIMIT: i16 = 21;
 }
 
 /// A decoded packet.
@@ -193,7 +193,7 @@ pub enum Message {
         /// The node that is to use the values.
         to: Node,
         /// The time from which the stimulus applies.
-        from: AppliesFrom,
+        from: StimulusStart,
         /// The sensor values.
         page: SensorPage,
     },
@@ -308,9 +308,12 @@ impl Message {
                 Self::Configured { from: sender()?, tag: epoch.0, answer }
             }
             Kind::Stimulus => {
-                let from =
-                    if count & FROM_NEXT_FLAG == 0 { AppliesFrom::Epoch(epoch) } else { AppliesFrom::Next };
-                let page = SensorPage::decode(kind, count & !FROM_NEXT_FLAG, words.first_six())?;
+                let from = if count & FROM_NEXT_JOINTS_FLAG == 0 {
+                    StimulusStart::Epoch(epoch)
+                } else {
+                    StimulusStart::Next
+                };
+                let page = SensorPage::decode(kind, count & !FROM_NEXT_JOINTS_FLAG, words.first_six())?;
                 Self::Stimulus { to: addressee(kind, node)?, from, page }
             }
         })
@@ -355,8 +358,8 @@ impl Message {
             Self::Stimulus { from, page, .. } => {
                 let (page, words) = page.encode();
                 let (epoch, flag) = match from {
-                    AppliesFrom::Epoch(epoch) => (epoch, 0),
-                    AppliesFrom::Next => (Epoch(0), FROM_NEXT_FLAG),
+                    StimulusStart::Epoch(epoch) => (epoch, 0),
+                    StimulusStart::Next => (Epoch(0), FROM_NEXT_JOINTS_FLAG),
                 };
                 packet(words, epoch, page | flag)
             }
@@ -400,14 +403,14 @@ impl Message {
             | Self::Torque { epoch, .. }
             | Self::Sensors { epoch, .. }
             | Self::Network { epoch, .. }
-            | Self::Stimulus { from: AppliesFrom::Epoch(epoch), .. } => Some(epoch),
+            | Self::Stimulus { from: StimulusStart::Epoch(epoch), .. } => Some(epoch),
             Self::Halt
             | Self::Sync
             | Self::Resume
             | Self::Report
             | Self::Configure { .. }
             | Self::Configured { .. }
-            | Self::Stimulus { from: AppliesFrom::Next, .. } => None,
+            | Self::Stimulus { from: StimulusStart::Next, .. } => None,
         }
     }
 

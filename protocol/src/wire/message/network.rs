@@ -16,9 +16,9 @@ pub enum NetworkPage {
     /// Page 2: counters of rejected frames, by reason.
     Rejected(RejectedCounts),
     /// Page 3: the place of the cell in the tree, and counters of sums.
-    Tree(Tree),
+    Tree(TreePage),
     /// Page 4: the state of each port.
-    Ports(Ports),
+    Ports(PortsPage),
 }
 
 /// Page 0: the heartbeat, sent four times a second and after each sync. The epoch byte is that of the last
@@ -75,7 +75,7 @@ pub struct RejectedCounts {
 
 /// Page 3: a cell's place in the tree. The epoch byte is that of the last accepted joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Tree {
+pub struct TreePage {
     /// The parent, to which the cell sends its sums: the node id of a cell, or 0 for the gateway's side. `None` while
     /// the cell is unreachable.
     pub parent: Option<u8>,
@@ -100,7 +100,7 @@ pub struct Tree {
 
 /// Page 4: the state of a cell's ports.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Ports {
+pub struct PortsPage {
     /// The state of each port.
     pub ports: [PortState; 4],
     /// Number of times that the cell changed its parent, modulo 2^16.
@@ -123,27 +123,27 @@ pub struct PortState {
 }
 
 impl PortState {
-    const RECEIVES: u16 = 1 << 12;
-    const WORKS: u16 = 1 << 13;
-    const OTHER_VERSION: u16 = 1 << 14;
+    const RECEIVES_FLAG: u16 = 1 << 12;
+    const WORKS_FLAG: u16 = 1 << 13;
+    const OTHER_VERSION_FLAG: u16 = 1 << 14;
 
     const fn decode(word: u16) -> Self {
         let [number, high] = word.to_le_bytes();
         Self {
             number,
             port: high & 7,
-            receives: word & Self::RECEIVES != 0,
-            works: word & Self::WORKS != 0,
-            other_version: word & Self::OTHER_VERSION != 0,
+            receives: word & Self::RECEIVES_FLAG != 0,
+            works: word & Self::WORKS_FLAG != 0,
+            other_version: word & Self::OTHER_VERSION_FLAG != 0,
         }
     }
 
     fn encode(self) -> u16 {
         let flag = |set: bool, flag| if set { flag } else { 0 };
         u16::from_le_bytes([self.number, self.port & 7])
-            | flag(self.receives, Self::RECEIVES)
-            | flag(self.works, Self::WORKS)
-            | flag(self.other_version, Self::OTHER_VERSION)
+            | flag(self.receives, Self::RECEIVES_FLAG)
+            | flag(self.works, Self::WORKS_FLAG)
+            | flag(self.other_version, Self::OTHER_VERSION_FLAG)
     }
 }
 
@@ -155,9 +155,9 @@ pub struct NetworkPages {
     /// Counters of rejected frames.
     pub rejected: Option<RejectedCounts>,
     /// Its place in the tree.
-    pub tree: Option<Tree>,
+    pub tree: Option<TreePage>,
     /// The state of its ports.
-    pub ports: Option<Ports>,
+    pub ports: Option<PortsPage>,
 }
 
 impl NetworkPages {
@@ -217,7 +217,7 @@ impl NetworkPage {
                 let ([parent, up], [depth, round]) = (a.to_le_bytes(), b.to_le_bytes());
                 let [children, works] = c.to_le_bytes();
                 let parent = (parent != NO_PARENT).then_some(parent);
-                Ok(Self::Tree(Tree {
+                Ok(Self::Tree(TreePage {
                     parent,
                     parent_port: up,
                     depth,
@@ -229,7 +229,7 @@ impl NetworkPage {
                     dropped: f,
                 }))
             }
-            4 => Ok(Self::Ports(Ports { ports: [a, b, c, d].map(PortState::decode), changes: e })),
+            4 => Ok(Self::Ports(PortsPage { ports: [a, b, c, d].map(PortState::decode), changes: e })),
             _ => Err(MessageError::Page { kind: Kind::Network, page }),
         }
     }
@@ -261,7 +261,7 @@ impl NetworkPage {
                 ];
                 (3, [place[0], place[1], place[2], tree.sent, tree.accepted, tree.dropped])
             }
-            Self::Ports(Ports { ports: [a, b, c, d], changes }) => {
+            Self::Ports(PortsPage { ports: [a, b, c, d], changes }) => {
                 let [a, b, c, d] = [a, b, c, d].map(PortState::encode);
                 (4, [a, b, c, d, changes, 0])
             }

@@ -48,14 +48,14 @@ pub struct SkinSensors {
 
 /// The values of all simulated pages: the contact state of a cell.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Readings {
+pub struct SensorReadings {
     /// Page 0.
     pub skin: SkinSensors,
     /// Page 1: acceleration in g.
     pub acceleration: [Q3_12; 3],
 }
 
-impl Readings {
+impl SensorReadings {
     /// Sets the values of a page. Other pages than simulated ones have no effect.
     pub const fn set(&mut self, page: &SensorPage) {
         match *page {
@@ -78,7 +78,7 @@ impl SensorPage {
 
     /// Returns the index in [`Self::SIMULATED`]; `None` for a page that is only measured.
     #[must_use]
-    pub const fn simulated(&self) -> Option<usize> {
+    pub const fn simulated_index(&self) -> Option<usize> {
         match self {
             Self::Skin(_) => Some(0),
             Self::Acceleration(_) => Some(1),
@@ -90,7 +90,7 @@ impl SensorPage {
     ///
     /// # Errors
     /// Returns an error if a stimulus has no page of this number.
-    pub fn of_stimulus(number: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
+    pub fn from_stimulus(number: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
         Self::decode(Kind::Stimulus, number, words)
     }
 

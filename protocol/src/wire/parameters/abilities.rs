@@ -54,21 +54,21 @@ impl fmt::Display for MissingAbility {
 }
 
 impl Abilities {
-    const ROWS: u32 = 4;
-    const PRISMATIC: u16 = 1 << 10;
-    const FIXED: u16 = 1 << 11;
-    const Q5_10: u16 = 1 << 12;
-    const Q7_8: u16 = 1 << 13;
+    const ROWS_SHIFT: u32 = 4;
+    const PRISMATIC_ROW_FLAG: u16 = 1 << 10;
+    const FIXED_ROW_FLAG: u16 = 1 << 11;
+    const Q5_10_FLAG: u16 = 1 << 12;
+    const Q7_8_FLAG: u16 = 1 << 13;
 
     /// All abilities of this version of the protocol.
     #[expect(clippy::cast_possible_truncation, reason = "14 joints and 32 rows")]
     pub const ALL: Self = Self(
         MAX_JOINTS as u16
-            | (MAX_ROWS as u16) << Self::ROWS
-            | Self::PRISMATIC
-            | Self::FIXED
-            | Self::Q5_10
-            | Self::Q7_8,
+            | (MAX_ROWS as u16) << Self::ROWS_SHIFT
+            | Self::PRISMATIC_ROW_FLAG
+            | Self::FIXED_ROW_FLAG
+            | Self::Q5_10_FLAG
+            | Self::Q7_8_FLAG,
     );
 
     /// Decodes the abilities from their word.
@@ -85,17 +85,17 @@ impl Abilities {
 
     /// Returns the maximum number of joints of a chain.
     #[must_use]
-    pub fn joints(self) -> usize {
-        Self::or_six(self.0 & 0xF)
+    pub fn max_joints(self) -> usize {
+        Self::six_if_zero(self.0 & 0xF)
     }
 
     /// Returns the maximum number of rows of a table.
     #[must_use]
-    pub fn rows(self) -> usize {
-        Self::or_six(self.0 >> Self::ROWS & 0x3F)
+    pub fn max_rows(self) -> usize {
+        Self::six_if_zero(self.0 >> Self::ROWS_SHIFT & 0x3F)
     }
 
-    fn or_six(number: u16) -> usize {
+    fn six_if_zero(number: u16) -> usize {
         if number == 0 { 6 } else { number.into() }
     }
 
@@ -107,24 +107,24 @@ impl Abilities {
     #[must_use]
     pub fn first_missing(self, parameters: &Parameters) -> Option<MissingAbility> {
         let (joints, table) = (usize::from(parameters.joints), parameters.all_rows());
-        if joints > self.joints() {
-            return Some(MissingAbility::Joints { needed: joints, most: self.joints() });
+        if joints > self.max_joints() {
+            return Some(MissingAbility::Joints { needed: joints, most: self.max_joints() });
         }
-        if table.len() > self.rows() {
-            return Some(MissingAbility::Rows { needed: table.len(), most: self.rows() });
+        if table.len() > self.max_rows() {
+            return Some(MissingAbility::Rows { needed: table.len(), most: self.max_rows() });
         }
         let can = |kind| match kind {
             RowKind::Revolute => true,
-            RowKind::Prismatic => self.has(Self::PRISMATIC),
-            RowKind::Fixed => self.has(Self::FIXED),
+            RowKind::Prismatic => self.has(Self::PRISMATIC_ROW_FLAG),
+            RowKind::Fixed => self.has(Self::FIXED_ROW_FLAG),
         };
         if let Some(row) = table.iter().find(|row| !can(row.kind)) {
             return Some(MissingAbility::Kind(row.kind));
         }
         let has_format = match parameters.torque_format {
             TorqueFormat::Q3_12 => true,
-            TorqueFormat::Q5_10 => self.has(Self::Q5_10),
-            TorqueFormat::Q7_8 => self.has(Self::Q7_8),
+            TorqueFormat::Q5_10 => self.has(Self::Q5_10_FLAG),
+            TorqueFormat::Q7_8 => self.has(Self::Q7_8_FLAG),
         };
         (!has_format).then_some(MissingAbility::Format(parameters.torque_format))
     }

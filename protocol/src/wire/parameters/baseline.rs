@@ -30,8 +30,8 @@ pub struct BaselineSettings {
 }
 
 impl Baseline {
-    const HOLD: i16 = 1;
-    const FOLLOW: i16 = 2;
+    const MODE_HOLD: i16 = 1;
+    const MODE_FOLLOW: i16 = 2;
 
     /// Encodes the mode as the words of parameter 11.
     #[must_use]
@@ -39,7 +39,7 @@ impl Baseline {
         let Self::On(zeroing) = self else { return [0; WORDS] };
         let BaselineSettings { threshold, hysteresis, rate_un_per_s, limit, n_per_c } = zeroing;
         packet::padded_words([
-            if rate_un_per_s == 0 { Self::HOLD } else { Self::FOLLOW },
+            if rate_un_per_s == 0 { Self::MODE_HOLD } else { Self::MODE_FOLLOW },
             threshold.to_bits(),
             hysteresis.to_bits(),
             rate_un_per_s.cast_signed(),
@@ -55,8 +55,8 @@ impl Baseline {
         let [mode, threshold, hysteresis, rate, limit, n_per_c] = words;
         let rate_un_per_s = match mode {
             0 => return Some(Self::Off),
-            Self::HOLD => 0,
-            Self::FOLLOW if rate != 0 => rate.cast_unsigned(),
+            Self::MODE_HOLD => 0,
+            Self::MODE_FOLLOW if rate != 0 => rate.cast_unsigned(),
             _ => return None,
         };
         let sound = threshold > 0 && (0..=1 << 14).contains(&hysteresis) && limit >= 0;
@@ -72,7 +72,7 @@ impl Baseline {
 
 /// A tare command: a write of parameter 12.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Tare {
+pub enum TareCommand {
     /// 0: discards the zero. The cell finds a new one as after a start.
     Forget,
     /// 1: takes the present reading as the zero, unless the cell is touched.
@@ -81,7 +81,7 @@ pub enum Tare {
     Forced,
 }
 
-impl Tare {
+impl TareCommand {
     /// Decodes the words of parameter 12. Returns `None` for an undefined command.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Option<Self> {

@@ -30,10 +30,10 @@ mod rows;
 mod switches;
 
 pub use abilities::{Abilities, MissingAbility};
-pub use baseline::{Baseline, BaselineSettings, Tare};
+pub use baseline::{Baseline, BaselineSettings, TareCommand};
 pub use error::ParameterError;
 pub use rows::{Row, RowKind};
-pub use switches::{Events, LinksDown, Reply, Sensing, Slots};
+pub use switches::{Events, LinksDown, Reply, Sensing, SumSchedule};
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
 use crate::packet::{MAX_WORDS, WORDS, crc16_of_parts, padded_words};
@@ -43,12 +43,12 @@ pub const MAX_JOINTS: usize = MAX_WORDS;
 /// Maximum number of rows of a chain's table.
 pub const MAX_ROWS: usize = 32;
 /// Minimum number of rows in a flash image. The rows of a chain with more than six follow.
-const IMAGE_ROWS: usize = 6;
+const MIN_IMAGE_ROWS: usize = 6;
 /// The parameter number of row 1.
-const FIRST_ROW: u8 = 16;
+const FIRST_ROW_NUMBER: u8 = 16;
 /// The parameter number after the last row.
 #[expect(clippy::cast_possible_truncation, reason = "32 rows")]
-const END_ROW: u8 = FIRST_ROW + MAX_ROWS as u8;
+const END_ROW_NUMBER: u8 = FIRST_ROW_NUMBER + MAX_ROWS as u8;
 
 /// A parameter. `configure` and `configured` packets carry its number.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -107,8 +107,8 @@ const PARAMETER_NUMBERS: [(Parameter, u8); 13] = [
 impl Parameter {
     /// Returns the parameters that are stored for a chain with `rows` rows, in the order in which they are
     /// hashed.
-    pub fn stored(rows: usize) -> impl Iterator<Item = Self> {
-        let rows = rows.clamp(IMAGE_ROWS, MAX_ROWS);
+    pub fn stored_for_rows(rows: usize) -> impl Iterator<Item = Self> {
+        let rows = rows.clamp(MIN_IMAGE_ROWS, MAX_ROWS);
         STORED_BEFORE_ROWS.into_iter().chain((0..).take(rows).map(Self::Row))
     }
 
@@ -121,8 +121,8 @@ impl Parameter {
     /// Returns the parameter with this number; `None` for other numbers.
     #[must_use]
     pub fn from_number(number: u8) -> Option<Self> {
-        if (FIRST_ROW..END_ROW).contains(&number) {
-            return Some(Self::Row(number - FIRST_ROW));
+        if (FIRST_ROW_NUMBER..END_ROW_NUMBER).contains(&number) {
+            return Some(Self::Row(number - FIRST_ROW_NUMBER));
         }
         PARAMETER_NUMBERS.iter().find(|(_, known)| *known == number).map(|(parameter, _)| *parameter)
     }
@@ -131,9 +131,9 @@ impl Parameter {
     #[must_use]
     pub fn number(self) -> u8 {
         if let Self::Row(row) = self
-            && row < END_ROW - FIRST_ROW
+            && row < END_ROW_NUMBER - FIRST_ROW_NUMBER
         {
-            return FIRST_ROW + row;
+            return FIRST_ROW_NUMBER + row;
         }
         PARAMETER_NUMBERS.iter().find(|(known, _)| *known == self).map_or(127, |(_, number)| *number)
     }
@@ -162,7 +162,7 @@ impl Parameter {
             Self::Sensing => Sensing::from_words(words).is_some(),
             Self::Events => Events::from_words(words).is_some(),
             Self::Baseline => Baseline::from_words(words).is_some(),
-            Self::Tare => Tare::from_words(words).is_some(),
+            Self::Tare => TareCommand::from_words(words).is_some(),
             Self::Identity
             | Self::Mount
             | Self::Pose
@@ -249,7 +249,7 @@ impl Default for Parameters {
 }
 
 /// Size in bytes of the image for a chain with up to 6 rows.
-pub const IMAGE_BYTES: usize = (STORED_BEFORE_ROWS.len() + IMAGE_ROWS) * WORDS * 2;
+pub const IMAGE_BYTES: usize = (STORED_BEFORE_ROWS.len() + MIN_IMAGE_ROWS) * WORDS * 2;
 /// Size in bytes of the image for a chain with 32 rows.
 pub const MAX_IMAGE_BYTES: usize = (STORED_BEFORE_ROWS.len() + MAX_ROWS) * WORDS * 2;
 
@@ -422,7 +422,7 @@ impl Parameters {
         }
     }
 
-    /// Encodes all stored parameters, in the order of [`Parameter::stored`], words little endian.
+    /// Encodes all stored parameters, in the order of [`Parameter::stored_for_rows`], words little endian.
     #[must_use]
     pub fn image(&self) -> Image {
         self.image_parts().flatten().collect()
@@ -430,7 +430,7 @@ impl Parameters {
 
     /// Returns [`Parameters::image`] in pieces of one parameter each, for callers with a small stack.
     pub fn image_parts(&self) -> impl Iterator<Item = [u8; WORDS * 2]> {
-        Parameter::stored(self.all_rows().len()).map(|parameter| self.image_part(parameter))
+        Parameter::stored_for_rows(self.all_rows().len()).map(|parameter| self.image_part(parameter))
     }
 
     /// Encodes one parameter.
@@ -451,7 +451,7 @@ impl Parameters {
     pub fn from_image(image: &[u8]) -> Result<Self, ParameterError> {
         let mut parameters = Self::default();
         let mut words = image.as_chunks::<2>().0.as_chunks::<WORDS>().0.iter();
-        for parameter in Parameter::stored(MAX_ROWS) {
+        for parameter in Parameter::stored_for_rows(MAX_ROWS) {
             let Some(chunk) = words.next() else { break };
             parameters.set(parameter, chunk.map(i16::from_le_bytes))?;
         }

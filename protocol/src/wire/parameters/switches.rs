@@ -11,12 +11,12 @@ pub enum Reply {
     Torque,
     /// The sum of the cell's own torque and those of its children in the tree, in Q7.8. Cells send at times that depend
     /// on their depth.
-    Sum(Slots),
+    Sum(SumSchedule),
 }
 
 /// The schedule by which the cells of a tree send their sums, the deepest first.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Slots {
+pub struct SumSchedule {
     /// Width of a slot in µs.
     pub slot_us: u16,
     /// Depth of the deepest cell; a root has depth 0. A cell at depth d sends in slot `deepest - d`.
@@ -31,7 +31,7 @@ impl Reply {
     pub fn words(self) -> [i16; WORDS] {
         match self {
             Self::Torque => [0; WORDS],
-            Self::Sum(Slots { slot_us, deepest, carry }) => {
+            Self::Sum(SumSchedule { slot_us, deepest, carry }) => {
                 packet::padded_words([1, slot_us.cast_signed(), i16::from(deepest), i16::from(carry)])
             }
         }
@@ -43,7 +43,7 @@ impl Reply {
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
         match words {
             [0, ..] => Some(Self::Torque),
-            [1, slot_us, deepest, carry @ (0 | 1), ..] if slot_us != 0 => Some(Self::Sum(Slots {
+            [1, slot_us, deepest, carry @ (0 | 1), ..] if slot_us != 0 => Some(Self::Sum(SumSchedule {
                 slot_us: slot_us.cast_unsigned(),
                 deepest: u8::try_from(deepest).ok().filter(|deepest| *deepest <= 253)?,
                 carry: carry == 1,

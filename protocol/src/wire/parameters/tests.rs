@@ -46,7 +46,7 @@ fn what_is_wrong_is_said() {
 #[test]
 fn the_hash_sees_every_word() {
     let hash = sound().hash();
-    for parameter in Parameter::stored(2) {
+    for parameter in Parameter::stored_for_rows(2) {
         let mut other = sound();
         let mut words = other.words(parameter);
         words[0] ^= 1;

@@ -6,9 +6,9 @@ use crate::fixed::TorqueFormat;
 use crate::packet::{MAX_WORDS, WORDS};
 
 /// Size of six words in bytes.
-const WORD_BYTES: usize = 2 * WORDS;
+const SIX_WORDS_BYTES: usize = 2 * WORDS;
 /// Index of the count byte. In a joints packet, this byte is the number of joints in use.
-const COUNT: usize = WORD_BYTES + 1;
+const COUNT_BYTE_INDEX: usize = SIX_WORDS_BYTES + 1;
 
 /// The format of a field's bits.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
@@ -51,7 +51,7 @@ pub enum FieldFormat {
     Parameter(u8),
     /// A page number of this many bits, which selects the layout of the words.
     Page(u8),
-    /// The reason of a refusal, a number in [`super::reasons`].
+    /// The reason of a refusal, a number in [`super::refusal_reasons`].
     Reason,
     /// Several fields within one word.
     Group(Vec<Field>),
@@ -127,7 +127,7 @@ impl Field {
     }
 
     /// Returns the number of bits of one element, the number of its fraction bits, and true if it is two's complement.
-    fn shape(&self) -> (u8, u32, bool) {
+    fn bit_layout(&self) -> (u8, u32, bool) {
         match self.format {
             FieldFormat::Unsigned(bits)
             | FieldFormat::Ports(bits, _)
@@ -140,7 +140,7 @@ impl Field {
             }
             FieldFormat::Signed | FieldFormat::Choice | FieldFormat::Reason => (16, 0, true),
             FieldFormat::Angle | FieldFormat::Position => (16, 14, true),
-            FieldFormat::Torque => (16, TorqueFormat::default().fraction(), true),
+            FieldFormat::Torque => (16, TorqueFormat::default().fraction_bits(), true),
             FieldFormat::Fixed(fraction)
             | FieldFormat::Threshold(fraction)
             | FieldFormat::Saturating(fraction)
@@ -151,19 +151,19 @@ impl Field {
     /// Returns the number of bits of one element.
     #[must_use]
     pub fn width(&self) -> u8 {
-        self.shape().0
+        self.bit_layout().0
     }
 
     /// Returns the number of fraction bits; 0 for integers.
     #[must_use]
     pub fn fraction(&self) -> u32 {
-        self.shape().1
+        self.bit_layout().1
     }
 
     /// Returns true if the value is two's complement.
     #[must_use]
     pub fn is_signed(&self) -> bool {
-        self.shape().2
+        self.bit_layout().2
     }
 
     /// Returns the number of elements: 1, or the number of labels.
@@ -179,9 +179,9 @@ impl Field {
     }
 
     /// Returns the raw value of an element, sign-extended if the field is signed. `bytes` are those of
-    /// [`crate::packet::Packet::fields`]; an element beyond their end is 0.
+    /// [`crate::packet::Packet::field_bytes`]; an element beyond their end is 0.
     #[must_use]
-    pub fn raw(&self, bytes: &[u8], element: usize) -> i64 {
+    pub fn raw_value(&self, bytes: &[u8], element: usize) -> i64 {
         // Epoch and count follow the sixth word.
         let element = element + usize::from(element >= WORDS);
         let (at, width) = (self.first_bit() + element * 16, u32::from(self.width()));
@@ -194,15 +194,15 @@ impl Field {
     /// Returns the sum of the field's word and the two words after it.
     #[must_use]
     pub fn sum_of_words(&self, bytes: &[u8]) -> f64 {
-        (0..3).map(|element| self.real(self.raw(bytes, element))).sum()
+        (0..3).map(|element| self.raw_to_real(self.raw_value(bytes, element))).sum()
     }
 
     /// Returns the number of elements in use: for positions the joints in use, for other fields whose length varies the
     /// words of the packet, else all elements.
     #[must_use]
     pub fn elements_in(&self, bytes: &[u8]) -> usize {
-        let there = bytes.len().saturating_sub(WORD_BYTES + 2) / 2 + WORDS;
-        match bytes.get(COUNT) {
+        let there = bytes.len().saturating_sub(SIX_WORDS_BYTES + 2) / 2 + WORDS;
+        match bytes.get(COUNT_BYTE_INDEX) {
             Some(&in_use) if self.format == FieldFormat::Position => self.elements().min(usize::from(in_use)),
             Some(_) | None if self.varies_with_chain() => there,
             Some(_) | None => self.elements(),
@@ -231,7 +231,7 @@ impl Field {
     /// layout.
     #[must_use]
     pub fn is_present(&self, bytes: &[u8], first: &Self) -> bool {
-        self.is_present_for(Some(first.raw(bytes, 0)))
+        self.is_present_for(Some(first.raw_value(bytes, 0)))
     }
 
     /// Returns true if the field is present when the first field of its layout has the value `first`.

@@ -11,7 +11,7 @@ use super::field::Field;
 use crate::id::{Command, Kind};
 
 static SCHEMA: LazyLock<Schema> = LazyLock::new(|| {
-    let file: File = toml::from_str(include_str!("../../../schema.toml")).expect("a test reads it");
+    let file: SchemaFile = toml::from_str(include_str!("../../../schema.toml")).expect("a test reads it");
     Schema::from(file)
 });
 
@@ -23,30 +23,30 @@ pub fn packets() -> &'static [PacketSchema] {
 
 /// Returns the layout of every parameter, in the order of their numbers.
 #[must_use]
-pub fn parameters() -> &'static [Layout] {
+pub fn parameter_layouts() -> &'static [Layout] {
     &SCHEMA.parameters
 }
 
 /// Returns the layouts of the messages over wires, by their first byte. Hello and return have no human-readable text
 /// here, because their text depends on several fields together.
 #[must_use]
-pub fn wires() -> &'static [Layout] {
+pub fn wire_layouts() -> &'static [Layout] {
     &SCHEMA.wires
 }
 
 /// Returns the reasons of refusals. Each is a number and its meaning.
 #[must_use]
-pub fn reasons() -> &'static [(i16, String)] {
+pub fn refusal_reasons() -> &'static [(i16, String)] {
     &SCHEMA.reasons
 }
 
 /// The layout of a packet that uses no words.
-pub(super) fn empty() -> &'static Layout {
+pub(super) fn empty_layout() -> &'static Layout {
     &SCHEMA.empty
 }
 
 /// Returns the layout of six words with unknown meaning.
-pub(super) fn unknown() -> &'static Layout {
+pub(super) fn unknown_layout() -> &'static Layout {
     &SCHEMA.unknown
 }
 
@@ -103,7 +103,7 @@ impl TextPiece {
         Self::Field { name: name.to_owned(), decimals: decimals.parse().unwrap_or_default() }
     }
 
-    fn all(mut text: &str) -> Vec<Self> {
+    fn parse_all(mut text: &str) -> Vec<Self> {
         let mut pieces = Vec::new();
         while let Some((before, (inside, after))) =
             text.split_once('{').and_then(|(before, after)| Some((before, after.split_once('}')?)))
@@ -130,7 +130,7 @@ impl<'de> Deserialize<'de> for TextPart {
             RawPart::Within(min, max, text) => ([min, max], None, text),
             RawPart::Of(field, min, max, text) => ([min, max], Some(field), text),
         };
-        Ok(Self { when, of, pieces: TextPiece::all(&text) })
+        Ok(Self { when, of, pieces: TextPiece::parse_all(&text) })
     }
 }
 
@@ -193,7 +193,7 @@ pub struct PacketSchema {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct File {
+struct SchemaFile {
     packets: Vec<RawPacket>,
     layouts: BTreeMap<String, Vec<Layout>>,
     reasons: Vec<(i16, String)>,
@@ -222,8 +222,8 @@ fn kind_or_command<'de, D: Deserializer<'de>>(deserializer: D) -> Result<(Kind, 
     kind.map(|kind| (kind, command)).ok_or_else(|| D::Error::custom(format!("{name} is no packet")))
 }
 
-impl From<File> for Schema {
-    fn from(File { packets, layouts, reasons }: File) -> Self {
+impl From<SchemaFile> for Schema {
+    fn from(SchemaFile { packets, layouts, reasons }: SchemaFile) -> Self {
         let set = |name: &str| -> Vec<_> {
             layouts.get(name).into_iter().flatten().flat_map(Layout::expand).collect()
         };

@@ -14,11 +14,13 @@ mod file;
 mod units;
 
 pub use field::{Field, FieldFormat, FieldRange, WhenAbsent};
-pub use file::{Layout, PacketSchema, TextPart, TextPiece, packets, parameters, reasons, wires};
+pub use file::{
+    Layout, PacketSchema, TextPart, TextPiece, packets, parameter_layouts, refusal_reasons, wire_layouts,
+};
 pub use units::Units;
 
 use crate::id::{Id, Kind};
-use crate::message::{FROM_NEXT_FLAG, Message, REFUSAL_NUMBER, Request, WRITE_FLAG};
+use crate::message::{FROM_NEXT_JOINTS_FLAG, Message, REFUSAL_NUMBER, Request, WRITE_FLAG};
 use crate::packet::{Packet, WORDS};
 use crate::parameters::Parameter;
 
@@ -48,18 +50,18 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     let number = match packet.id.kind {
         Kind::Command | Kind::Sum | Kind::Torque => 0,
         Kind::Sensors | Kind::Network => packet.count,
-        Kind::Stimulus => packet.count & !FROM_NEXT_FLAG,
+        Kind::Stimulus => packet.count & !FROM_NEXT_JOINTS_FLAG,
         Kind::Configure | Kind::Configured => packet.count & !WRITE_FLAG,
     };
     if matches!(message, Message::Configure { request: Request::Read { .. }, .. }) {
-        return file::empty();
+        return file::empty_layout();
     }
     let is_refusal = packet.id.kind == Kind::Configured && number == REFUSAL_NUMBER;
     if matches!(packet.id.kind, Kind::Configure | Kind::Configured) && !is_refusal {
         return parameter_layout(number, packet.words.first_six());
     }
     let layouts = PacketSchema::for_id(packet.id).map_or(&[][..], |schema| &schema.layouts);
-    layouts.iter().find(|layout| layout.number == number).unwrap_or_else(file::empty)
+    layouts.iter().find(|layout| layout.number == number).unwrap_or_else(file::empty_layout)
 }
 
 /// Returns the layout of the words of a parameter. Invalid words and unknown parameters get a layout of plain words
@@ -67,25 +69,28 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
 #[must_use]
 pub fn parameter_layout(number: u8, words: [i16; WORDS]) -> &'static Layout {
     let can_be = Parameter::from_number(number).is_some_and(|parameter| parameter.accepts(words));
-    parameters().iter().find(|layout| can_be && layout.number == number).unwrap_or_else(file::unknown)
+    parameter_layouts()
+        .iter()
+        .find(|layout| can_be && layout.number == number)
+        .unwrap_or_else(file::unknown_layout)
 }
 
 /// Returns the name of the parameter with this number; `None` if it does not exist.
 #[must_use]
 pub fn parameter_name(number: u8) -> Option<&'static str> {
-    parameters().iter().find(|layout| layout.number == number).map(|layout| layout.name.as_str())
+    parameter_layouts().iter().find(|layout| layout.number == number).map(|layout| layout.name.as_str())
 }
 
 /// Returns the layout of the parameter with this name.
 #[must_use]
 pub fn find_parameter(name: &str) -> Option<&'static Layout> {
-    parameters().iter().find(|layout| layout.name == name)
+    parameter_layouts().iter().find(|layout| layout.name == name)
 }
 
 /// Returns the meaning of a refusal's reason, in words.
 #[must_use]
-pub fn reason(number: i64) -> &'static str {
-    let found = reasons().iter().find(|(known, _)| i64::from(*known) == number);
+pub fn refusal_reason(number: i64) -> &'static str {
+    let found = refusal_reasons().iter().find(|(known, _)| i64::from(*known) == number);
     found.map_or("for a reason that this version does not know", |(_, meaning)| meaning)
 }
 

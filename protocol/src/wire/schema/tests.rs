@@ -8,7 +8,7 @@ fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {
     let packets = packets()
         .iter()
         .flat_map(|schema| schema.layouts.iter().map(move |layout| (&schema.end[..], layout)));
-    packets.chain(wires().iter().map(|layout| (&[][..], layout)))
+    packets.chain(wire_layouts().iter().map(|layout| (&[][..], layout)))
 }
 
 #[test]
@@ -70,7 +70,7 @@ fn whatever_is_a_message_has_a_layout() {
 #[test]
 fn a_field_gives_its_bits_with_their_sign() {
     let bytes = [0x34, 0x12, 0xFF, 0xFF, 0x21];
-    let raw = |text: &str, element| toml::from_str::<Field>(text).unwrap().raw(&bytes, element);
+    let raw = |text: &str, element| toml::from_str::<Field>(text).unwrap().raw_value(&bytes, element);
     assert_eq!(raw("word = 0", 0), 0x1234);
     assert_eq!(raw("word = 1", 0), 0xFFFF);
     assert_eq!(raw("format = { fixed = 8 }", 1), -1);

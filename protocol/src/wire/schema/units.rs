@@ -52,12 +52,12 @@ impl Units {
 }
 
 impl Field {
-    /// Returns the value of one step of an element, in the unit [`Self::unit_in`].
+    /// Returns the value of one step of an element, in the unit [`Self::element_unit`].
     #[must_use]
-    pub fn step_in(&self, element: usize, units: Units) -> f64 {
+    pub fn element_step_size(&self, element: usize, units: Units) -> f64 {
         let step = 1.0 / f64::from(1_u32 << self.fraction());
         if self.format == FieldFormat::Torque {
-            units.torque.step()
+            units.torque.step_size()
         } else if self.format == FieldFormat::Angle
             || self.format == FieldFormat::Position && !units.is_prismatic(self, element)
         {
@@ -67,21 +67,21 @@ impl Field {
         }
     }
 
-    /// Converts the raw value of an element to the unit [`Self::unit_in`].
+    /// Converts the raw value of an element to the unit [`Self::element_unit`].
     #[must_use]
-    pub fn real_in(&self, raw: i64, element: usize, units: Units) -> f64 {
-        f64::from(i16::try_from(raw).unwrap_or_default()) * self.step_in(element, units)
+    pub fn element_value(&self, raw: i64, element: usize, units: Units) -> f64 {
+        f64::from(i16::try_from(raw).unwrap_or_default()) * self.element_step_size(element, units)
     }
 
     /// Converts a raw value to the unit of the field, for fields whose unit is the same on every bus.
     #[must_use]
-    pub fn real(&self, raw: i64) -> f64 {
-        self.real_in(raw, 0, Units::default())
+    pub fn raw_to_real(&self, raw: i64) -> f64 {
+        self.element_value(raw, 0, Units::default())
     }
 
     /// Returns the unit of an element: that of the field, but m or N if the element belongs to a prismatic joint.
     #[must_use]
-    pub fn unit_in(&self, element: usize, units: Units) -> &str {
+    pub fn element_unit(&self, element: usize, units: Units) -> &str {
         let (turns, slides) = (JointKind::Revolute, JointKind::Prismatic);
         match self.unit.as_str() {
             unit if !units.is_prismatic(self, element) => unit,
@@ -102,9 +102,9 @@ mod tests {
         let units = Units { prismatic: 0b10, ..Units::default() };
         let fields = || packets().iter().flat_map(|packet| packet.layouts.iter().flat_map(|it| &it.fields));
         let positions = fields().find(|field| field.format == FieldFormat::Position).unwrap();
-        assert_eq!([0, 1, 2].map(|joint| positions.unit_in(joint, units)), ["rad", "m", "rad"]);
+        assert_eq!([0, 1, 2].map(|joint| positions.element_unit(joint, units)), ["rad", "m", "rad"]);
         let torques = fields().find(|field| field.format == FieldFormat::Torque).unwrap();
-        assert_eq!([0, 1].map(|joint| torques.unit_in(joint, units)), ["Nm", "N"]);
-        assert_eq!([0, 1].map(|joint| torques.unit_in(joint, Units::default())), ["Nm", "Nm"]);
+        assert_eq!([0, 1].map(|joint| torques.element_unit(joint, units)), ["Nm", "N"]);
+        assert_eq!([0, 1].map(|joint| torques.element_unit(joint, Units::default())), ["Nm", "Nm"]);
     }
 }

@@ -28,12 +28,12 @@ pub enum SlcanLine {
     /// Any other line of printable characters, such as the version of an adapter. The caller ignores it.
     Other,
     /// An invalid line, which [`Decoder::refused`] counts.
-    Refused(Refusal),
+    Refused(LineRefusal),
 }
 
 /// The reason for which the decoder refused a line.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
-pub enum Refusal {
+pub enum LineRefusal {
     /// The line contains an unprintable byte, or a frame contains a byte that is not a hexadecimal digit.
     Garbage,
     /// The line is longer than [`MAX_LINE`], or longer than a frame with its DLC and a time stamp.
@@ -49,15 +49,15 @@ pub enum Refusal {
 /// Numbers of refused lines, by reason. Each counter saturates.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct RejectedLines {
-    /// Number of lines refused as [`Refusal::Garbage`].
+    /// Number of lines refused as [`LineRefusal::Garbage`].
     pub garbage: u32,
-    /// Number of lines refused as [`Refusal::Long`].
+    /// Number of lines refused as [`LineRefusal::Long`].
     pub long: u32,
-    /// Number of lines refused as [`Refusal::Short`].
+    /// Number of lines refused as [`LineRefusal::Short`].
     pub short: u32,
-    /// Number of lines refused as [`Refusal::Dlc`].
+    /// Number of lines refused as [`LineRefusal::Dlc`].
     pub dlc: u32,
-    /// Number of lines refused as [`Refusal::Identifier`].
+    /// Number of lines refused as [`LineRefusal::Identifier`].
     pub identifier: u32,
 }
 
@@ -69,13 +69,13 @@ impl RejectedLines {
         [garbage, long, short, dlc, identifier].into_iter().map(u64::from).sum()
     }
 
-    const fn count(&mut self, refusal: Refusal) {
+    const fn count(&mut self, refusal: LineRefusal) {
         let counter = match refusal {
-            Refusal::Garbage => &mut self.garbage,
-            Refusal::Long => &mut self.long,
-            Refusal::Short => &mut self.short,
-            Refusal::Dlc => &mut self.dlc,
-            Refusal::Identifier => &mut self.identifier,
+            LineRefusal::Garbage => &mut self.garbage,
+            LineRefusal::Long => &mut self.long,
+            LineRefusal::Short => &mut self.short,
+            LineRefusal::Dlc => &mut self.dlc,
+            LineRefusal::Identifier => &mut self.identifier,
         };
         *counter = counter.saturating_add(1);
     }
@@ -97,7 +97,7 @@ pub struct Decoder {
     /// The bytes of the current line so far.
     line: heapless::Vec<u8, MAX_LINE>,
     /// The reason for which the current line will be refused, if an error was found in it.
-    fault: Option<Refusal>,
+    fault: Option<LineRefusal>,
     refused: RejectedLines,
     endings: EndDigitDetector,
 }
@@ -115,20 +115,20 @@ struct EndDigitDetector {
 
 impl EndDigitDetector {
     /// Number of frames of one form after which a single frame of the other form is refused. Two in a row are accepted.
-    const CONFIRMED_AFTER: u8 = 16;
+    const CONFIRMED_AFTER_FRAMES: u8 = 16;
 
     const fn new() -> Self {
         Self { has_state: false, run_length: 0, deviated: false }
     }
 
     /// Records the form of a frame. Returns true if the form is plausible after the earlier frames.
-    const fn record(&mut self, has_state: bool) -> bool {
+    const fn record_form(&mut self, has_state: bool) -> bool {
         if self.has_state == has_state {
             self.run_length = self.run_length.saturating_add(1);
             self.deviated = false;
             return true;
         }
-        let is_sure = self.run_length >= Self::CONFIRMED_AFTER && !self.deviated;
+        let is_sure = self.run_length >= Self::CONFIRMED_AFTER_FRAMES && !self.deviated;
         if is_sure {
             self.deviated = true;
         } else {
@@ -156,23 +156,23 @@ impl Decoder {
     /// line of its own, and an unfinished line before it counts as garbage.
     pub fn push(&mut self, byte: u8) -> Option<SlcanLine> {
         match byte {
-            CR => Some(self.end()),
-            b'\n' => (!self.is_empty()).then(|| self.end()),
+            CR => Some(self.finish_line()),
+            b'\n' => (!self.is_empty()).then(|| self.finish_line()),
             BEL => {
                 if !self.is_empty() {
-                    self.refused.count(Refusal::Garbage);
+                    self.refused.count(LineRefusal::Garbage);
                 }
                 self.clear();
                 Some(SlcanLine::Failed)
             }
             b' '..=b'~' => {
                 if self.line.push(byte).is_err() {
-                    self.fault.get_or_insert(Refusal::Long);
+                    self.fault.get_or_insert(LineRefusal::Long);
                 }
                 None
             }
             _ => {
-                self.fault.get_or_insert(Refusal::Garbage);
+                self.fault.get_or_insert(LineRefusal::Garbage);
                 None
             }
         }
@@ -186,10 +186,10 @@ impl Decoder {
 
     /// Discards an unfinished line, for example when the connection was lost, and counts it as short. Returns true if
     /// there was one.
-    pub fn restart(&mut self) -> bool {
+    pub fn discard_unfinished(&mut self) -> bool {
         let begun = !self.is_empty();
         if begun {
-            self.refused.count(Refusal::Short);
+            self.refused.count(LineRefusal::Short);
         }
         self.clear();
         begun
@@ -204,7 +204,7 @@ impl Decoder {
         self.fault = None;
     }
 
-    fn end(&mut self) -> SlcanLine {
+    fn finish_line(&mut self) -> SlcanLine {
         let endings = &mut self.endings;
         let line = self.fault.map_or_else(|| decode_line(&self.line, endings), SlcanLine::Refused);
         if let SlcanLine::Refused(refusal) = line {
@@ -232,34 +232,34 @@ fn decode_line(line: &[u8], endings: &mut EndDigitDetector) -> SlcanLine {
         }
     };
     let is_remote = kind.eq_ignore_ascii_case(&b'r');
-    match frame(rest, kind.is_ascii_uppercase(), flags, is_remote, endings) {
+    match decode_frame(rest, kind.is_ascii_uppercase(), flags, is_remote, endings) {
         Ok(frame) => SlcanLine::Frame(frame),
         Err(refusal) => SlcanLine::Refused(refusal),
     }
 }
 
 /// Decodes the part of a frame after its first letter. `flags` are the FD flags, or `None` for a classic frame.
-fn frame(
+fn decode_frame(
     text: &[u8],
     is_extended: bool,
     flags: Option<u8>,
     is_remote: bool,
     endings: &mut EndDigitDetector,
-) -> Result<Frame, Refusal> {
+) -> Result<Frame, LineRefusal> {
     let (digits, flag, max) = if is_extended { (8, EXTENDED, EXTENDED_MASK) } else { (3, 0, STANDARD_MASK) };
-    let (id, rest) = text.split_at_checked(digits).ok_or(Refusal::Short)?;
-    let id = number(id).ok_or(Refusal::Garbage)?;
+    let (id, rest) = text.split_at_checked(digits).ok_or(LineRefusal::Short)?;
+    let id = number(id).ok_or(LineRefusal::Garbage)?;
     if id > max {
-        return Err(Refusal::Identifier);
+        return Err(LineRefusal::Identifier);
     }
     let id = id | flag;
-    let (&dlc, rest) = rest.split_first().ok_or(Refusal::Short)?;
-    let dlc = digit(dlc).ok_or(Refusal::Garbage)?;
+    let (&dlc, rest) = rest.split_first().ok_or(LineRefusal::Short)?;
+    let dlc = digit(dlc).ok_or(LineRefusal::Garbage)?;
     if flags.is_none() && dlc > 8 {
-        return Err(Refusal::Dlc);
+        return Err(LineRefusal::Dlc);
     }
     let len = if is_remote { 0 } else { dlc_len(dlc) };
-    let (text, rest) = rest.split_at_checked(2 * len).ok_or(Refusal::Short)?;
+    let (text, rest) = rest.split_at_checked(2 * len).ok_or(LineRefusal::Short)?;
     let (time, state) = match rest {
         [time @ .., b'S'] => (time, Some(b'S')),
         // Adapters that append a state write upper case; a lower-case digit may belong to the next line after
@@ -272,18 +272,18 @@ fn frame(
         time => (time, None),
     };
     if !matches!(time.len(), 0 | 4 | 8) {
-        return Err(Refusal::Long);
+        return Err(LineRefusal::Long);
     }
-    number(time).ok_or(Refusal::Garbage)?;
+    number(time).ok_or(LineRefusal::Garbage)?;
     let mut data = [0; 64];
     let (pairs, _) = text.as_chunks();
     for (byte, &[high, low]) in data.iter_mut().zip(pairs) {
-        *byte = (digit(high).ok_or(Refusal::Garbage)? << 4) | digit(low).ok_or(Refusal::Garbage)?;
+        *byte = (digit(high).ok_or(LineRefusal::Garbage)? << 4) | digit(low).ok_or(LineRefusal::Garbage)?;
     }
     // `S` cannot be mistaken for a digit, so it is always plausible.
     let has_state = matches!(state, Some(b'0' | b'1'));
-    if state != Some(b'S') && !endings.record(has_state) {
-        return Err(if has_state { Refusal::Long } else { Refusal::Short });
+    if state != Some(b'S') && !endings.record_form(has_state) {
+        return Err(if has_state { LineRefusal::Long } else { LineRefusal::Short });
     }
     let passive = if matches!(state, Some(b'1' | b'S')) { ERROR_STATE } else { 0 };
     let frame = match flags {
@@ -291,5 +291,5 @@ fn frame(
         None => Frame::with_buffer(id, Format::Classic, 0, data, len),
         Some(flags) => Frame::with_buffer(id, Format::Fd, flags | passive, data, len),
     };
-    frame.map_err(|_| Refusal::Dlc)
+    frame.map_err(|_| LineRefusal::Dlc)
 }

@@ -27,14 +27,14 @@ const TRANSMIT_WARNING: u8 = 0x08;
 const RECEIVE_PASSIVE: u8 = 0x10;
 const TRANSMIT_PASSIVE: u8 = 0x20;
 const ERROR_ACTIVE: u8 = 0x40;
-const ONE_BIT: u8 = 0x01;
-const FORM: u8 = 0x02;
-const STUFF: u8 = 0x04;
-const BIT_0: u8 = 0x08;
-const BIT_1: u8 = 0x10;
-const TRANSMITTING: u8 = 0x80;
-const AT_CRC: u8 = 0x08;
-const AT_ACK: u8 = 0x19;
+const SINGLE_BIT_ERROR: u8 = 0x01;
+const FORM_ERROR: u8 = 0x02;
+const STUFF_ERROR: u8 = 0x04;
+const BIT_0_ERROR: u8 = 0x08;
+const BIT_1_ERROR: u8 = 0x10;
+const ERROR_ON_TRANSMISSION: u8 = 0x80;
+const CRC_LOCATION: u8 = 0x08;
+const ACK_LOCATION: u8 = 0x19;
 
 /// The state of a CAN controller, which follows from its error counters.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
@@ -148,17 +148,17 @@ impl AdapterFault {
     }
 
     /// Returns the class, and the controller, protocol and location bytes, of the error frame for this fault.
-    const fn error(self) -> (u32, u8, u8, u8) {
+    const fn error_frame_parts(self) -> (u32, u8, u8, u8) {
         const BUS_CLASSES: u32 = CLASS_PROTOCOL | CLASS_BUS_ERROR;
         match self {
-            Self::Ack => (BUS_CLASSES | CLASS_ACK, 0, 0, AT_ACK),
-            Self::Bit0 => (BUS_CLASSES, 0, BIT_0, 0),
-            Self::Bit1 => (BUS_CLASSES, 0, BIT_1, 0),
-            Self::Crc => (BUS_CLASSES, 0, ONE_BIT, AT_CRC),
-            Self::Form => (BUS_CLASSES, 0, FORM, 0),
-            Self::Stuff => (BUS_CLASSES, 0, STUFF, 0),
+            Self::Ack => (BUS_CLASSES | CLASS_ACK, 0, 0, ACK_LOCATION),
+            Self::Bit0 => (BUS_CLASSES, 0, BIT_0_ERROR, 0),
+            Self::Bit1 => (BUS_CLASSES, 0, BIT_1_ERROR, 0),
+            Self::Crc => (BUS_CLASSES, 0, SINGLE_BIT_ERROR, CRC_LOCATION),
+            Self::Form => (BUS_CLASSES, 0, FORM_ERROR, 0),
+            Self::Stuff => (BUS_CLASSES, 0, STUFF_ERROR, 0),
             Self::Bus | Self::ReceiveFailed => (BUS_CLASSES, 0, 0, 0),
-            Self::TransmitFailed => (BUS_CLASSES, 0, TRANSMITTING, 0),
+            Self::TransmitFailed => (BUS_CLASSES, 0, ERROR_ON_TRANSMISSION, 0),
             Self::Arbitration => (CLASS_LOST_ARBITRATION, 0, 0, 0),
             Self::ReceiveOverrun => (CLASS_CONTROLLER, RECEIVE_OVERFLOW, 0, 0),
             Self::TransmitOverrun => (CLASS_CONTROLLER, TRANSMIT_OVERFLOW, 0, 0),
@@ -207,10 +207,10 @@ impl AdapterReport {
     /// Returns the error frame that Linux' slcan driver creates for this report. `before` is the controller state
     /// before the report. Returns `None` if there is no fault and the state has not changed.
     #[must_use]
-    pub fn frame(self, before: BusState) -> Option<Frame> {
+    pub fn error_frame(self, before: BusState) -> Option<Frame> {
         let bus_error = if self.is_bus_error { CLASS_PROTOCOL | CLASS_BUS_ERROR } else { 0 };
         let (mut class, mut controller, mut protocol, mut location) = (bus_error, 0, 0, 0);
-        for error in self.faults().map(AdapterFault::error) {
+        for error in self.faults().map(AdapterFault::error_frame_parts) {
             class |= error.0;
             controller |= error.1;
             protocol |= error.2;
@@ -261,9 +261,9 @@ impl AdapterReport {
     pub(super) fn read(line: &[u8]) -> Option<Self> {
         match line {
             [b'e', count @ b'1'..=b'8', letters @ ..] => {
-                Self::bus_errors(letters.get(..usize::from(count - b'0'))?)
+                Self::decode_bus_errors(letters.get(..usize::from(count - b'0'))?)
             }
-            [b's', state, counters @ ..] => Self::state_line(*state, counters),
+            [b's', state, counters @ ..] => Self::decode_state_line(*state, counters),
             [b'E', state @ b'0'..=b'3', last @ b'0'..=b'6', digits @ ..] => {
                 let [flags, transmit, receive] = hex_bytes(digits)?;
                 let counters = Some(ErrorCounters { transmit: transmit.into(), receive: receive.into() });
@@ -299,7 +299,7 @@ impl AdapterReport {
     }
 
     /// Decodes a line of bus errors, one letter each. Returns `None` if a letter is unknown.
-    fn bus_errors(letters: &[u8]) -> Option<Self> {
+    fn decode_bus_errors(letters: &[u8]) -> Option<Self> {
         letters.iter().try_fold(Self { is_bus_error: true, ..Self::default() }, |report, letter| {
             Some(report.with(match letter {
                 b'a' => AdapterFault::Ack,
@@ -315,7 +315,7 @@ impl AdapterReport {
         })
     }
 
-    fn state_line(state: u8, counters: &[u8]) -> Option<Self> {
+    fn decode_state_line(state: u8, counters: &[u8]) -> Option<Self> {
         let state = match state {
             b'a' => BusState::Active,
             b'w' => BusState::Warning,

@@ -83,11 +83,11 @@ fn time_stamps_are_passed_over() {
         SlcanLine::Frame(fd(EXTENDED | 1, BIT_RATE_SWITCH, &[1; 64]))
     );
     for (text, refusal) in [
-        ("t12320102E", Refusal::Long),
-        ("t12320102EA5", Refusal::Long),
-        ("t12320102EA5F12", Refusal::Long),
-        ("t12320102EA5F2", Refusal::Long),
-        ("t12320102EA5G", Refusal::Garbage),
+        ("t12320102E", LineRefusal::Long),
+        ("t12320102EA5", LineRefusal::Long),
+        ("t12320102EA5F12", LineRefusal::Long),
+        ("t12320102EA5F2", LineRefusal::Long),
+        ("t12320102EA5G", LineRefusal::Garbage),
     ] {
         assert_eq!(one(text), SlcanLine::Refused(refusal), "{text}");
     }
@@ -96,28 +96,28 @@ fn time_stamps_are_passed_over() {
 #[test]
 fn what_is_no_frame_is_refused_for_its_reason() {
     for (text, refusal) in [
-        ("t", Refusal::Short),
-        ("t12", Refusal::Short),
-        ("t123", Refusal::Short),
-        ("t1231", Refusal::Short),
-        ("t1231A", Refusal::Short),
-        ("T1234567", Refusal::Short),
-        ("b1239000102030405060708090A", Refusal::Short),
-        ("t1239000102030405060708090A0B", Refusal::Dlc),
-        ("r123F", Refusal::Dlc),
-        ("T00000001A", Refusal::Dlc),
-        ("t8000", Refusal::Identifier),
-        ("d8000", Refusal::Identifier),
-        ("T200000000", Refusal::Identifier),
-        ("tXYZ0", Refusal::Garbage),
-        ("t123G", Refusal::Garbage),
-        ("t1231G0", Refusal::Garbage),
-        ("t12310-", Refusal::Garbage),
-        ("t+120", Refusal::Garbage),
-        ("t1230 ", Refusal::Long),
-        ("t12301\u{7f}", Refusal::Garbage),
-        ("C\0", Refusal::Garbage),
-        ("t1230é", Refusal::Garbage),
+        ("t", LineRefusal::Short),
+        ("t12", LineRefusal::Short),
+        ("t123", LineRefusal::Short),
+        ("t1231", LineRefusal::Short),
+        ("t1231A", LineRefusal::Short),
+        ("T1234567", LineRefusal::Short),
+        ("b1239000102030405060708090A", LineRefusal::Short),
+        ("t1239000102030405060708090A0B", LineRefusal::Dlc),
+        ("r123F", LineRefusal::Dlc),
+        ("T00000001A", LineRefusal::Dlc),
+        ("t8000", LineRefusal::Identifier),
+        ("d8000", LineRefusal::Identifier),
+        ("T200000000", LineRefusal::Identifier),
+        ("tXYZ0", LineRefusal::Garbage),
+        ("t123G", LineRefusal::Garbage),
+        ("t1231G0", LineRefusal::Garbage),
+        ("t12310-", LineRefusal::Garbage),
+        ("t+120", LineRefusal::Garbage),
+        ("t1230 ", LineRefusal::Long),
+        ("t12301\u{7f}", LineRefusal::Garbage),
+        ("C\0", LineRefusal::Garbage),
+        ("t1230é", LineRefusal::Garbage),
     ] {
         assert_eq!(one(text), SlcanLine::Refused(refusal), "{text}");
     }
@@ -149,16 +149,16 @@ fn the_state_of_a_sender_behind_the_data_is_read() {
     assert_eq!(longest.len(), MAX_LINE);
     assert_eq!(one(&longest), SlcanLine::Frame(fd(EXTENDED | 1, BIT_RATE_SWITCH | ERROR_STATE, &[1; 64])));
     for (text, refusal) in [
-        ("t1232AABB2", Refusal::Long),
-        ("t1232AABB00", Refusal::Long),
-        ("t1232AABBs", Refusal::Long),
-        ("t1232AABBSS", Refusal::Long),
-        ("t1232AABB0S", Refusal::Long),
-        ("t1232AABBG000S", Refusal::Garbage),
-        ("t1232AABS", Refusal::Garbage),
+        ("t1232AABB2", LineRefusal::Long),
+        ("t1232AABB00", LineRefusal::Long),
+        ("t1232AABBs", LineRefusal::Long),
+        ("t1232AABBSS", LineRefusal::Long),
+        ("t1232AABB0S", LineRefusal::Long),
+        ("t1232AABBG000S", LineRefusal::Garbage),
+        ("t1232AABS", LineRefusal::Garbage),
         // The line ending between two lines is lost.
-        ("t1230d0010", Refusal::Long),
-        ("t1230b0012AAB0", Refusal::Long),
+        ("t1230d0010", LineRefusal::Long),
+        ("t1230b0012AAB0", LineRefusal::Long),
     ] {
         assert_eq!(one(text), SlcanLine::Refused(refusal), "{text}");
     }
@@ -168,7 +168,8 @@ fn the_state_of_a_sender_behind_the_data_is_read() {
 fn an_adapter_ends_all_frames_in_one_way_and_two_in_another_show_that_it_has_changed() {
     let frame = SlcanLine::Frame(Frame::classic(0x123, &[0x11]).unwrap());
     let [plain, ended] = [b"t123111\r", b"t1231110\r".as_slice()].map(|text| text.to_vec());
-    for (usual, other, refusal) in [(&plain, &ended, Refusal::Long), (&ended, &plain, Refusal::Short)] {
+    for (usual, other, refusal) in [(&plain, &ended, LineRefusal::Long), (&ended, &plain, LineRefusal::Short)]
+    {
         let mixed = [usual.repeat(15), other.clone(), usual.repeat(16)].concat();
         assert_eq!(lines(&mixed), [frame; 32], "nothing is sure yet");
         let bytes = [usual.repeat(16), other.clone(), usual.clone(), other.repeat(2), usual.clone()].concat();
@@ -220,13 +221,13 @@ fn faults_of_an_adapter_are_the_error_frames_of_the_kernels_driver() {
             continue;
         }
         let frame = Frame::classic(ERROR | class, &data).unwrap();
-        assert_eq!(reported(text).frame(before), Some(frame), "{text}");
+        assert_eq!(reported(text).error_frame(before), Some(frame), "{text}");
     }
     // A known state is not an event.
     for (text, before) in
         [("sb256256", Off), ("sp130000", Passive), ("F20", Passive), ("F00", Active), ("E20001000", Passive)]
     {
-        assert_eq!(reported(text).frame(before), None, "{text}");
+        assert_eq!(reported(text).error_frame(before), None, "{text}");
     }
     assert_eq!(reported("sp128007").counters(), Some(ErrorCounters { receive: 128, transmit: 7 }));
     assert_eq!(
@@ -357,8 +358,8 @@ fn what_was_refused_is_counted_by_reason() {
     let text = format!("t12\rt12\rt1239\rt9990\rt1230XX\rt1X3\r\x01\r{long}\rt12");
     let refused = text.bytes().filter_map(|byte| decoder.push(byte)).count();
     assert_eq!(refused, 8);
-    assert!(decoder.restart());
-    assert!(!decoder.restart());
+    assert!(decoder.discard_unfinished());
+    assert!(!decoder.discard_unfinished());
     let expected = RejectedLines { garbage: 2, long: 2, short: 3, dlc: 1, identifier: 1 };
     assert_eq!(decoder.refused(), expected);
     assert_eq!(expected.total(), 9);
@@ -367,8 +368,8 @@ fn what_was_refused_is_counted_by_reason() {
 #[test]
 fn the_longest_line_fits_and_one_byte_more_does_not() {
     assert_eq!(one(&"x".repeat(MAX_LINE)), SlcanLine::Other);
-    assert_eq!(one(&"x".repeat(MAX_LINE + 1)), SlcanLine::Refused(Refusal::Long));
-    assert_eq!(one(&"x".repeat(1_000_000)), SlcanLine::Refused(Refusal::Long));
+    assert_eq!(one(&"x".repeat(MAX_LINE + 1)), SlcanLine::Refused(LineRefusal::Long));
+    assert_eq!(one(&"x".repeat(1_000_000)), SlcanLine::Refused(LineRefusal::Long));
 }
 
 /// Generates frames that slcan can represent without loss.

@@ -6,12 +6,12 @@
 //! `every_frame` computes the table from all possible frames. The maxima in the table are one to four bits below the
 //! usual formula, which treats the CRC as free.
 
-use super::{Bits, CLASSIC_TAIL, fd_bits, stuffing};
+use super::{CLASSIC_TAIL_BITS, FrameBits, fd_bits, stuffing};
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_dlc, fd_len};
 
 /// The kind of a frame, as far as the number of bits depends on it.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
-pub enum Coding {
+pub enum FrameCoding {
     /// A classic data frame.
     Classic,
     /// A classic remote frame.
@@ -24,9 +24,9 @@ pub enum Coding {
 
 /// The kind and length of a frame, without the values of identifier and data.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
-pub struct Shape {
+pub struct FrameShape {
     /// The kind of frame.
-    pub coding: Coding,
+    pub coding: FrameCoding,
     /// True for a 29-bit identifier.
     pub extended: bool,
     /// Number of data bytes, at most 8 (FD: 64). Greater values are clamped, and FD lengths are rounded up to the next
@@ -34,55 +34,55 @@ pub struct Shape {
     pub len: u8,
 }
 
-impl Shape {
+impl FrameShape {
     /// Returns the shape of a frame.
     #[must_use]
     pub const fn from_frame(frame: &Frame) -> Self {
         let coding = match frame.format() {
-            Format::Classic if frame.is_remote() => Coding::Remote,
-            Format::Classic => Coding::Classic,
-            Format::Fd if frame.flags() & BIT_RATE_SWITCH != 0 => Coding::FdSwitched,
-            Format::Fd => Coding::Fd,
+            Format::Classic if frame.is_remote() => FrameCoding::Remote,
+            Format::Classic => FrameCoding::Classic,
+            Format::Fd if frame.flags() & BIT_RATE_SWITCH != 0 => FrameCoding::FdSwitched,
+            Format::Fd => FrameCoding::Fd,
         };
         Self { coding, extended: frame.is_extended(), len: frame.len() }
     }
 
     /// Returns the minimum number of bits of a frame of this shape.
     #[must_use]
-    pub fn min_bits(self) -> Bits {
-        self.bits(|range| range.0)
+    pub fn min_bits(self) -> FrameBits {
+        self.count_bits(|range| range.0)
     }
 
     /// Returns the maximum number of bits of a frame of this shape.
     #[must_use]
-    pub fn max_bits(self) -> Bits {
-        self.bits(|range| range.1)
+    pub fn max_bits(self) -> FrameBits {
+        self.count_bits(|range| range.1)
     }
 
-    fn bits(self, pick: fn(BitRange) -> u32) -> Bits {
+    fn count_bits(self, pick: fn(BitRange) -> u32) -> FrameBits {
         match self.coding {
-            Coding::Classic => self.classic(false, pick),
-            Coding::Remote => self.classic(true, pick),
-            Coding::Fd => self.fd(false, pick),
-            Coding::FdSwitched => self.fd(true, pick),
+            FrameCoding::Classic => self.classic_frame_bits(false, pick),
+            FrameCoding::Remote => self.classic_frame_bits(true, pick),
+            FrameCoding::Fd => self.fd_frame_bits(false, pick),
+            FrameCoding::FdSwitched => self.fd_frame_bits(true, pick),
         }
     }
 
-    fn classic(self, remote: bool, pick: fn(BitRange) -> u32) -> Bits {
+    fn classic_frame_bits(self, remote: bool, pick: fn(BitRange) -> u32) -> FrameBits {
         let table = match (remote, self.extended) {
-            (false, false) => &CLASSIC,
-            (false, true) => &CLASSIC_EXTENDED,
+            (false, false) => &CLASSIC_STUFF_BITS,
+            (false, true) => &CLASSIC_EXTENDED_STUFF_BITS,
             (true, false) => &REMOTE,
-            (true, true) => &REMOTE_EXTENDED,
+            (true, true) => &REMOTE_EXTENDED_STUFF_BITS,
         };
         let len = self.len.min(8);
         let stuffed = table.get(usize::from(len)).copied().unwrap_or_default();
         let head = if self.extended { 39 } else { 19 };
         let data = if remote { 0 } else { 8 * u32::from(len) };
-        Bits { nominal: head + data + 15 + pick(stuffed) + CLASSIC_TAIL, data: 0 }
+        FrameBits { nominal: head + data + 15 + pick(stuffed) + CLASSIC_TAIL_BITS, data: 0 }
     }
 
-    fn fd(self, switched: bool, pick: fn(BitRange) -> u32) -> Bits {
+    fn fd_frame_bits(self, switched: bool, pick: fn(BitRange) -> u32) -> FrameBits {
         let len = fd_len(usize::from(self.len));
         // RRS 0, IDE 0, or RRS 0 alone; then FDF 1, res 0, BRS.
         let fdf_res_brs = 0b100 | u64::from(switched);
@@ -109,14 +109,15 @@ impl Shape {
 type BitRange = (u32, u32);
 
 /// Ranges for classic data frames with 11-bit identifiers, by number of data bytes.
-const CLASSIC: [BitRange; 9] = [(1, 6), (1, 7), (1, 9), (1, 12), (0, 14), (0, 15), (0, 18), (0, 21), (0, 22)];
+const CLASSIC_STUFF_BITS: [BitRange; 9] =
+    [(1, 6), (1, 7), (1, 9), (1, 12), (0, 14), (0, 15), (0, 18), (0, 21), (0, 22)];
 /// Ranges for classic data frames with 29-bit identifiers, by number of data bytes.
-const CLASSIC_EXTENDED: [BitRange; 9] =
+const CLASSIC_EXTENDED_STUFF_BITS: [BitRange; 9] =
     [(1, 11), (1, 13), (1, 15), (1, 17), (0, 19), (0, 21), (0, 23), (0, 25), (0, 27)];
 /// Ranges for remote frames with 11-bit identifiers, by requested number of bytes.
 const REMOTE: [BitRange; 9] = [(1, 5), (1, 6), (0, 5), (0, 6), (0, 4), (0, 4), (0, 4), (0, 5), (0, 5)];
 /// Ranges for remote frames with 29-bit identifiers, by requested number of bytes.
-const REMOTE_EXTENDED: [BitRange; 9] =
+const REMOTE_EXTENDED_STUFF_BITS: [BitRange; 9] =
     [(1, 10), (1, 11), (0, 10), (0, 11), (0, 10), (0, 10), (0, 9), (0, 10), (0, 10)];
 
 /// For each state of stuffing, the minimum and maximum number of stuff bits in any sequence of bits that ends in it.
@@ -131,13 +132,13 @@ impl StuffBits {
     fn push_fixed(self, word: u64, count: u32) -> Self {
         (0..count).rev().fold(self, |ways, place| {
             let bit = (word >> place) & 1 == 1;
-            ways.step(!bit, bit)
+            ways.push_possible_bit(!bit, bit)
         })
     }
 
     /// Appends `count` bits that can have any value.
     fn push_any(self, count: u32) -> Self {
-        (0..count).fold(self, |ways, _| ways.step(true, true))
+        (0..count).fold(self, |ways, _| ways.push_possible_bit(true, true))
     }
 
     /// Keeps the reachable states but sets the numbers of stuff bits to 0.
@@ -150,11 +151,11 @@ impl StuffBits {
         self.0.into_iter().flatten().reduce(hull).unwrap_or((0, 0))
     }
 
-    fn step(self, zero: bool, one: bool) -> Self {
+    fn push_possible_bit(self, zero: bool, one: bool) -> Self {
         let mut then = [None; stuffing::STATES];
         for (state, range) in (0..).zip(self.0) {
             for (bit, _) in [(0, zero), (1, one)].into_iter().filter(|&(_, may)| may) {
-                let (next, more) = stuffing::next(state, bit);
+                let (next, more) = stuffing::next_state(state, bit);
                 let range = range.map(|(min, most)| (min + u32::from(more), most + u32::from(more)));
                 if let Some(slot) = then.get_mut(usize::from(next)) {
                     *slot = slot.map_or(range, |old| Some(range.map_or(old, |new| hull(old, new))));

@@ -24,8 +24,8 @@ pub enum BitRatesError {
     /// The nominal bit rate is out of range.
     #[error(
         "nominal bit rate {got} bit/s: CAN allows {} to {} (10k to 1M)",
-        BitRates::MIN_NOMINAL,
-        BitRates::MAX_NOMINAL
+        BitRates::MIN_NOMINAL_BIT_RATE,
+        BitRates::MAX_NOMINAL_BIT_RATE
     )]
     Nominal {
         /// The requested rate in bit/s.
@@ -34,7 +34,7 @@ pub enum BitRatesError {
     /// The data bit rate is out of range.
     #[error(
         "data bit rate {got} bit/s: CAN FD allows {min} (the nominal one) to {} (8M)",
-        BitRates::MAX_DATA
+        BitRates::MAX_DATA_BIT_RATE
     )]
     Data {
         /// The requested rate in bit/s.
@@ -46,11 +46,11 @@ pub enum BitRatesError {
 
 impl BitRates {
     /// The minimum nominal bit rate in bit/s, also for skin descriptions.
-    pub const MIN_NOMINAL: u32 = 10_000;
+    pub const MIN_NOMINAL_BIT_RATE: u32 = 10_000;
     /// The maximum nominal bit rate in bit/s.
-    pub const MAX_NOMINAL: u32 = 1_000_000;
+    pub const MAX_NOMINAL_BIT_RATE: u32 = 1_000_000;
     /// The maximum data bit rate in bit/s.
-    pub const MAX_DATA: u32 = 8_000_000;
+    pub const MAX_DATA_BIT_RATE: u32 = 8_000_000;
 
     /// Creates a pair of rates in bit/s.
     ///
@@ -58,10 +58,10 @@ impl BitRates {
     /// Returns an error if `nominal` is not in [10 000, 1 000 000], or `data` is not
     /// between `nominal` and 8 000 000.
     pub const fn new(nominal: u32, data: u32) -> Result<Self, BitRatesError> {
-        if nominal < Self::MIN_NOMINAL || nominal > Self::MAX_NOMINAL {
+        if nominal < Self::MIN_NOMINAL_BIT_RATE || nominal > Self::MAX_NOMINAL_BIT_RATE {
             return Err(BitRatesError::Nominal { got: nominal });
         }
-        if data < nominal || data > Self::MAX_DATA {
+        if data < nominal || data > Self::MAX_DATA_BIT_RATE {
             return Err(BitRatesError::Data { got: data, min: nominal });
         }
         Ok(Self { nominal, data })
@@ -77,13 +77,13 @@ impl BitRates {
 
     /// Returns the nominal rate in bit/s. Arbitration and frames without bit rate switch use it.
     #[must_use]
-    pub const fn nominal(self) -> u32 {
+    pub const fn nominal_rate(self) -> u32 {
         self.nominal
     }
 
     /// Returns the data rate in bit/s. The data phase of frames with bit rate switch uses it.
     #[must_use]
-    pub const fn data(self) -> u32 {
+    pub const fn data_rate(self) -> u32 {
         self.data
     }
 }

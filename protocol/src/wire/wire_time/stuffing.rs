@@ -10,35 +10,35 @@ pub(super) const STATES: usize = 8;
 /// Number of sequences of up to eight bits. A sequence is encoded with a leading one.
 const SEQUENCES: usize = 512;
 /// For each state and sequence, the next state in the lowest three bits and the number of stuff bits above them.
-static STEPS: [u8; STATES * SEQUENCES] = steps();
+static TRANSITIONS: [u8; STATES * SEQUENCES] = compute_transitions();
 
 /// The current run of equal bits, and the number of stuff bits so far.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Run {
+pub(super) struct BitRun {
     state: u8,
     /// Number of stuff bits so far.
     pub(super) stuffed: u32,
 }
 
-impl Run {
+impl BitRun {
     /// The state of the idle bus: recessive bits, before the dominant first bit of a frame.
     pub(super) const IDLE: Self = Self { state: 0b100, stuffed: 0 };
 
     /// Appends eight bits, most significant first.
     #[inline]
-    pub(super) fn byte(self, byte: u8) -> Self {
-        self.step(0x100 | usize::from(byte))
+    pub(super) fn push_byte(self, byte: u8) -> Self {
+        self.push_sequence(0x100 | usize::from(byte))
     }
 
     /// Appends the lowest `count` bits of a word, most significant first.
     #[inline]
-    pub(super) fn bits(mut self, word: u64, count: u32) -> Self {
+    pub(super) fn push_bits(mut self, word: u64, count: u32) -> Self {
         let mut left = count;
         while left > 0 {
             let some = if left.is_multiple_of(8) { 8 } else { left % 8 };
             left -= some;
             let bits = (word >> left) & ((1 << some) - 1);
-            self = self.step((1 << some) | usize::try_from(bits).unwrap_or(0));
+            self = self.push_sequence((1 << some) | usize::try_from(bits).unwrap_or(0));
         }
         self
     }
@@ -50,15 +50,15 @@ impl Run {
     }
 
     #[inline]
-    fn step(self, word: usize) -> Self {
-        let at = (usize::from(self.state) * SEQUENCES + word) % STEPS.len();
-        let step = STEPS.get(at).copied().unwrap_or(0);
+    fn push_sequence(self, word: usize) -> Self {
+        let at = (usize::from(self.state) * SEQUENCES + word) % TRANSITIONS.len();
+        let step = TRANSITIONS.get(at).copied().unwrap_or(0);
         Self { state: step & 7, stuffed: self.stuffed + u32::from(step >> 3) }
     }
 }
 
 /// Appends one bit. Returns the next state, and 1 if a stuff bit was inserted.
-pub(super) const fn next(state: u8, bit: u8) -> (u8, u8) {
+pub(super) const fn next_state(state: u8, bit: u8) -> (u8, u8) {
     let (same, run) = (state >> 2 == bit, state & 3);
     match (same, run) {
         (true, 3) => ((bit ^ 1) << 2, 1),
@@ -72,7 +72,7 @@ pub(super) const fn next(state: u8, bit: u8) -> (u8, u8) {
     clippy::cast_possible_truncation,
     reason = "worked out by the compiler, which would stop; a state has three bits"
 )]
-const fn steps() -> [u8; STATES * SEQUENCES] {
+const fn compute_transitions() -> [u8; STATES * SEQUENCES] {
     let mut steps = [0; STATES * SEQUENCES];
     let mut state = 0;
     while state < STATES {
@@ -82,7 +82,7 @@ const fn steps() -> [u8; STATES * SEQUENCES] {
             let mut left = word.ilog2();
             while left > 0 {
                 left -= 1;
-                let (then, more) = next(now, ((word >> left) & 1) as u8);
+                let (then, more) = next_state(now, ((word >> left) & 1) as u8);
                 now = then;
                 stuffed += more;
             }

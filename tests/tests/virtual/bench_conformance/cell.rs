@@ -310,7 +310,7 @@ impl TestBus for VirtualBus {
         self.now
     }
 
-    fn carries(&self, _: Format) -> bool {
+    fn supports_format(&self, _: Format) -> bool {
         true
     }
 

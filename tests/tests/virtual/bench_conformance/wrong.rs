@@ -6,7 +6,7 @@ use protocol::can::{Format, Frame};
 use protocol::fixed::Q1_14;
 use protocol::id::CellId;
 use protocol::message::{
-    Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+    Answer, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart,
 };
 use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembler, Reassembly, WORDS, Words};
 use protocol::parameters::{MAX_JOINTS, Parameter, Parameters};
@@ -24,7 +24,7 @@ pub(crate) struct Memory {
     pub(crate) joints: usize,
     pub(crate) last: Option<(Epoch, Joints)>,
     pub(crate) latched: SkinSensors,
-    pub(crate) pending: Vec<(AppliesFrom, SensorPage)>,
+    pub(crate) pending: Vec<(StimulusStart, SensorPage)>,
     pub(crate) staged: Parameters,
     pub(crate) commits: Vec<Parameters>,
     pub(crate) test_mode: bool,
@@ -61,7 +61,7 @@ impl Memory {
         let joints = self.last.map(|(_, joints)| joints).unwrap_or_default();
         let j: [Q1_14; MAX_JOINTS] = Wrench::new(parameters).jacobian(&joints.positions);
         let force = force(parameters, &self.latched);
-        let bits = 30 - parameters.torque_format.fraction();
+        let bits = 30 - parameters.torque_format.fraction_bits();
         let words = j.map(|j| {
             let word = word(i64::from(j.to_bits()) * force, bits);
             i16::from_le_bytes([word.to_le_bytes()[0], word.to_le_bytes()[1]])
@@ -84,7 +84,7 @@ impl Memory {
                 self.last = Some((epoch, joints));
                 let latched = &mut self.latched;
                 self.pending.retain(|(from, page)| {
-                    let waits = matches!(from, AppliesFrom::Epoch(first) if epoch.epochs_since(*first) < 0);
+                    let waits = matches!(from, StimulusStart::Epoch(first) if epoch.epochs_since(*first) < 0);
                     if let (false, SensorPage::Skin(skin)) = (waits, page) {
                         *latched = *skin;
                     }
@@ -97,8 +97,8 @@ impl Memory {
                 if to.addresses(cell) && self.test_mode && self.pending.len() < 8 =>
             {
                 let from = match (from, self.last) {
-                    (AppliesFrom::Epoch(first), Some((last, _))) if last.epochs_since(first) >= 0 => {
-                        AppliesFrom::Next
+                    (StimulusStart::Epoch(first), Some((last, _))) if last.epochs_since(first) >= 0 => {
+                        StimulusStart::Next
                     }
                     (from, _) => from,
                 };

@@ -15,7 +15,7 @@ use crate::embedded::client::Client;
 use crate::embedded::routing::ClientId;
 
 /// The maximum size of the send buffer for a client, in bytes. A client may request less.
-const BUFFER_MAX: usize = 64 << 20;
+const MAX_SEND_BUFFER_BYTES: usize = 64 << 20;
 
 /// The maximum number of clients accepted before frames are forwarded again.
 const MAX_ADMISSIONS: usize = 64;
@@ -24,12 +24,12 @@ impl Server {
     /// Accepts waiting clients, at most [`ADMISSIONS`].
     pub(super) fn accept(&mut self) {
         for _ in 0..MAX_ADMISSIONS {
-            match self.accepted() {
+            match self.accept_socket() {
                 Ok(socket) => self.admit(socket),
                 Err(Errno::INTR | Errno::CONNABORTED) => {}
                 Err(Errno::AGAIN) => return,
                 // The system reports the lack of a file descriptor even if no client waits.
-                Err(Errno::MFILE | Errno::NFILE) => match self.turn_away() {
+                Err(Errno::MFILE | Errno::NFILE) => match self.reject_client() {
                     Ok(()) => {}
                     Err(Errno::AGAIN) => return,
                     Err(_) => return self.pause(LISTENER),
@@ -39,18 +39,18 @@ impl Server {
         }
     }
 
-    fn accepted(&self) -> Result<OwnedFd, Errno> {
+    fn accept_socket(&self) -> Result<OwnedFd, Errno> {
         rustix::net::accept_with(&self.place.listener, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)
     }
 
     /// Accepts a client with the reserved file descriptor and disconnects it, because no other descriptor is free. If
     /// the client's hello has not arrived yet, the descriptor is in use until [`Server::part`] is called.
-    fn turn_away(&mut self) -> Result<(), Errno> {
+    fn reject_client(&mut self) -> Result<(), Errno> {
         drop(self.spare.take());
-        let accepted = self.accepted();
+        let accepted = self.accept_socket();
         if let Ok(socket) = accepted {
             self.post.totals.turned_away += 1;
-            let has_sent = hang_up(&socket);
+            let has_sent = close_connection(&socket);
             self.parting = (!has_sent).then_some(socket);
         } else {
             self.close_parting();
@@ -66,7 +66,7 @@ impl Server {
     /// Disconnects the client that uses the reserved file descriptor, and reserves the descriptor again.
     pub(super) fn close_parting(&mut self) {
         if let Some(socket) = self.parting.take() {
-            hang_up(&socket);
+            close_connection(&socket);
         }
         self.spare = self.post.epoll.try_clone().ok();
     }
@@ -76,7 +76,7 @@ impl Server {
         let data = EventData::new_u64(index as u64);
         if epoll::add(&self.post.epoll, &socket, data, EventFlags::IN).is_err() {
             self.post.totals.turned_away += 1;
-            hang_up(&socket);
+            close_connection(&socket);
             return;
         }
         let mut client = Client::new(ClientId(index), socket);
@@ -93,7 +93,7 @@ impl Server {
     }
 
     /// Reads the first datagram of a client, its hello, and sets the filters in it.
-    pub(super) fn greet(&mut self, id: ClientId) {
+    pub(super) fn receive_hello(&mut self, id: ClientId) {
         let Some(client) = self.client(id) else { return };
         let mut bytes = [0; MAX_HELLO_BYTES + 1];
         let hello = match rustix::net::recv(&client.socket, &mut bytes, RecvFlags::DONTWAIT) {
@@ -108,7 +108,8 @@ impl Server {
             self.post.totals.refused += 1;
             return self.remove_client(id);
         };
-        let target = usize::try_from(hello.buffer).unwrap_or(BUFFER_MAX).min(BUFFER_MAX);
+        let target =
+            usize::try_from(hello.buffer).unwrap_or(MAX_SEND_BUFFER_BYTES).min(MAX_SEND_BUFFER_BYTES);
         if sockopt::set_socket_send_buffer_size_force(&client.socket, target).is_err() {
             // If the size cannot be set, the client is told the size that the socket has.
             let _ = sockopt::set_socket_send_buffer_size(&client.socket, target);
@@ -116,7 +117,7 @@ impl Server {
         let granted = sockopt::socket_send_buffer_size(&client.socket).unwrap_or(0) as u64;
         client.greeted = true;
         client.fd = hello.fd;
-        if welcome(&client.socket, granted).is_err() {
+        if send_welcome(&client.socket, granted).is_err() {
             return self.remove_client(id);
         }
         self.post.totals.clients += 1;
@@ -126,14 +127,14 @@ impl Server {
 
 /// Closes a connection without an answer. Returns true if the client had sent something. That data is read first,
 /// because closing with unread data would cause a reset, which the client takes for the end of the server.
-fn hang_up(socket: &OwnedFd) -> bool {
+fn close_connection(socket: &OwnedFd) -> bool {
     let _ = shutdown(socket, Shutdown::Write);
     rustix::net::recv(socket, &mut [0; MAX_HELLO_BYTES + 1], RecvFlags::DONTWAIT).err() != Some(Errno::AGAIN)
 }
 
 /// Sends the answer to a client's hello. As the first datagram in the socket it always finds room, so only a lack of
 /// memory can prevent it.
-fn welcome(socket: &OwnedFd, granted: u64) -> io::Result<usize> {
+fn send_welcome(socket: &OwnedFd, granted: u64) -> io::Result<usize> {
     let answer = HelloReply::Welcome { granted }.encode();
     let mut tries = 0..10;
     loop {

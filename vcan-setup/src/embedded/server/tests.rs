@@ -9,7 +9,7 @@ use super::*;
 
 /// A source of datagrams that returns given errors before it receives from the socket.
 struct Faulty {
-    batch: Batch,
+    batch: ReceiveBatch,
     /// The result of each reception to come: an error, or `None` to receive.
     errors: VecDeque<Option<Errno>>,
     /// The error of all receptions after those in `errors`.
@@ -40,7 +40,7 @@ impl TestServer {
     fn new(errors: &[Option<Errno>], last: Option<Errno>) -> Self {
         let directory = TempDir::new().unwrap();
         let server = Server::bind_in(&directory.path().join("skinbus"), "vcan0").unwrap();
-        let faulty = Faulty { batch: Batch::new(), errors: errors.iter().copied().collect(), last };
+        let faulty = Faulty { batch: ReceiveBatch::new(), errors: errors.iter().copied().collect(), last };
         let (stop, stopped) = UnixStream::pair().unwrap();
         let thread = std::thread::spawn(move || server.run_with(stopped, faulty));
         Self { directory, stop, thread }

@@ -154,7 +154,7 @@ proptest! {
     fn a_plan_leads_to_what_is_requested_and_touches_nothing_else(
         world in any_world(), target in any_target(), set: bool,
     ) {
-        let Ok(plan) = up(&target, &world.here, set) else {
+        let Ok(plan) = plan_up(&target, &world.here, set) else {
             let harmless = |target: &InterfaceTarget| find(&world.here, &target.name)
                 .map_or_else(|| target.hardware().is_none(), |it| it.is_virtual() && it.ours);
             prop_assert!(!target.iter().all(harmless), "refused, and all could have been had");
@@ -171,16 +171,16 @@ proptest! {
                 && (before.is_virtual() && before.ours || hardware && set);
             prop_assert!(may_change || after.named(&before.name) == before, "{before:?}");
         }
-        prop_assert_eq!(up(&target, &after.here, set).unwrap().steps, []);
-        prop_assert_eq!(up(&target, &after.here, false).unwrap().steps, []);
+        prop_assert_eq!(plan_up(&target, &after.here, set).unwrap().steps, []);
+        prop_assert_eq!(plan_up(&target, &after.here, false).unwrap().steps, []);
     }
 
     #[test]
     fn down_takes_back_what_up_made(world in any_world(), target in any_target()) {
-        let Ok(plan) = up(&target, &world.here, false) else { return Ok(()) };
+        let Ok(plan) = plan_up(&target, &world.here, false) else { return Ok(()) };
         let after = world.carry_out_all(&plan);
         let made: Vec<_> = plan.steps.iter().map(|step| InterfaceTarget::named(&step.name)).collect();
-        let end = after.carry_out_all(&down(&made, &after.here).unwrap());
+        let end = after.carry_out_all(&plan_down(&made, &after.here).unwrap());
         let kept = |it: &&Interface| plan.steps.iter().all(|step| step.name != it.name);
         for before in world.here.iter().filter(kept) {
             let taken_along = before.peer().is_some_and(|peer| peer.namespace_id.is_none());
@@ -191,7 +191,7 @@ proptest! {
 
     #[test]
     fn down_removes_what_is_ours_and_only_that(world in any_world(), target in any_target()) {
-        let Ok(plan) = down(&target, &world.here) else {
+        let Ok(plan) = plan_down(&target, &world.here) else {
             let foreign = |target: &InterfaceTarget| find(&world.here, &target.name)
                 .is_some_and(|it| !it.ours || !it.is_virtual());
             prop_assert!(target.iter().any(|target| target.skin.is_none() && foreign(target)));
@@ -202,6 +202,6 @@ proptest! {
             let unchanged = find(&after.here, &target.name);
             prop_assert!(unchanged.is_none_or(|it| !it.ours || !it.is_virtual()), "{unchanged:?}");
         }
-        prop_assert_eq!(down(&target, &after.here).unwrap().steps, []);
+        prop_assert_eq!(plan_down(&target, &after.here).unwrap().steps, []);
     }
 }

@@ -12,7 +12,7 @@ use cortex_m::peripheral::NVIC;
 use nrf51_pac::generic::{Reg, RegisterSpec, Writable};
 use nrf51_pac::{self as pac, Interrupt, NVMC, TIMER0, UART0, WDT, interrupt};
 use protocol::can::Frame;
-use protocol::factory::Factory;
+use protocol::factory::FactoryRecord;
 use protocol::slcan::{Decoder, SlcanLine};
 use protocol::time::Micros;
 
@@ -72,13 +72,13 @@ impl SelectedBoard {
 impl Board for SelectedBoard {
     type Flash = Pages;
 
-    fn factory(&mut self) -> Option<Factory> {
+    fn factory(&mut self) -> Option<FactoryRecord> {
         let factory = factory()?;
         self.hosted = factory.hosted;
         Some(factory)
     }
 
-    fn open(&mut self, _: &Factory) {
+    fn open(&mut self, _: &FactoryRecord) {
         let uart = uart();
         write_register(&uart.pseltxd, TX);
         write_register(&uart.pselrxd, RX);

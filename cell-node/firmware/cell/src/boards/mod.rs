@@ -12,12 +12,12 @@ pub use stm32g4::SelectedBoard;
 
 use core::ptr::read_volatile;
 
-use protocol::factory::{BYTES, ERASED, Factory};
+use protocol::factory::{ERASED, FactoryRecord, RECORD_BYTES};
 
 /// The factory record, in a flash page of its own. The page is erased until the manufacturer writes it.
 #[used]
 #[unsafe(link_section = ".factory")]
-static FACTORY: [u8; BYTES] = ERASED;
+static FACTORY: [u8; RECORD_BYTES] = ERASED;
 
 unsafe extern "C" {
     /// The start of the pages for parameters; only its address is meaningful.
@@ -25,9 +25,9 @@ unsafe extern "C" {
 }
 
 /// Reads the factory record from flash. The volatile read keeps the compiler from using the initial value.
-fn factory() -> Option<Factory> {
+fn factory() -> Option<FactoryRecord> {
     // SAFETY: a static of this type, which is only read.
-    Factory::decode(&unsafe { read_volatile(&raw const FACTORY) })
+    FactoryRecord::decode(&unsafe { read_volatile(&raw const FACTORY) })
 }
 
 /// Returns the address of the first page for parameters.

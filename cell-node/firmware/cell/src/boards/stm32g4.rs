@@ -10,7 +10,7 @@ use core::ptr::{read_volatile, write_volatile};
 use cell_node::node::Node;
 use cortex_m::asm::wfi;
 use protocol::can::{self, EXTENDED, Format, Frame};
-use protocol::factory::Factory;
+use protocol::factory::FactoryRecord;
 use protocol::time::{Micros, Span};
 
 use super::{factory, store};
@@ -122,11 +122,11 @@ impl SelectedBoard {
 impl Board for SelectedBoard {
     type Flash = Pages;
 
-    fn factory(&mut self) -> Option<Factory> {
+    fn factory(&mut self) -> Option<FactoryRecord> {
         factory()
     }
 
-    fn open(&mut self, factory: &Factory) {
+    fn open(&mut self, factory: &FactoryRecord) {
         // PA11 and PA12: alternate function 9, high speed.
         change(GPIOA_AFRH, 0xFF << 12, 0x99 << 12);
         change(GPIOA_OSPEEDR, 0xF << 22, 0xA << 22);
@@ -153,7 +153,7 @@ impl Board for SelectedBoard {
         }
     }
 
-    fn filter(&mut self, node: &Node, factory: &Factory) {
+    fn filter(&mut self, node: &Node, factory: &FactoryRecord) {
         let wires =
             factory.link_ids.into_iter().flatten().map(|link_id| link_id.reversed().raw_id() & !EXTENDED);
         can1::filter(node.received_ids().map(|id| id.to_bits().into()), wires);

@@ -60,14 +60,14 @@ impl AxisFrame {
     }
 
     /// Returns the products needed to rotate x and y by a turn about z.
-    pub(super) fn turn(self) -> RotationProducts {
+    pub(super) fn turn_products(self) -> RotationProducts {
         let [x, y, _] = self.known;
         if self.base { RotationProducts::Base } else { RotationProducts::new(x, y) }
     }
 
     /// Returns the frame after a turn about z and a twist about the new x axis, and the products needed for the twist.
-    pub(super) fn after<N>(self, twist: Twist<N>) -> (Self, RotationProducts) {
-        let (x, v) = self.turn().axes();
+    pub(super) fn after_twist<N>(self, twist: Twist<N>) -> (Self, RotationProducts) {
+        let (x, v) = self.turn_products().axes();
         let z = self.z();
         let mix = RotationProducts::new(v, z);
         let (y, z) = match twist {
@@ -120,14 +120,14 @@ impl RotationProducts {
 
 /// The products needed to transform a vector from a frame to the base.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct ToBase {
-    pub(super) level: Level,
-    pub(super) height: Height,
+pub(super) struct BaseTransform {
+    pub(super) level: HorizontalTerms,
+    pub(super) height: VerticalTerms,
 }
 
 /// The axes that contribute to the first two components of the transformed vector.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Level {
+pub(super) enum HorizontalTerms {
     Xy,
     Xz,
     All,
@@ -135,7 +135,7 @@ pub(super) enum Level {
 
 /// The axes that contribute to the third component of the transformed vector.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Height {
+pub(super) enum VerticalTerms {
     /// The component is not needed.
     Nothing,
     /// Only the y axis, which is vertical, so no product is needed.
@@ -149,28 +149,28 @@ pub(super) enum Height {
     All,
 }
 
-impl ToBase {
+impl BaseTransform {
     /// Creates the transform from a frame with these known components. `upright` is true if the third component is not
     /// needed.
     pub(super) fn new(AxisFrame { known, .. }: AxisFrame, upright: bool) -> Self {
         let [_, y, z] = known;
         let level = if y.is_upright() {
-            Level::Xz
+            HorizontalTerms::Xz
         } else if z.is_upright() {
-            Level::Xy
+            HorizontalTerms::Xy
         } else {
-            Level::All
+            HorizontalTerms::All
         };
         let height = match known {
-            _ if upright => Height::Nothing,
-            [_, Axis::Up, _] => Height::Y,
-            [_, Axis::Down, _] => Height::MinusY,
-            [_, _, Axis::Up] => Height::Z,
-            [_, _, Axis::Down] => Height::MinusZ,
-            [Axis::Level, _, _] => Height::Yz,
-            [_, Axis::Level, _] => Height::Xz,
-            [_, _, Axis::Level] => Height::Xy,
-            _ => Height::All,
+            _ if upright => VerticalTerms::Nothing,
+            [_, Axis::Up, _] => VerticalTerms::Y,
+            [_, Axis::Down, _] => VerticalTerms::MinusY,
+            [_, _, Axis::Up] => VerticalTerms::Z,
+            [_, _, Axis::Down] => VerticalTerms::MinusZ,
+            [Axis::Level, _, _] => VerticalTerms::Yz,
+            [_, Axis::Level, _] => VerticalTerms::Xz,
+            [_, _, Axis::Level] => VerticalTerms::Xy,
+            _ => VerticalTerms::All,
         };
         Self { level, height }
     }
@@ -186,7 +186,7 @@ pub(super) struct Rotation<N>(pub(super) [N; 2]);
 impl<N: Number> Rotation<N> {
     /// Returns `c a + s b`, with cosine c and sine s.
     #[inline(always)]
-    pub(super) fn ahead(
+    pub(super) fn rotate_first(
         self,
         mix: RotationProducts,
         &[a0, a1, a2]: &Vector<N>,
@@ -206,7 +206,7 @@ impl<N: Number> Rotation<N> {
 
     /// Replaces a by `c a + s b`, and b by `c b - s a`, with cosine c and sine s.
     #[inline(always)]
-    pub(super) fn both(
+    pub(super) fn rotate_both(
         self,
         mix: RotationProducts,
         [a0, a1, a2]: &mut Vector<N>,
@@ -253,17 +253,17 @@ impl<N: Number> Rotation<N> {
 
     fn sum(self, a: N, b: N) -> N {
         let Self([sine, cosine]) = self;
-        N::bounded(N::bounded_plus(cosine.times(a), sine.times(b)))
+        N::round_bounded(N::bounded_plus(cosine.times(a), sine.times(b)))
     }
 
     fn difference(self, b: N, a: N) -> N {
         let Self([sine, cosine]) = self;
-        N::bounded(N::bounded_minus(cosine.times(b), sine.times(a)))
+        N::round_bounded(N::bounded_minus(cosine.times(b), sine.times(a)))
     }
 }
 
 fn product<N: Number>(factor: N, number: N) -> N {
-    N::bounded(factor.times(number))
+    N::round_bounded(factor.times(number))
 }
 
 /// Negates an axis.

@@ -13,7 +13,7 @@ use crate::kernel::Number;
 /// most that norm times itself; and no component of an axis exceeds 1 plus that norm. For 32 rows this is
 /// still below 1.1.
 pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links: &[ChainLink<N>]) -> bool {
-    let off = links.iter().fold(0, |off, _| further_off(further_off(off)));
+    let off = links.iter().fold(0, |off, _| error_after_rotation(error_after_rotation(off)));
     let axes = (1 << 14) + off;
     // Rounding adds less than one step to a vector, and so does this division.
     let along = |norm: u32| ((axes * norm) >> 14) + 2;
@@ -22,7 +22,9 @@ pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links
         return false;
     };
     for link in links {
-        let Some(length) = N::norm([N::word(link.a), N::word(link.d), N::zero()]) else { return false };
+        let Some(length) = N::norm([N::from_word(link.a), N::from_word(link.d), N::zero()]) else {
+            return false;
+        };
         reach += along(length);
         if !within(&reach) {
             return false;
@@ -34,7 +36,7 @@ pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links
 }
 
 /// Returns the bound of the axes' error after one more rotation, given the bound before it.
-fn further_off(off: u32) -> u32 {
+fn error_after_rotation(off: u32) -> u32 {
     off + (off >> 10) + 20
 }
 
@@ -44,7 +46,7 @@ mod tests {
     use protocol::fixed::Q1_14;
     use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
-    use crate::kernel::oracle::{Counted, Projection};
+    use crate::kernel::oracle::{CountingWord, Projection};
     use crate::kernel::{Kernel, Operations};
 
     /// Returns an arm with `rows` rows. Quarter turns and zeros are more frequent than by chance, and some rows are
@@ -78,7 +80,7 @@ mod tests {
             rows in prop_oneof![1..=7_usize, 1..=MAX_ROWS], words: [i16; 29], joints: [i16; MAX_JOINTS],
         ) {
             let joints = joints.map(Q1_14::from_bits);
-            let kernel = Projection::<Counted>::new(&arm(rows, &words));
+            let kernel = Projection::<CountingWord>::new(&arm(rows, &words));
             let held = Projection { bounded: false, ..kernel };
             prop_assert_eq!(
                 Operations::count(|| kernel.jacobian(&joints)),

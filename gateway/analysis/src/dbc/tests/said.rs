@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use protocol::fixed::{Q, Q1_14, Q3_12, Q7_8};
-use protocol::message::{Answer, AppliesFrom, Message, NetworkPage, Request, SensorPage, State};
+use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage, State, StimulusStart};
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
 
@@ -270,8 +270,8 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
             format!("configured_{from}")
         }
         Message::Stimulus { to, from, page } => {
-            said.put("epoch", if let AppliesFrom::Epoch(epoch) = from { epoch.0 } else { 0 });
-            said.put("from_next", u8::from(from == AppliesFrom::Next));
+            said.put("epoch", if let StimulusStart::Epoch(epoch) = from { epoch.0 } else { 0 });
+            said.put("from_next", u8::from(from == StimulusStart::Next));
             said.contact_state(page);
             format!("stimulus_{to}")
         }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
 use protocol::packet::Length;
 use protocol::parameters::Sensing;
-use protocol::wire_time::{Bits, Coding, Shape};
+use protocol::wire_time::{FrameBits, FrameCoding, FrameShape};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
@@ -79,7 +79,7 @@ struct Bench<'a> {
     case: &'a BusCase,
     data: Data,
     /// The content of the longest frame.
-    longest: Bits,
+    longest: FrameBits,
     dice: Pcg64Mcg,
     bus: BusModel,
     /// The frames that are to be sent, by time, each with the time from which its delay counts.
@@ -116,7 +116,7 @@ impl Bench<'_> {
             let tag = u64::try_from(self.on_the_way.len()).unwrap();
             self.on_the_way.push((sent, due, index + 1 == frames.len()));
             let bits = match self.data {
-                Data::Any | Data::Zeros => Bits::from_frame(frame).unwrap(),
+                Data::Any | Data::Zeros => FrameBits::from_frame(frame).unwrap(),
                 Data::Longest => self.longest,
             };
             let priority = Priority::from_frame(frame);
@@ -133,8 +133,10 @@ fn simulate(case: &BusCase, epochs: u64, seed: u64, how: (Computation, Heartbeat
         case,
         data,
         longest: match case.format {
-            Format::Fd => Shape { coding: Coding::FdSwitched, extended: false, len: 16 }.max_bits(),
-            Format::Classic => Shape { coding: Coding::Classic, extended: false, len: 8 }.max_bits(),
+            Format::Fd => FrameShape { coding: FrameCoding::FdSwitched, extended: false, len: 16 }.max_bits(),
+            Format::Classic => {
+                FrameShape { coding: FrameCoding::Classic, extended: false, len: 8 }.max_bits()
+            }
         },
         dice: Pcg64Mcg::seed_from_u64(seed),
         bus: BusModel::new(case.rates),
@@ -250,7 +252,7 @@ fn reached(case: &BusCase, data: &[Data], seeds: u64) -> f64 {
         assert!(longest.heartbeat_ns <= heartbeat_ns, "{longest:?} of {heartbeat_ns}, {seed}, {how:?}");
         slowest_ns = slowest_ns.max(longest.last_ns);
     }
-    slowest_ns as f64 / times.last_ns().unwrap() as f64
+    slowest_ns as f64 / times.last_answer_ns().unwrap() as f64
 }
 
 /// The content of torques and heartbeats as cells send them.

@@ -8,14 +8,14 @@ use protocol::packet::data_id;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
-use protocol::wire_time::Bits;
+use protocol::wire_time::FrameBits;
 
-use super::moments::Moments;
+use super::moments::BusProblems;
 use super::touched::TouchHistory;
 use crate::fit::rates::ChosenRates;
 use crate::report::thin::{BinnedSums, ThinnedLine};
-use model::central::Central;
-use model::table::{BusTotals, Replies, Table};
+use model::central::CentralComputation;
+use model::table::{BusTable, BusTotals, Replies};
 use trace::capture::LatchedFrame;
 
 /// Interval in µs at which timeouts of cells are checked, as in the gateway's receiver.
@@ -47,7 +47,7 @@ struct OpenEpoch {
 
 /// Series over time with one point for each epoch.
 #[derive(Debug, Default)]
-pub(super) struct Lines {
+pub(super) struct EpochSeries {
     pub(super) due: ThinnedLine,
     pub(super) in_time: ThinnedLine,
     pub(super) late: ThinnedLine,
@@ -96,20 +96,20 @@ pub(super) struct FrameState {
 #[derive(Debug)]
 pub(super) struct BusFigures {
     pub(super) name: String,
-    pub(super) table: Table,
+    pub(super) table: BusTable,
     /// The central computation for the cells of the bus.
-    central: Central,
+    central: CentralComputation,
     /// The last reported force in N of each cell that measures, by its index on the bus.
     measured: Vec<Option<f64>>,
     pub(super) touched: TouchHistory,
-    pub(super) moments: Moments,
+    pub(super) moments: BusProblems,
     /// Time in s and size in Nm of the largest error of the bus's torque.
     pub(super) largest_error: Option<(f64, f64)>,
     /// True if cells answer with sums.
     pub(super) sums: bool,
     pub(super) received: FrameState,
     open: Option<OpenEpoch>,
-    pub(super) lines: Lines,
+    pub(super) lines: EpochSeries,
     /// Reply times of each cell, by its index on the bus.
     pub(super) latency: Vec<Latency>,
     pub(super) frames: u64,
@@ -134,16 +134,16 @@ impl BusFigures {
         (rates, rates_from): (ChosenRates, Option<&'static str>),
         is_of_frames_only: bool,
     ) -> Self {
-        let mut table = Table::new(skin, bus);
+        let mut table = BusTable::new(skin, bus);
         table.set_comparing(true);
         let described = skin.buses.get(bus);
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
             latency: vec![Latency::default(); table.cells().len()],
             measured: vec![None; table.cells().len()],
-            central: Central::new(&skin.with_cells_of_bus(bus)),
+            central: CentralComputation::new(&skin.with_cells_of_bus(bus)),
             touched: TouchHistory::new(skin, bus),
-            moments: Moments::default(),
+            moments: BusProblems::default(),
             largest_error: None,
             table,
             sums: described.is_some_and(|bus| bus.reply != SkinReply::Torque),
@@ -154,9 +154,9 @@ impl BusFigures {
                 in_contact: None,
             },
             open: None,
-            lines: Lines {
+            lines: EpochSeries {
                 difference: vec![ThinnedLine::default(); skin.joints_on_bus(bus).len()],
-                ..Lines::default()
+                ..EpochSeries::default()
             },
             frames: 0,
             joints: None,
@@ -174,14 +174,14 @@ impl BusFigures {
     }
 
     /// Starts counting, after the packets from before the start.
-    pub(super) fn begin(&mut self) {
-        self.table.begin_accounts();
+    pub(super) fn begin_counting(&mut self) {
+        self.table.reset_counts();
         self.open =
             self.table.newest_joints().map(|(number, _, _)| OpenEpoch { number, ..OpenEpoch::default() });
     }
 
     /// Handles the next frame, `at` seconds after the start of the recording.
-    pub(super) fn frame(&mut self, at: f64, record: &Record<'_>) -> Option<FrameEffect> {
+    pub(super) fn receive_frame(&mut self, at: f64, record: &Record<'_>) -> Option<FrameEffect> {
         let now = Micros(record.time.nanos / 1_000);
         self.frames += 1;
         if now.0 >= self.received.last_timeout_check.0 + TIMEOUT_INTERVAL_US {
@@ -201,7 +201,7 @@ impl BusFigures {
             self.record_reply_time(now, message);
             self.record_measured_force(message);
         }
-        let seconds = Bits::from_frame(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
+        let seconds = FrameBits::from_frame(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
         self.load_of_all.add(at, seconds);
         let before = self.table.snapshot().sums;
         self.table.receive(now, own, &read, &mut |_| None);
@@ -222,7 +222,7 @@ impl BusFigures {
     }
 
     /// Adds the time that a frame takes on a real bus; zero for a frame that only a bench sends.
-    pub(super) fn add_real_load(&mut self, at: f64, bits: Option<Bits>) {
+    pub(super) fn add_real_load(&mut self, at: f64, bits: Option<FrameBits>) {
         self.load.add(at, bits.map_or(0.0, |bits| bits.seconds(self.rates.rates)));
     }
 
@@ -266,7 +266,7 @@ impl BusFigures {
         let mut in_contact = Some(0);
         let forces = sensors.map(|(place, (((sensors, _), cell), measured))| {
             let stimulated = sensors.map(|sensors| central.force(place, &sensors));
-            let force = stimulated.or_else(|| measured.filter(|_| cell.measures() == Some(true)));
+            let force = stimulated.or_else(|| measured.filter(|_| cell.is_measuring() == Some(true)));
             let is_known = !cell.is_ready() || force.is_some() && !cell.has_unseen_stimuli();
             let is_pressed = force.is_some_and(|force| force > 0.0);
             in_contact = in_contact.filter(|_| is_known).map(|count| count + u32::from(is_pressed));
@@ -277,12 +277,12 @@ impl BusFigures {
     }
 
     /// Returns the counts of due and received replies over all epochs.
-    pub(super) fn account(&self) -> Replies {
+    pub(super) fn reply_counts(&self) -> Replies {
         self.table.replies()
     }
 
     /// Returns the number and the sum in Nm of the torque errors so far.
-    fn errors(&self) -> (u64, f64) {
+    fn torque_errors(&self) -> (u64, f64) {
         let accuracy = self.table.accuracy();
         let errors = if self.sums { accuracy.sums } else { accuracy.whole };
         (errors.count(), errors.mean().unwrap_or(0.0) * errors.count() as f64)
@@ -301,7 +301,7 @@ impl BusFigures {
     /// Ends the epoch. Returns the number of replies that were due in it, and the counts of replies and errors after
     /// it.
     fn close_epoch(&mut self) -> (u64, Replies, (u64, f64)) {
-        let (account, errors) = (self.account(), self.errors());
+        let (account, errors) = (self.reply_counts(), self.torque_errors());
         let Some(OpenEpoch { at, due, before, errors: errors_before, lost, slowest, .. }) = self.open.take()
         else {
             return (account.due, account, errors);
@@ -317,7 +317,7 @@ impl BusFigures {
         lines.missing.push(at, account.missing.saturating_sub(before.missing) as f64);
         lines.slowest.push(at, slowest.map_or(f64::NAN, |took| took as f64 * 1e-3));
         lines.error.push(at, if compared > 0 { error } else { f64::NAN });
-        let difference = self.table.difference();
+        let difference = self.table.torque_difference();
         for error in difference.iter().flatten().map(|error| error.abs()) {
             if error > self.largest_error.map_or(0.0, |(_, farthest)| farthest) {
                 self.largest_error = Some((at, error));

@@ -8,7 +8,7 @@
 //! ```
 //!
 //! A recording contains the frames, but no counts of replies, losses and errors. The frames pass through the same
-//! [`Table`](model::table::Table) as in the gateway, and so give the same accounts. The load of a real bus is that of
+//! [`BusTable`](model::table::BusTable) as in the gateway, and so give the same accounts. The load of a real bus is that of
 //! `skinbus fit` for the same recording.
 
 mod bus_figures;
@@ -31,8 +31,8 @@ use bus_figures::BusFigures;
 use frames_only::FramesOnly;
 use motion::TickSeries;
 use trace::capture::{
-    CaptureError, CaptureFormat, Entry, Item, Note, NoteKind, OtherMessage, Reader, RecordingExtras,
-    SKIN_ATTACHMENT, seconds_since,
+    CaptureEntry, CaptureError, CaptureFormat, CaptureNote, NoteKind, OtherMessage, Reader, RecordingExtras,
+    RecordingItem, SKIN_ATTACHMENT, seconds_since,
 };
 use trace::recording::layout::Layout;
 use trace::ros2::read;
@@ -134,7 +134,7 @@ pub struct ReportOptions {
 impl ReportOptions {
     /// Returns where the bit rates of a bus come from: the names of the options, or the key in the skin; `None` for
     /// defaults.
-    fn origin(&self, bus: &SkinBus) -> Option<&'static str> {
+    fn rates_origin(&self, bus: &SkinBus) -> Option<&'static str> {
         match (self.nominal, self.data, bus.bitrate) {
             (Some(_), Some(_), _) => Some("--nominal, --data"),
             (Some(_), None, _) => Some("--nominal"),
@@ -158,7 +158,7 @@ impl ReportOptions {
 /// the bit rates.
 pub fn report(paths: &[PathBuf], options: &ReportOptions) -> Result<RunReport, ReportError> {
     let (run, broken, is_damaged) = read(paths, options)?;
-    let missing = broken.map(|why| run.missing(&why));
+    let missing = broken.map(|why| run.early_end_sentence(&why));
     let page = page::page(&run, &options.command, missing.as_deref());
     let lacking = run.frames_only.as_ref().map(|it| format!("not in {}: {}", it.noun, run.missing_parts()));
     let remarks = lacking.into_iter().chain(run.remarks).collect();
@@ -204,13 +204,13 @@ fn read(paths: &[PathBuf], options: &ReportOptions) -> Result<(RunData, Option<S
     let (mut items, bytes) = open(paths, options)?;
     let name = items.name().to_owned();
     // The header is known once the file is open, unless the file is damaged; then the damage is the reason.
-    let begun = RunData::begin(&name, bytes.unwrap_or(0), (items.format(), items.extras()), options);
+    let begun = RunData::from_extras(&name, bytes.unwrap_or(0), (items.format(), items.extras()), options);
     while begun.is_err() && items.extras().skin().is_none() && items.next_item()?.is_some() {}
     let mut run = begun?;
     run.files = paths.iter().map(|path| path.display().to_string()).collect();
     let damaged = loop {
         match items.next_item() {
-            Ok(Some(item)) => run.take(&item),
+            Ok(Some(item)) => run.receive_item(&item),
             Ok(None) => break None,
             Err(error) => break Some(error),
         }
@@ -288,7 +288,7 @@ struct RunData {
 }
 
 impl RunData {
-    fn begin(
+    fn from_extras(
         name: &str,
         bytes: u64,
         (format, extras): (CaptureFormat, &RecordingExtras),
@@ -316,7 +316,7 @@ impl RunData {
         let layout = Layout::new(&skin);
         let buses = skin.buses.iter().enumerate();
         let bus_figures = buses.map(|(at, bus)| {
-            let rates = (options.rates(bus)?, options.origin(bus));
+            let rates = (options.rates(bus)?, options.rates_origin(bus));
             Ok(BusFigures::new(&skin, at, rates, frames_only.is_some()))
         });
         let mut bus_figures = bus_figures.collect::<Result<Vec<_>, ReportError>>()?;
@@ -327,7 +327,7 @@ impl RunData {
                 bus_figures.receive_latched(before);
             }
         }
-        bus_figures.iter_mut().for_each(BusFigures::begin);
+        bus_figures.iter_mut().for_each(BusFigures::begin_counting);
         Ok(Self {
             topics: ["joint_states", "torques"].map(|topic| format!("/{}/{topic}", layout.arm)),
             motion: TickSeries::new(layout.joints.len()),
@@ -350,16 +350,16 @@ impl RunData {
         })
     }
 
-    fn take(&mut self, item: &Item<'_>) {
+    fn receive_item(&mut self, item: &RecordingItem<'_>) {
         match item {
-            Item::Entry(Entry::Frame(record)) => {
+            RecordingItem::Entry(CaptureEntry::Frame(record)) => {
                 let at = self.seconds(record.time.nanos);
                 let zero = self.run_began.map_or(at, |nanos| self.seconds(nanos));
                 self.zero.get_or_insert(zero);
                 let bus = self.skin.bus_named(record.interface);
                 match bus.and_then(|bus| Some((bus, self.bus_figures.get_mut(bus)?))) {
                     Some((bus, bus_figures)) => {
-                        let effect = bus_figures.frame(at, record);
+                        let effect = bus_figures.receive_frame(at, record);
                         if let Some(frames_only) = &mut self.frames_only {
                             frames_only.began.get_or_insert(record.time.nanos);
                             let so_far = (&self.skin, self.bus_figures.as_slice());
@@ -374,14 +374,14 @@ impl RunData {
                     }
                 }
             }
-            Item::Entry(Entry::Note(note)) => self.note(note),
+            RecordingItem::Entry(CaptureEntry::Note(note)) => self.receive_note(note),
             // Without its skin, these are not read, and are reported as missing.
-            Item::Other(other) if self.frames_only.is_none() => self.message(other),
-            Item::Other(_) => {}
+            RecordingItem::Other(other) if self.frames_only.is_none() => self.receive_message(other),
+            RecordingItem::Other(_) => {}
         }
     }
 
-    fn note(&mut self, note: &Note<'_>) {
+    fn receive_note(&mut self, note: &CaptureNote<'_>) {
         match note.kind {
             NoteKind::Dropped(frames) => {
                 match self.skin.bus_named(note.interface).and_then(|bus| self.bus_figures.get_mut(bus)) {
@@ -394,15 +394,15 @@ impl RunData {
         }
     }
 
-    fn message(&mut self, other: &OtherMessage<'_>) {
+    fn receive_message(&mut self, other: &OtherMessage<'_>) {
         let at = self.seconds(other.nanos);
         let [states, torques] = &self.topics;
         let taken = if other.topic == states {
-            read::joints(other.message).map(|joints| self.motion.joints(at, &joints))
+            read::joints(other.message).map(|joints| self.motion.record_joints(at, &joints))
         } else if other.topic == torques {
-            read::torques(other.message).map(|torques| self.motion.torques(at, &torques))
+            read::torques(other.message).map(|torques| self.motion.record_torques(at, &torques))
         } else if other.topic == "/gateway/timing" {
-            read::timing(other.message).map(|timing| self.motion.timing(at, &timing))
+            read::timing(other.message).map(|timing| self.motion.record_timing(at, &timing))
         } else {
             Ok(())
         };
@@ -479,7 +479,7 @@ impl RunData {
     }
 
     /// Returns a sentence about a recording that ends early; `why` is the reason.
-    fn missing(&self, why: &str) -> String {
+    fn early_end_sentence(&self, why: &str) -> String {
         let here = self.motion.seconds();
         let planned = self.fact("configuration", "duration_s").and_then(|text| text.parse::<f64>().ok());
         let lacks = planned.filter(|planned| *planned > here).map_or_else(String::new, |planned| {

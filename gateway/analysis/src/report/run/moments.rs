@@ -8,7 +8,7 @@ use model::tracker::MAX_LATE_EPOCHS;
 /// Maximum time in s between losses that are listed as one.
 const MAX_LOSS_GAP_S: f64 = 0.5;
 /// Maximum number of losses, and of notices, that are kept.
-const MAX_KEPT: usize = 500;
+const MAX_KEPT_ENTRIES: usize = 500;
 
 /// Late, missing or lost items within a short time, listed as one loss.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -29,7 +29,7 @@ impl Loss {
 
 /// The losses and notices of one bus.
 #[derive(Debug, Default)]
-pub(super) struct Moments {
+pub(super) struct BusProblems {
     /// Start times of the most recent epochs, newest first.
     opened: VecDeque<f64>,
     pub(super) losses: Vec<Loss>,
@@ -38,7 +38,7 @@ pub(super) struct Moments {
     pub(super) further: u64,
 }
 
-impl Moments {
+impl BusProblems {
     /// Records the end of an epoch that began at `at`. The counts of replies before and after it show how many became
     /// late or missing, and `packets` is the number of packets found lost.
     pub(super) fn record_epoch(&mut self, at: f64, before: &Replies, now: &Replies, packets: u64) {
@@ -52,7 +52,7 @@ impl Moments {
         // A reply is late for one of the previous epochs, and missing once it can no longer arrive.
         let behind = if missing > 0 { MAX_LATE_EPOCHS } else { usize::from(late > 0) };
         let from = self.opened.get(behind).or_else(|| self.opened.back()).copied().unwrap_or(at);
-        let is_full = self.losses.len() >= MAX_KEPT;
+        let is_full = self.losses.len() >= MAX_KEPT_ENTRIES;
         match self.losses.last_mut() {
             Some(last) if from - last.seconds.1 <= MAX_LOSS_GAP_S => {
                 last.seconds.1 = at.max(last.seconds.1);
@@ -67,7 +67,7 @@ impl Moments {
 
     /// Records a notice of the bus's table, such as a silent cell.
     pub(super) fn record_notice(&mut self, at: f64, notice: Notice) {
-        if self.notices.len() < MAX_KEPT {
+        if self.notices.len() < MAX_KEPT_ENTRIES {
             self.notices.push((at, notice));
         } else {
             self.further += 1;
@@ -86,7 +86,7 @@ mod tests {
 
     #[test]
     fn losses_that_follow_each_other_are_one_and_begin_with_the_epoch_that_lacks_something() {
-        let mut moments = Moments::default();
+        let mut moments = BusProblems::default();
         let mut before = Replies::default();
         for epoch in 0..200_u32 {
             let mut now = before;

@@ -1,7 +1,7 @@
 //! Series from the ticks of a recording: joints, torques, the loop's timing.
 
 use crate::report::thin::ThinnedLine;
-use model::quantiles::Times;
+use model::quantiles::TimeHistogram;
 use trace::ros2::read::{Joints, Torques};
 use trace::ros2::skin::LoopTiming;
 
@@ -21,7 +21,7 @@ pub(super) struct TickSeries {
     pub(super) took: TickDurations,
     pub(super) central_took: TickDurations,
     /// Durations of ticks without a central computation.
-    pub(super) plain: Times,
+    pub(super) plain: TimeHistogram,
     pub(super) counts: TickCounts,
     /// Sum of active cells over all ticks with a central computation, and the number of these ticks.
     pub(super) active_sum: (u64, u64),
@@ -53,7 +53,7 @@ pub(super) struct TickCounts {
 #[derive(Debug, Default)]
 pub(super) struct TickDurations {
     pub(super) line: ThinnedLine,
-    pub(super) times: Times,
+    pub(super) times: TimeHistogram,
 }
 
 impl TickDurations {
@@ -69,12 +69,12 @@ impl TickSeries {
         Self { position: each(), velocity: each(), distributed: each(), central: each(), ..Self::default() }
     }
 
-    pub(super) fn joints(&mut self, at: f64, joints: &Joints) {
+    pub(super) fn record_joints(&mut self, at: f64, joints: &Joints) {
         push(&mut self.position, at, joints.position.iter().copied());
         push(&mut self.velocity, at, joints.velocity.iter().copied());
     }
 
-    pub(super) fn torques(&mut self, at: f64, torques: &Torques) {
+    pub(super) fn record_torques(&mut self, at: f64, torques: &Torques) {
         push(&mut self.distributed, at, torques.distributed.iter().copied());
         // Without a central computation, the line has a gap.
         push(&mut self.central, at, torques.central.iter().copied().chain(std::iter::repeat(f64::NAN)));
@@ -92,7 +92,7 @@ impl TickSeries {
         self.comparing = Some(compared);
     }
 
-    pub(super) fn timing(&mut self, at: f64, timing: &LoopTiming) {
+    pub(super) fn record_timing(&mut self, at: f64, timing: &LoopTiming) {
         self.first.get_or_insert(at);
         self.last = self.last.max(at);
         self.counts.record(timing, self.number.replace(timing.tick));
@@ -162,7 +162,7 @@ mod tests {
     fn numbers_of_ticks_that_cannot_be_are_counted_as_far_as_a_count_goes() {
         let mut motion = TickSeries::new(1);
         for tick in [u64::MAX - 1, 0, u64::MAX] {
-            motion.timing(0.0, &LoopTiming { tick, skipped: u64::MAX, ..LoopTiming::default() });
+            motion.record_timing(0.0, &LoopTiming { tick, skipped: u64::MAX, ..LoopTiming::default() });
         }
         assert_eq!((motion.counts.ticks, motion.counts.skipped), (3, u64::MAX));
     }

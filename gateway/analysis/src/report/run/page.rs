@@ -12,7 +12,9 @@ use super::bus_figures::BusFigures;
 use super::frames_only::FramesOnly;
 use super::moments::Loss;
 use crate::paper;
-use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, Shape, number, quantity};
+use crate::report::figure::{
+    Axis, Figure, Finding, MarkLine, Page, Section, Series, Shape, number, quantity,
+};
 use crate::report::thin::ThinnedLine;
 use model::table::{Accuracy, CellState, Uplink};
 
@@ -55,9 +57,9 @@ pub(super) fn page(run: &RunData, command: &str, missing: Option<&str>) -> Page 
 fn intro_of_run(run: &RunData) -> String {
     format!(
         "A run of {} on {} and {} of its {} control loop, from the recording {}. Times count from the first tick.",
-        cells_of(run),
+        skin_size_text(run),
         count_text(run.skin.buses.len(), "bus", "buses"),
-        hundredths(run.motion.seconds()),
+        format_seconds(run.motion.seconds()),
         quantity(run.skin.timing.control_hz, "Hz"),
         run.name,
     )
@@ -67,9 +69,9 @@ fn intro_of_frames(run: &RunData, frames_only: &FramesOnly) -> String {
     let remarks: String = run.remarks.iter().map(|remark| format!(" {remark}.")).collect();
     format!(
         "Frames of {} on {} during {}, from the {} {}. Times count from the first joints. Not in {}: {}.{remarks}",
-        cells_of(run),
+        skin_size_text(run),
         count_text(run.skin.buses.len(), "bus", "buses"),
-        hundredths(run.motion.seconds()),
+        format_seconds(run.motion.seconds()),
         frames_only.format,
         run.name,
         frames_only.noun,
@@ -77,11 +79,11 @@ fn intro_of_frames(run: &RunData, frames_only: &FramesOnly) -> String {
     )
 }
 
-fn cells_of(run: &RunData) -> String {
+fn skin_size_text(run: &RunData) -> String {
     format!("{} with {} cells", run.skin.name, run.skin.cells.len())
 }
 
-fn hundredths(seconds: f64) -> String {
+fn format_seconds(seconds: f64) -> String {
     quantity((seconds * 100.0).round() / 100.0, "s")
 }
 
@@ -105,8 +107,8 @@ impl PageDraft<'_> {
         if seconds > 0.0 { axis.with_ends(0.0, seconds) } else { axis }
     }
 
-    fn marks(&self) -> Vec<Mark> {
-        self.run.motion.changes.iter().map(|&(at, what)| Mark::x(at - self.zero, what)).collect()
+    fn marks(&self) -> Vec<MarkLine> {
+        self.run.motion.changes.iter().map(|&(at, what)| MarkLine::at_x(at - self.zero, what)).collect()
     }
 
     fn bus_caption(&self, bus_figures: &BusFigures) -> String {
@@ -122,15 +124,15 @@ impl PageDraft<'_> {
             .bus_figures
             .iter()
             .map(|bus_figures| bus_figures.table.accuracy())
-            .reduce(Accuracy::with);
+            .reduce(Accuracy::merged);
         let accuracy = accuracy.unwrap_or_default();
         let farthest = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.largest_error);
         let farthest =
             farthest.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(at, _)| self.view_command(at));
         for (what, theirs, errors, is_whole) in [
-            ("torques of single cells, loaded joints", paper::SINGLE_NM, accuracy.single, false),
-            ("the whole skin's torque, all joints", paper::SUMMED_NM, accuracy.whole, true),
-            ("sums along the tree, loaded joints", paper::SUMMED_NM, accuracy.sums, true),
+            ("torques of single cells, loaded joints", paper::SINGLE_CELL_ERROR_NM, accuracy.single, false),
+            ("the whole skin's torque, all joints", paper::SUMMED_ERROR_NM, accuracy.whole, true),
+            ("sums along the tree, loaded joints", paper::SUMMED_ERROR_NM, accuracy.sums, true),
         ] {
             let finding = |mean| {
                 let what = format!("{what}: mean absolute error");
@@ -153,18 +155,19 @@ impl PageDraft<'_> {
             );
             findings.push(Finding::less_is_better(what, law, (median, "µs")));
         }
-        findings.push(Finding::stated("cells", skin.cells.len() as f64).with_paper_value(PAPER_CELLS));
+        findings.push(Finding::new_unrated("cells", skin.cells.len() as f64).with_paper_value(PAPER_CELLS));
         if motion.seconds() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
             if motion.counts.ticks > 0 {
                 let ticks = motion.counts.ticks.saturating_add(motion.counts.unrecorded);
                 let loop_hz = hertz(ticks, motion.seconds());
-                findings.push(Finding::stated("control loop", loop_hz).with_paper_value(PAPER_CONTROL_HZ));
+                findings
+                    .push(Finding::new_unrated("control loop", loop_hz).with_paper_value(PAPER_CONTROL_HZ));
             }
             let joints = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.joints);
             let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
             if let Some((first, last, count)) = most {
-                let finding = Finding::stated("joints", hertz(count, last - first));
+                let finding = Finding::new_unrated("joints", hertz(count, last - first));
                 findings.push(finding.with_paper_value(PAPER_BROADCAST_HZ));
             }
             if motion.counts.ticks > 0 {
@@ -172,14 +175,14 @@ impl PageDraft<'_> {
                 findings.push(skipped.with_command(motion.skip.map(|(at, _)| self.view_command(at))));
             }
         }
-        let accounts = self.run.bus_figures.iter().map(BusFigures::account);
+        let accounts = self.run.bus_figures.iter().map(BusFigures::reply_counts);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
             let what = format!("replies not received before the next joints, of {due} due");
             let period = 1.0 / skin.timing.broadcast_hz();
             let bar = format!("none after {}", quantity(period, "s"));
             let late = due - in_time;
-            let finding = Finding::stated(what, late as f64).with_requirement(bar, late == 0);
+            let finding = Finding::new_unrated(what, late as f64).with_requirement(bar, late == 0);
             let worst = self.worst_loss(|loss| loss.late + loss.missing);
             findings.push(finding.with_origin("skin: joint_broadcast_hz").with_command(worst));
         }
@@ -188,7 +191,7 @@ impl PageDraft<'_> {
         let uplink: Uplink = self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
         let lost = zero_required("packets of cells lost, by their own count".to_owned(), uplink.lost);
         findings.push(lost.with_command(self.worst_loss(|loss| loss.packets)));
-        findings.extend(self.stuck());
+        findings.extend(self.stuck_cells_finding());
         Section::new("summary", "In numbers").findings(findings).text(
             "Compared with the paper (Efficient Distributed Torque Computation for Large Scale Robot Skin). Numbers within \
              5 % of the paper's count as the same. The commands show the recording where a number is worst.",
@@ -196,7 +199,7 @@ impl PageDraft<'_> {
     }
 
     /// Returns the finding of cells that sent constant words while the expected words changed; `None` without any.
-    fn stuck(&self) -> Option<Finding> {
+    fn stuck_cells_finding(&self) -> Option<Finding> {
         let cells = self.run.bus_figures.iter().flat_map(|bus_figures| {
             let name = |cell: &CellState| {
                 let kinds: Vec<_> =
@@ -237,7 +240,7 @@ fn without_empty_series(mut figure: Figure) -> Option<Figure> {
 
 /// Creates a finding whose count must be zero.
 fn zero_required(what: String, count: u64) -> Finding {
-    Finding::stated(what, count as f64).with_requirement("none", count == 0).with_origin("default")
+    Finding::new_unrated(what, count as f64).with_requirement("none", count == 0).with_origin("default")
 }
 
 fn count_text(count: usize, one: &str, more: &str) -> String {

@@ -4,15 +4,15 @@ use std::fmt::Write as _;
 
 use protocol::xml::escaped;
 
-use super::super::figure::{Axis, Drawing, FigureWidth, Legend, Map, Panel, Strip, quantity};
+use super::super::figure::{Axis, CellMap, CellStrip, Drawing, FigureWidth, Legend, Panel, quantity};
 use super::super::scale::AxisSpan;
-use super::colour::{LEVELS, TRACK, colours, level};
+use super::colour::{BACKGROUND_COLOURS, LEVEL_COUNT, colours, level};
 use super::{FAINT, INK, LETTER_SIZE, dark_rules, natural_size};
 
 /// Mean width of a letter, in pixels.
 const LETTER_WIDTH: f64 = 0.56 * LETTER_SIZE;
 /// Margin of a drawing, in pixels.
-const MARGIN: f64 = 12.0;
+const MARGIN_PX: f64 = 12.0;
 /// Height of the legend with the space below it, in pixels.
 const LEGEND_HEIGHT: f64 = 52.0;
 /// Height of the heading of a panel or group, in pixels.
@@ -20,7 +20,7 @@ const HEADING_HEIGHT: f64 = 24.0;
 /// Maximum distance between the centres of adjacent cells, in pixels.
 const MAX_PITCH: f64 = 18.0;
 /// Overlap of adjacent areas in pixels, so that no seams are visible.
-const SEAM: f64 = 0.3;
+const SEAM_OVERLAP_PX: f64 = 0.3;
 /// Distance between cells in m that is assumed for a link with a single cell.
 const SINGLE_CELL_PITCH_M: f64 = 0.028;
 
@@ -37,7 +37,7 @@ pub fn draw(drawing: &Drawing) -> String {
 /// Draws cells as an element of a page that contains the CSS rules of [`dark_rules`](super::dark_rules); `width` is the width in pixels before
 /// scaling.
 #[must_use]
-pub fn inline(drawing: &Drawing, width: u32, class: &str) -> String {
+pub fn draw_inline(drawing: &Drawing, width: u32, class: &str) -> String {
     let (height, body) = body(drawing, width.into());
     document(drawing, (width.into(), height), &format!("class=\"{class}\""), &body)
 }
@@ -54,8 +54,8 @@ fn document(drawing: &Drawing, (width, height): (f64, f64), attributes: &str, bo
 fn body(drawing: &Drawing, width: f64) -> (f64, String) {
     let mut out = String::new();
     let height = match drawing {
-        Drawing::Strip(strip) => strip_of(&mut out, strip, width),
-        Drawing::Map(map) => map_of(&mut out, map, width),
+        Drawing::Strip(strip) => write_strip(&mut out, strip, width),
+        Drawing::Map(map) => write_map(&mut out, map, width),
     };
     (height.ceil(), out)
 }
@@ -83,7 +83,7 @@ fn write_text(out: &mut String, (x, y): (f64, f64), anchor: Anchor, is_faint: bo
     );
 }
 
-fn line(out: &mut String, path: &str) {
+fn write_line(out: &mut String, path: &str) {
     let (r, g, b) = (FAINT.0, FAINT.1, FAINT.2);
     let _ = writeln!(
         out,
@@ -91,16 +91,16 @@ fn line(out: &mut String, path: &str) {
     );
 }
 
-fn track(out: &mut String, path: &str) {
-    let [paper, _] = TRACK;
+fn write_background(out: &mut String, path: &str) {
+    let [paper, _] = BACKGROUND_COLOURS;
     let _ = writeln!(out, "<path class=\"track\" fill=\"{paper}\" d=\"{path}\"/>");
 }
 
 /// Areas to fill, by level of colour; the areas of a level become one SVG element.
 #[derive(Default)]
-struct Levels([String; LEVELS]);
+struct LevelPaths([String; LEVEL_COUNT]);
 
-impl Levels {
+impl LevelPaths {
     fn path_of_value(&mut self, value: f64, max: f64) -> Option<&mut String> {
         self.0.get_mut(level(value, max))
     }
@@ -113,21 +113,22 @@ impl Levels {
     }
 }
 
-fn rectangle(path: &mut String, (x, y): (f64, f64), (width, height): (f64, f64)) {
+fn add_rectangle(path: &mut String, (x, y): (f64, f64), (width, height): (f64, f64)) {
     let _ = write!(path, "M{x:.1} {y:.1}h{width:.1}v{height:.1}h-{width:.1}z");
 }
 
 /// Draws the legend of the colours at the top.
-fn legend(out: &mut String, legend: &Legend, width: f64) {
+fn write_legend(out: &mut String, legend: &Legend, width: f64) {
     let bar = (width * 0.4).min(260.0);
-    let left = MARGIN + LETTER_WIDTH * legend.caption.chars().count() as f64 + 14.0;
-    write_text(out, (MARGIN, 23.0), Anchor::Start, false, &legend.caption);
-    let mut levels = Levels::default();
-    for at in 0..LEVELS {
-        let part = bar / LEVELS as f64;
-        let path = levels.path_of_value((at as f64 + 0.5) / LEVELS as f64, 1.0);
-        path.into_iter()
-            .for_each(|path| rectangle(path, (left + part * at as f64, 12.0), (part + SEAM, 14.0)));
+    let left = MARGIN_PX + LETTER_WIDTH * legend.caption.chars().count() as f64 + 14.0;
+    write_text(out, (MARGIN_PX, 23.0), Anchor::Start, false, &legend.caption);
+    let mut levels = LevelPaths::default();
+    for at in 0..LEVEL_COUNT {
+        let part = bar / LEVEL_COUNT as f64;
+        let path = levels.path_of_value((at as f64 + 0.5) / LEVEL_COUNT as f64, 1.0);
+        path.into_iter().for_each(|path| {
+            add_rectangle(path, (left + part * at as f64, 12.0), (part + SEAM_OVERLAP_PX, 14.0))
+        });
     }
     levels.write(out);
     for (part, anchor) in [(0.0, Anchor::Middle), (0.5, Anchor::Middle), (1.0, Anchor::Middle)] {
@@ -135,34 +136,35 @@ fn legend(out: &mut String, legend: &Legend, width: f64) {
     }
 }
 
-fn strip_of(out: &mut String, strip: &Strip, width: f64) -> f64 {
-    legend(out, &strip.legend, width);
+fn write_strip(out: &mut String, strip: &CellStrip, width: f64) -> f64 {
+    write_legend(out, &strip.legend, width);
     let rows: usize = strip.groups.iter().map(|group| group.rows.len()).sum();
     let row = if rows > 20 { 14.0 } else { 18.0 };
     let captions = strip.groups.iter().flat_map(|group| &group.rows).map(|row| row.caption.chars().count());
-    let left = MARGIN + LETTER_WIDTH * captions.max().unwrap_or(0) as f64 + 10.0;
+    let left = MARGIN_PX + LETTER_WIDTH * captions.max().unwrap_or(0) as f64 + 10.0;
     let right = width - 24.0;
     let time = Axis::new("time", "s").with_ends(strip.seconds.0, strip.seconds.1);
     let span = AxisSpan::new(&time, [].into_iter(), 0.0);
     let place = |seconds: f64| left + span.position(seconds).clamp(0.0, 1.0) * (right - left);
-    let (mut tracks, mut levels, mut y) = (String::new(), Levels::default(), LEGEND_HEIGHT);
+    let (mut tracks, mut levels, mut y) = (String::new(), LevelPaths::default(), LEGEND_HEIGHT);
     for group in &strip.groups {
-        write_text(out, (MARGIN, y + 16.0), Anchor::Start, false, &group.title);
+        write_text(out, (MARGIN_PX, y + 16.0), Anchor::Start, false, &group.title);
         y += HEADING_HEIGHT;
         for of_cell in &group.rows {
             write_text(out, (left - 8.0, y + row * 0.5 + 4.5), Anchor::End, true, &of_cell.caption);
-            rectangle(&mut tracks, (left, y), (right - left, row - 2.0));
+            add_rectangle(&mut tracks, (left, y), (right - left, row - 2.0));
             for (from, to, value) in &of_cell.values {
                 let (from, to) = (place(*from), place(*to));
                 let path = levels.path_of_value(*value, strip.legend.max);
-                path.into_iter()
-                    .for_each(|path| rectangle(path, (from, y), ((to - from).max(0.5) + SEAM, row - 2.0)));
+                path.into_iter().for_each(|path| {
+                    add_rectangle(path, (from, y), ((to - from).max(0.5) + SEAM_OVERLAP_PX, row - 2.0))
+                });
             }
             y += row;
         }
         y += 4.0;
     }
-    track(out, &tracks);
+    write_background(out, &tracks);
     levels.write(out);
     let mut axis = format!("M{left:.1} {y:.1}H{right:.1}");
     let most = if width > 600.0 { 12 } else { 5 };
@@ -171,7 +173,7 @@ fn strip_of(out: &mut String, strip: &Strip, width: f64) -> f64 {
         let _ = write!(axis, "M{x:.1} {y:.1}v5");
         write_text(out, (x, y + 19.0), Anchor::Middle, false, &span.caption(tick, most));
     }
-    line(out, &axis);
+    write_line(out, &axis);
     write_text(out, ((left + right) / 2.0, y + 38.0), Anchor::Middle, false, &span.title(&time));
     y + 46.0
 }
@@ -217,29 +219,29 @@ impl<'a> PanelLayout<'a> {
     }
 }
 
-fn map_of(out: &mut String, map: &Map, width: f64) -> f64 {
-    legend(out, &map.legend, width);
+fn write_map(out: &mut String, map: &CellMap, width: f64) -> f64 {
+    write_legend(out, &map.legend, width);
     let sheets: Vec<_> =
         map.panels.iter().filter(|panel| !panel.cells.is_empty()).map(PanelLayout::new).collect();
     let max = |of: &dyn Fn(&PanelLayout<'_>) -> f64| sheets.iter().map(of).fold(f64::MIN_POSITIVE, f64::max);
     let pitch = sheets.iter().map(|sheet| sheet.pitch).fold(f64::INFINITY, f64::min);
     // Scale in pixels per metre, the same for all links.
-    let scale = (MAX_PITCH / pitch).min((width - 2.0 * MARGIN - 50.0) / max(&|sheet| sheet.size[0]));
-    let (mut x, mut y, mut height) = (MARGIN, LEGEND_HEIGHT, 0.0_f64);
+    let scale = (MAX_PITCH / pitch).min((width - 2.0 * MARGIN_PX - 50.0) / max(&|sheet| sheet.size[0]));
+    let (mut x, mut y, mut height) = (MARGIN_PX, LEGEND_HEIGHT, 0.0_f64);
     for sheet in &sheets {
         let title = LETTER_WIDTH * sheet.panel.title.chars().count() as f64;
         let wide = (sheet.size[0] * scale + 50.0).max(title);
-        if x > MARGIN && x + wide > width - MARGIN {
-            (x, y, height) = (MARGIN, y + height, 0.0);
+        if x > MARGIN_PX && x + wide > width - MARGIN_PX {
+            (x, y, height) = (MARGIN_PX, y + height, 0.0);
         }
-        let high = panel_of(out, sheet, &map.legend, (x, y), scale);
+        let high = write_panel(out, sheet, &map.legend, (x, y), scale);
         (x, height) = (x + wide + 20.0, height.max(high + 12.0));
     }
     y + height
 }
 
 /// Draws one link, and returns its height in pixels, including heading and axis.
-fn panel_of(
+fn write_panel(
     out: &mut String,
     sheet: &PanelLayout<'_>,
     legend: &Legend,
@@ -250,8 +252,8 @@ fn panel_of(
     let (left, top) = (x + 44.0, y + HEADING_HEIGHT);
     let [wide, high] = sheet.size.map(|size| size * scale);
     let mut ground = String::new();
-    rectangle(&mut ground, (left, top), (wide, high));
-    track(out, &ground);
+    add_rectangle(&mut ground, (left, top), (wide, high));
+    write_background(out, &ground);
     let mut axis = String::new();
     let radius = sheet.pitch / 3_f64.sqrt() * 0.94 * scale;
     for cell in &sheet.panel.cells {
@@ -264,7 +266,7 @@ fn panel_of(
             let _ = write!(path, "{}{x:.1} {y:.1}", if corner == 0 { "M" } else { "L" });
         }
         path.push('z');
-        hexagon(out, cell.value, legend, &cell.caption, &path);
+        write_hexagon(out, cell.value, legend, &cell.caption, &path);
     }
     // The axes show cm along the link, and degrees around it.
     let step = if high > 120.0 { 0.1 } else { 0.05 };
@@ -294,11 +296,11 @@ fn panel_of(
     } else {
         write_text(out, (left, bottom + 18.0), Anchor::Start, true, "flat");
     }
-    line(out, &axis);
+    write_line(out, &axis);
     HEADING_HEIGHT + high + 24.0
 }
 
-fn hexagon(out: &mut String, value: Option<f64>, legend: &Legend, caption: &str, path: &str) {
+fn write_hexagon(out: &mut String, value: Option<f64>, legend: &Legend, caption: &str, path: &str) {
     let (fill, text) = match value {
         Some(value) if value > 0.0 => {
             let level = level(value, legend.max);

@@ -5,7 +5,7 @@
 use std::fmt::Write as _;
 
 /// Number of colours for values above 0.
-pub(super) const LEVELS: usize = 16;
+pub(super) const LEVEL_COUNT: usize = 16;
 
 /// The colours of cividis at equal distances, as red, green and blue.
 const CIVIDIS: [[f64; 3]; 10] = [
@@ -22,7 +22,7 @@ const CIVIDIS: [[f64; 3]; 10] = [
 ];
 
 /// The background of cells and rows, on paper and on a dark screen.
-pub(super) const TRACK: [&str; 2] = ["#EBEDEF", "#26292E"];
+pub(super) const BACKGROUND_COLOURS: [&str; 2] = ["#EBEDEF", "#26292E"];
 
 /// Returns the cividis colour at a position from 0 to 1, as a CSS colour.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 9, and 0 to 255")]
@@ -40,22 +40,22 @@ fn cividis(place: f64) -> String {
 
 /// Returns the colours of a level on paper and on a dark screen; levels count from 0.
 pub(super) fn colours(level: usize) -> [String; 2] {
-    let part = level as f64 / (LEVELS - 1) as f64;
+    let part = level as f64 / (LEVEL_COUNT - 1) as f64;
     [cividis(1.0 - part), cividis(0.2 + 0.8 * part)]
 }
 
 /// Returns the level of colour, from 0, for a value above 0 and up to `max`.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 15")]
 pub(super) fn level(value: f64, max: f64) -> usize {
-    let part = (value / max).clamp(0.0, 1.0) * LEVELS as f64;
-    (part.ceil() as usize).clamp(1, LEVELS) - 1
+    let part = (value / max).clamp(0.0, 1.0) * LEVEL_COUNT as f64;
+    (part.ceil() as usize).clamp(1, LEVEL_COUNT) - 1
 }
 
 /// Adds the CSS rules with which a dark screen replaces the colours.
 pub(super) fn add_dark_rules(rules: &mut String) {
-    let [_, track] = TRACK;
+    let [_, track] = BACKGROUND_COLOURS;
     let _ = write!(rules, ".track{{fill:{track}}}");
-    for level in 0..LEVELS {
+    for level in 0..LEVEL_COUNT {
         let [_, colour] = colours(level);
         let _ = write!(rules, ".v{level}{{fill:{colour}}}");
     }
@@ -74,9 +74,9 @@ mod tests {
 
     #[test]
     fn levels_grow_darker_on_paper_and_lighter_on_a_dark_screen() {
-        let all: Vec<_> = (0..LEVELS).map(colours).collect();
+        let all: Vec<_> = (0..LEVEL_COUNT).map(colours).collect();
         assert_eq!(all[0][0], "#FEE838");
-        assert_eq!(all[LEVELS - 1], ["#00224E", "#FEE838"]);
+        assert_eq!(all[LEVEL_COUNT - 1], ["#00224E", "#FEE838"]);
         assert!(all.is_sorted_by(|one, next| luminance(&one[0]) > luminance(&next[0])));
         assert!(all.is_sorted_by(|one, next| luminance(&one[1]) < luminance(&next[1])));
     }

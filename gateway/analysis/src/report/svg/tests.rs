@@ -145,7 +145,7 @@ fn a_diagram_below_has_its_own_scale_and_the_same_time() {
         marks: Vec::new(),
     };
     let upper = Figure { y: Axis::new("torque", "Nm").with_ends(-1e5, 1e5), ..figure(vec![line(&upper)]) };
-    let text = draw(&upper.below(below));
+    let text = draw(&upper.with_lower_diagram(below));
     let document = Document::parse(&text).unwrap();
     let places = lines(&document, "c0-s");
     let ([(left, bottom), (right, top)], [(from, lowest), (to, highest)]) = (&places[0][..], &places[2][..])

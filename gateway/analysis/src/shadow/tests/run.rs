@@ -8,8 +8,8 @@ use protocol::can::{BIT_RATE_SWITCH, FD_FORMAT, Format};
 use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    AppliesFrom, Heartbeat, Joints, Message, NetworkPage, ReceivedCounts, RejectedCounts, Request,
-    SensorPage, SkinSensors, State,
+    Heartbeat, Joints, Message, NetworkPage, ReceivedCounts, RejectedCounts, Request, SensorPage,
+    SkinSensors, State, StimulusStart,
 };
 use protocol::packet::{Epoch, WORDS};
 
@@ -48,7 +48,7 @@ fn sensors(from: i64, second: bool) -> Message {
 
 fn stimulus(to: i64) -> Message {
     let to = Node::Cell(cell(to));
-    Message::Stimulus { to, from: AppliesFrom::Next, page: SensorPage::Skin(SkinSensors::default()) }
+    Message::Stimulus { to, from: StimulusStart::Next, page: SensorPage::Skin(SkinSensors::default()) }
 }
 
 impl Run {

@@ -16,11 +16,11 @@ use super::REPLY_WINDOW;
 use super::states::contact::{EndNow, RecordedContact};
 use super::states::first_joints::{self, FirstJoints};
 use super::states::line::{self, BusCondition};
-use super::states::pass::{self, Pass};
-use super::states::progress::{self, Progress};
-use super::states::sending::{self, Sending};
-use super::sums::{SumsByCell, Trees};
-use super::tally::Uncompared;
+use super::states::pass::{self, CapturePass};
+use super::states::progress::{self, CellProgress};
+use super::states::sending::{self, SendState};
+use super::sums::{ParentHistory, SumsByCell};
+use super::tally::UncomparedReplies;
 use crate::replay::difference::ReplyKind;
 use crate::replay::survey::SurveyedCell as Surveyed;
 use model::latched::KnownContacts;
@@ -40,30 +40,30 @@ pub struct PresentCell {
     /// First and last counters that the cell reported.
     pub counters: Option<(ReceivedCounts, ReceivedCounts)>,
     /// Progress with the joints announced last.
-    pub(super) progress: Progress,
+    pub(super) progress: CellProgress,
 }
 
 impl PresentCell {
     /// Returns true if the next joints wait for this cell.
     pub(super) fn is_awaited(&self) -> bool {
-        self.claim.is_settled() && matches!(self.progress, Progress::Awaited { .. })
+        self.claim.is_settled() && matches!(self.progress, CellProgress::Awaited { .. })
     }
 
     pub(super) const fn is_given_up(&self) -> bool {
-        matches!(self.progress, Progress::GivenUp { .. })
+        matches!(self.progress, CellProgress::GivenUp { .. })
     }
 }
 
 /// A value from the recording, and its counterpart from this replay.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Both<T> {
+pub(super) struct RecordedAndNow<T> {
     pub(super) recorded: T,
     pub(super) now: T,
 }
 
 /// Joints that are about to be sent, or were sent.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Announced {
+pub(super) struct AnnouncedJoints {
     pub(super) announcement: u64,
     /// Number of their round, or `None` for joints that only restore a state.
     pub(super) round: Option<u64>,
@@ -71,23 +71,23 @@ pub(super) struct Announced {
 
 /// A round: recorded joints, with the recorded replies and the replies in this replay.
 #[derive(Debug, Default)]
-pub(super) struct Round {
+pub(super) struct JointsRound {
     pub(super) epoch: Epoch,
     /// Recording time in ns since 1970.
     pub(super) nanos: u64,
     /// State of resending the joints.
-    pub(super) sending: Sending,
+    pub(super) sending: SendState,
     /// Words of each reply, in the recording and in this replay.
-    pub(super) replies: BTreeMap<(CellId, ReplyKind), Both<Option<Words>>>,
+    pub(super) replies: BTreeMap<(CellId, ReplyKind), RecordedAndNow<Option<Words>>>,
     /// Sums, in the recording and in this replay.
-    pub(super) sums: Both<SumsByCell>,
+    pub(super) sums: RecordedAndNow<SumsByCell>,
     /// Cells that the recorded stimuli touch at the previous joints, and at these joints.
     pub(super) touched: [KnownContacts; 2],
     /// True if a pass over the capture begins with these joints.
     pub(super) is_first: bool,
 }
 
-impl Round {
+impl JointsRound {
     /// Returns true if sums of this epoch answer the last sending of these joints, not an earlier one.
     pub(super) fn has_sums_of(&self, epoch: Epoch) -> bool {
         self.sending.sent_epoch().unwrap_or(self.epoch) == epoch
@@ -141,8 +141,8 @@ struct PendingRequest {
 
 /// State of a pass over the capture, up to the message that was read last.
 #[derive(Debug, Default)]
-struct Reading {
-    pass: Pass,
+struct PassState {
+    pass: CapturePass,
     /// State at the last recorded joints, and the cells touched at them.
     state: LatchedState,
     touched: KnownContacts,
@@ -150,9 +150,9 @@ struct Reading {
     first_round: u64,
 }
 
-impl Reading {
+impl PassState {
     /// Handles the next item of the capture. Returns true if it is the first joints of the pass.
-    const fn next(&mut self, input: pass::Input) -> bool {
+    const fn next(&mut self, input: pass::ReadEvent) -> bool {
         let (next, is_first) = self.pass.next(input);
         self.pass = next;
         is_first
@@ -169,22 +169,22 @@ pub(super) struct BusComparator {
     pub(super) known: BTreeMap<CellId, KnownCell>,
     pub(super) announcements: u64,
     /// Latest announced joints of each epoch.
-    pub(super) announced: Vec<Option<Announced>>,
+    pub(super) announced: Vec<Option<AnnouncedJoints>>,
     /// Round of the latest recorded joints of each epoch.
     pub(super) recorded_rounds: Vec<Option<u64>>,
     /// Number of the first element of `rounds`.
     pub(super) base: u64,
-    pub(super) rounds: VecDeque<Round>,
+    pub(super) rounds: VecDeque<JointsRound>,
     /// Trees of the cells, recorded and now.
-    pub(super) trees: Both<Trees>,
+    pub(super) trees: RecordedAndNow<ParentHistory>,
     pub(super) answers: BTreeMap<CellId, PendingAnswers>,
     /// Cells whose last recorded sum did not end a contact. Each must send another sum, or the end of the contact.
     pub(super) contributing: BTreeSet<CellId>,
     /// True if cells were configured to send sensor frames without request, which arrive at times of their own.
     pub(super) sends_unrequested_sensors: bool,
     /// State of each cell's first joints since its start, in the recording and in this replay.
-    pub(super) first_joints: Both<PerCell<FirstJoints>>,
-    reading: Reading,
+    pub(super) first_joints: RecordedAndNow<PerCell<FirstJoints>>,
+    reading: PassState,
     /// Number of announced rounds.
     pub(super) sent: u64,
     /// Last round with joints in the capture, once known.
@@ -210,8 +210,8 @@ impl BusComparator {
     }
 
     /// Returns true if messages came before the first round of this pass.
-    pub(super) const fn begins_later(&self) -> bool {
-        self.reading.pass.begins_later()
+    pub(super) const fn has_earlier_messages(&self) -> bool {
+        self.reading.pass.has_earlier_messages()
     }
 
     pub(super) const fn is_down(&self) -> bool {
@@ -219,34 +219,34 @@ impl BusComparator {
     }
 
     /// Handles an event of the bus.
-    pub(super) const fn handle_bus_event(&mut self, input: line::Input) {
+    pub(super) const fn handle_bus_event(&mut self, input: line::BusConditionEvent) {
         self.line = self.line.next(input);
     }
 
-    pub(super) fn round(&mut self, number: u64) -> Option<&mut Round> {
+    pub(super) fn round(&mut self, number: u64) -> Option<&mut JointsRound> {
         let at = number.checked_sub(self.base)?;
         self.rounds.get_mut(usize::try_from(at).ok()?)
     }
 
     /// Returns the round of the latest recorded joints of an epoch.
-    pub(super) fn recorded_round(&mut self, epoch: Epoch) -> Option<&mut Round> {
+    pub(super) fn recorded_round(&mut self, epoch: Epoch) -> Option<&mut JointsRound> {
         let number = self.recorded_rounds.get(usize::from(epoch.0)).copied().flatten()?;
         self.round(number)
     }
 
     /// Returns the latest announced joints of an epoch.
-    fn announced(&self, epoch: Epoch) -> Option<Announced> {
+    fn announced(&self, epoch: Epoch) -> Option<AnnouncedJoints> {
         self.announced.get(usize::from(epoch.0)).copied().flatten()
     }
 
     /// Returns the number and the state of the round whose joints were sent last under an epoch.
-    pub(super) fn announced_round(&mut self, epoch: Epoch) -> Option<(u64, &mut Round)> {
+    pub(super) fn announced_round(&mut self, epoch: Epoch) -> Option<(u64, &mut JointsRound)> {
         let number = self.announced(epoch)?.round?;
         Some((number, self.round(number)?))
     }
 
     /// Counts a torque or sum in the replayed part whose joints are not in that part, by the reason.
-    pub(super) fn count_without_joints(&self, epoch: Epoch, lacking: &mut Uncompared) {
+    pub(super) fn count_without_joints(&self, epoch: Epoch, lacking: &mut UncomparedReplies) {
         if self.is_earlier(epoch) {
             lacking.joints_earlier += 1;
         } else if !self.rounds.is_empty() {
@@ -255,27 +255,27 @@ impl BusComparator {
     }
 
     /// Requires from each cell another heartbeat, which confirms all messages announced so far.
-    pub(super) fn announce(&mut self) {
+    pub(super) fn mark_all_awaited(&mut self) {
         self.announcements += 1;
-        let announced = |progress: Progress| progress.next(progress::Input::Announced);
+        let announced = |progress: CellProgress| progress.next(progress::CellEvent::Announced);
         self.present.values_mut().for_each(|present| present.progress = announced(present.progress));
     }
 
     /// Stops waiting. Returns the cells that have not answered in time.
-    pub(super) fn give_up(&mut self) -> Vec<CellId> {
+    pub(super) fn time_out_cells(&mut self) -> Vec<CellId> {
         let mut late = Vec::new();
         for (cell, present) in self.present.iter_mut().filter(|(_, present)| present.is_awaited()) {
-            present.progress = present.progress.next(progress::Input::TimesOut);
+            present.progress = present.progress.next(progress::CellEvent::TimesOut);
             late.push(*cell);
         }
         late
     }
 
     /// Handles an event of sending a round's joints, if the round is remembered.
-    pub(super) fn send(&mut self, number: u64, input: sending::Input) {
+    pub(super) fn update_send_state(&mut self, number: u64, input: sending::SendEvent) {
         let Some(round) = self.round(number) else { return };
         round.sending = round.sending.next(input);
-        if matches!(input, sending::Input::Sent { .. }) {
+        if matches!(input, sending::SendEvent::Sent { .. }) {
             // After repeated joints, all cells send their sums again.
             round.sums.now.clear();
         }
@@ -294,10 +294,10 @@ impl BusComparator {
     }
 
     /// Starts another pass over the capture.
-    pub(super) fn begin(&mut self) {
+    pub(super) fn begin_pass(&mut self) {
         self.recorded_rounds.fill(None);
-        let mut reading = Reading { first_round: self.rounds_so_far(), ..Reading::default() };
-        reading.next(pass::Input::Begins);
+        let mut reading = PassState { first_round: self.rounds_so_far(), ..PassState::default() };
+        reading.next(pass::ReadEvent::Begins);
         self.reading = reading;
     }
 
@@ -309,12 +309,12 @@ impl BusComparator {
     pub(super) fn record_joints(&mut self, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
         let number = self.rounds_so_far();
         let last = self.reading.state.last_epoch();
-        let input = if is_sent { pass::Input::Joints { last } } else { pass::Input::NotSent };
+        let input = if is_sent { pass::ReadEvent::Joints { last } } else { pass::ReadEvent::NotSent };
         let is_first = self.reading.next(input);
         let before = self.apply_joints(epoch);
         if is_sent {
             let touched = [before, self.reading.touched];
-            self.rounds.push_back(Round { epoch, nanos, touched, is_first, ..Round::default() });
+            self.rounds.push_back(JointsRound { epoch, nanos, touched, is_first, ..JointsRound::default() });
         }
         let round = is_sent.then_some(number);
         *self.recorded_rounds.get_mut(usize::from(epoch.0))? = round;
@@ -329,7 +329,7 @@ impl BusComparator {
     /// Adds any other message of the capture. `is_in_part` is true if the message is in the replayed part.
     pub(super) fn record_state(&mut self, message: &Message, is_in_part: bool) {
         if !is_in_part {
-            self.reading.next(pass::Input::NotSent);
+            self.reading.next(pass::ReadEvent::NotSent);
         }
         if let Message::Joints { epoch, .. } = *message {
             self.apply_joints(epoch);
@@ -357,7 +357,7 @@ impl BusComparator {
     /// Returns true if a reply of this epoch answers joints from before the replayed part. Call it only if no joints in
     /// the part have had this epoch yet.
     fn is_earlier(&self, epoch: Epoch) -> bool {
-        let Reading { pass, state, first_round, .. } = &self.reading;
+        let PassState { pass, state, first_round, .. } = &self.reading;
         let last = pass.earlier_epoch(state.last_epoch());
         self.rounds_so_far() - first_round < REPLY_WINDOW
             && last.is_some_and(|last| (0..100).contains(&last.epochs_since(epoch)))
@@ -369,7 +369,7 @@ impl BusComparator {
         let answers = self.answers.entry(from).or_default();
         match answers.announced.iter().position(|announced| announced.tag == tag) {
             Some(at) => drop(answers.announced.remove(at)),
-            None if self.reading.pass.begins_later() => return false,
+            None if self.reading.pass.has_earlier_messages() => return false,
             None => {}
         }
         answers.recorded.push_back((rounds, tag, answer));
@@ -390,10 +390,11 @@ impl BusComparator {
         self.trees.now.set_parent(cell, parent, last.map_or(self.sent, |last| last + 1));
     }
 
-    pub(super) fn network(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {
+    pub(super) fn observe_network_page(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {
         let reported = self.announced(epoch).map(|announced| announced.announcement);
         let has_announced = self.announcements > 0;
-        let found = || PresentCell { progress: Progress::found(has_announced), ..PresentCell::default() };
+        let found =
+            || PresentCell { progress: CellProgress::initial_state(has_announced), ..PresentCell::default() };
         let present = self.present.entry(cell).or_insert_with(found);
         if let NetworkPage::Heartbeat(heartbeat) = page {
             if matches!(
@@ -403,9 +404,9 @@ impl BusComparator {
                 return;
             }
             present.progress = present.progress.next(if reported == Some(self.announcements) {
-                progress::Input::ReportsLast
+                progress::CellEvent::ReportsLast
             } else {
-                progress::Input::ReportsOther
+                progress::CellEvent::ReportsOther
             });
             if !present.claim.is_settled() {
                 self.note_parent(cell, epoch, None);
@@ -427,9 +428,9 @@ impl BusComparator {
 impl PendingAnswers {
     /// Returns true if the recording explains why it lacks the answer of this tag, and counts the reason. `rounds` is
     /// the total number of rounds.
-    pub(super) fn explain_extra(
+    pub(super) fn explain_extra_answer(
         &mut self,
-        lacking: &mut Uncompared,
+        lacking: &mut UncomparedReplies,
         known_cell: Option<&mut KnownCell>,
         tag: u8,
         rounds: u64,
@@ -459,7 +460,7 @@ impl PendingAnswers {
 
 /// Updates the state of the message's sender: whether it has received joints since its start.
 pub(super) fn update_first_joints(cells: &mut PerCell<FirstJoints>, message: &Message) {
-    let Some((cell, input)) = first_joints::Input::from_message(message) else { return };
+    let Some((cell, input)) = first_joints::JointsEvidence::from_message(message) else { return };
     if let Some(place) = cells.get_mut(cell) {
         *place = place.next(input);
     }

@@ -5,10 +5,10 @@ use std::collections::BTreeSet;
 use protocol::id::CellId;
 use protocol::packet::Words;
 
-use super::bus_comparator::{Both, BusComparator, KnownCell, Round};
+use super::bus_comparator::{BusComparator, JointsRound, KnownCell, RecordedAndNow};
 use super::states::contact::{self, EndNow};
-use super::sums::{EpochSums, OmitReason, ROUNDING, SumComparison, compare};
-use super::tally::Uncompared;
+use super::sums::{EpochSums, MAX_ROUNDING_STEPS, OmitReason, SumComparison, compare};
+use super::tally::UncomparedReplies;
 use super::{Comparator, FirstDifference, Tally};
 use crate::replay::difference::{DifferenceKind, ReplyKind, SentValue};
 
@@ -36,7 +36,7 @@ impl Comparator {
             }
         }
         if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
-            bus_comparator.close_sums(number, &round, (tally, tolerance), first);
+            bus_comparator.compare_sums(number, &round, (tally, tolerance), first);
         }
         bus_comparator.trees.recorded.forget_before(number);
         bus_comparator.trees.now.forget_before(number);
@@ -48,12 +48,12 @@ impl BusComparator {
     fn compare_reply(
         &mut self,
         number: u64,
-        round: &Round,
+        round: &JointsRound,
         (cell, what): (CellId, ReplyKind),
-        Both { recorded, now }: Both<Option<Words>>,
+        RecordedAndNow { recorded, now }: RecordedAndNow<Option<Words>>,
         (tally, tolerance): (&mut Tally, u16),
     ) -> Option<DifferenceKind> {
-        let (is_last, begins_later) = (self.last_round == Some(number), self.begins_later());
+        let (is_last, begins_later) = (self.last_round == Some(number), self.has_earlier_messages());
         let is_torque = what == ReplyKind::Torque;
         let mut known_cell = self.known.get_mut(&cell);
         let contact = known_cell.as_ref().map(|known_cell| known_cell.contact).unwrap_or_default();
@@ -83,7 +83,7 @@ impl BusComparator {
             (Some(recorded), None) => {
                 let is_end = is_torque && recorded.is_zero();
                 // The cell had not received the joints at which the contact ended.
-                let was_over = contact.was_over(begins_later, round.may_answer(cell));
+                let was_over = contact.was_over_before_late_end(begins_later, round.may_answer(cell));
                 let is_later = |known_cell: &&mut KnownCell| {
                     let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
                     is_end && (known_cell.end == EndNow::Earlier || was_over)
@@ -98,17 +98,23 @@ impl BusComparator {
             // This replay may have requested the report itself.
             (None, Some(now)) => {
                 let counts = is_torque
-                    && !explain_extra(&mut tally.lacking, known_cell, (cell, round), is_last, now.is_zero());
+                    && !explain_extra_reply(
+                        &mut tally.lacking,
+                        known_cell,
+                        (cell, round),
+                        is_last,
+                        now.is_zero(),
+                    );
                 counts.then_some(DifferenceKind::Extra)
             }
         }
     }
 
     /// Compares each cell's own contribution to the sums of a round.
-    fn close_sums(
+    fn compare_sums(
         &mut self,
         number: u64,
-        round: &Round,
+        round: &JointsRound,
         (tally, tolerance): (&mut Tally, u16),
         first: &mut FirstDifference,
     ) {
@@ -134,12 +140,12 @@ impl BusComparator {
             {
                 outcome = SumComparison::Omitted(OmitReason::NotTaken);
             }
-            let owns = [then.own_term(cell), now.own_term(cell)];
+            let owns = [then.own_contribution(cell), now.own_contribution(cell)];
             if let ([Some(then), Some(now)], SumComparison::Equal | SumComparison::Different) =
                 (&owns, outcome)
             {
                 let max = tally.sum_words.count(then.differences(now));
-                tally.tolerated += u64::from(outcome == SumComparison::Equal && max > ROUNDING);
+                tally.tolerated += u64::from(outcome == SumComparison::Equal && max > MAX_ROUNDING_STEPS);
             }
             let how = match outcome {
                 SumComparison::Nothing => continue,
@@ -165,7 +171,9 @@ impl BusComparator {
                     continue;
                 }
                 // Only a torque's words show that a contact has ended; a sum does not.
-                SumComparison::Extra if explain_extra(lacking, known_cell, (cell, round), is_last, false) => {
+                SumComparison::Extra
+                    if explain_extra_reply(lacking, known_cell, (cell, round), is_last, false) =>
+                {
                     continue;
                 }
                 SumComparison::Extra => DifferenceKind::Extra,
@@ -190,13 +198,13 @@ impl BusComparator {
     }
 
     /// Compares the answers to `configure` with the recorded ones, in order.
-    pub(super) fn close_answers(&mut self, tally: &mut Tally, first: &mut FirstDifference) {
+    pub(super) fn compare_answers(&mut self, tally: &mut Tally, first: &mut FirstDifference) {
         for (cell, mut answers) in std::mem::take(&mut self.answers) {
             loop {
                 let known_cell = self.known.get_mut(&cell);
                 let next = answers.recorded.front().map(|(_, tag, _)| *tag);
                 if let Some((tag, _)) = answers.now.front().copied().filter(|(tag, _)| Some(*tag) != next)
-                    && answers.explain_extra(&mut tally.lacking, known_cell, tag, self.base)
+                    && answers.explain_extra_answer(&mut tally.lacking, known_cell, tag, self.base)
                 {
                     answers.now.pop_front();
                     continue;
@@ -223,10 +231,10 @@ impl BusComparator {
 }
 
 /// Returns true if the recording explains why it lacks this reply, and counts the reason.
-fn explain_extra(
-    lacking: &mut Uncompared,
+fn explain_extra_reply(
+    lacking: &mut UncomparedReplies,
     known_cell: Option<&mut KnownCell>,
-    (cell, round): (CellId, &Round),
+    (cell, round): (CellId, &JointsRound),
     is_last: bool,
     is_end: bool,
 ) -> bool {

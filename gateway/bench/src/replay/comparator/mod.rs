@@ -26,15 +26,15 @@ use protocol::schema::Units;
 use protocol::skin::Skin;
 
 pub use bus_comparator::PresentCell;
-use bus_comparator::{Announced, Both, BusComparator, update_first_joints};
+use bus_comparator::{AnnouncedJoints, BusComparator, RecordedAndNow, update_first_joints};
 use states::first_joints::FirstJoints;
-use states::progress::Progress;
+use states::progress::CellProgress;
 use states::{line, sending};
-pub use sums::OwnTerm;
+pub use sums::OwnContribution;
 use sums::{CellSum, EpochSums};
-pub use tally::{StepHistogram, Tally, Uncompared};
+pub use tally::{StepHistogram, Tally, UncomparedReplies};
 
-use super::difference::{Difference, DifferenceKind, Position, ReplyKind, SentValue};
+use super::difference::{Difference, DifferenceKind, JointsPosition, ReplyKind, SentValue};
 use super::survey::SurveyedCell as Surveyed;
 
 /// Maximum number of joint broadcasts between the joints that a reply answers and the arrival of the reply. It is far
@@ -64,7 +64,7 @@ impl FirstDifference {
         }
         let when = round.map(|(joints, epoch, nanos)| {
             let at_s = std::time::Duration::from_nanos(nanos.saturating_sub(self.nanos)).as_secs_f64();
-            Position { joints, epoch: epoch.0, at_s }
+            JointsPosition { joints, epoch: epoch.0, at_s }
         });
         self.difference =
             Some(Difference::new(how, (bus, units), cell, when, recorded.as_ref(), now.as_ref()));
@@ -126,7 +126,7 @@ impl Comparator {
     }
 
     /// Adds any other message of the capture. `is_in_part` is true if the message is in the replayed part.
-    pub fn expect(&mut self, bus_index: usize, message: &Message, is_in_part: bool) {
+    pub fn expect_message(&mut self, bus_index: usize, message: &Message, is_in_part: bool) {
         let expects = self.tolerance.is_some();
         let (Some(bus_comparator), tally) =
             (self.buses.get_mut(bus_index).filter(|_| expects), &mut self.tally)
@@ -178,7 +178,7 @@ impl Comparator {
     /// Starts another pass over the capture. Replies before the first joints of this pass do not answer joints of the
     /// pass before.
     pub fn expect_restart(&mut self) {
-        self.buses.iter_mut().for_each(BusComparator::begin);
+        self.buses.iter_mut().for_each(BusComparator::begin_pass);
     }
 
     /// Notes that the capture has no more joints.
@@ -191,16 +191,16 @@ impl Comparator {
 
     /// Notes that joints are about to be sent. `round` is the number of their round, or `None` if they only restore a
     /// state.
-    pub fn sent_joints(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
+    pub fn announce_joints(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
         let Some(it) = self.buses.get_mut(bus_index) else { return };
-        it.announce();
-        let announced = Announced { announcement: it.announcements, round };
+        it.mark_all_awaited();
+        let announced = AnnouncedJoints { announcement: it.announcements, round };
         if let Some(place) = it.announced.get_mut(usize::from(epoch.0)) {
             *place = Some(announced);
         }
         let Some(number) = round else { return };
         it.sent = it.sent.max(number + 1);
-        it.send(number, sending::Input::Sent { under: epoch });
+        it.update_send_state(number, sending::SendEvent::Sent { under: epoch });
         while self
             .buses
             .get(bus_index)
@@ -213,7 +213,7 @@ impl Comparator {
     /// Notes a sync without joints, after which all cells must confirm all messages sent so far.
     pub fn announce_sync(&mut self, bus_index: usize) {
         let Some(it) = self.buses.get_mut(bus_index) else { return };
-        it.announce();
+        it.mark_all_awaited();
         let (announcement, last) = (it.announcements, it.announcements - 1);
         if let Some(announced) =
             it.announced.iter_mut().flatten().find(|announced| announced.announcement == last)
@@ -225,17 +225,17 @@ impl Comparator {
     /// Notes that a bus refused the joints of a round.
     pub fn mark_unsent(&mut self, bus_index: usize, round: u64) {
         if let Some(bus_comparator) = self.buses.get_mut(bus_index) {
-            bus_comparator.send(round, sending::Input::Refused);
+            bus_comparator.update_send_state(round, sending::SendEvent::Refused);
         }
     }
 
     /// Handles a message that another sender has sent on a bus.
     pub fn observe(&mut self, index: usize, message: &Message) {
         let Some(bus_comparator) = self.buses.get_mut(index) else { return };
-        bus_comparator.handle_bus_event(line::Input::Message);
+        bus_comparator.handle_bus_event(line::BusConditionEvent::Message);
         update_first_joints(&mut bus_comparator.first_joints.now, message);
         if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
-            bus_comparator.network(cell, epoch, &page);
+            bus_comparator.observe_network_page(cell, epoch, &page);
         } else if let Message::Joints { .. } | Message::Network { .. } = message {
             self.other_gateway.get_or_insert(index);
         }
@@ -292,13 +292,13 @@ impl Comparator {
     #[must_use]
     pub fn done_count(&self, bus_index: usize) -> usize {
         self.buses.get(bus_index).map_or(0, |bus_comparator| {
-            bus_comparator.present.values().filter(|present| present.progress == Progress::Done).count()
+            bus_comparator.present.values().filter(|present| present.progress == CellProgress::Done).count()
         })
     }
 
     /// Stops waiting for the cells of a bus, and returns those that have not answered.
-    pub fn give_up(&mut self, bus_index: usize) -> Vec<CellId> {
-        self.buses.get_mut(bus_index).map_or_else(Vec::new, BusComparator::give_up)
+    pub fn time_out_cells(&mut self, bus_index: usize) -> Vec<CellId> {
+        self.buses.get_mut(bus_index).map_or_else(Vec::new, BusComparator::time_out_cells)
     }
 
     /// Returns the number of recorded torques and sums of a round that the cells on the bus have not sent in this
@@ -317,7 +317,7 @@ impl Comparator {
         let replies = round.replies.iter().filter(|((_, what), _)| *what == ReplyKind::Torque);
         let unanswered = replies.filter(|(_, pair)| pair.recorded.is_some() && pair.now.is_none());
         let torques = unanswered.filter(|((cell, _), _)| is_there(cell)).count();
-        let Both { recorded: then, now } = &round.sums;
+        let RecordedAndNow { recorded: then, now } = &round.sums;
         if then.is_empty() {
             return torques;
         }
@@ -329,7 +329,7 @@ impl Comparator {
     /// Marks a bus as down, so that its cells are not awaited until the next message arrives.
     pub fn mark_down(&mut self, bus_index: usize) {
         if let Some(bus_comparator) = self.buses.get_mut(bus_index) {
-            bus_comparator.handle_bus_event(line::Input::Lost);
+            bus_comparator.handle_bus_event(line::BusConditionEvent::Lost);
         }
     }
 
@@ -387,7 +387,7 @@ impl Comparator {
             }
         }
         for bus_comparator in &mut self.buses {
-            bus_comparator.close_answers(&mut self.tally, &mut self.first);
+            bus_comparator.compare_answers(&mut self.tally, &mut self.first);
         }
     }
 

@@ -19,7 +19,7 @@ use protocol::parameters::MAX_JOINTS;
 
 /// The parent of each cell, as it changes from round to round.
 #[derive(Debug, Default)]
-pub(super) struct Trees(BTreeMap<CellId, VecDeque<ParentChange>>);
+pub(super) struct ParentHistory(BTreeMap<CellId, VecDeque<ParentChange>>);
 
 /// A change of a cell's parent.
 #[derive(Clone, Copy, Debug)]
@@ -29,7 +29,7 @@ struct ParentChange {
     parent: Option<u8>,
 }
 
-impl Trees {
+impl ParentHistory {
     /// Sets the parent that a cell reports, from round `since` on.
     pub(super) fn set_parent(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
         let steps = self.0.entry(cell).or_default();
@@ -52,7 +52,7 @@ impl Trees {
     /// Returns the cells that may have changed their parent in this round, and their parents before and after the
     /// change. A page with the new parent carries the epoch of the last joints, so the change is at those joints or the
     /// next. A cell between two parents sends no page; a cell that has lost its parent for good is not included.
-    fn affected(&self, round: u64) -> BTreeSet<CellId> {
+    fn cells_changing_parent(&self, round: u64) -> BTreeSet<CellId> {
         let mut all = BTreeSet::new();
         for (cell, steps) in &self.0 {
             let is_away = self.parent(*cell, round) == Some(None);
@@ -125,11 +125,11 @@ impl SumsByCell {
 
 /// Maximum difference in steps between the words of two sums from the same contact state, because rounding carries its
 /// remainder into the next sum.
-pub(super) const ROUNDING: u32 = 1;
+pub(super) const MAX_ROUNDING_STEPS: u32 = 1;
 
 /// A cell's own contribution to its sum.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct OwnTerm {
+pub struct OwnContribution {
     /// The sum as it was sent.
     pub sum: Words,
     /// Number of cells that contribute to the sum.
@@ -143,7 +143,7 @@ pub struct OwnTerm {
     pub cells: i32,
 }
 
-impl OwnTerm {
+impl OwnContribution {
     /// Returns true if all unsaturated words are zero.
     fn is_zero(&self) -> bool {
         self.steps.iter().flatten().all(|step| *step == 0)
@@ -192,7 +192,7 @@ pub(super) enum SumComparison {
 }
 
 impl<'a> EpochSums<'a> {
-    pub(super) fn new(sums: &'a SumsByCell, trees: &Trees, round: u64) -> Self {
+    pub(super) fn new(sums: &'a SumsByCell, trees: &ParentHistory, round: u64) -> Self {
         let mut children: BTreeMap<u8, Vec<CellId>> = BTreeMap::new();
         for cell in trees.0.keys() {
             if let Some(parent) = trees.parent(*cell, round).flatten() {
@@ -202,7 +202,13 @@ impl<'a> EpochSums<'a> {
         let is_known = sums.cells().all(|cell| trees.parent(cell, round).is_some());
         let parents = trees.0.iter().filter(|(_, steps)| steps.len() > 1);
         let parents = parents.map(|(cell, steps)| (*cell, steps.iter().filter_map(|it| it.parent).collect()));
-        Self { sums, children, affected: trees.affected(round), parents: parents.collect(), is_known }
+        Self {
+            sums,
+            children,
+            affected: trees.cells_changing_parent(round),
+            parents: parents.collect(),
+            is_known,
+        }
     }
 
     fn children(&self, cell: CellId) -> &[CellId] {
@@ -210,7 +216,7 @@ impl<'a> EpochSums<'a> {
     }
 
     /// Returns a cell's own contribution to its sum, or `None` if the cell sent no sum.
-    pub(super) fn own_term(&self, cell: CellId) -> Option<OwnTerm> {
+    pub(super) fn own_contribution(&self, cell: CellId) -> Option<OwnContribution> {
         let CellSum { torque: sum, count } = *self.sums.0.get(&cell)?;
         let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
         let (mut children, mut cells) = (Vec::new(), i32::from(count));
@@ -222,14 +228,14 @@ impl<'a> EpochSums<'a> {
                 *own = own.zip(unsaturated(word)).map(|(own, word)| own - word);
             }
         }
-        Some(OwnTerm { sum, count, children, steps, cells })
+        Some(OwnContribution { sum, count, children, steps, cells })
     }
 
     /// Returns true if a cell's sum minus its children's sums cannot be its own contribution, given whether stimuli
     /// touch the cell. Its children were then others than their pages report or, if joints were resent (`is_mixed`),
     /// sums of two sendings are mixed.
     pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
-        self.own_term(cell).is_some_and(|own| {
+        self.own_contribution(cell).is_some_and(|own| {
             let adds = own.cells == 0 && !own.is_zero();
             is_touched.is_some_and(|is_touched| is_touched != (own.cells > 0)) || is_mixed && adds
         })
@@ -237,13 +243,13 @@ impl<'a> EpochSums<'a> {
 
     /// Returns true if the cell itself is in contact.
     pub(super) fn is_in_contact(&self, cell: CellId) -> bool {
-        self.own_term(cell).is_some_and(|own| own.cells > 0)
+        self.own_contribution(cell).is_some_and(|own| own.cells > 0)
     }
 
     /// Returns true if a cell's sum contains the received sums of all its children. The sum minus those sums is then
     /// the cell's own contribution.
     fn contains_children(&self, cell: CellId, other: &Self) -> bool {
-        let Some(own) = self.own_term(cell) else { return true };
+        let Some(own) = self.own_contribution(cell) else { return true };
         let adds_up = match own.cells {
             // The sum contains the cell's own contribution but lacks the sum of a child, which counts one cell.
             0 => own.is_zero() || !other.is_in_contact(cell),
@@ -259,7 +265,7 @@ impl<'a> EpochSums<'a> {
     /// that cell is not a child in this epoch, because a page follows the change that it reports. Its sum must not be
     /// contained in another parent's sum.
     fn contains_moved_cell(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
-        let own_of = |cell| Some((self.own_term(cell)?, other.own_term(cell)?));
+        let own_of = |cell| Some((self.own_contribution(cell)?, other.own_contribution(cell)?));
         let Some((own, its)) = own_of(cell) else { return false };
         let adds = |sum: &CellSum| {
             let words = own.steps.iter().zip(&its.steps).zip(sum.torque.padded());
@@ -315,7 +321,7 @@ pub(super) fn compare(
     if !recorded.contains_children(cell, now) || !now.contains_children(cell, recorded) {
         return SumComparison::Omitted(OmitReason::NotTaken);
     }
-    let (then, today) = (recorded.own_term(cell), now.own_term(cell));
+    let (then, today) = (recorded.own_contribution(cell), now.own_contribution(cell));
     match (then, today) {
         (Some(then), Some(today)) => {
             // A word can be saturated by the sum over a whole subtree, so in another tree other cells have saturated
@@ -325,9 +331,9 @@ pub(super) fn compare(
                     || recorded.subtree(cell) != now.subtree(cell)
             };
             // A cell that only forwards others' sums has no torque that could differ.
-            let finer = 1 << (format.fraction() - TorqueFormat::Q7_8.fraction());
+            let finer = 1 << (format.fraction_bits() - TorqueFormat::Q7_8.fraction_bits());
             let tolerance = if then.cells > 0 { tolerance.div_ceil(finer) } else { 0 };
-            let allowed = ROUNDING + u32::from(tolerance);
+            let allowed = MAX_ROUNDING_STEPS + u32::from(tolerance);
             let mut words = then
                 .steps
                 .iter()

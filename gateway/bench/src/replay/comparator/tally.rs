@@ -29,7 +29,7 @@ pub struct Tally {
     /// -8 Nm).
     pub sum_words: StepHistogram,
     /// Replies that have no recorded counterpart, or whose joints were not recorded.
-    pub lacking: Uncompared,
+    pub lacking: UncomparedReplies,
 }
 
 /// Histogram of the differences between words in this replay and in the recording, in steps.
@@ -60,7 +60,7 @@ impl StepHistogram {
 
 /// Replies that lack a recorded counterpart or recorded joints, by the reason that the recording shows.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Uncompared {
+pub struct UncomparedReplies {
     /// Replies of cells that were silent in the recording: absent, killed, hung, or claiming their node id.
     pub silent: u64,
     /// Replies to joints that the cell missed in the recording, by its own counters.
@@ -131,7 +131,7 @@ impl Tally {
 
     /// Returns true if all recorded replies came and are equal, and no others came.
     #[must_use]
-    pub const fn is_good(&self) -> bool {
+    pub const fn has_only_equal_replies(&self) -> bool {
         self.different == 0
             && self.missing == 0
             && self.extra == 0

@@ -4,7 +4,7 @@ use crate::replay::survey::{Survey, TimeRange};
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::fixed::Q3_12;
-use protocol::message::{Heartbeat, Joints, ReceivedCounts, SensorPage, State as Flags, Tree};
+use protocol::message::{Heartbeat, Joints, ReceivedCounts, SensorPage, State as Flags, TreePage};
 use protocol::packet;
 use protocol::parameters::Parameter as P;
 
@@ -35,7 +35,7 @@ fn sum(node: i64, epoch: u8, bits: i16, count: u8) -> Message {
 }
 
 fn tree(node: i64, epoch: u8, parent: Option<u8>) -> Message {
-    let page = NetworkPage::Tree(Tree { parent, ..Tree::default() });
+    let page = NetworkPage::Tree(TreePage { parent, ..TreePage::default() });
     Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(epoch), page }
 }
 
@@ -54,7 +54,7 @@ fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Compa
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(tolerance));
     let times = (1_u64..).map(|at| at * MS);
     for (nanos, message) in times.clone().zip(recording) {
-        let time = Timestamp::six_digits(nanos);
+        let time = Timestamp::with_six_digits(nanos);
         for frame in message.encode().frames(Format::Fd) {
             survey.add_frame(&Record { time, interface: "vcan0", frame, direction: None });
         }
@@ -67,14 +67,14 @@ fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Compa
         if let Message::Joints { epoch, .. } = *message {
             comparator.expect_joints(0, nanos, epoch, true);
         } else {
-            comparator.expect(0, message, true);
+            comparator.expect_message(0, message, true);
         }
     }
     comparator.expect_end();
     let mut round = 0;
     for message in now {
         if let Message::Joints { epoch, .. } = *message {
-            comparator.sent_joints(0, Some(round), epoch);
+            comparator.announce_joints(0, Some(round), epoch);
             round += 1;
         } else {
             comparator.observe(0, message);
@@ -181,7 +181,7 @@ fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
         heard(1, 5, 105),
     ];
     let comparator = rated(&recording, &run());
-    let Uncompared { untaken, said_later, .. } = comparator.tally.lacking;
+    let UncomparedReplies { untaken, said_later, .. } = comparator.tally.lacking;
     assert_eq!((counts(&comparator), untaken, said_later), ([2, 0, 0, 0], 1, 1));
     let mut knows = recording;
     knows[10] = heard(1, 5, 106);
@@ -279,12 +279,12 @@ fn joints_that_a_bus_did_not_take_have_no_answer() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     comparator.mute(false);
     comparator.expect_joints(0, 1, Epoch(1), true);
-    comparator.expect(0, &torque(1, 1, 5), true);
-    comparator.sent_joints(0, Some(0), Epoch(1));
+    comparator.expect_message(0, &torque(1, 1, 5), true);
+    comparator.announce_joints(0, Some(0), Epoch(1));
     comparator.mark_unsent(0, 0);
     comparator.finish(true);
     assert_eq!((counts(&comparator), comparator.tally.not_requested), ([0, 0, 0, 0], 1));
-    assert!(!comparator.tally.is_good());
+    assert!(!comparator.tally.has_only_equal_replies());
 }
 
 #[test]
@@ -317,7 +317,7 @@ fn epochs_wrap_around_and_old_rounds_are_compared_on_the_way() {
     for number in 0..1_000_u64 {
         let epoch = Epoch(number.to_le_bytes()[0]);
         comparator.expect_joints(0, number, epoch, true);
-        comparator.sent_joints(0, Some(number), epoch);
+        comparator.announce_joints(0, Some(number), epoch);
         assert!(comparator.buses[0].rounds.len() <= 102);
     }
 }
@@ -358,7 +358,7 @@ fn sums_less_their_children_are_equal_in_another_tree() {
     assert_eq!((counts(&comparator), comparator.tally.sums), ([18, 0, 0, 0], 18), "all three sent");
     let comparator = rated(&row(), &beside([10, 30]));
     assert_eq!((counts(&comparator), comparator.tally.sums), ([12, 0, 0, 0], 12), "{:?}", comparator.first());
-    assert!(comparator.tally.is_good());
+    assert!(comparator.tally.has_only_equal_replies());
     let comparator = rated(&row(), &beside([11, 29]));
     assert_eq!(counts(&comparator), [12, 0, 0, 0], "one step is rounding");
 }
@@ -430,7 +430,7 @@ fn a_cell_that_changes_its_parent_is_omitted_in_that_epoch_and_counted() {
     let comparator = rated(&row(), &now);
     // Cells 2 and 3 in the epochs before and after the change; later, cell 2 has nothing to forward.
     assert_eq!((comparator.tally.lacking.parent_changing, counts(&comparator)), (4, [6 + 2 + 4, 0, 0, 0]));
-    assert!(comparator.tally.is_good());
+    assert!(comparator.tally.has_only_equal_replies());
 }
 
 #[test]
@@ -439,7 +439,7 @@ fn without_a_tree_nothing_is_compared_and_that_is_no_success() {
     lost.remove(5);
     let comparator = rated(&lost, &row());
     assert_eq!((counts(&comparator), comparator.tally.lacking.tree_unknown), ([0, 0, 0, 0], 18));
-    assert!(!comparator.tally.is_good());
+    assert!(!comparator.tally.has_only_equal_replies());
 }
 
 #[test]
@@ -447,16 +447,16 @@ fn joints_that_are_retried_have_the_sums_of_the_last_time() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     comparator.mute(false);
     for message in &row()[3..6] {
-        comparator.expect(0, message, true);
+        comparator.expect_message(0, message, true);
         comparator.observe(0, message);
     }
     comparator.observe(0, &heartbeat(1, 0, 0, Flags::TEST_MODE));
     comparator.expect_joints(0, 1, Epoch(7), true);
-    comparator.expect(0, &sum(1, 7, 40, 1), true);
-    comparator.sent_joints(0, Some(0), Epoch(7));
+    comparator.expect_message(0, &sum(1, 7, 40, 1), true);
+    comparator.announce_joints(0, Some(0), Epoch(7));
     comparator.observe(0, &sum(1, 7, 90, 2));
     assert_eq!(comparator.unanswered(0, 0), 0);
-    comparator.sent_joints(0, Some(0), Epoch(6));
+    comparator.announce_joints(0, Some(0), Epoch(6));
     assert_eq!(comparator.unanswered(0, 0), 1);
     comparator.observe(0, &sum(1, 7, 90, 2));
     comparator.observe(0, &sum(1, 6, 40, 1));
@@ -472,20 +472,20 @@ fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
     comparator.observe(0, &beat(1, 0));
     comparator.observe(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
     assert!(comparator.is_done(0), "nothing was sent");
-    comparator.sent_joints(0, None, Epoch(9));
+    comparator.announce_joints(0, None, Epoch(9));
     assert!(!comparator.is_done(0));
     comparator.observe(0, &beat(1, 8));
     assert!(!comparator.is_done(0), "sent before it took them");
     comparator.observe(0, &beat(1, 9));
     assert!(comparator.is_done(0), "a cell that claims its node id is not waited for");
-    comparator.sent_joints(0, None, Epoch(10));
+    comparator.announce_joints(0, None, Epoch(10));
     // A cell that refuses these joints sends its old epoch: once in its periodic heartbeat, once because of the sync.
     comparator.observe(0, &beat(1, 9));
     assert!(!comparator.is_done(0));
     comparator.observe(0, &beat(1, 9));
     assert!(comparator.is_done(0));
-    comparator.sent_joints(0, None, Epoch(11));
-    assert_eq!(comparator.give_up(0), [cell(1)]);
+    comparator.announce_joints(0, None, Epoch(11));
+    assert_eq!(comparator.time_out_cells(0), [cell(1)]);
     assert!(comparator.is_done(0), "given up");
     comparator.observe(0, &beat(1, 10));
     assert!(!comparator.is_done(0), "it sends again");

@@ -22,7 +22,7 @@ struct Fake {
     stops_at: Option<u64>,
 }
 
-impl Stage for Fake {
+impl PlayerBackend for Fake {
     fn now(&self) -> u64 {
         self.clock
     }
@@ -46,7 +46,7 @@ impl Stage for Fake {
     fn mark_unsent(&mut self, bus_link: usize, round: u64) {
         self.unsent.push((bus_link, round));
     }
-    fn wait_for_answers(&mut self, bus_link: usize, _: &OpenJoints) {
+    fn wait_for_answers(&mut self, bus_link: usize, _: &AwaitedJoints) {
         self.waited.push((self.sent.len(), bus_link));
     }
     fn restore(&mut self, _: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
@@ -84,7 +84,7 @@ fn plain(at_us: u64, bus_link: usize, id: u32) -> PlayerStep {
 
 fn joints(at_us: u64, bus_link: usize, round: u64) -> PlayerStep {
     let role =
-        FrameRole::Joints(OpenJoints { epoch: Epoch(7), joints: Joints::default(), round: Some(round) });
+        FrameRole::Joints(AwaitedJoints { epoch: Epoch(7), joints: Joints::default(), round: Some(round) });
     PlayerStep::Frame(DueFrame {
         at: at_us * 1_000,
         bus_index: bus_link,
@@ -110,7 +110,7 @@ fn frames_come_at_their_times_and_those_of_the_same_time_together() {
     for (speed, last) in [(1.0, 5_000), (0.1, 50_000), (100.0, 50)] {
         let mut stage = Fake { clock: 42, ..Fake::default() };
         let steps = [plain(100, 0, 1), plain(100, 0, 2), plain(5_100, 0, 3)];
-        let played = play(Player::new(1, Pace::Timed(speed), None), &mut stage, steps);
+        let played = play(Player::new(1, ReplaySpeed::Timed(speed), None), &mut stage, steps);
         assert_eq!(identifiers(&stage), [vec![1, 2], vec![3]]);
         assert_eq!(stage.sent[1].0 - stage.sent[0].0, last * 1_000);
         assert_eq!((played.late.len(), played.late.max(), played.bus_links[0].sent), (3, 0, 3));
@@ -121,7 +121,7 @@ fn frames_come_at_their_times_and_those_of_the_same_time_together() {
 fn a_bus_that_is_slow_delays_what_is_due_and_not_what_comes_after() {
     let mut stage = Fake { takes: 3_000_000, ..Fake::default() };
     let steps = (0..4).map(|n| plain(n * 2_000, 0, u32::try_from(n).unwrap()));
-    let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
+    let played = play(Player::new(1, ReplaySpeed::Timed(1.0), None), &mut stage, steps);
     // The second frame waits 1 ms for the first; the third and the fourth go together.
     assert_eq!(identifiers(&stage), [vec![0], vec![1], vec![2, 3]]);
     assert_eq!(played.late.max() / 1_000, 2_000, "the third one, within three digits");
@@ -132,7 +132,7 @@ fn buses_are_served_in_turn_and_no_batch_is_larger_than_the_kernel_takes() {
     let mut stage = Fake::default();
     let many = (0..100).map(|id| plain(0, 0, id));
     let steps = many.chain([plain(0, 1, 0x100), plain(0, 0, 0x200)]);
-    play(Player::new(2, Pace::Max, None), &mut stage, steps);
+    play(Player::new(2, ReplaySpeed::Max, None), &mut stage, steps);
     let sizes: Vec<_> = stage.sent.iter().map(|(_, bus_link, frames)| (*bus_link, frames.len())).collect();
     assert_eq!(sizes, [(0, 64), (0, 36), (1, 1), (0, 1)]);
 }
@@ -150,7 +150,7 @@ fn in_lockstep_joints_wait_for_the_answers_to_those_before_on_their_bus() {
         joints(0, 0, 1),
         joints(0, 1, 1),
     ];
-    play(Player::new(2, Pace::Max, Some(sync)), &mut stage, steps);
+    play(Player::new(2, ReplaySpeed::Max, Some(sync)), &mut stage, steps);
     // A sync follows each joint packet; later frames do not wait, but the next joints do, on their own bus.
     let expected = [vec![0x70C, 1, 2], vec![1, 2], vec![0x70D, 0x70E], vec![1, 2], vec![1, 2]];
     assert_eq!(identifiers(&stage), expected);
@@ -170,7 +170,7 @@ fn the_first_segment_of_joints_waits_too() {
     let sync = vec![vec![frame(2), frame(2)]];
     let mut stage = Fake::default();
     play(
-        Player::new(1, Pace::Max, Some(sync)),
+        Player::new(1, ReplaySpeed::Max, Some(sync)),
         &mut stage,
         [segment.clone(), joints(0, 0, 0), segment, joints(0, 0, 1)],
     );
@@ -192,7 +192,7 @@ fn what_a_bus_does_not_take_is_counted_by_its_reason() {
         plain(4_000, 0, 6),
         plain(5_000, 0, 7),
     ];
-    let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
+    let played = play(Player::new(1, ReplaySpeed::Timed(1.0), None), &mut stage, steps);
     assert_eq!(played.bus_links, [BusTally { sent: 2, refused: 1, lost: 3, outages: 2 }]);
     assert_eq!(stage.unsent, [(0, 0), (0, 1)]);
     assert_eq!(
@@ -212,7 +212,7 @@ fn a_state_that_is_restored_takes_its_time_and_the_clock_begins_after_it() {
         PlayerStep::Restore(Vec::new()),
         plain(1_000, 0, 3),
     ];
-    let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
+    let played = play(Player::new(1, ReplaySpeed::Timed(1.0), None), &mut stage, steps);
     assert_eq!((stage.restored, played.late.max()), (2, 0));
     assert!(stage.sent[2].0 - stage.sent[1].0 > 1_000_000_000);
 }
@@ -222,16 +222,22 @@ fn frames_older_than_the_last_one_are_sent_at_once_and_are_not_late() {
     let late =
         DueFrame { at: 9_000_000, bus_index: 0, frame: frame(9), role: FrameRole::Plain, is_late: true };
     let mut stage = Fake::default();
-    let played =
-        play(Player::new(1, Pace::Timed(1.0), None), &mut stage, [plain(0, 0, 1), PlayerStep::Frame(late)]);
+    let played = play(
+        Player::new(1, ReplaySpeed::Timed(1.0), None),
+        &mut stage,
+        [plain(0, 0, 1), PlayerStep::Frame(late)],
+    );
     assert_eq!((identifiers(&stage), played.late.len()), (vec![vec![1, 9]], 1));
 }
 
 #[test]
 fn a_replay_can_be_stopped() {
     let mut stage = Fake { stops_at: Some(5_000_000), ..Fake::default() };
-    let played =
-        play(Player::new(1, Pace::Timed(1.0), None), &mut stage, (0..100).map(|n| plain(n * 1_000, 0, 1)));
+    let played = play(
+        Player::new(1, ReplaySpeed::Timed(1.0), None),
+        &mut stage,
+        (0..100).map(|n| plain(n * 1_000, 0, 1)),
+    );
     assert!(played.was_stopped && played.bus_links[0].sent < 10, "{played:?}");
 }
 
@@ -261,7 +267,7 @@ proptest! {
             _ => down(sent),
         });
         let mut stage = Fake { takes, outcomes: outcomes.collect(), ..Fake::default() };
-        let played = play(Player::new(3, Pace::Timed(1.0), syncs), &mut stage, steps.clone());
+        let played = play(Player::new(3, ReplaySpeed::Timed(1.0), syncs), &mut stage, steps.clone());
         let tried: Vec<_> = stage.sent.iter()
             .flat_map(|(at, bus_link, frames)| frames.iter().map(move |frame| (*at, *bus_link, *frame)))
             .filter(|(_, _, frame)| frame.id() != 0x7FF).collect();

@@ -5,7 +5,7 @@ use crate::replay::survey::TimeRange;
 use protocol::can::{ERROR, EXTENDED, Format};
 use protocol::candump::Timestamp;
 use protocol::id::{CellId, Node};
-use protocol::message::AppliesFrom;
+use protocol::message::StimulusStart;
 use protocol::message::{SensorPage, SkinSensors};
 use protocol::port;
 
@@ -22,7 +22,11 @@ fn joints(epoch: u8) -> Frame {
 
 fn press(number: i64) -> Frame {
     let page = SensorPage::Skin(SkinSensors::default());
-    frame(&Message::Stimulus { to: Node::Cell(CellId::new(number).unwrap()), from: AppliesFrom::Next, page })
+    frame(&Message::Stimulus {
+        to: Node::Cell(CellId::new(number).unwrap()),
+        from: StimulusStart::Next,
+        page,
+    })
 }
 
 fn torque(number: i64, epoch: u8) -> Frame {
@@ -52,7 +56,7 @@ fn decoded(frame: &Frame) -> Decoded {
 /// All steps of `passes` passes.
 fn plan_summary(
     part: TimeRange,
-    selection: impl FnOnce(&mut Selection),
+    selection: impl FnOnce(&mut FrameSelection),
     passes: u32,
 ) -> (Vec<DueFrame>, PlanSummary) {
     share_of(&capture(), part, selection, passes)
@@ -61,12 +65,12 @@ fn plan_summary(
 fn share_of(
     capture: &[(u64, &'static str, Frame)],
     part: TimeRange,
-    selection: impl FnOnce(&mut Selection),
+    selection: impl FnOnce(&mut FrameSelection),
     passes: u32,
 ) -> (Vec<DueFrame>, PlanSummary) {
     let mut survey = Survey::new(part);
     let record = |(nanos, interface, frame): &(u64, &'static str, Frame)| Record {
-        time: Timestamp::nine_digits(*nanos),
+        time: Timestamp::with_nine_digits(*nanos),
         interface,
         frame: *frame,
         direction: None,
@@ -74,7 +78,7 @@ fn share_of(
     capture.iter().for_each(|it| survey.add_frame(&record(it)));
     survey.finish();
     let bus_links = vec![Some(0), Some(1)];
-    let mut chosen = Selection { only: SenderFilter::All, destinations: bus_links, reads: true };
+    let mut chosen = FrameSelection { only: SenderFilter::All, destinations: bus_links, reads: true };
     selection(&mut chosen);
     let names = ["a", "b"].map(|name| (name.to_owned(), BTreeMap::new()));
     let mut comparator = Comparator::new(names, 0, Some(0));
@@ -108,7 +112,7 @@ fn all_is_sent_but_what_never_was_on_a_bus() {
     assert_eq!(plan_summary.skipped, BTreeMap::from([(reason::ERROR, 1)]));
     // Joints are numbered per bus.
     let rounds = due.iter().filter_map(|due| match due.role {
-        FrameRole::Joints(OpenJoints { round, .. }) => Some((due.bus_index, round)),
+        FrameRole::Joints(AwaitedJoints { round, .. }) => Some((due.bus_index, round)),
         FrameRole::Plain | FrameRole::SegmentOfJoints => None,
     });
     assert_eq!(rounds.collect::<Vec<_>>(), [(0, Some(0)), (1, Some(0)), (0, Some(1))]);
@@ -132,7 +136,8 @@ fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are(
     let data = |id: u32, byte| Frame::classic(id, &[byte; 8]).unwrap();
     let classic = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
     let page = SensorPage::Skin(SkinSensors::default());
-    let press = Message::Stimulus { to: Node::Cell(CellId::new(2).unwrap()), from: AppliesFrom::Next, page };
+    let press =
+        Message::Stimulus { to: Node::Cell(CellId::new(2).unwrap()), from: StimulusStart::Next, page };
     let halt = classic(&Message::Halt);
     let frames: Vec<_> = [data(0x001, 1), data(0x201, 2), halt[0], data(0x701, 3), halt[1], data(0x001, 4)]
         .into_iter()
@@ -154,13 +159,13 @@ fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are(
 fn wire_messages_are_never_sent() {
     let survey = Survey::new(TimeRange::default());
     for only in [SenderFilter::All, SenderFilter::Inputs, SenderFilter::Replies] {
-        let selection = Selection { only, destinations: vec![Some(0)], reads: true };
+        let selection = FrameSelection { only, destinations: vec![Some(0)], reads: true };
         let replay_plan = ReplayPlan::new(&survey, &selection);
         let frame = port::LinkId { wire: 9, back: false }.encode_frame(port::PortMessage::Join);
-        assert_eq!(replay_plan.skip_reason(0, &frame, &decoded(&frame)), Some(reason::WIRE));
+        assert_eq!(replay_plan.skip_reason(0, &frame, &decoded(&frame)), Some(reason::SIMULATED_WIRE));
         // A damaged frame does not show which protocol it belongs to, and counts as foreign.
         let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();
-        assert_ne!(replay_plan.skip_reason(0, &other, &decoded(&other)), Some(reason::WIRE));
+        assert_ne!(replay_plan.skip_reason(0, &other, &decoded(&other)), Some(reason::SIMULATED_WIRE));
     }
 }
 
@@ -169,7 +174,8 @@ fn a_part_begins_and_ends_at_its_times_and_buses_are_mapped() {
     let part = TimeRange { from: Some(MS), to: Some(6 * MS) };
     let (due, plan_summary) = plan_summary(part, |selection| selection.destinations = vec![None, Some(0)], 1);
     assert_eq!(shown(&due), [(0, 0, 1)]);
-    let skipped = [(reason::BEFORE, 1), (reason::AFTER, 2), (reason::NOT_PICKED, 3), (reason::ERROR, 1)];
+    let skipped =
+        [(reason::BEFORE_PART, 1), (reason::AFTER_PART, 2), (reason::NOT_PICKED, 3), (reason::ERROR, 1)];
     assert_eq!(plan_summary.skipped, BTreeMap::from(skipped));
 }
 
@@ -180,7 +186,7 @@ fn passes_follow_each_other_as_joints_do() {
     // A pass lasts 6 ms, which is also the time from the first joints to the second.
     assert_eq!(starts, [0, 12, 24]);
     let rounds = due.iter().filter_map(|due| match due.role {
-        FrameRole::Joints(OpenJoints { round, .. }) if due.bus_index == 0 => round,
+        FrameRole::Joints(AwaitedJoints { round, .. }) if due.bus_index == 0 => round,
         FrameRole::Joints(_) | FrameRole::Plain | FrameRole::SegmentOfJoints => None,
     });
     assert_eq!(rounds.collect::<Vec<_>>(), [0, 1, 2, 3, 4, 5]);

@@ -8,7 +8,7 @@ use crate::summary::{
     CellError, ErrorCells, HaltSummary, HostSummary, NetworkSummary, OutagesSummary, SumsSummary,
     UplinkSummary,
 };
-use model::table::{Contributions, Errors};
+use model::table::{Contributions, TorqueErrors};
 use trace::recording::account::{RecordingAccount, WrittenFile};
 
 /// A run of 253 cells that is well.
@@ -42,7 +42,7 @@ fn well_in_sums() -> Summary {
     summary.buses[0].replies = RepliesSummary::default();
     summary.buses[0].sums = Some(SumsSummary { roots: 1, contributions, ..SumsSummary::default() });
     summary.buses[0].network = Some(NetworkSummary { tree_ready_s: Some(0.4), ..NetworkSummary::default() });
-    summary.accuracy.single = Errors::default();
+    summary.accuracy.single = TorqueErrors::default();
     summary.accuracy.sums = [0.0035].into_iter().collect();
     summary
 }
@@ -90,13 +90,13 @@ fn nothing_is_well_that_is_not_known() {
     }
     let untouched = look_at(|it| {
         it.buses[0].replies = RepliesSummary::default();
-        it.accuracy.single = Errors::default();
+        it.accuracy.single = TorqueErrors::default();
     });
     assert_eq!(
         untouched,
         ["no torque was due: no cell was in contact, so nothing was compared; --scenario FILE touches cells"]
     );
-    let distributed = look_at(|it| it.accuracy.single = Errors::default());
+    let distributed = look_at(|it| it.accuracy.single = TorqueErrors::default());
     assert!(
         distributed[0].starts_with("no torque was compared with the central computation"),
         "{distributed:?}"

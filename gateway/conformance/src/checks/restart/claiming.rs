@@ -16,7 +16,7 @@ use crate::session::{CellPacket, Session};
 const ATTEMPTS: usize = 4;
 /// The maximum time that a cell which waits for a processor takes to process a frame; beyond it, the whole group is
 /// repeated.
-const MARGIN: Span = Span::from_millis(100);
+const PROCESSING_MARGIN: Span = Span::from_millis(100);
 const CLAIM_OVER: &str = "the bench was late each time: the claim was over";
 
 /// Returns the earliest end of a cell's claim, from the time of its first heartbeat.
@@ -26,26 +26,29 @@ fn earliest_end(session: &Session<'_>, claimed: Micros) -> Micros {
 }
 
 /// Checks the packets that a claiming cell accepts and those that it ignores.
-pub(super) fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -> Result<(), StopReason> {
+pub(super) fn check_while_claiming(
+    session: &mut Session<'_>,
+    after_test_mode: bool,
+) -> Result<(), StopReason> {
     // Test mode is off after a start, whatever it was before.
     if session.about.test_mode {
-        session.test_mode(false)?;
+        session.switch_test_mode(false)?;
     }
     for _ in 0..ATTEMPTS {
-        if ignores(session, after_test_mode)? {
+        if send_ignored_packets(session, after_test_mode)? {
             return Ok(());
         }
     }
     session.findings.not_tested("CLAIM-2", CLAIM_OVER);
     session.idle(claim(session))?;
     session.known.may_be_silent = false;
-    session.extend_life();
-    session.ready(&arm::example_parameters(2))?;
+    session.excuse_silence();
+    session.prepare_cell(&arm::example_parameters(2))?;
     Ok(())
 }
 
 /// Sends packets that a claiming cell must ignore. Returns true if all of them arrived while it was claiming.
-fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, StopReason> {
+fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, StopReason> {
     let claimed = restart(session)?;
     let end = earliest_end(session, claimed);
     let state =
@@ -55,7 +58,7 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
         "test mode must have the same initial value after each restart, but kept an earlier one".to_owned()
     });
     session.begin_expected_exchange();
-    session.press(arm::press(4_096))?;
+    session.press(arm::press_with_sum(4_096))?;
     let first = session.next_epoch();
     let second = session.next_epoch();
     let own = Node::Cell(session.cell);
@@ -85,10 +88,10 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
         last = session.send_messages(&[message])?;
         session.idle(Span::from_millis(3))?;
     }
-    if last + MARGIN >= end {
+    if last + PROCESSING_MARGIN >= end {
         // The cell had to answer some of them, and may send sensor values from now on.
         session.idle(Span::from_millis(200))?;
-        session.consume();
+        session.mark_expected();
         session.known.senses = true;
         return Ok(false);
     }
@@ -124,22 +127,22 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
             Some((_, SensorPage::Skin(skin))) => Some(*skin),
             _ => None,
         });
-        session.check("STIM-8", skin == Some(arm::press(4_096)), || {
+        session.check("STIM-8", skin == Some(arm::press_with_sum(4_096)), || {
             format!("a claiming cell must latch a stimulus, but {} is latched", arm::format_skin(skin))
         });
     }
-    session.ready(&arm::example_parameters(2))?;
+    session.prepare_cell(&arm::example_parameters(2))?;
     Ok(true)
 }
 
 /// Checks that the cell does not give way to claims with a higher serial number, before and after its first heartbeat.
-pub(super) fn stays(session: &mut Session<'_>) -> Result<(), StopReason> {
+pub(super) fn check_stays(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = session.about.serial.unwrap_or_default();
     let Some(higher) = own.checked_add(1) else {
         session.findings.not_tested("CLAIM-3", "no serial number is higher than its own");
         return Ok(());
     };
-    let Some(claimed) = claimed_before_its_first(session, higher)? else { return Ok(()) };
+    let Some(claimed) = claim_during_start(session, higher)? else { return Ok(()) };
     let low_is_lower = if own & 0xFFFF > 0 { own.checked_add(0xFFFF) } else { None };
     let end = earliest_end(session, claimed);
     for serial in [Some(higher), low_is_lower, Some(u32::MAX)].into_iter().flatten() {
@@ -155,7 +158,7 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), StopReason> {
         let came =
             session.wait(at + Span::from_millis(100), |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let answer = session.answers().iter().find_map(|it| Some((it.at, it.beat()?.0.state)));
-        session.consume();
+        session.mark_expected();
         session.check("CLAIM-3", came, || {
             format!("a claiming cell must answer a claim with the higher serial number {serial}, but did not")
         });
@@ -177,14 +180,14 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), StopReason> {
         "the cell must not give way to a higher serial number, but did".to_owned()
     });
     session.known.hash = None;
-    session.ready(&arm::example_parameters(2))?;
+    session.prepare_cell(&arm::example_parameters(2))?;
     Ok(())
 }
 
 /// Sends claims with a higher serial number continuously while the cell starts, and returns the time of its first
 /// heartbeat. That heartbeat is sent (serial mod 64) ms after the start, and must have DUPLICATE if a claim came before
 /// it. A late computer may delay the claims, so the check is then repeated.
-fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, StopReason> {
+fn claim_during_start(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, StopReason> {
     const ATTEMPTS: usize = 3;
     let rest = twin_heartbeat(session, higher, true);
     let is_long = session.about.serial.unwrap_or_default() % 64 >= 30;
@@ -221,7 +224,7 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
 }
 
 /// Checks that a claiming cell ignores a `4nn` of a page that does not exist.
-pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), StopReason> {
+pub(super) fn check_invalid_page(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claimed = restart(session)?;
     session.begin_expected_exchange();
     let mut packet = twin_heartbeat(session, 0, true).encode();
@@ -248,13 +251,17 @@ pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that a claiming cell gives way to a packet, and is silent after it.
-pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) -> Result<(), StopReason> {
+pub(super) fn check_gives_way(
+    session: &mut Session<'_>,
+    what: &str,
+    other: &Message,
+) -> Result<(), StopReason> {
     for _ in 0..ATTEMPTS {
         let claimed = restart(session)?;
         session.begin_expected_exchange();
         let at = session.send_messages(&[*other])?;
-        if at + MARGIN < earliest_end(session, claimed) {
-            return is_silent(session, claimed, what);
+        if at + PROCESSING_MARGIN < earliest_end(session, claimed) {
+            return check_silent(session, claimed, what);
         }
     }
     session.findings.not_tested("CLAIM-3", CLAIM_OVER);
@@ -262,9 +269,9 @@ pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) 
 }
 
 /// Checks that a cell that gave way sends nothing.
-fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(), StopReason> {
+fn check_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(), StopReason> {
     session.idle(Span::from_millis(3))?;
-    session.consume();
+    session.mark_expected();
     session.begin_expected_exchange();
     for message in [Message::Sync, Message::Report] {
         session.send_messages(&[message])?;
@@ -274,7 +281,7 @@ fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(
     let until = claimed + claim_end(session);
     session.wait(until, |_| false)?;
     let came = session.answers().len();
-    session.consume();
+    session.mark_expected();
     let serial = session.about.serial.unwrap_or_default();
     session.check("CLAIM-3", came == 0, || {
         format!("the cell (serial number {serial}) must give way to {what}, but sent {came} packets after it")

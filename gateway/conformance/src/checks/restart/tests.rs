@@ -31,7 +31,7 @@ impl TestBus for Script {
         self.now
     }
 
-    fn carries(&self, _: Format) -> bool {
+    fn supports_format(&self, _: Format) -> bool {
         true
     }
 
@@ -118,7 +118,7 @@ fn failed(format: Format, takes: Span, former: &[Frame], before: usize, new: &[F
     let mut session = Session::new(&mut bus, "vcan0", cell(), format, Span::from_millis(60_000));
     session.about.serial = Some(100_012);
     session.idle(Span((before.len() as u64 + 1) * OLD.0)).unwrap();
-    session.consume();
+    session.mark_expected();
     let claimed = restart(&mut session).map(|claimed| settled(&mut session, claimed));
     assert!(matches!(claimed, Ok(Ok(_))), "{claimed:?}");
     session.idle(Span::from_millis(500)).unwrap();

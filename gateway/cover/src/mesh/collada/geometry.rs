@@ -4,11 +4,11 @@ use nalgebra::Point3;
 use roxmltree::Node;
 
 use super::{ElementIds, Named as _, child, children, floats, numbers};
-use crate::mesh::polygon::{Triangulation, fan};
+use crate::mesh::polygon::{Triangulation, add_fan};
 use crate::mesh::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
 
 /// The maximum number of indices that a file may give for a corner.
-const MAX_OFFSET: usize = 64;
+const MAX_INDICES_PER_CORNER: usize = 64;
 
 /// A `mesh` element, with the elements that it refers to.
 #[derive(Debug)]
@@ -50,15 +50,15 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             let corners = self.corners(element, kind)?;
             match kind {
                 "triangles" => self.read_triangles(element, &corners, &mut filled)?,
-                "polylist" => self.polylist(element, &corners, &mut filled)?,
-                "polygons" => self.polygons(element, &corners, &mut filled)?,
+                "polylist" => self.read_polylist(element, &corners, &mut filled)?,
+                "polygons" => self.read_polygons(element, &corners, &mut filled)?,
                 _ => {
                     for indices in children(element, "p") {
                         let points = self.points(indices, &corners)?;
                         if kind == "tristrips" {
-                            strip(&points, &mut filled.triangles);
+                            add_strip(&points, &mut filled.triangles);
                         } else {
-                            fan(&points, &mut filled.triangles);
+                            add_fan(&points, &mut filled.triangles);
                         }
                     }
                 }
@@ -90,7 +90,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     }
 
     /// Reads a primitive of polygons whose corners are in one list.
-    fn polylist(
+    fn read_polylist(
         &self,
         element: Node<'a, 'i>,
         corners: &Corners,
@@ -116,7 +116,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     }
 
     /// Reads a primitive of polygons with a list of corners each. Polygons may have holes.
-    fn polygons(
+    fn read_polygons(
         &self,
         element: Node<'a, 'i>,
         corners: &Corners,
@@ -186,9 +186,12 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         let mut vertex = None;
         for input in children(element, "input") {
             let text = input.attribute("offset").unwrap_or("0");
-            let offset = text.trim().parse().ok().filter(|offset| *offset < MAX_OFFSET);
+            let offset = text.trim().parse().ok().filter(|offset| *offset < MAX_INDICES_PER_CORNER);
             let offset = offset.ok_or_else(|| {
-                self.error(&format!("an input has the offset {text:?}, not one of 0 to {}", MAX_OFFSET - 1))
+                self.error(&format!(
+                    "an input has the offset {text:?}, not one of 0 to {}",
+                    MAX_INDICES_PER_CORNER - 1
+                ))
             })?;
             stride = stride.max(offset + 1);
             if input.attribute("semantic") == Some("VERTEX") {
@@ -229,7 +232,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
 }
 
 /// Adds the triangles of a strip. Every other triangle is reversed, so that all have the same winding.
-fn strip(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
+fn add_strip(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
     triangles.extend(corners.windows(3).enumerate().filter_map(|(at, corners)| {
         let &[a, b, c] = corners else { return None };
         Some(if at % 2 == 0 { [a, b, c] } else { [b, a, c] })

@@ -206,10 +206,10 @@ impl Truth {
     }
 
     /// Returns the tree that cells would build, breadth first.
-    fn trees(&self) -> BTreeMap<CellId, Tree> {
+    fn trees(&self) -> BTreeMap<CellId, TreePage> {
         let mut trees = BTreeMap::new();
         let mut next =
-            VecDeque::from([(cell(1), Tree { parent: Some(0), parent_port: 4, ..Tree::default() })]);
+            VecDeque::from([(cell(1), TreePage { parent: Some(0), parent_port: 4, ..TreePage::default() })]);
         while let Some((node, tree)) = next.pop_front() {
             if trees.contains_key(&node) {
                 continue;
@@ -220,7 +220,7 @@ impl Truth {
                 let depth = tree.depth + 1;
                 next.push_back((
                     other.cell,
-                    Tree { parent: Some(node.get()), parent_port: up, depth, ..Tree::default() },
+                    TreePage { parent: Some(node.get()), parent_port: up, depth, ..TreePage::default() },
                 ));
             }
         }
@@ -245,7 +245,7 @@ impl Truth {
                         || self.versions.contains_key(&cell),
                 };
             }
-            Ports { ports, changes: 0 }
+            PortsPage { ports, changes: 0 }
         };
         let seen = |(&node, &heartbeat): (&CellId, &Heartbeat)| {
             let described = usize::from(node.get()) <= self.cells;

@@ -31,7 +31,7 @@ pub(super) struct Candidate {
 
 impl Candidate {
     /// Returns the candidate after a heartbeat that is not the owner's; `before` is the candidate before it.
-    pub(super) fn next(before: Option<Self>, new: Incarnation) -> Self {
+    pub(super) fn after_heartbeat(before: Option<Self>, new: Incarnation) -> Self {
         let goes_on = |it: &Self| {
             it.last.packets_until(&new).is_some()
                 && new.at.elapsed_since(it.last.at) >= MIN_HEARTBEAT_INTERVAL
@@ -41,7 +41,7 @@ impl Candidate {
     }
 
     /// Returns true if the candidate owns the node id from its last heartbeat on; `owner` is the owner so far.
-    pub(super) fn succeeds(&self, owner: Option<&Incarnation>) -> bool {
+    pub(super) fn becomes_owner(&self, owner: Option<&Incarnation>) -> bool {
         let is_silent = owner.is_none_or(|owner| !owner.is_alive(self.last.at));
         is_silent && (self.last.has_just_started() || self.consecutive >= PROVING_HEARTBEATS)
     }
@@ -61,7 +61,7 @@ mod tests {
 
     fn after(heard: &[(u64, u32, u16)]) -> Candidate {
         let next = |before, &(ms, serial, sent): &(u64, u32, u16)| {
-            Some(Candidate::next(before, life(ms, serial, sent)))
+            Some(Candidate::after_heartbeat(before, life(ms, serial, sent)))
         };
         heard.iter().fold(None, next).unwrap()
     }
@@ -89,9 +89,9 @@ mod tests {
     fn a_silent_owner_is_succeeded_by_a_start_or_a_third_heartbeat() {
         let (alive, silent) = (life(0, 5, 1), life(0, 5, 1));
         let start = after(&[(601, 7, 0)]);
-        assert!(start.succeeds(Some(&silent)) && start.succeeds(None));
-        assert!(!after(&[(600, 7, 0)]).succeeds(Some(&alive)));
+        assert!(start.becomes_owner(Some(&silent)) && start.becomes_owner(None));
+        assert!(!after(&[(600, 7, 0)]).becomes_owner(Some(&alive)));
         let [two, three] = [2, 3].map(|many| after(&[(500, 7, 1), (600, 7, 2), (700, 7, 3)][..many]));
-        assert!(!two.succeeds(None) && three.succeeds(Some(&silent)));
+        assert!(!two.becomes_owner(None) && three.becomes_owner(Some(&silent)));
     }
 }

@@ -7,7 +7,7 @@ use crate::tracker::DEAD_AFTER;
 
 /// A packet counter that falls back by more than this proves a restart. A smaller step back may be a heartbeat that was
 /// overtaken by others.
-pub(super) const MAX_OVERTAKEN: u16 = 128;
+pub(super) const MAX_OVERTAKEN_PACKETS: u16 = 128;
 
 /// Upper bound of the packets that a cell sends until it counts as dead: three packets for each of 500 joints per
 /// second make 900 in that time.
@@ -39,7 +39,7 @@ impl Incarnation {
     }
 
     /// Returns this life, with the last heartbeat of `last`.
-    pub(super) const fn with_last(self, last: Self) -> Self {
+    pub(super) const fn with_heartbeat_of(self, last: Self) -> Self {
         Self { claimed: self.claimed, ..last }
     }
 
@@ -62,7 +62,7 @@ impl Incarnation {
     }
 
     /// Returns true if the cell may still be alive at `at`, though silent because its bus was lost.
-    pub(super) fn may_go_on(&self, at: Micros) -> bool {
+    pub(super) fn may_still_be_alive(&self, at: Micros) -> bool {
         at.elapsed_since(self.at) <= GONE_AFTER
     }
 
@@ -75,12 +75,12 @@ impl Incarnation {
     /// be its next heartbeat.
     pub(super) fn packets_until(&self, next: &Self) -> Option<u16> {
         let sent = next.distance_behind(self);
-        let is_next = self.is_same_cell(next) && self.may_go_on(next.at) && sent.cast_signed() > 0;
-        (is_next && self.has_time_for(next.at, sent)).then_some(sent)
+        let is_next = self.is_same_cell(next) && self.may_still_be_alive(next.at) && sent.cast_signed() > 0;
+        (is_next && self.can_have_sent(next.at, sent)).then_some(sent)
     }
 
     /// Returns true if the cell can have sent this number of packets from its last heartbeat to the time `at`.
-    pub(super) fn has_time_for(&self, at: Micros, sent: u16) -> bool {
+    pub(super) fn can_have_sent(&self, at: Micros, sent: u16) -> bool {
         u64::from(sent)
             <= u64::from(MAX_PACKETS_BEFORE_DEAD) * (1 + at.elapsed_since(self.at).0 / DEAD_AFTER.0)
     }
@@ -88,12 +88,12 @@ impl Incarnation {
     /// Returns true if a heartbeat is an old one of this life, or a copy of its last one.
     pub(super) fn is_own_past(&self, old: &Self) -> bool {
         let back = self.distance_behind(old);
-        self.is_same_cell(old) && (back == 0 || back <= MAX_OVERTAKEN && old.heartbeat.sent > 1)
+        self.is_same_cell(old) && (back == 0 || back <= MAX_OVERTAKEN_PACKETS && old.heartbeat.sent > 1)
     }
 
     /// Returns true if this life still claims the node id at the time of `next`, so that a heartbeat without CLAIMING
     /// cannot be from it.
-    pub(super) fn claims_until(&self, next: &Self) -> bool {
+    pub(super) fn is_still_claiming_at(&self, next: &Self) -> bool {
         let settles = !self.is_settled() && next.is_settled();
         settles && self.claimed.is_some_and(|claimed| next.at.elapsed_since(claimed) < MIN_CLAIM_TIME)
     }

@@ -69,12 +69,12 @@ impl AddressClaim {
     /// here.
     pub fn receive(&mut self, at: Micros, heartbeat: &Heartbeat) -> HeartbeatKind {
         let new = Incarnation::new(at, heartbeat);
-        let (mut next, mut word) = self.ownership.next(self.ownership.evidence(&new), new);
+        let (mut next, mut word) = self.ownership.after_heartbeat(self.ownership.evidence(&new), new);
         if word == HeartbeatKind::Outsider {
-            let candidate = Candidate::next(self.candidate, new);
+            let candidate = Candidate::after_heartbeat(self.candidate, new);
             self.candidate = Some(candidate);
-            if candidate.succeeds(self.ownership.owner()) {
-                (next, word) = self.ownership.next(Evidence::Succeeds, new);
+            if candidate.becomes_owner(self.ownership.owner()) {
+                (next, word) = self.ownership.after_heartbeat(Evidence::Succeeds, new);
             }
         }
         match word {
@@ -94,7 +94,7 @@ impl AddressClaim {
 
     /// Returns true if an accepted start of the owner may still be taken back.
     pub(super) fn is_in_question(&self, at: Micros) -> bool {
-        self.ownership.former().is_some_and(|former| former.may_go_on(at))
+        self.ownership.former().is_some_and(|former| former.may_still_be_alive(at))
     }
 
     /// Returns the last heartbeat of the owner of the node id, or of the first cell to claim it.

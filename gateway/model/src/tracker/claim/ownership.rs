@@ -125,7 +125,7 @@ impl Ownership {
 
     /// Returns the state after the owner's next heartbeat.
     fn with_last_heartbeat(self, last: Incarnation) -> Self {
-        self.owner().map_or(self, |owner| self.with_owner(owner.with_last(last)))
+        self.owner().map_or(self, |owner| self.with_owner(owner.with_heartbeat_of(last)))
     }
 
     /// Returns the fact that a heartbeat proves; `new` is the life that would begin with it.
@@ -151,16 +151,18 @@ impl Ownership {
             return Evidence::Repeats;
         }
         match (owner.packets_until(new), of_former) {
-            (Some(_), Some(_)) if owner.claims_until(new) => Evidence::FormerContinues,
+            (Some(_), Some(_)) if owner.is_still_claiming_at(new) => Evidence::FormerContinues,
             (Some(own), Some(its)) if owner.claimed.is_none() && self.fits_former_better(new, own, its) => {
                 Evidence::FormerContinues
             }
             (Some(_), _) => Evidence::Continues,
             (None, Some(_)) => Evidence::FormerContinues,
-            (None, None) if owner.distance_behind(new).cast_signed() < 0 && !owner.may_go_on(new.at) => {
+            (None, None)
+                if owner.distance_behind(new).cast_signed() < 0 && !owner.may_still_be_alive(new.at) =>
+            {
                 Evidence::Returns
             }
-            (None, None) if !owner.has_time_for(new.at, new.heartbeat.sent) => Evidence::Exceeds,
+            (None, None) if !owner.can_have_sent(new.at, new.heartbeat.sent) => Evidence::Exceeds,
             (None, None) => Evidence::Jumps,
         }
     }
@@ -174,11 +176,12 @@ impl Ownership {
 
     /// Returns the state after a heartbeat with this evidence, and the meaning of the heartbeat; `new` is the life that
     /// would begin with it. Each arm names its rows of the table.
-    pub(super) fn next(self, evidence: Evidence, new: Incarnation) -> (Self, HeartbeatKind) {
+    pub(super) fn after_heartbeat(self, evidence: Evidence, new: Incarnation) -> (Self, HeartbeatKind) {
         use Evidence as E;
-        const AGAIN: HeartbeatKind = HeartbeatKind::Started { again: true };
-        let left_of =
-            |former: Incarnation, owner: Incarnation| if former.may_go_on(new.at) { former } else { owner };
+        const RESTARTED: HeartbeatKind = HeartbeatKind::Started { again: true };
+        let left_of = |former: Incarnation, owner: Incarnation| {
+            if former.may_still_be_alive(new.at) { former } else { owner }
+        };
         match (self, evidence) {
             // first_claim
             (Self::Free, E::Claims) => (Self::Sole { owner: new }, HeartbeatKind::Started { again: false }),
@@ -209,11 +212,11 @@ impl Ownership {
             }
             // start
             (Self::Sole { owner }, E::Intrudes | E::Starts | E::Jumps | E::Succeeds) => {
-                (Self::Doubted { owner: new, former: owner }, AGAIN)
+                (Self::Doubted { owner: new, former: owner }, RESTARTED)
             }
             // further_start, start_after_former
             (Self::Doubted { owner, former }, E::Intrudes | E::Starts | E::Jumps | E::Succeeds) => {
-                (Self::Doubted { owner: new, former: left_of(former, owner) }, AGAIN)
+                (Self::Doubted { owner: new, former: left_of(former, owner) }, RESTARTED)
             }
             // taken_back
             (Self::Doubted { .. } | Self::Inherited { .. }, E::FormerContinues) => {
@@ -226,10 +229,12 @@ impl Ownership {
                 E::Intrudes | E::Starts | E::Jumps | E::Returns | E::Exceeds,
             ) => (self, HeartbeatKind::Outsider),
             // successor
-            (Self::Shared { owner }, E::Succeeds) => (Self::Inherited { owner: new, former: owner }, AGAIN),
+            (Self::Shared { owner }, E::Succeeds) => {
+                (Self::Inherited { owner: new, former: owner }, RESTARTED)
+            }
             // further_successor, successor_after_former
             (Self::Inherited { owner, former }, E::Succeeds) => {
-                (Self::Inherited { owner: new, former: left_of(former, owner) }, AGAIN)
+                (Self::Inherited { owner: new, former: left_of(former, owner) }, RESTARTED)
             }
             // incomparable
             (

@@ -8,7 +8,7 @@ use std::fmt;
 
 use protocol::candump::Timestamp;
 
-use super::console::Stamp;
+use super::console::LineTime;
 use crate::capture::last_times::LastTimes;
 
 /// The time between successive frames, in ns, that is assumed if the lines hold no times.
@@ -73,16 +73,16 @@ impl Clock {
     pub(crate) const NEW: Self = Self { relative: None, last: None };
 
     /// Returns the time of the last frame, in ns; 0 before the first one.
-    pub(super) fn last(self) -> u64 {
+    pub(super) fn last_ns(self) -> u64 {
         self.last.unwrap_or(0)
     }
 
     /// Returns true if the reference of relative times is not known yet.
-    pub(super) const fn is_open(self) -> bool {
+    pub(super) const fn is_undecided(self) -> bool {
         self.relative.is_none()
     }
 
-    pub(super) const fn decide(&mut self, relative: TimeReference) {
+    pub(super) const fn set_reference(&mut self, relative: TimeReference) {
         self.relative = Some(relative);
     }
 
@@ -92,19 +92,19 @@ impl Clock {
     }
 
     /// Returns the time of the next frame, and a remark if the time is not absolute.
-    pub(super) fn time(&mut self, stamp: Stamp) -> (Timestamp, Option<Remark>) {
+    pub(super) fn time(&mut self, stamp: LineTime) -> (Timestamp, Option<Remark>) {
         let (time, remark) = match stamp {
-            Stamp::None => {
+            LineTime::None => {
                 let nanos = self.last.map_or(0, |last| last.saturating_add(STEP_NS));
-                (Timestamp::six_digits(nanos), Some(Remark::NoTimes))
+                (Timestamp::with_six_digits(nanos), Some(Remark::NoTimes))
             }
-            Stamp::Absolute(time) => (time, None),
-            Stamp::Local(time) => (time, Some(Remark::LocalTimes)),
-            Stamp::Relative(time) if self.relative == Some(TimeReference::Before) => {
-                let nanos = self.last().saturating_add(time.nanos);
+            LineTime::Absolute(time) => (time, None),
+            LineTime::Local(time) => (time, Some(Remark::LocalTimes)),
+            LineTime::Relative(time) if self.relative == Some(TimeReference::Before) => {
+                let nanos = self.last_ns().saturating_add(time.nanos);
                 (Timestamp { nanos, ..time }, Some(Remark::Differences))
             }
-            Stamp::Relative(time) => (time, Some(Remark::SinceFirst)),
+            LineTime::Relative(time) => (time, Some(Remark::SinceFirst)),
         };
         self.set(time.nanos);
         (time, remark)
@@ -113,14 +113,14 @@ impl Clock {
 
 /// Compares the times of several lines to find out what they are relative to.
 #[derive(Debug, Default)]
-pub(super) struct Evidence {
+pub(super) struct TimeEvidence {
     last: LastTimes<MAX_BUSES>,
     compared: u32,
     smaller: u32,
     same: u32,
 }
 
-impl Evidence {
+impl TimeEvidence {
     pub(super) fn add(&mut self, interface: &str, nanos: u64) {
         let Some(last) = self.last.replace(interface, nanos) else { return };
         self.compared += 1;

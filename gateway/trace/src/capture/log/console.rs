@@ -22,7 +22,7 @@ use protocol::candump::{self, Direction, LineError, Timestamp, eight_digit_ident
 /// A frame parsed from a line, with the information whether the line showed its flags.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ConsoleFrame<'a> {
-    pub(super) stamp: Stamp,
+    pub(super) stamp: LineTime,
     pub(super) interface: &'a str,
     pub(super) frame: Frame,
     pub(super) direction: Option<Direction>,
@@ -32,7 +32,7 @@ pub(super) struct ConsoleFrame<'a> {
 
 /// The time of a line.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Stamp {
+pub(super) enum LineTime {
     /// The line has no time.
     None,
     /// The time since 1970.
@@ -59,19 +59,19 @@ pub(super) fn parse(line: &[u8]) -> Option<Result<ConsoleLine<'_>, LineError>> {
     let text = line.trim_ascii_end();
     memchr::memchr3(b'[', b'{', b'#', text)?;
     let mut cursor = Cursor { text, at: 0 };
-    cursor.quotes();
+    cursor.skip_quotes();
     if matches!(cursor.rest().first(), Some(b'#' | b';' | b'/')) {
         return None;
     }
-    let first = cursor.line();
+    let first = cursor.parse_line();
     if first.is_some() || cursor.rest().starts_with(b"(") {
         return first;
     }
     // Text before the frame may be a prompt. A malformed frame after such text is not an error, because the line may be
     // anything.
-    while !cursor.word().is_empty() {
-        cursor.blanks();
-        if let Some(Ok(frame)) = cursor.line() {
+    while !cursor.take_word().is_empty() {
+        cursor.skip_blanks();
+        if let Some(Ok(frame)) = cursor.parse_line() {
             return Some(Ok(frame));
         }
     }
@@ -105,16 +105,16 @@ struct Cursor<'a> {
 
 impl<'a> Cursor<'a> {
     /// Parses a line from the position of the cursor on. Blanks are skipped first.
-    fn line(mut self) -> Option<Result<ConsoleLine<'a>, LineError>> {
-        let stamp = if self.accept(b'(') { self.stamp()? } else { Stamp::None };
-        self.blanks();
-        let interface = core::str::from_utf8(self.word()).ok().filter(|name| !name.is_empty())?;
-        self.blanks();
-        let marks = self.marks();
-        self.blanks();
+    fn parse_line(mut self) -> Option<Result<ConsoleLine<'a>, LineError>> {
+        let stamp = if self.accept(b'(') { self.stamp()? } else { LineTime::None };
+        self.skip_blanks();
+        let interface = core::str::from_utf8(self.take_word()).ok().filter(|name| !name.is_empty())?;
+        self.skip_blanks();
+        let marks = self.parse_direction_and_flags();
+        self.skip_blanks();
         let id_at = self.at;
-        let id = self.word();
-        if let (Stamp::Local(_), None) = (stamp, marks) {
+        let id = self.take_word();
+        if let (LineTime::Local(_), None) = (stamp, marks) {
             // The line is from a log whose times are dates.
             let frame = id.contains(&b'#').then(|| core::str::from_utf8(id).ok()).flatten();
             if let Some(frame) = frame.and_then(|text| candump::parse_frame(text).ok()) {
@@ -123,7 +123,7 @@ impl<'a> Cursor<'a> {
                 return Some(Ok(ConsoleLine::Frame(seen)));
             }
         }
-        if !matches!(id.len(), 3 | 8) || !id.iter().all(u8::is_ascii_hexdigit) || !self.blanks() {
+        if !matches!(id.len(), 3 | 8) || !id.iter().all(u8::is_ascii_hexdigit) || !self.skip_blanks() {
             return None;
         }
         let length = self.length()?;
@@ -135,7 +135,7 @@ impl<'a> Cursor<'a> {
         let expected = "an identifier, at most 7FF in 3 digits";
         let frame = identifier_of(id).ok_or(LineError { column: id_at + 1, expected });
         let frame = frame.and_then(|id| self.frame(id, length, flags.unwrap_or(0)));
-        if self.is_of_isotpsniffer(frame.is_ok()) {
+        if self.is_isotpsniffer_output(frame.is_ok()) {
             return None;
         }
         Some(
@@ -147,8 +147,8 @@ impl<'a> Cursor<'a> {
 
     /// Parses the direction (`T` or `R`) after a frame in a log.
     fn direction(&mut self) -> Option<Direction> {
-        self.blanks();
-        match self.word() {
+        self.skip_blanks();
+        match self.take_word() {
             b"T" => Some(Direction::Sent),
             b"R" => Some(Direction::Received),
             _ => None,
@@ -157,7 +157,7 @@ impl<'a> Cursor<'a> {
 
     /// Returns true if a dash and a quoted text follow the data. isotpsniffer prints messages this way, which it has
     /// joined from several frames.
-    fn is_of_isotpsniffer(&self, has_frame: bool) -> bool {
+    fn is_isotpsniffer_output(&self, has_frame: bool) -> bool {
         if has_frame {
             self.rest().starts_with(b"- '")
         } else {
@@ -180,7 +180,7 @@ impl<'a> Cursor<'a> {
     }
 
     /// Skips blanks and colours. Returns true if there were any.
-    fn blanks(&mut self) -> bool {
+    fn skip_blanks(&mut self) -> bool {
         let from = self.at;
         loop {
             match self.rest() {
@@ -195,17 +195,17 @@ impl<'a> Cursor<'a> {
     }
 
     /// Skips blanks, colours, and the quotation marks of mails and issues.
-    fn quotes(&mut self) {
-        while self.blanks() || self.accept(b'>') || self.accept(b'|') {}
+    fn skip_quotes(&mut self) {
+        while self.skip_blanks() || self.accept(b'>') || self.accept(b'|') {}
     }
 
     /// Returns the text up to the next blank or colour.
-    fn word(&mut self) -> &'a [u8] {
-        self.run(|byte| !matches!(byte, b' ' | b'\t' | 0x1B))
+    fn take_word(&mut self) -> &'a [u8] {
+        self.take_while(|byte| !matches!(byte, b' ' | b'\t' | 0x1B))
     }
 
     /// Returns the longest run of bytes from the cursor on that match `is`.
-    fn run(&mut self, is: impl Fn(u8) -> bool) -> &'a [u8] {
+    fn take_while(&mut self, is: impl Fn(u8) -> bool) -> &'a [u8] {
         let rest = self.rest();
         let len = rest.iter().take_while(|&&byte| is(byte)).count();
         self.at += len;
@@ -214,30 +214,30 @@ impl<'a> Cursor<'a> {
 
     /// Returns a decimal number and the count of its digits.
     fn number(&mut self) -> Option<(u64, usize)> {
-        let digits = self.run(|byte| byte.is_ascii_digit());
+        let digits = self.take_while(|byte| byte.is_ascii_digit());
         Some((core::str::from_utf8(digits).ok()?.parse().ok()?, digits.len()))
     }
 
     /// Parses the time in parentheses before the bus name, up to and including the closing parenthesis.
-    fn stamp(&mut self) -> Option<Stamp> {
+    fn stamp(&mut self) -> Option<LineTime> {
         let is_padded = self.rest().first() == Some(&b'0');
         let (number, digits) = self.number()?;
         let is_date = self.accept(b'-');
-        let seconds = if is_date { self.date(number)? } else { number };
-        let fraction = self.accept(b'.').then(|| self.run(|byte| byte.is_ascii_digit()))?;
-        let (fraction, fraction_digits) = candump::fraction(fraction)?;
+        let seconds = if is_date { self.parse_date(number)? } else { number };
+        let fraction = self.accept(b'.').then(|| self.take_while(|byte| byte.is_ascii_digit()))?;
+        let (fraction, fraction_digits) = candump::fraction_to_nanos(fraction)?;
         let nanos = seconds.checked_mul(1_000_000_000)?.checked_add(fraction)?;
-        let time = Timestamp { nine_digits: fraction_digits > 6, ..Timestamp::six_digits(nanos) };
+        let time = Timestamp { nine_digits: fraction_digits > 6, ..Timestamp::with_six_digits(nanos) };
         self.accept(b')').then_some(())?;
         Some(match digits {
-            _ if is_date => Stamp::Local(time),
-            10.. => Stamp::Absolute(Timestamp { min_digits: if is_padded { 10 } else { 1 }, ..time }),
-            _ => Stamp::Relative(time),
+            _ if is_date => LineTime::Local(time),
+            10.. => LineTime::Absolute(Timestamp { min_digits: if is_padded { 10 } else { 1 }, ..time }),
+            _ => LineTime::Relative(time),
         })
     }
 
     /// Parses the rest of `2026-11-24 03:55:42` after the year. Returns seconds since 1970.
-    fn date(&mut self, year: u64) -> Option<u64> {
+    fn parse_date(&mut self, year: u64) -> Option<u64> {
         let mut two_digits = |end: Option<u8>| {
             let (number, digits) = self.number()?;
             (digits == 2 && end.is_none_or(|end| self.accept(end))).then_some(number)
@@ -246,13 +246,13 @@ impl<'a> Cursor<'a> {
         let (hour, minute, second) = (two_digits(Some(b':'))?, two_digits(Some(b':'))?, two_digits(None)?);
         let is_date = (1970..2554).contains(&year) && (1..=12).contains(&month) && (1..=31).contains(&day);
         (is_date && hour < 24 && minute < 60 && second <= 60)
-            .then(|| ((days(year, month, day) * 24 + hour) * 60 + minute) * 60 + second)
+            .then(|| ((days_since_1970(year, month, day) * 24 + hour) * 60 + minute) * 60 + second)
     }
 
     /// Parses the output of `-x`: the direction, and the flags of an FD frame, which may be missing.
-    fn marks(&mut self) -> Option<(Direction, Option<u8>)> {
+    fn parse_direction_and_flags(&mut self) -> Option<(Direction, Option<u8>)> {
         let mut cursor = *self;
-        let direction = match cursor.word() {
+        let direction = match cursor.take_word() {
             b"TX" => Direction::Sent,
             b"RX" => Direction::Received,
             _ => return None,
@@ -260,8 +260,8 @@ impl<'a> Cursor<'a> {
         self.at = cursor.at;
         let mut flags = 0;
         for (letters, flag) in [(b"BS", BIT_RATE_SWITCH), (b"ER", ERROR_STATE)] {
-            cursor.blanks();
-            match cursor.word() {
+            cursor.skip_blanks();
+            match cursor.take_word() {
                 b"-" => {}
                 [letter] if letters.contains(letter) => flags |= flag,
                 _ => return Some((direction, None)),
@@ -274,7 +274,7 @@ impl<'a> Cursor<'a> {
     fn length(&mut self) -> Option<Length> {
         let is_dlc = self.accept(b'{');
         if is_dlc {
-            let digit = self.run(|byte| byte.is_ascii_hexdigit());
+            let digit = self.take_while(|byte| byte.is_ascii_hexdigit());
             let [digit] = digit else { return None };
             let dlc = char::from(*digit).to_digit(16).and_then(|dlc| u8::try_from(dlc).ok())?;
             return self.accept(b'}').then_some(Length::Dlc(dlc));
@@ -297,7 +297,7 @@ impl<'a> Cursor<'a> {
             Length::Classic(len) | Length::Fd(len) => len,
             Length::CanXl => 0,
         };
-        self.blanks();
+        self.skip_blanks();
         let made = if self.rest().starts_with(b"remote request") {
             Frame::remote(id, len)
         } else {
@@ -323,23 +323,23 @@ impl<'a> Cursor<'a> {
             let swap = self.accept(b'`');
             is_swapped |= swap;
             if !swap {
-                self.blanks();
+                self.skip_blanks();
             }
             let missing = self.error("a data byte: there are fewer than the length says");
-            let digits = self.run(|byte| byte.is_ascii_hexdigit());
+            let digits = self.take_while(|byte| byte.is_ascii_hexdigit());
             *place = byte(digits).ok_or(missing)?;
         }
         if is_swapped && let Some(data) = data.get_mut(..len) {
             data.reverse();
         }
         let from = self.at;
-        self.blanks();
+        self.skip_blanks();
         let further = LineError {
             column: self.at + 1,
             expected: "the end: there are more data bytes than the length says",
         };
         let is_near = self.at <= from + 1;
-        if is_near && byte(Self { ..*self }.word()).is_some() { Err(further) } else { Ok(data) }
+        if is_near && byte(Self { ..*self }.take_word()).is_some() { Err(further) } else { Ok(data) }
     }
 }
 
@@ -355,7 +355,7 @@ fn byte(digits: &[u8]) -> Option<u8> {
 }
 
 /// Returns the days from 1970-01-01 to a day of the Gregorian calendar, for years from 1970 on.
-const fn days(year: u64, month: u64, day: u64) -> u64 {
+const fn days_since_1970(year: u64, month: u64, day: u64) -> u64 {
     // Years begin in March here, so that a leap day is the last day of its year.
     let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
     let of_years = year * 365 + year / 4 - year / 100 + year / 400;

@@ -12,4 +12,4 @@ pub(super) use read::{LogReader, known_time};
 #[cfg(test)]
 mod tests;
 
-pub use write::{Digits, LogWriter, OmittedProperties, Style, WriteOutcome};
+pub use write::{LogStyle, LogWriter, OmittedProperties, TimeDigits, WriteOutcome};

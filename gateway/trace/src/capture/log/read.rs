@@ -5,15 +5,15 @@ use std::ops::Range;
 
 use protocol::candump::{self, CandumpLine, Record};
 
-use super::clock::{Clock, Evidence, Remark};
-use super::console::{self, ConsoleFrame, ConsoleLine, Stamp};
-use crate::capture::{Entry, Note, NoteKind};
+use super::clock::{Clock, Remark, TimeEvidence};
+use super::console::{self, ConsoleFrame, ConsoleLine, LineTime};
+use crate::capture::{CaptureEntry, CaptureNote, NoteKind};
 use crate::container::read_uninterrupted;
 
 /// The maximum length of a line in bytes, with its line end: twice the longest CAN XL frame. Longer lines are cut.
 pub const MAX_LINE_BYTES: usize = 8_192;
 /// The number of bytes requested from the input at once. It must be a multiple of [`LONGEST`].
-const CHUNK: usize = 1 << 18;
+const READ_BYTES: usize = 1 << 18;
 /// The maximum size in bytes of the sample of lines before the first frame. The kind of a text without frames is
 /// recognised from this sample.
 const MAX_SAMPLE_BYTES: usize = 4_096;
@@ -42,7 +42,7 @@ pub(crate) struct LogReader {
 impl LogReader {
     /// Creates a reader for an input whose first bytes, `head`, have already been read.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
-        let mut buffer = vec![0; CHUNK];
+        let mut buffer = vec![0; READ_BYTES];
         let taken = head.len() as u64;
         let head = head.strip_prefix(BYTE_ORDER_MARK).unwrap_or(head);
         for (to, from) in buffer.iter_mut().zip(head) {
@@ -101,9 +101,11 @@ impl LogReader {
 
     /// Returns the next entry; each line is one entry. Never panics.
     #[inline]
-    pub(crate) fn next(&mut self) -> io::Result<Option<Entry<'_>>> {
+    pub(crate) fn next(&mut self) -> io::Result<Option<CaptureEntry<'_>>> {
         let Some((line, long)) = self.next_line()? else { return Ok(None) };
-        if self.clock.is_open() && relative(self.buffer.get(line.clone()).unwrap_or_default()).is_some() {
+        if self.clock.is_undecided()
+            && parse_relative_time(self.buffer.get(line.clone()).unwrap_or_default()).is_some()
+        {
             self.rest.start = line.start;
             self.detect_time_reference()?;
             return self.next();
@@ -111,14 +113,14 @@ impl LogReader {
         self.lines += 1;
         let text = self.buffer.get(line).unwrap_or_default();
         if long {
-            return Ok(Some(Entry::Note(note(text, long, self.clock.last(), self.lines))));
+            return Ok(Some(CaptureEntry::Note(note(text, long, self.clock.last_ns(), self.lines))));
         }
         if let Ok(CandumpLine::Frame(record)) = candump::parse_bytes(text) {
             self.clock.set(record.time.nanos);
             self.any_frame = true;
-            return Ok(Some(Entry::Frame(record)));
+            return Ok(Some(CaptureEntry::Frame(record)));
         }
-        let mut note = note(text, long, self.clock.last(), self.lines);
+        let mut note = note(text, long, self.clock.last_ns(), self.lines);
         match console::parse(text) {
             None => {}
             Some(Ok(ConsoleLine::CanXl)) => note.kind = NoteKind::CanXl,
@@ -131,7 +133,7 @@ impl LogReader {
                     }
                 }
                 self.any_frame = true;
-                return Ok(Some(Entry::Frame(Record { time, interface, frame, direction })));
+                return Ok(Some(CaptureEntry::Frame(Record { time, interface, frame, direction })));
             }
             Some(Err(error)) => note.kind = NoteKind::Unreadable(error.to_string()),
         }
@@ -139,21 +141,21 @@ impl LogReader {
             self.sample.extend_from_slice(text.get(..MAX_SAMPLE_BYTES).unwrap_or(text));
             self.sample.push(b'\n');
         }
-        Ok(Some(Entry::Note(note)))
+        Ok(Some(CaptureEntry::Note(note)))
     }
 
     /// Determines what relative times count from, by the lines that follow in the buffer. Reads as many lines as are
     /// needed and fit.
     #[cold]
     fn detect_time_reference(&mut self) -> io::Result<()> {
-        let mut evidence = Evidence::default();
+        let mut evidence = TimeEvidence::default();
         let mut seen = 0;
         while !evidence.is_enough() {
             let fresh = self.buffer.get(self.rest.start + seen..self.rest.end).unwrap_or_default();
             let end = line_end(fresh);
             let line = fresh.get(..end.unwrap_or(fresh.len())).unwrap_or_default();
             if end.is_some() || self.at_end {
-                if let Some((interface, nanos)) = relative(line) {
+                if let Some((interface, nanos)) = parse_relative_time(line) {
                     evidence.add(interface, nanos);
                 }
                 seen += line.len() + 1;
@@ -165,7 +167,7 @@ impl LogReader {
                 self.fill()?;
             }
         }
-        self.clock.decide(evidence.verdict());
+        self.clock.set_reference(evidence.verdict());
         Ok(())
     }
 
@@ -177,11 +179,11 @@ impl LogReader {
         let fresh = self.buffer.get(start..end).unwrap_or_default();
         match line_end(fresh) {
             Some(at) if at < MAX_LINE_BYTES => match fresh.get(at..) {
-                Some([b'\r']) => self.line_beyond(),
+                Some([b'\r']) => self.next_unbuffered_line(),
                 Some([b'\r', b'\n', ..]) => Ok(Some((self.end_line(start + at, 2), false))),
                 _ => Ok(Some((self.end_line(start + at, 1), false))),
             },
-            _ => self.line_beyond(),
+            _ => self.next_unbuffered_line(),
         }
     }
 
@@ -194,7 +196,7 @@ impl LogReader {
     }
 
     /// Returns the next line if the buffer does not hold all of it, or if it is too long.
-    fn line_beyond(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
+    fn next_unbuffered_line(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
         let mut seen = 0;
         loop {
             let Range { start, end } = self.rest;
@@ -272,13 +274,13 @@ fn line_end(text: &[u8]) -> Option<usize> {
 
 /// Returns the bus and the time of the frame in a line if the time is relative; `None` for other lines.
 #[inline]
-fn relative(line: &[u8]) -> Option<(&str, u64)> {
+fn parse_relative_time(line: &[u8]) -> Option<(&str, u64)> {
     // Lines of a log have ten digits before the point.
     if line.first() == Some(&b'(') && line.get(11) == Some(&b'.') {
         return None;
     }
     match console::parse(line) {
-        Some(Ok(ConsoleLine::Frame(ConsoleFrame { stamp: Stamp::Relative(time), interface, .. }))) => {
+        Some(Ok(ConsoleLine::Frame(ConsoleFrame { stamp: LineTime::Relative(time), interface, .. }))) => {
             Some((interface, time.nanos))
         }
         _ => None,
@@ -293,9 +295,9 @@ pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
         return Some(Some(record.time.nanos));
     }
     match console::parse(line)?.ok()? {
-        ConsoleLine::Frame(ConsoleFrame { stamp: Stamp::Absolute(time) | Stamp::Local(time), .. }) => {
-            Some(Some(time.nanos))
-        }
+        ConsoleLine::Frame(ConsoleFrame {
+            stamp: LineTime::Absolute(time) | LineTime::Local(time), ..
+        }) => Some(Some(time.nanos)),
         ConsoleLine::Frame(_) => Some(None),
         ConsoleLine::CanXl => None,
     }
@@ -304,7 +306,7 @@ pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
 /// Makes a note of a line that is not a frame. Only a line that begins with a parenthesis, as lines with frames do,
 /// counts as unreadable; others are text.
 #[cold]
-fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> Note<'_> {
+fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> CaptureNote<'_> {
     let why = format!("a line of more than {MAX_LINE_BYTES} bytes, whose rest is left out");
     let kind = match candump::parse_bytes(text) {
         _ if long => NoteKind::Unreadable(why),
@@ -313,12 +315,12 @@ fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> Note<'_> {
         Ok(CandumpLine::CanXl) => NoteKind::CanXl,
         Err(error) => NoteKind::Unreadable(error.to_string()),
     };
-    let interface = if matches!(kind, NoteKind::Dropped(_)) { quoted(text) } else { "" };
-    Note { kind, nanos, interface, line, text }
+    let interface = if matches!(kind, NoteKind::Dropped(_)) { quoted_bus_name(text) } else { "" };
+    CaptureNote { kind, nanos, interface, line, text }
 }
 
 /// Returns the bus of candump's message on lost frames: `... frames on 'vcan0' socket ...`.
-fn quoted(text: &[u8]) -> &str {
+fn quoted_bus_name(text: &[u8]) -> &str {
     text.split(|&byte| byte == b'\'').nth(1).and_then(|name| core::str::from_utf8(name).ok()).unwrap_or("")
 }
 
@@ -345,8 +347,8 @@ mod tests {
         let mut all = Vec::new();
         loop {
             match log.next().unwrap() {
-                Some(Entry::Note(note)) => all.push((note.line, note.text.to_vec(), note.kind)),
-                Some(Entry::Frame(_)) => {}
+                Some(CaptureEntry::Note(note)) => all.push((note.line, note.text.to_vec(), note.kind)),
+                Some(CaptureEntry::Frame(_)) => {}
                 None => return all,
             }
         }
@@ -372,10 +374,10 @@ mod tests {
     fn of_a_line_without_end_the_beginning_is_kept_and_the_next_one_is_read() {
         let long =
             || Err::<(), _>(format!("a line of more than {MAX_LINE_BYTES} bytes, whose rest is left out"));
-        for piece in [4097, CHUNK] {
-            let mut bytes = vec![b'('; 3 * CHUNK];
+        for piece in [4097, READ_BYTES] {
+            let mut bytes = vec![b'('; 3 * READ_BYTES];
             bytes.extend_from_slice(b"\nnext\n");
-            bytes.extend_from_slice(&vec![b'x'; CHUNK]);
+            bytes.extend_from_slice(&vec![b'x'; READ_BYTES]);
             let found = all(&bytes, piece);
             let unreadable = NoteKind::Unreadable(long().unwrap_err());
             assert_eq!(found[0], (1, vec![b'('; MAX_LINE_BYTES], unreadable.clone()));
@@ -388,7 +390,7 @@ mod tests {
     #[test]
     fn a_line_may_be_as_long_as_the_limit_and_not_longer() {
         let line = |len: usize| [b"#".repeat(len - 1).as_slice(), b"\nnext\n"].concat();
-        for piece in [1023, CHUNK] {
+        for piece in [1023, READ_BYTES] {
             let longest = all(&line(MAX_LINE_BYTES), piece);
             assert_eq!(longest, [text(1, &b"#".repeat(MAX_LINE_BYTES - 1)), text(2, b"next")]);
             let longer = all(&line(MAX_LINE_BYTES + 1), piece);
@@ -410,7 +412,7 @@ mod tests {
         let mut log = LogReader::new(&[], Box::new(&bytes[..]));
         let mut notes = Vec::new();
         while let Some(entry) = log.next().unwrap() {
-            if let Entry::Note(note) = entry {
+            if let CaptureEntry::Note(note) = entry {
                 notes.push((note.line, note.nanos, note.interface.to_owned(), note.kind));
             }
         }

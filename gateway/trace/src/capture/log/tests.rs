@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 
 use super::*;
-use crate::capture::{Entry, NoteKind};
+use crate::capture::{CaptureEntry, NoteKind};
 
 /// Lines in the forms of candump 2020.11 and 2025, written by hand. Each is followed by the frame as a log has it, a
 /// note's kind, or an error.
@@ -18,14 +18,14 @@ fn entries(text: &[u8]) -> (Vec<String>, Vec<Remark>) {
     let mut all = Vec::new();
     while let Some(entry) = log.next().unwrap() {
         all.push(match entry {
-            Entry::Frame(record) => {
+            CaptureEntry::Frame(record) => {
                 let way = record.direction.map_or("", |way| match way {
                     protocol::candump::Direction::Sent => " T",
                     protocol::candump::Direction::Received => " R",
                 });
                 format!("{record}{way}")
             }
-            Entry::Note(note) => match note.kind {
+            CaptureEntry::Note(note) => match note.kind {
                 NoteKind::Text => "text".to_owned(),
                 NoteKind::CanXl => "CAN XL".to_owned(),
                 NoteKind::Dropped(frames) => format!("dropped {frames}"),
@@ -105,7 +105,7 @@ fn no_more_of_a_pipe_is_waited_for_than_is_needed() {
     }
     let mut log = LogReader::new(&[], Box::new(Lines(0)));
     for _ in 0..21 {
-        assert!(matches!(log.next().unwrap(), Some(Entry::Frame(_))));
+        assert!(matches!(log.next().unwrap(), Some(CaptureEntry::Frame(_))));
     }
 }
 
@@ -262,7 +262,7 @@ proptest! {
         let mut log = LogReader::new(&[], Box::new(std::io::Cursor::new(text.clone().into_bytes())));
         let mut times = Vec::new();
         for (nanos, bus, frame, sent) in &expected {
-            let Some(Entry::Frame(record)) = log.next().unwrap() else { panic!("{text}") };
+            let Some(CaptureEntry::Frame(record)) = log.next().unwrap() else { panic!("{text}") };
             let way = record.direction.map(|way| way == protocol::candump::Direction::Sent);
             prop_assert_eq!((record.interface, record.frame, way), (*bus, *frame, *sent), "{}", text);
             times.push((record.time.nanos, *nanos));

@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use protocol::candump::{Direction, Record, Timestamp, write_record};
 use protocol::usage::is_unprintable;
 
-use crate::capture::{Entry, Note, NoteKind};
+use crate::capture::{CaptureEntry, CaptureNote, NoteKind};
 
 /// The size in bytes at which buffered lines are written.
 const WRITE_BYTES: usize = 1 << 16;
@@ -17,7 +17,7 @@ const MAX_WAITING_BYTES: usize = 1 << 20;
 
 /// The number of decimals of a time in seconds.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum Digits {
+pub enum TimeDigits {
     /// As many decimals as in the capture.
     #[default]
     Own,
@@ -29,9 +29,9 @@ pub enum Digits {
 
 /// The style in which a log is written.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Style {
+pub struct LogStyle {
     /// The number of decimals of the times.
-    pub digits: Digits,
+    pub digits: TimeDigits,
     /// True to write only frames, and no raw DLC, so that every tool can read the log.
     pub plain: bool,
     /// True to write `T` or `R` after frames whose direction is known, as `candump -x` does. Wireshark does not read
@@ -67,7 +67,7 @@ pub struct OmittedProperties {
 #[derive(Debug)]
 pub struct LogWriter<W> {
     out: W,
-    style: Style,
+    style: LogStyle,
     /// Lines that wait to be written.
     lines: Lines,
     any_frame: bool,
@@ -136,7 +136,7 @@ impl BusNames {
 
 impl<W: Write> LogWriter<W> {
     /// Creates a writer that buffers lines.
-    pub fn new(out: W, style: Style) -> Self {
+    pub fn new(out: W, style: LogStyle) -> Self {
         let lines = Lines(Vec::with_capacity(2 * WRITE_BYTES));
         Self { out, style, lines, any_frame: false, lost: HashMap::new(), names: BusNames::default() }
     }
@@ -145,21 +145,21 @@ impl<W: Write> LogWriter<W> {
     ///
     /// # Errors
     /// Returns an error if `out` fails.
-    pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
+    pub fn write(&mut self, entry: &CaptureEntry<'_>) -> io::Result<WriteOutcome> {
         match entry {
-            Entry::Frame(record) => self.frame(record),
-            Entry::Note(_) if self.style.plain => Ok(WriteOutcome::Nothing),
-            Entry::Note(note) => self.note(note),
+            CaptureEntry::Frame(record) => self.write_frame(record),
+            CaptureEntry::Note(_) if self.style.plain => Ok(WriteOutcome::Nothing),
+            CaptureEntry::Note(note) => self.write_note(note),
         }
     }
 
-    fn frame(&mut self, record: &Record<'_>) -> io::Result<WriteOutcome> {
+    fn write_frame(&mut self, record: &Record<'_>) -> io::Result<WriteOutcome> {
         let Record { time, interface, frame, direction } = *record;
         let Timestamp { nanos, nine_digits: own, .. } = time;
         let nine_digits = match self.style.digits {
-            Digits::Own => own,
-            Digits::Six => false,
-            Digits::Nine => true,
+            TimeDigits::Own => own,
+            TimeDigits::Six => false,
+            TimeDigits::Nine => true,
         };
         let mut less =
             OmittedProperties { digits: !nine_digits && nanos % 1_000 != 0, ..OmittedProperties::default() };
@@ -191,7 +191,7 @@ impl<W: Write> LogWriter<W> {
 
     /// Writes a note: a line of a log unchanged, and a note of a recording as candump's message on lost frames or as a
     /// comment.
-    fn note(&mut self, note: &Note<'_>) -> io::Result<WriteOutcome> {
+    fn write_note(&mut self, note: &CaptureNote<'_>) -> io::Result<WriteOutcome> {
         let lines = &mut self.lines.0;
         match note.kind {
             // A line feed within the text would begin a further line, which the source does not have.
@@ -255,7 +255,7 @@ mod tests {
     use super::*;
     use protocol::candump::{CandumpLine, parse};
 
-    fn written(style: Style, entries: &[Entry<'_>]) -> (String, Vec<WriteOutcome>) {
+    fn written(style: LogStyle, entries: &[CaptureEntry<'_>]) -> (String, Vec<WriteOutcome>) {
         let mut bytes = Vec::new();
         let mut log = LogWriter::new(&mut bytes, style);
         let wrote = entries.iter().map(|entry| log.write(entry).unwrap()).collect();
@@ -263,37 +263,37 @@ mod tests {
         (String::from_utf8_lossy(&bytes).into_owned(), wrote)
     }
 
-    fn frame(line: &str) -> Entry<'_> {
+    fn frame(line: &str) -> CaptureEntry<'_> {
         let Ok(CandumpLine::Frame(record)) = parse(line) else { panic!("{line}") };
-        Entry::Frame(record)
+        CaptureEntry::Frame(record)
     }
 
-    fn note(kind: NoteKind, line: u64, text: &[u8]) -> Entry<'_> {
-        Entry::Note(Note { kind, nanos: 0, interface: "vcan0", line, text })
+    fn note(kind: NoteKind, line: u64, text: &[u8]) -> CaptureEntry<'_> {
+        CaptureEntry::Note(CaptureNote { kind, nanos: 0, interface: "vcan0", line, text })
     }
 
     #[test]
     fn a_frame_is_written_as_it_was_or_as_was_requested() {
         let line = "(1.000000007) can0 123#1122334455667788_A T";
-        let style = |digits, plain| Style { digits, plain, directions: !plain };
+        let style = |digits, plain| LogStyle { digits, plain, directions: !plain };
         let as_is = |line: &str| (format!("{line}\n"), vec![WriteOutcome::All]);
-        assert_eq!(written(style(Digits::Own, false), &[frame(line)]), as_is(line));
+        assert_eq!(written(style(TimeDigits::Own, false), &[frame(line)]), as_is(line));
         let less = OmittedProperties::default();
         let bare = (
             line.replace(" T", "\n"),
             vec![WriteOutcome::Less(OmittedProperties { direction: true, ..less })],
         );
-        assert_eq!(written(Style::default(), &[frame(line)]), bare);
+        assert_eq!(written(LogStyle::default(), &[frame(line)]), bare);
         let six = (
             "(1.000000) can0 123#1122334455667788_A T\n".to_owned(),
             vec![WriteOutcome::Less(OmittedProperties { digits: true, ..less })],
         );
-        assert_eq!(written(style(Digits::Six, false), &[frame(line)]), six);
+        assert_eq!(written(style(TimeDigits::Six, false), &[frame(line)]), six);
         let less = OmittedProperties { direction: true, raw_dlc: true, ..less };
         let plain = ("(1.000000007) can0 123#1122334455667788\n".to_owned(), vec![WriteOutcome::Less(less)]);
-        assert_eq!(written(style(Digits::Own, true), &[frame(line)]), plain);
+        assert_eq!(written(style(TimeDigits::Own, true), &[frame(line)]), plain);
         let short = frame("(1.000001) can0 123#");
-        assert_eq!(written(style(Digits::Nine, true), &[short]), as_is("(1.000001000) can0 123#"));
+        assert_eq!(written(style(TimeDigits::Nine, true), &[short]), as_is("(1.000001000) can0 123#"));
     }
 
     #[test]
@@ -305,13 +305,13 @@ mod tests {
             note(NoteKind::CanXl, 4, b"(1.0) xl"),
         ];
         let mut bytes = Vec::new();
-        let mut log = LogWriter::new(&mut bytes, Style::default());
+        let mut log = LogWriter::new(&mut bytes, LogStyle::default());
         for entry in &entries {
             assert_eq!(log.write(entry).unwrap(), WriteOutcome::All);
         }
         log.flush().unwrap();
         assert_eq!(bytes, b" # odd  \n(\xFF\nDROPCOUNT: dropped 3 of them\n(1.0) xl\n");
-        let plain = Style { plain: true, ..Style::default() };
+        let plain = LogStyle { plain: true, ..LogStyle::default() };
         assert_eq!(written(plain, &entries), (String::new(), vec![WriteOutcome::Nothing; 4]));
     }
 
@@ -323,7 +323,7 @@ mod tests {
             note(NoteKind::Text, 0, b"two\n\x1blines"),
             note(NoteKind::Unreadable("a message is too short".to_owned()), 0, b"\0"),
         ];
-        let (text, wrote) = written(Style::default(), &entries);
+        let (text, wrote) = written(LogStyle::default(), &entries);
         let expected = "DROPCOUNT: dropped 3 CAN frames on 'vcan0' socket (total drops 3)\n\
                         DROPCOUNT: dropped 1 CAN frame on 'vcan0' socket (total drops 4)\n\
                         # two  lines\n";
@@ -333,7 +333,7 @@ mod tests {
 
     #[test]
     fn a_bus_whose_name_no_line_can_have_gets_another_that_is_its_own() {
-        let Entry::Frame(record) = frame("(1.000000) can0 123#") else { panic!() };
+        let CaptureEntry::Frame(record) = frame("(1.000000) can0 123#") else { panic!() };
         let names = [
             "",
             "my bus",
@@ -358,8 +358,8 @@ mod tests {
             "can0",
             "_my_bus",
         ];
-        let entries = names.map(|interface| Entry::Frame(Record { interface, ..record }));
-        let (text, wrote) = written(Style::default(), &entries);
+        let entries = names.map(|interface| CaptureEntry::Frame(Record { interface, ..record }));
+        let (text, wrote) = written(LogStyle::default(), &entries);
         let lines = expected.map(|name| format!("(1.000000) {name} 123#"));
         assert_eq!(text.lines().collect::<Vec<_>>(), lines);
         let other = WriteOutcome::Less(OmittedProperties { name: true, ..OmittedProperties::default() });
@@ -373,7 +373,7 @@ mod tests {
     #[test]
     fn nothing_is_written_before_the_first_frame() {
         let mut bytes = Vec::new();
-        let mut log = LogWriter::new(&mut bytes, Style::default());
+        let mut log = LogWriter::new(&mut bytes, LogStyle::default());
         log.write(&note(NoteKind::Text, 1, b"words")).unwrap();
         log.flush_lines().unwrap();
         assert!(log.out.is_empty());

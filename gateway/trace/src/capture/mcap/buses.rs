@@ -63,7 +63,7 @@ impl ForeignBuses {
         let is_shared = self.topics.get(frame_id).is_some_and(|topics| topics.len() > 1);
         let own = Some(frame_id).filter(|name| !name.is_empty() && !is_shared).map(str::to_owned);
         self.is_shared |= is_shared && !frame_id.is_empty();
-        let short = beginning(topic);
+        let short = truncate_topic(topic);
         let further = (1..).map(|number| match number {
             1 => format!("{short}/{frame_id}"),
             _ => format!("{short}/{frame_id}-{number}"),
@@ -76,7 +76,7 @@ impl ForeignBuses {
 }
 
 /// Returns the beginning of a topic's name, at most [`LONGEST`] bytes long.
-pub(super) fn beginning(topic: &str) -> &str {
+pub(super) fn truncate_topic(topic: &str) -> &str {
     let ends = (0..=MAX_NAME_BYTES.min(topic.len())).rev();
     ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()
 }

@@ -79,7 +79,7 @@ impl ForeignType {
                 Frame::with_data(id, Format::Fd, FD_FORMAT, data)
             }
         };
-        let time = Timestamp::nine_digits(if stamp == 0 { log_time } else { stamp });
+        let time = Timestamp::with_nine_digits(if stamp == 0 { log_time } else { stamp });
         Ok(Record { time, interface, frame: frame.map_err(|_| wrong)?, direction: None })
     }
 }
@@ -122,7 +122,7 @@ mod tests {
         for byte in [0_u8, 0, 3] {
             out.put(byte);
         }
-        out.bytes(&[1, 2, 3]);
+        out.put_bytes(&[1, 2, 3]);
         let foreign = ForeignType::from_schema("cdr", "ros2_socketcan_msgs/msg/FdFrame").unwrap();
         let record = foreign.decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(0.000000009)  22C##4010203");
@@ -158,7 +158,7 @@ mod tests {
             let mut out = CdrWriter::new(&mut bytes);
             head(&mut out, 1, "can", id);
             [extended, 0, 1].into_iter().for_each(|byte| out.put(byte));
-            out.bytes(&[0xAA]);
+            out.put_bytes(&[0xAA]);
             let read = ForeignType::Fd.decode(&bytes, 9).map(|record| record.frame.id());
             assert_eq!(read.ok(), fits.then_some(id), "{id:X}");
         }

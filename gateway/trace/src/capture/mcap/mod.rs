@@ -13,7 +13,7 @@ pub(super) use read::McapReader;
 pub(super) use state::McapState;
 pub(super) use survey::TopicSurvey;
 pub(super) use write::{LOG_ORIGIN, McapWriter};
-pub use write::{ORIGIN_METADATA, Origin};
+pub use write::{ORIGIN_METADATA, RecordingOrigin};
 
 use std::io;
 

@@ -9,9 +9,9 @@ use ::mcap::records::op;
 use super::ReadFault;
 use super::buses::ForeignBuses;
 use super::state::{MAX_KEPT_BYTES, McapState, RequestedMessage};
-use crate::capture::{Item, RecordingExtras};
+use crate::capture::{RecordingExtras, RecordingItem};
 use crate::container::{
-    Chunk, FormatError, Framed, MAGIC, MAX_RECORD_BYTES, Record, RecordReader, first_record, parse,
+    Chunk, FormatError, FramedRecord, MAGIC, MAX_RECORD_BYTES, Record, RecordReader, first_record, parse,
 };
 
 /// The number of bytes that are read at once.
@@ -84,7 +84,8 @@ impl McapReader {
         file: Option<File>,
     ) -> Self {
         let input = BufReader::with_capacity(READ_BYTES, Cursor::new(Vec::new()).chain(input));
-        let (source, chunk) = (RecordReader::at(bytes, input, MAX_KEPT_BYTES as u64), Chunk::default());
+        let (source, chunk) =
+            (RecordReader::resume_at(bytes, input, MAX_KEPT_BYTES as u64), Chunk::default());
         Self {
             source,
             chunk,
@@ -104,7 +105,7 @@ impl McapReader {
 
     /// Returns a position from which the next message can be found: the offset of a record, and the number of messages
     /// in that record before it. The message may also be in a later record.
-    pub(crate) const fn anchor(&self) -> (u64, u32) {
+    pub(crate) const fn resume_point(&self) -> (u64, u32) {
         self.anchor
     }
 
@@ -131,7 +132,7 @@ impl McapReader {
     }
 
     /// Returns the next entry, or the next message of another topic if such messages are requested. Never panics.
-    pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, ReadFault> {
+    pub(crate) fn next(&mut self) -> Result<Option<RecordingItem<'_>>, ReadFault> {
         let target = match self.first.take() {
             Some(first) => Some(first?),
             None => self.advance()?,
@@ -161,12 +162,12 @@ impl McapReader {
     /// Reads one record.
     fn step(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
         let Self { source, chunk, place, state, anchor, messages, .. } = self;
-        let began = source.read();
+        let began = source.bytes_read();
         let mut take = |opcode, body: &[u8], in_chunk| {
             if let Some(messages) = messages.as_mut().filter(|_| opcode == op::MESSAGE) {
                 *messages += 1;
             }
-            state.process(opcode, body, in_chunk)
+            state.process_record(opcode, body, in_chunk)
         };
         match place {
             Phase::Finished => {}
@@ -185,15 +186,15 @@ impl McapReader {
                 let framed = source.next()?;
                 source.check(framed)?;
                 match framed {
-                    Framed::Record(op::CHUNK) => {
-                        chunk.unpack(source.body(), source.read())?;
+                    FramedRecord::Record(op::CHUNK) => {
+                        chunk.unpack(source.body(), source.bytes_read())?;
                         (*place, *anchor) = (Phase::InChunk, (began, 0));
                     }
-                    Framed::Record(op::DATA_END) => {
+                    FramedRecord::Record(op::DATA_END) => {
                         source.check_section(op::DATA_END)?;
                         source.begin_summary();
                     }
-                    Framed::Record(op::FOOTER) => {
+                    FramedRecord::Record(op::FOOTER) => {
                         *place = Phase::Finished;
                         // A damaged summary is ignored; the records after it are still read.
                         if source.check_section(op::FOOTER).is_err() {
@@ -202,26 +203,28 @@ impl McapReader {
                         self.expect_magic()?;
                         self.check_end()?;
                     }
-                    Framed::Record(opcode) => {
+                    FramedRecord::Record(opcode) => {
                         let target = take(opcode, source.body(), false)?;
                         if target.is_some() {
                             *anchor = (began, 0);
                         }
                         return Ok(target);
                     }
-                    Framed::Skipped(op::STATISTICS, _) => {
+                    FramedRecord::Skipped(op::STATISTICS, _) => {
                         let count = source.body().first_chunk();
                         self.stated = count.map(|count| u64::from_le_bytes(*count));
                     }
-                    Framed::Skipped(..) | Framed::Unknown(..) => {}
-                    Framed::Oversized(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
-                    Framed::Oversized(_, bytes) => {
+                    FramedRecord::Skipped(..) | FramedRecord::Unknown(..) => {}
+                    FramedRecord::Oversized(op::ATTACHMENT, _) => {
+                        state.add_attachment(source.attachment_name(), &[])
+                    }
+                    FramedRecord::Oversized(_, bytes) => {
                         return Err(
                             FormatError::TooLong { what: "record", bytes, limit: MAX_RECORD_BYTES }.into()
                         );
                     }
-                    Framed::Truncated(_, bytes) => self.truncated(bytes)?,
-                    Framed::End(bytes) => self.truncated(bytes)?,
+                    FramedRecord::Truncated(_, bytes) => self.handle_truncation(bytes)?,
+                    FramedRecord::End(bytes) => self.handle_truncation(bytes)?,
                 }
             }
         }
@@ -230,11 +233,11 @@ impl McapReader {
 
     /// Reads the magic bytes. Returns an error if other bytes are found.
     fn expect_magic(&mut self) -> Result<(), ReadFault> {
-        if !self.source.magic()? {
+        if !self.source.read_magic()? {
             if !MAGIC.starts_with(self.source.body()) {
                 return Err(FormatError::Magic.into());
             }
-            self.truncated(0)?;
+            self.handle_truncation(0)?;
         }
         Ok(())
     }
@@ -247,7 +250,7 @@ impl McapReader {
             return Err(FormatError::Messages { found, stated }.into());
         }
         match &self.file {
-            Some(file) if file.metadata()?.len() > self.source.read() => {
+            Some(file) if file.metadata()?.len() > self.source.bytes_read() => {
                 Err(FormatError::TrailingData.into())
             }
             _ => Ok(()),
@@ -256,26 +259,26 @@ impl McapReader {
 
     /// Handles an input that ends within a record, after `bytes` bytes of it. The recording was cut off, unless its end
     /// or other records follow the beginning of this record; then the length of the record is wrong.
-    fn truncated(&mut self, bytes: u64) -> Result<(), ReadFault> {
+    fn handle_truncation(&mut self, bytes: u64) -> Result<(), ReadFault> {
         self.place = Phase::Finished;
-        if self.source.ends_with_magic() && self.source.read() > 2 * MAGIC.len() as u64 {
+        if self.source.ends_with_magic() && self.source.bytes_read() > 2 * MAGIC.len() as u64 {
             let is_footer = bytes == MAGIC.len() as u64;
             return Err(if is_footer { FormatError::Footer } else { FormatError::Beyond { bytes } }.into());
         }
-        let read = self.source.read();
+        let read = self.source.bytes_read();
         if let Some(file) = &self.file
             && file.metadata()?.len() == read
         {
-            let any = self.source.plain_chunk().is_none();
+            let any = self.source.uncompressed_chunk_length().is_none();
             // An earlier message may have a wrong length that led into the middle of a record and skipped those
             // between.
             let before = self.source.message_before().filter(|_| any);
-            let began = before.unwrap_or_else(|| self.source.began());
+            let began = before.unwrap_or_else(|| self.source.record_offset());
             if first_record(&mut OffsetReader { file, at: 0 }, began + 1, read, any)?.is_some() {
                 return Err(FormatError::Beyond { bytes }.into());
             }
         }
-        self.state.truncated(read);
+        self.state.record_truncation(read);
         Ok(())
     }
 }

@@ -8,11 +8,13 @@ use ::mcap::records::op;
 use protocol::candump::{Direction, Record, Timestamp};
 
 use super::ReadFault;
-use super::buses::{ForeignBuses, beginning};
+use super::buses::{ForeignBuses, truncate_topic};
 use super::foreign::ForeignType;
 use super::write::{SECONDS_DIGITS, TIME_DIGITS};
 use crate::capture::log::MAX_LINE_BYTES as LONGEST_LINE;
-use crate::capture::{Entry, Item, LatchedFrame, Note, NoteKind, OtherMessage, RecordingExtras, Topic};
+use crate::capture::{
+    CaptureEntry, CaptureNote, LatchedFrame, NoteKind, OtherMessage, RecordingExtras, RecordingItem, Topic,
+};
 use crate::container::{FormatError, MAGIC, MetadataMap, NameBudget, Record as Raw, parse, seek_record};
 use crate::recording::STATE_TOPIC_PREFIX;
 use crate::ros2::cdr::CdrError;
@@ -129,14 +131,14 @@ impl McapState {
     }
 
     /// Records that the file ends without a footer, after `read` bytes.
-    pub(super) fn truncated(&mut self, read: u64) {
+    pub(super) fn record_truncation(&mut self, read: u64) {
         let why = || format!("it has no end: after {read} bytes it was cut off, or never finished");
         self.extras.unfinished.get_or_insert_with(why);
     }
 
     /// Reads the attachments and metadata of a seekable file in advance; other records are skipped. Also detects that
     /// the end of the file is missing.
-    pub(crate) fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
+    pub(crate) fn read_extras_ahead(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
         let size = file.seek(SeekFrom::End(0))?;
         file.seek(SeekFrom::Start(size.saturating_sub(MAGIC.len() as u64)))?;
         let mut end = Vec::new();
@@ -144,7 +146,7 @@ impl McapState {
         file.rewind()?;
         let has_end = end == MAGIC && size > MAGIC.len() as u64;
         if !has_end {
-            self.truncated(size);
+            self.record_truncation(size);
         }
         if self.knows_files {
             return Ok(());
@@ -172,8 +174,8 @@ impl McapState {
                 }
             }
             match parse(opcode, &body) {
-                Ok(Raw::Attachment { name, data, .. }) => self.attachment(name, data),
-                Ok(Raw::Metadata { name, facts }) => self.metadata(name, &facts),
+                Ok(Raw::Attachment { name, data, .. }) => self.add_attachment(name, data),
+                Ok(Raw::Metadata { name, facts }) => self.add_metadata(name, &facts),
                 // Errors are reported when this record is read again in its place.
                 _ => {}
             }
@@ -189,7 +191,7 @@ impl McapState {
     }
 
     /// Processes a record. Returns the message if it is requested.
-    pub(crate) fn process(
+    pub(crate) fn process_record(
         &mut self,
         opcode: u8,
         body: &[u8],
@@ -205,15 +207,15 @@ impl McapState {
             // A channel may be repeated in the summary or in every chunk.
             Raw::Channel { id, .. } if self.channels.contains_key(&id) => {}
             Raw::Channel { id, schema, topic, encoding, facts } => {
-                self.channel(id, schema, topic, encoding, &facts)?;
+                self.add_channel(id, schema, topic, encoding, &facts)?;
             }
             Raw::Message { channel, log_time, publish_time, data, .. } => {
                 let target = self.is_requested(channel, data)?;
                 let times = MessageTimes { logged: log_time, published: publish_time };
                 return Ok(target.then_some(RequestedMessage { channel, times, in_chunk }));
             }
-            Raw::Attachment { name, data, .. } if !self.knows_files => self.attachment(name, data),
-            Raw::Metadata { name, facts } if !self.knows_files => self.metadata(name, &facts),
+            Raw::Attachment { name, data, .. } if !self.knows_files => self.add_attachment(name, data),
+            Raw::Metadata { name, facts } if !self.knows_files => self.add_metadata(name, &facts),
             Raw::Header { .. }
             | Raw::Attachment { .. }
             | Raw::Metadata { .. }
@@ -237,11 +239,11 @@ impl McapState {
             }
             ChannelUsage::Latched if !self.is_first => Ok(false),
             ChannelUsage::Latched => {
-                let record =
-                    latched(data).map_err(|source| FormatError::Message { topic: topic.clone(), source })?;
+                let record = decode_latched_frame(data)
+                    .map_err(|source| FormatError::Message { topic: topic.clone(), source })?;
                 let (bus, own) = (record.interface, record.direction == Some(Direction::Sent));
                 let (frame, nanos) = (record.frame, record.time.nanos);
-                self.keep(bus.len() + ENTRY_OVERHEAD, |extras| {
+                self.keep_if_it_fits(bus.len() + ENTRY_OVERHEAD, |extras| {
                     extras.latched.push(LatchedFrame { bus: bus.to_owned(), own, frame, nanos });
                 });
                 Ok(false)
@@ -251,30 +253,30 @@ impl McapState {
     }
 
     /// Calls `keep` if `size` more bytes fit into the limit [`KEPT`].
-    fn keep(&mut self, size: usize, keep: impl FnOnce(&mut RecordingExtras)) {
+    fn keep_if_it_fits(&mut self, size: usize, keep: impl FnOnce(&mut RecordingExtras)) {
         self.kept = self.kept.saturating_add(size);
         if self.is_first && self.kept <= MAX_KEPT_BYTES {
             keep(&mut self.extras);
         }
     }
 
-    pub(super) fn attachment(&mut self, name: &str, data: &[u8]) {
+    pub(super) fn add_attachment(&mut self, name: &str, data: &[u8]) {
         let fits = self.kept.saturating_add(name.len() + ENTRY_OVERHEAD + data.len()) <= MAX_KEPT_BYTES;
         let data = if fits { data } else { &[] };
-        self.keep(name.len() + ENTRY_OVERHEAD + data.len(), |extras| {
+        self.keep_if_it_fits(name.len() + ENTRY_OVERHEAD + data.len(), |extras| {
             extras.attachments.push((name.to_owned(), data.to_vec()));
         });
     }
 
-    fn metadata(&mut self, name: &str, facts: &MetadataMap<'_>) {
+    fn add_metadata(&mut self, name: &str, facts: &MetadataMap<'_>) {
         let size = facts.iter().map(|(key, value)| key.len() + value.len() + ENTRY_OVERHEAD).sum::<usize>();
-        self.keep(name.len() + ENTRY_OVERHEAD + size, |extras| {
+        self.keep_if_it_fits(name.len() + ENTRY_OVERHEAD + size, |extras| {
             let facts = facts.iter().map(|(key, value)| (key.to_owned(), value.to_owned()));
             extras.metadata.push((name.to_owned(), facts.collect()));
         });
     }
 
-    fn channel(
+    fn add_channel(
         &mut self,
         id: u16,
         schema: u16,
@@ -292,8 +294,8 @@ impl McapState {
         } else if schema == Record::TYPE && topic.starts_with(STATE_TOPIC_PREFIX) {
             Some(ChannelUsage::Latched)
         } else if schema == Record::TYPE {
-            Some(ChannelUsage::Frames(form(facts)))
-        } else if schema == Note::TYPE {
+            Some(ChannelUsage::Frames(timestamp_format(facts)))
+        } else if schema == CaptureNote::TYPE {
             Some(ChannelUsage::Notes)
         } else {
             None
@@ -311,29 +313,35 @@ impl McapState {
         Ok(())
     }
 
-    pub(super) fn item<'a>(&'a mut self, channel: u16, times: MessageTimes, message: &'a [u8]) -> Item<'a> {
+    pub(super) fn item<'a>(
+        &'a mut self,
+        channel: u16,
+        times: MessageTimes,
+        message: &'a [u8],
+    ) -> RecordingItem<'a> {
         // Programs may publish messages by another clock than that of the recorder.
         let MessageTimes { logged: log_time, published } = times;
         let Some(Channel { topic, what }) = self.channels.get(&channel) else {
-            return Item::Entry(unreadable("", log_time, message, &"no channel"));
+            return RecordingItem::Entry(unreadable_note("", log_time, message, &"no channel"));
         };
         let decoded = match *what {
             ChannelUsage::Counted(place) => {
                 let topic = self.extras.topics.get(place);
                 let (topic, schema) = topic.map_or(("", ""), |topic| (&topic.name, &topic.schema));
-                return Item::Other(OtherMessage { topic, schema, nanos: published, message });
+                return RecordingItem::Other(OtherMessage { topic, schema, nanos: published, message });
             }
             // Latched frames are never requested.
-            ChannelUsage::Latched => latched(message).map(Entry::Frame),
+            ChannelUsage::Latched => decode_latched_frame(message).map(CaptureEntry::Frame),
             ChannelUsage::Frames(form) => {
                 let time = Timestamp { nanos: published, ..form };
-                decode(message, MAX_FRAME_MESSAGE, |message| messages::frame(message, time)).map(Entry::Frame)
+                decode(message, MAX_FRAME_MESSAGE, |message| messages::frame(message, time))
+                    .map(CaptureEntry::Frame)
             }
             ChannelUsage::Foreign(foreign) => {
                 let record = decode(message, MAX_FRAME_MESSAGE, |message| foreign.decode(message, log_time));
                 let buses = &mut self.buses;
                 record.map(|record| {
-                    Entry::Frame(Record { interface: buses.name(topic, record.interface), ..record })
+                    CaptureEntry::Frame(Record { interface: buses.name(topic, record.interface), ..record })
                 })
             }
             ChannelUsage::Notes => {
@@ -342,18 +350,18 @@ impl McapState {
                     if note.line > 0 && !self.any_frame {
                         note.nanos = 0;
                     }
-                    Entry::Note(note)
+                    CaptureEntry::Note(note)
                 })
             }
         };
-        let entry = decoded.unwrap_or_else(|why| unreadable(topic, log_time, message, &why));
-        self.any_frame |= matches!(entry, Entry::Frame(_));
-        Item::Entry(entry)
+        let entry = decoded.unwrap_or_else(|why| unreadable_note(topic, log_time, message, &why));
+        self.any_frame |= matches!(entry, CaptureEntry::Frame(_));
+        RecordingItem::Entry(entry)
     }
 }
 
 /// Returns the form of times that is stated in the metadata of a channel.
-fn form(facts: &MetadataMap<'_>) -> Timestamp {
+fn timestamp_format(facts: &MetadataMap<'_>) -> Timestamp {
     let nine_digits = facts.get(TIME_DIGITS).is_none_or(|digits| digits != "6");
     let min_digits = facts.get(SECONDS_DIGITS).and_then(|digits| digits.parse().ok()).unwrap_or(1);
     Timestamp { nanos: 0, nine_digits, min_digits }
@@ -370,16 +378,16 @@ fn decode<'a, T>(
 }
 
 /// Decodes a latched frame with the time at which it was on the bus.
-fn latched(message: &[u8]) -> Result<Record<'_>, MessageError> {
+fn decode_latched_frame(message: &[u8]) -> Result<Record<'_>, MessageError> {
     decode(message, MAX_FRAME_MESSAGE, |message| {
-        messages::frame(message, Timestamp::nine_digits(messages::stamp(message)?))
+        messages::frame(message, Timestamp::with_nine_digits(messages::stamp(message)?))
     })
 }
 
 /// Makes the note for a message that cannot be decoded by the type of its channel.
-fn unreadable<'a>(topic: &str, nanos: u64, message: &'a [u8], why: &dyn Display) -> Entry<'a> {
-    let topic = beginning(topic);
+fn unreadable_note<'a>(topic: &str, nanos: u64, message: &'a [u8], why: &dyn Display) -> CaptureEntry<'a> {
+    let topic = truncate_topic(topic);
     let kind = NoteKind::Unreadable(format!("a message of {topic}: {why}"));
     let message = message.get(..LONGEST_LINE).unwrap_or(message);
-    Entry::Note(Note { kind, nanos, interface: "", line: 0, text: message })
+    CaptureEntry::Note(CaptureNote { kind, nanos, interface: "", line: 0, text: message })
 }

@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use protocol::candump::{Record, Timestamp};
 use robots::UniqueNames;
 
-use crate::capture::{Entry, Note, NoteKind};
+use crate::capture::{CaptureEntry, CaptureNote, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
 use crate::recording::{BUS_TOPIC_PREFIX, NOTES_TOPIC};
 
@@ -66,7 +66,7 @@ struct WaitingNote {
 
 /// The source that a recording is converted from, and the file that it is written to.
 #[derive(Clone, Copy, Debug)]
-pub struct Origin<'a> {
+pub struct RecordingOrigin<'a> {
     /// True if the source is a log, false if it is a recording.
     pub of_log: bool,
     /// The metadata of the file that is written. Its inode is stored in the recording, so that an unfinished file can
@@ -76,13 +76,13 @@ pub struct Origin<'a> {
 
 impl<W: Write> McapWriter<W> {
     /// Begins a recording.
-    pub(crate) fn new(out: W, origin: Origin<'_>) -> io::Result<Self> {
+    pub(crate) fn new(out: W, origin: RecordingOrigin<'_>) -> io::Result<Self> {
         let mut file = match origin.file {
-            Some(about) => FileWriter::in_file(out, about)?,
+            Some(about) => FileWriter::with_file_identity(out, about)?,
             None => FileWriter::new(out)?,
         };
         let (key, value) = if origin.of_log { LOG_ORIGIN } else { RECORDING_ORIGIN };
-        file.metadata(ORIGIN_METADATA, &[(key.to_owned(), value.to_owned())].into())?;
+        file.write_metadata(ORIGIN_METADATA, &[(key.to_owned(), value.to_owned())].into())?;
         let mut taken = UniqueNames::default();
         taken.assign(NOTES_TOPIC.to_owned());
         Ok(Self {
@@ -98,17 +98,17 @@ impl<W: Write> McapWriter<W> {
     }
 
     /// Writes an entry.
-    pub(crate) fn write(&mut self, entry: &Entry<'_>) -> io::Result<()> {
+    pub(crate) fn write(&mut self, entry: &CaptureEntry<'_>) -> io::Result<()> {
         match entry {
-            Entry::Frame(record) => {
+            CaptureEntry::Frame(record) => {
                 if self.waiting.is_some() {
                     self.write_waiting(record.time.nanos)?;
                 }
-                let place = self.channel(record)?;
+                let place = self.channel_index(record)?;
                 let Some(bus) = self.channels.get_mut(place) else { return Ok(()) };
                 self.file.write(&mut bus.channel, record.time.nanos, record)
             }
-            Entry::Note(note) => match &mut self.waiting {
+            CaptureEntry::Note(note) => match &mut self.waiting {
                 Some(waiting) if note.line > 0 && self.bytes < MAX_WAITING_BYTES => {
                     self.bytes += note.text.len() + size_of::<WaitingNote>();
                     let (kind, interface) = (note.kind.clone(), note.interface.to_owned());
@@ -117,7 +117,7 @@ impl<W: Write> McapWriter<W> {
                 }
                 _ => {
                     self.write_waiting(note.nanos)?;
-                    self.note(note)
+                    self.write_note(note)
                 }
             },
         }
@@ -127,21 +127,21 @@ impl<W: Write> McapWriter<W> {
     /// would begin in 1970.
     fn write_waiting(&mut self, nanos: u64) -> io::Result<()> {
         for WaitingNote { kind, interface, line, text } in self.waiting.take().unwrap_or_default() {
-            self.note(&Note { kind, nanos, interface: &interface, line, text: &text })?;
+            self.write_note(&CaptureNote { kind, nanos, interface: &interface, line, text: &text })?;
         }
         Ok(())
     }
 
-    fn note(&mut self, note: &Note<'_>) -> io::Result<()> {
+    fn write_note(&mut self, note: &CaptureNote<'_>) -> io::Result<()> {
         let channel = match &mut self.notes {
             Some(channel) => channel,
-            none => none.insert(self.file.channel::<Note<'_>>(NOTES_TOPIC, &[])?),
+            none => none.insert(self.file.channel::<CaptureNote<'_>>(NOTES_TOPIC, &[])?),
         };
         self.file.write(channel, note.nanos, note)
     }
 
     /// Returns the index of the channel for a frame. Creates the channel at its first frame.
-    fn channel(&mut self, record: &Record<'_>) -> io::Result<usize> {
+    fn channel_index(&mut self, record: &Record<'_>) -> io::Result<usize> {
         let form = Timestamp { nanos: 0, ..record.time };
         let is = |name: &str, bus: &BusChannel| bus.form == form && bus.interface == name;
         if self.channels.get(self.last).is_some_and(|bus| is(record.interface, bus)) {

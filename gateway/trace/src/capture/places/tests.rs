@@ -1,6 +1,6 @@
 use super::*;
-use crate::capture::log::{Digits, Style};
-use crate::capture::{CaptureFormat, Entry, convert::CaptureWriter};
+use crate::capture::log::{LogStyle, TimeDigits};
+use crate::capture::{CaptureEntry, CaptureFormat, convert::CaptureWriter};
 use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
 use std::os::fd::AsRawFd;
@@ -10,7 +10,7 @@ const MS: u64 = 1_000_000;
 
 /// Writes a capture of two buses whose frames are read in turn, up to 0.3 s late.
 fn capture(path: &Path, format: CaptureFormat) {
-    let style = Style { digits: Digits::Nine, ..Style::default() };
+    let style = LogStyle { digits: TimeDigits::Nine, ..LogStyle::default() };
     let mut out = CaptureWriter::new(File::create(path).unwrap(), format, style).unwrap();
     for number in 0..COUNT {
         let burst = u64::from(number / 300);
@@ -19,8 +19,8 @@ fn capture(path: &Path, format: CaptureFormat) {
             second => ("can1", burst * 300 * MS + u64::from(second - 150) * 2 * MS + MS),
         };
         let frame = Frame::classic(0x123, &number.to_be_bytes()).unwrap();
-        let time = Timestamp::nine_digits(1_700_000_000_000_000_000 + nanos);
-        out.write(&Entry::Frame(Record { time, interface, frame, direction: None })).unwrap();
+        let time = Timestamp::with_nine_digits(1_700_000_000_000_000_000 + nanos);
+        out.write(&CaptureEntry::Frame(Record { time, interface, frame, direction: None })).unwrap();
     }
     out.finish().unwrap();
 }
@@ -29,7 +29,7 @@ fn capture(path: &Path, format: CaptureFormat) {
 fn next(reader: &mut Reader, count: usize) -> Vec<(u32, u64)> {
     let mut all = Vec::new();
     while let Some(entry) = reader.next().unwrap() {
-        let Entry::Frame(record) = entry else { continue };
+        let CaptureEntry::Frame(record) = entry else { continue };
         all.push((u32::from_be_bytes(record.frame.data().try_into().unwrap()), record.time.nanos));
         if all.len() == count {
             break;
@@ -55,7 +55,7 @@ fn a_reader_goes_on_where_it_was_and_no_moment_is_before_its_place() {
             all.push(one);
         }
         assert_eq!(all.len(), COUNT as usize);
-        assert!(places.latest() >= all.last().unwrap().1, "{format:?}");
+        assert!(places.latest_ns() >= all.last().unwrap().1, "{format:?}");
         for from in (0..all.len()).step_by(997) {
             reader.seek(&places, here[from]).unwrap();
             let count = 900.min(all.len() - from);
@@ -93,7 +93,7 @@ fn in_console_text_whose_times_depend_on_other_lines_a_reader_goes_on_too() {
         let all = next(&mut reader, 9_000);
         let (_, end) = all[8_999];
         assert_eq!(end, if stamp == "none" { 8_999_000 } else { 13_500 * MS }, "{stamp}");
-        assert_eq!(places.latest(), end);
+        assert_eq!(places.latest_ns(), end);
         for from in (0..all.len()).step_by(997) {
             reader.seek(&places, places.point_before(all[from].1)).unwrap();
             let (first, _) = next(&mut reader, 1)[0];
@@ -124,11 +124,11 @@ fn messages_outside_chunks_and_files_without_an_end_have_places() {
     }
     drop(writer);
     let whole = SeekIndex::with_min_distance(std::slice::from_ref(&path), 1_000).unwrap();
-    assert!(whole.marks.len() > 100 && whole.latest() == 2_999);
+    assert!(whole.marks.len() > 100 && whole.latest_ns() == 2_999);
     let bytes = std::fs::read(&path).unwrap();
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
     let cut = SeekIndex::with_min_distance(&[path], 1_000).unwrap();
-    assert!(cut.marks.len() > 40 && (1_000..2_000).contains(&cut.latest()), "{}", cut.latest());
+    assert!(cut.marks.len() > 40 && (1_000..2_000).contains(&cut.latest_ns()), "{}", cut.latest_ns());
 }
 
 #[test]
@@ -144,6 +144,6 @@ fn what_cannot_be_gone_back_in_is_named() {
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).unwrap();
         let places = SeekIndex::open(&[path]).unwrap();
-        assert_eq!((places.latest(), places.point_before(5).offset), (0, 0), "{name}");
+        assert_eq!((places.latest_ns(), places.point_before(5).offset), (0, 0), "{name}");
     }
 }

@@ -10,12 +10,12 @@ use std::io::{self, Write};
 
 use crate::capture::is_foreign_frame;
 use crate::container::{FormatError, NameBudget, Record, parse};
-use crate::recording::file::{FileWriter, is_frames};
+use crate::recording::file::{FileWriter, is_frame_channel};
 use mcap::records::op;
 
 /// The reliability of a description, by the checksum that covers it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Trust {
+pub(super) enum DescriptionTrust {
     /// A correct checksum covers it.
     Certain,
     /// No checksum covers it.
@@ -46,7 +46,7 @@ pub(super) struct DescriptionSet {
 
 impl DescriptionSet {
     /// Adds a description, if the record is a schema or a channel.
-    pub(super) fn add(&mut self, code: u8, body: &[u8], trust: Trust) -> Result<(), FormatError> {
+    pub(super) fn add(&mut self, code: u8, body: &[u8], trust: DescriptionTrust) -> Result<(), FormatError> {
         let (id, statements) = match parse(code, body)? {
             Record::Schema { id, .. } => (id, &mut self.schemas),
             Record::Channel { id, .. } => (id, &mut self.channels),
@@ -69,8 +69,9 @@ impl DescriptionSet {
             }
         };
         if let Some(statement) = known.get_mut(place) {
-            statement.times = statement.times.saturating_add(u32::from(trust != Trust::Doubtful));
-            statement.certain = statement.certain.saturating_add(u32::from(trust == Trust::Certain));
+            statement.times = statement.times.saturating_add(u32::from(trust != DescriptionTrust::Doubtful));
+            statement.certain =
+                statement.certain.saturating_add(u32::from(trust == DescriptionTrust::Certain));
         }
         Ok(())
     }
@@ -79,23 +80,24 @@ impl DescriptionSet {
     /// messages are frames.
     pub(super) fn write<W: Write>(&self, writer: &mut FileWriter<W>) -> io::Result<BTreeMap<u16, bool>> {
         let mut types = BTreeMap::new();
-        for body in self.schemas.values().filter_map(|all| chosen(all)) {
+        for body in self.schemas.values().filter_map(|all| choose_description(all)) {
             if let Ok(Record::Schema { id, name, encoding, data }) = parse(op::SCHEMA, body)
                 && id != 0
             {
-                writer.schema_as(id, (name, encoding), data)?;
+                writer.add_schema_with_id(id, (name, encoding), data)?;
                 types.insert(id, name.to_owned());
             }
         }
         let mut topics = BTreeMap::new();
-        for body in self.channels.values().filter_map(|all| chosen(all)) {
+        for body in self.channels.values().filter_map(|all| choose_description(all)) {
             let Ok(Record::Channel { id, schema, topic, encoding, facts }) = parse(op::CHANNEL, body) else {
                 continue;
             };
             let of = types.get(&schema).map(String::as_str);
             if schema == 0 || of.is_some() {
-                writer.channel_as((id, schema), (topic, encoding), &facts.into())?;
-                let is_frames = of.is_some_and(|of| is_frames(topic, of) || is_foreign_frame(encoding, of));
+                writer.add_channel_with_id((id, schema), (topic, encoding), &facts.into())?;
+                let is_frames =
+                    of.is_some_and(|of| is_frame_channel(topic, of) || is_foreign_frame(encoding, of));
                 topics.insert(id, is_frames);
             }
         }
@@ -104,7 +106,7 @@ impl DescriptionSet {
 }
 
 /// Returns the description to be used; `None` if two are equally reliable.
-fn chosen(all: &[Description]) -> Option<&[u8]> {
+fn choose_description(all: &[Description]) -> Option<&[u8]> {
     let weight = |it: &Description| (it.certain, it.times);
     let best = all.iter().max_by_key(|it| weight(it))?;
     let equal = all.iter().filter(|it| weight(it) == weight(best)).count();

@@ -11,10 +11,10 @@ use std::io::{self, Read, Seek, SeekFrom};
 
 use mcap::records::op;
 
-use super::described::{DescriptionSet, Trust};
+use super::described::{DescriptionSet, DescriptionTrust};
 use super::{MAX_ATTACHMENT_BYTES, RecoverError, RecoveryResult};
 use crate::container::{
-    Chunk, FormatError, Framed, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER_BYTES, Record, RecordReader,
+    Chunk, FormatError, FramedRecord, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER_BYTES, Record, RecordReader,
     first_record, is_record, parse,
 };
 
@@ -53,7 +53,7 @@ struct SummarySection {
 }
 
 /// The result of examining a record.
-enum Examined {
+enum ExaminedRecord {
     /// The record is intact.
     Intact,
     /// The record is intact except for its operation code or one of its lengths. The fields are the correct operation
@@ -88,7 +88,7 @@ impl FileSurvey {
     /// Surveys a file.
     pub(super) fn new(from: impl Read + Seek) -> Result<Self, RecoverError> {
         let mut source = RecordReader::new(from, MAX_ATTACHMENT_BYTES);
-        let is_begun = source.magic().map_err(RecoverError::Read)?;
+        let is_begun = source.read_magic().map_err(RecoverError::Read)?;
         let first = source.body().to_vec();
         let size = source.size().map_err(RecoverError::Read)?;
         if !is_begun && first.len() < MAGIC.len() && MAGIC.starts_with(&first) {
@@ -115,8 +115,8 @@ impl<R: Read + Seek> Surveyor<R> {
             let known = summary.is_some() || self.is_header(at)?;
             if !known {
                 // A chunk proves that the file is a recording. Other records may stand before the chunk.
-                let Some(certain) = self.first(0, self.size, false)? else { return Ok(false) };
-                at = self.first(0, certain, true)?.unwrap_or(certain);
+                let Some(certain) = self.find_first_record(0, self.size, false)? else { return Ok(false) };
+                at = self.find_first_record(0, certain, true)?.unwrap_or(certain);
             }
             self.count_lost(at);
         }
@@ -126,23 +126,23 @@ impl<R: Read + Seek> Surveyor<R> {
         }
         self.source.seek(at)?;
         let mut is_ended = false;
-        while self.source.read() < self.limit {
-            let began = self.source.read();
+        while self.source.bytes_read() < self.limit {
+            let began = self.source.bytes_read();
             match self.examine()? {
-                Examined::Intact => self.add_intact(began),
-                Examined::WrongLength(code, length, end) => {
+                ExaminedRecord::Intact => self.add_intact(began),
+                ExaminedRecord::WrongLength(code, length, end) => {
                     self.survey.pieces.push(IntactRange::Record { at: began, code, length });
                     self.count_lost(0);
                     self.unsure.clear();
                     self.source.seek(end)?;
                 }
-                Examined::End => {
+                ExaminedRecord::End => {
                     is_ended = true;
                     break;
                 }
-                Examined::FalseEnd => {}
-                Examined::Damaged { end, rows } => {
-                    if !self.resume(began, end, rows)? {
+                ExaminedRecord::FalseEnd => {}
+                ExaminedRecord::Damaged { end, rows } => {
+                    if !self.resume_after_damage(began, end, rows)? {
                         break;
                     }
                 }
@@ -158,20 +158,20 @@ impl<R: Read + Seek> Surveyor<R> {
     fn is_header(&mut self, at: u64) -> io::Result<bool> {
         self.source.seek(at)?;
         let framed = self.source.next()?;
-        let is_header = framed == Framed::Record(op::HEADER) && self.source.check(framed).is_ok();
-        let end = self.source.read();
+        let is_header = framed == FramedRecord::Record(op::HEADER) && self.source.check(framed).is_ok();
+        let end = self.source.bytes_read();
         Ok(is_header && is_record(self.source.input(), end, self.size)?)
     }
 
-    fn first(&mut self, from: u64, until: u64, any: bool) -> io::Result<Option<u64>> {
+    fn find_first_record(&mut self, from: u64, until: u64, any: bool) -> io::Result<Option<u64>> {
         first_record(self.source.input(), from, until, any)
     }
 
     /// Returns the offset of the first record: a chunk or attachment at or after `from`, or several records in a row at
     /// or after `rows`.
     fn first_record_or_row(&mut self, from: u64, rows: u64, until: u64) -> io::Result<Option<u64>> {
-        match self.first(from, rows.min(until), false)? {
-            None => self.first(rows, until, true),
+        match self.find_first_record(from, rows.min(until), false)? {
+            None => self.find_first_record(rows, until, true),
             found => Ok(found),
         }
     }
@@ -184,7 +184,7 @@ impl<R: Read + Seek> Surveyor<R> {
 
     /// Adds a record that begins at `began` and ends at the source's position to the intact parts.
     fn add_intact(&mut self, began: u64) {
-        let to = self.source.read();
+        let to = self.source.bytes_read();
         match self.survey.pieces.last_mut() {
             Some(IntactRange::Records { to: end, .. }) if *end == began => *end = to,
             _ => self.survey.pieces.push(IntactRange::Records { from: began, to }),
@@ -192,56 +192,58 @@ impl<R: Read + Seek> Surveyor<R> {
     }
 
     /// Reads and examines the next record.
-    fn examine(&mut self) -> io::Result<Examined> {
+    fn examine(&mut self) -> io::Result<ExaminedRecord> {
         let framed = self.source.next()?;
-        let (began, end) = (self.source.began(), self.source.read());
+        let (began, end) = (self.source.record_offset(), self.source.bytes_read());
         let checked = self.source.check(framed);
         let content = began + RECORD_HEADER_BYTES as u64;
         // Compressed data does not look like records. If bytes are missing in a chunk, the records after it have moved
         // forward into the range that the chunk's length spans.
-        let own = self.source.plain_chunk();
+        let own = self.source.uncompressed_chunk_length();
         let rows = own.map_or(0, |own| content.saturating_add(own));
-        let wrong = Examined::Damaged { end: Some(end), rows };
+        let wrong = ExaminedRecord::Damaged { end: Some(end), rows };
         let code = match framed {
-            Framed::End(_) => return Ok(Examined::Damaged { end: None, rows: 0 }),
-            Framed::Unknown(_, length) => {
+            FramedRecord::End(_) => return Ok(ExaminedRecord::Damaged { end: None, rows: 0 }),
+            FramedRecord::Unknown(_, length) => {
                 let end = content.checked_add(length).filter(|by_length| *by_length == end);
-                return Ok(Examined::Damaged { end, rows: 0 });
+                return Ok(ExaminedRecord::Damaged { end, rows: 0 });
             }
-            Framed::Truncated(code, _) => {
-                let found = self.by_content(code, &checked)?;
-                return Ok(found.unwrap_or(Examined::Damaged { end: None, rows }));
+            FramedRecord::Truncated(code, _) => {
+                let found = self.examine_by_content(code, &checked)?;
+                return Ok(found.unwrap_or(ExaminedRecord::Damaged { end: None, rows }));
             }
-            Framed::Record(code) | Framed::Skipped(code, _) | Framed::Oversized(code, _) => code,
+            FramedRecord::Record(code)
+            | FramedRecord::Skipped(code, _)
+            | FramedRecord::Oversized(code, _) => code,
         };
         if let Err(FormatError::Swallowed(_)) = checked {
-            return Ok(Examined::Damaged { end: None, rows: 0 });
+            return Ok(ExaminedRecord::Damaged { end: None, rows: 0 });
         }
         if checked.is_err() {
-            return Ok(self.by_content(code, &checked)?.unwrap_or(wrong));
+            return Ok(self.examine_by_content(code, &checked)?.unwrap_or(wrong));
         }
         match (framed, code) {
-            (Framed::Record(_), op::DATA_END) => return self.data_end(began),
-            (Framed::Record(_), op::FOOTER) => {
-                let ends = end + MAGIC.len() as u64 == self.size && self.source.magic()?;
+            (FramedRecord::Record(_), op::DATA_END) => return self.examine_data_end(began),
+            (FramedRecord::Record(_), op::FOOTER) => {
+                let ends = end + MAGIC.len() as u64 == self.size && self.source.read_magic()?;
                 self.survey.recovered.has_end |= ends;
-                return Ok(if ends { Examined::End } else { wrong });
+                return Ok(if ends { ExaminedRecord::End } else { wrong });
             }
-            (Framed::Record(_), _) if self.check_contents(code).is_err() => return Ok(wrong),
-            (Framed::Oversized(..), _) => return Ok(wrong),
+            (FramedRecord::Record(_), _) if self.check_contents(code).is_err() => return Ok(wrong),
+            (FramedRecord::Oversized(..), _) => return Ok(wrong),
             _ => {}
         }
         match code {
             op::CHUNK if self.chunk.is_checked() => self.unsure.clear(),
             op::ATTACHMENT if !self.source.body().ends_with(&[0; 4]) => self.unsure.clear(),
-            op::CHUNK | op::ATTACHMENT => self.doubt(began, end),
-            _ => self.doubt(began, content),
+            op::CHUNK | op::ATTACHMENT => self.queue_unsure_record(began, end),
+            _ => self.queue_unsure_record(began, content),
         }
-        Ok(Examined::Intact)
+        Ok(ExaminedRecord::Intact)
     }
 
     /// Stores a record whose length is not confirmed by a checksum, to be examined again if the next record is wrong.
-    fn doubt(&mut self, began: u64, rows: u64) {
+    fn queue_unsure_record(&mut self, began: u64, rows: u64) {
         if self.unsure.len() == MAX_UNSURE_RECORDS {
             self.unsure.pop_front();
         }
@@ -249,9 +251,13 @@ impl<R: Read + Seek> Surveyor<R> {
     }
 
     /// Returns the last record with the length of its contents if only its length field is wrong.
-    fn by_content(&mut self, code: u8, checked: &Result<(), FormatError>) -> io::Result<Option<Examined>> {
+    fn examine_by_content(
+        &mut self,
+        code: u8,
+        checked: &Result<(), FormatError>,
+    ) -> io::Result<Option<ExaminedRecord>> {
         let &Err(FormatError::Length { own, bytes, .. }) = checked else { return Ok(None) };
-        let content = self.source.began() + RECORD_HEADER_BYTES as u64;
+        let content = self.source.record_offset() + RECORD_HEADER_BYTES as u64;
         let limit = if code == op::ATTACHMENT { MAX_ATTACHMENT_BYTES } else { MAX_RECORD_BYTES };
         let end = content + own.min(limit + 1);
         if own > limit || end > self.limit || matches!(code, op::DATA_END | op::FOOTER) {
@@ -266,10 +272,10 @@ impl<R: Read + Seek> Surveyor<R> {
         if !is_sure && !is_record(self.source.input(), end, self.limit)? {
             return Ok(None);
         }
-        let is_right = self.source.read_as(content - RECORD_HEADER_BYTES as u64, own)?
+        let is_right = self.source.read_with_length(content - RECORD_HEADER_BYTES as u64, own)?
             && self.check_contents(code).is_ok();
         let end = if is_shorter { by_length } else { end };
-        Ok(is_right.then_some(Examined::WrongLength(code, own, end)))
+        Ok(is_right.then_some(ExaminedRecord::WrongLength(code, own, end)))
     }
 
     /// Checks the record that was read last. Collects the schemas and channels in it.
@@ -281,14 +287,14 @@ impl<R: Read + Seek> Surveyor<R> {
             if let Record::Header { profile: of_file, .. } = parse(code, body)? {
                 of_file.clone_into(profile);
             }
-            return described.add(code, body, Trust::Unchecked);
+            return described.add(code, body, DescriptionTrust::Unchecked);
         }
-        chunk.unpack(body, source.read())?;
+        chunk.unpack(body, source.bytes_read())?;
         while let Some((code, body)) = chunk.next() {
             parse(code, body)?;
         }
         chunk.rewind();
-        let trust = if chunk.is_checked() { Trust::Certain } else { Trust::Unchecked };
+        let trust = if chunk.is_checked() { DescriptionTrust::Certain } else { DescriptionTrust::Unchecked };
         while let Some((code, body)) = chunk.next() {
             if matches!(code, op::SCHEMA | op::CHANNEL) {
                 described.add(code, body, trust)?;
@@ -298,41 +304,41 @@ impl<R: Read + Seek> Surveyor<R> {
     }
 
     /// Handles a record that ends the data section. If other records follow it, it is damage that looks like the end.
-    fn data_end(&mut self, began: u64) -> io::Result<Examined> {
+    fn examine_data_end(&mut self, began: u64) -> io::Result<ExaminedRecord> {
         let checked = self.source.check_section(op::DATA_END).is_ok();
-        let end = self.source.read();
+        let end = self.source.bytes_read();
         if self.limit < self.size && end < self.limit {
-            return Ok(Examined::Damaged { end: Some(end), rows: 0 });
+            return Ok(ExaminedRecord::Damaged { end: Some(end), rows: 0 });
         }
         self.survey.recovered.is_checksum_wrong |= !checked;
         if self.limit < self.size {
-            return Ok(Examined::End);
+            return Ok(ExaminedRecord::End);
         }
         self.source.begin_summary();
-        let (mut all, mut of_all) = (Vec::new(), Trust::Doubtful);
+        let (mut all, mut of_all) = (Vec::new(), DescriptionTrust::Doubtful);
         loop {
             let framed = self.source.next()?;
             if self.source.check(framed).is_err() {
                 break;
             }
             match framed {
-                Framed::Record(code @ (op::SCHEMA | op::CHANNEL)) => {
+                FramedRecord::Record(code @ (op::SCHEMA | op::CHANNEL)) => {
                     all.push((code, self.source.body().to_vec()));
                 }
-                Framed::Record(op::FOOTER) => {
+                FramedRecord::Record(op::FOOTER) => {
                     let has_none = self.source.body().ends_with(&[0; 4]);
                     let is_right = self.source.check_section(op::FOOTER).is_ok();
                     self.survey.recovered.is_checksum_wrong |= !is_right;
                     of_all = trust(is_right, has_none);
-                    self.survey.recovered.has_end = self.source.magic()?;
+                    self.survey.recovered.has_end = self.source.read_magic()?;
                     break;
                 }
-                Framed::Skipped(..) => {}
-                Framed::Record(_)
-                | Framed::Oversized(..)
-                | Framed::Unknown(..)
-                | Framed::Truncated(..)
-                | Framed::End(_) => break,
+                FramedRecord::Skipped(..) => {}
+                FramedRecord::Record(_)
+                | FramedRecord::Oversized(..)
+                | FramedRecord::Unknown(..)
+                | FramedRecord::Truncated(..)
+                | FramedRecord::End(_) => break,
             }
         }
         for (code, body) in all {
@@ -340,15 +346,17 @@ impl<R: Read + Seek> Surveyor<R> {
             let _ = self.survey.described.add(code, &body, of_all);
         }
         self.source.end_summary();
-        let Some(more) = self.first(began + 1, self.size, false)? else { return Ok(Examined::End) };
+        let Some(more) = self.find_first_record(began + 1, self.size, false)? else {
+            return Ok(ExaminedRecord::End);
+        };
         self.count_lost(more - began);
         self.source.seek(more)?;
         self.survey.recovered.has_end = false;
-        Ok(Examined::FalseEnd)
+        Ok(ExaminedRecord::FalseEnd)
     }
 
     /// Continues at the next intact records after a wrong one. Returns false if there are no more.
-    fn resume(&mut self, began: u64, end: Option<u64>, rows: u64) -> io::Result<bool> {
+    fn resume_after_damage(&mut self, began: u64, end: Option<u64>, rows: u64) -> io::Result<bool> {
         let end = match end.filter(|end| *end <= self.limit) {
             Some(end) => is_record(self.source.input(), end, self.limit)?.then_some(end),
             None => None,
@@ -368,7 +376,7 @@ impl<R: Read + Seek> Surveyor<R> {
         }
         let from = began + 1;
         let found = match end {
-            Some(end) => self.first(from, end, false)?.or(Some(end)),
+            Some(end) => self.find_first_record(from, end, false)?.or(Some(end)),
             None => self.first_record_or_row(from, rows.max(from), self.limit)?,
         };
         let Some(found) = found else {
@@ -416,7 +424,7 @@ impl<R: Read + Seek> Surveyor<R> {
             return Ok(None);
         }
         input.seek(SeekFrom::Start(start))?;
-        let mut of_summary = RecordReader::at(start, input, 0);
+        let mut of_summary = RecordReader::resume_at(start, input, 0);
         of_summary.begin_summary();
         let (mut stated, mut all) = (None, Vec::new());
         let checksum = loop {
@@ -425,24 +433,24 @@ impl<R: Read + Seek> Surveyor<R> {
                 return Ok(None);
             }
             match framed {
-                Framed::Record(op::FOOTER) => break of_summary.check_section(op::FOOTER),
-                Framed::Record(code @ (op::SCHEMA | op::CHANNEL)) => {
+                FramedRecord::Record(op::FOOTER) => break of_summary.check_section(op::FOOTER),
+                FramedRecord::Record(code @ (op::SCHEMA | op::CHANNEL)) => {
                     all.push((code, of_summary.body().to_vec()))
                 }
-                Framed::Skipped(op::STATISTICS, _) => {
+                FramedRecord::Skipped(op::STATISTICS, _) => {
                     stated = of_summary.body().first_chunk().map(|count| u64::from_le_bytes(*count));
                 }
-                Framed::Skipped(..) => {}
-                Framed::Record(_)
-                | Framed::Oversized(..)
-                | Framed::Unknown(..)
-                | Framed::Truncated(..)
-                | Framed::End(_) => {
+                FramedRecord::Skipped(..) => {}
+                FramedRecord::Record(_)
+                | FramedRecord::Oversized(..)
+                | FramedRecord::Unknown(..)
+                | FramedRecord::Truncated(..)
+                | FramedRecord::End(_) => {
                     return Ok(None);
                 }
             }
         };
-        if of_summary.read() != footer + FOOTER_BYTES as u64 {
+        if of_summary.bytes_read() != footer + FOOTER_BYTES as u64 {
             return Ok(None);
         }
         let is_right = checksum.is_ok();
@@ -456,10 +464,10 @@ impl<R: Read + Seek> Surveyor<R> {
 }
 
 /// Returns how reliable the descriptions in a summary are, by its checksum.
-const fn trust(is_right: bool, has_none: bool) -> Trust {
+const fn trust(is_right: bool, has_none: bool) -> DescriptionTrust {
     match (is_right, has_none) {
-        (false, _) => Trust::Doubtful,
-        (true, true) => Trust::Unchecked,
-        (true, false) => Trust::Certain,
+        (false, _) => DescriptionTrust::Doubtful,
+        (true, true) => DescriptionTrust::Unchecked,
+        (true, false) => DescriptionTrust::Certain,
     }
 }

@@ -29,7 +29,7 @@ impl Bench {
     }
 
     fn frame(&mut self, nanos: u64) {
-        let time = Timestamp::nine_digits(nanos);
+        let time = Timestamp::with_nine_digits(nanos);
         let record = CanFrame { time, interface: "vcan0", frame: Frame::EMPTY, direction: None };
         self.window.write(&mut self.frames, nanos, &record);
     }
@@ -41,13 +41,13 @@ impl Bench {
 
     fn at(&mut self, now: u64) -> MessageCount {
         let mut written = self.window.set_time(now, &mut self.file).unwrap();
-        written.add(self.window.release(&mut self.file).unwrap());
+        written.add(self.window.write_due(&mut self.file).unwrap());
         written
     }
 
     /// Returns all messages of the file, and the number of those that arrived after later ones had been written.
     fn end(mut self) -> (Vec<WrittenMessage>, u64) {
-        self.window.release_all(&mut self.file).unwrap();
+        self.window.write_all(&mut self.file).unwrap();
         assert_eq!(self.window.count(), MessageCount::default());
         self.file.finish().unwrap();
         let bytes = self.file.into_inner();
@@ -55,7 +55,7 @@ impl Bench {
             let message = message.unwrap();
             (message.channel.topic.clone(), message.log_time, message.publish_time, message.sequence)
         });
-        (seen.collect(), self.window.late())
+        (seen.collect(), self.window.late_messages())
     }
 }
 
@@ -130,7 +130,7 @@ fn no_more_waits_than_may() {
     for at in 0..3 * MAX_MESSAGES as u64 {
         bench.frame(START + at);
         if bench.window.is_full() {
-            bench.window.release(&mut bench.file).unwrap();
+            bench.window.write_due(&mut bench.file).unwrap();
         }
         assert!(bench.window.waiting.len() < MAX_MESSAGES);
     }
@@ -143,7 +143,7 @@ fn another_file_begins_with_the_same_buffers_and_an_order_of_its_own() {
     bench.frame(START + 10 * MS);
     bench.at(START + 60 * MS);
     bench.joints(START);
-    assert_eq!((bench.at(START + 101 * MS).others, bench.window.late()), (1, 1));
+    assert_eq!((bench.at(START + 101 * MS).others, bench.window.late_messages()), (1, 1));
     bench.frame(START + 99 * MS);
     bench.window.begin(START + 100 * MS);
     assert_eq!(bench.window.count(), MessageCount::default(), "it was for the file before");

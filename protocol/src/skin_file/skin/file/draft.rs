@@ -8,7 +8,7 @@ use crate::usage::printable;
 
 /// The text of a new skin file, written from top to bottom.
 #[derive(Clone, Debug, Default)]
-pub struct Draft(String);
+pub struct SkinDraft(String);
 
 /// A bus to write into a new skin file.
 #[derive(Clone, Copy, Debug)]
@@ -25,7 +25,7 @@ pub struct DraftBus<'a> {
 
 /// The direction in which a cell faces.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Facing {
+pub enum CellFacing {
     /// Outward normal, in the frame of the cell's row.
     Normal([f64; 3]),
     /// Orientation of the cell in the frame of its row, a unit quaternion x, y, z, w.
@@ -50,47 +50,47 @@ pub struct DraftCell<'a> {
     /// Position of the cell's centre in the frame of its row, in m.
     pub position: [f64; 3],
     /// Normal or orientation of the cell.
-    pub facing: Facing,
+    pub facing: CellFacing,
     /// Node ids of the neighbours at the cell's ports, 0 for a free port; `None` to omit the key.
     pub neighbors: Option<[u8; 4]>,
     /// True if the cell is wired to the gateway.
     pub root: bool,
 }
 
-impl Draft {
+impl SkinDraft {
     /// Adds a comment line.
-    pub fn comment(&mut self, text: &str) {
+    pub fn add_comment(&mut self, text: &str) {
         match text {
             "" => self.0.push_str("#\n"),
-            text => self.line(format_args!("# {}", printable(text))),
+            text => self.add_line(format_args!("# {}", printable(text))),
         }
     }
 
-    fn line(&mut self, text: core::fmt::Arguments<'_>) {
+    fn add_line(&mut self, text: core::fmt::Arguments<'_>) {
         let _ = writeln!(self.0, "{text}");
     }
 
     /// Adds an empty line and a table header, with an optional comment. `head` includes the brackets.
-    pub fn table(&mut self, head: &str, remark: Option<&str>) {
+    pub fn add_table_header(&mut self, head: &str, remark: Option<&str>) {
         match remark {
-            Some(remark) => self.line(format_args!("\n{head}   # {}", printable(remark))),
-            None => self.line(format_args!("\n{head}")),
+            Some(remark) => self.add_line(format_args!("\n{head}   # {}", printable(remark))),
+            None => self.add_line(format_args!("\n{head}")),
         }
     }
 
     /// Adds a key with a value.
     pub fn set(&mut self, key: &str, value: Value<'_>) {
-        self.line(format_args!("{key} = {value}"));
+        self.add_line(format_args!("{key} = {value}"));
     }
 
     /// Adds a key with a value and a comment, separated by `blanks` spaces.
     pub fn set_with_comment(&mut self, key: &str, value: Value<'_>, blanks: usize, remark: &str) {
-        self.line(format_args!("{key} = {value}{:blanks$}# {}", "", printable(remark)));
+        self.add_line(format_args!("{key} = {value}{:blanks$}# {}", "", printable(remark)));
     }
 
     /// Adds a key with an inline table.
     pub fn set_table(&mut self, key: &str, values: &[(&str, Value<'_>)]) {
-        self.line(format_args!("{key} = {}", inline(values)));
+        self.add_line(format_args!("{key} = {}", inline_table(values)));
     }
 
     /// Adds a key with an array of inline tables, one per line.
@@ -101,19 +101,19 @@ impl Draft {
         rows: impl Iterator<Item = Vec<(&'v str, Value<'v>)>>,
     ) {
         match remark {
-            Some(remark) => self.line(format_args!("{key} = [   # {}", printable(remark))),
-            None => self.line(format_args!("{key} = [")),
+            Some(remark) => self.add_line(format_args!("{key} = [   # {}", printable(remark))),
+            None => self.add_line(format_args!("{key} = [")),
         }
-        rows.for_each(|row| self.line(format_args!("  {},", inline(&row))));
+        rows.for_each(|row| self.add_line(format_args!("  {},", inline_table(&row))));
         self.0.push_str("]\n");
     }
 
     /// Adds the timing tables with this broadcast frequency in Hz, and the gains and thresholds of the paper.
-    pub fn paper(&mut self, broadcast_hz: f64) {
-        self.table("[timing]", None);
+    pub fn add_paper_settings(&mut self, broadcast_hz: f64) {
+        self.add_table_header("[timing]", None);
         self.set("control_hz", Value::Number(500.0));
         self.set("joint_broadcast_hz", Value::Number(broadcast_hz));
-        self.table("[contact]", Some("the paper's Algorithm 1"));
+        self.add_table_header("[contact]", Some("the paper's Algorithm 1"));
         for (key, value) in [
             ("alpha_c", 1.0),
             ("alpha_p", 0.0),
@@ -126,8 +126,8 @@ impl Draft {
     }
 
     /// Adds the table of a bus.
-    pub fn bus(&mut self, bus: &DraftBus<'_>) {
-        self.table("[[bus]]", None);
+    pub fn add_bus(&mut self, bus: &DraftBus<'_>) {
+        self.add_table_header("[[bus]]", None);
         self.set("name", Value::Text(bus.name));
         if let Some(chain) = bus.chain {
             self.set("chain", Value::Text(chain));
@@ -140,9 +140,9 @@ impl Draft {
     }
 
     /// Adds the table of a cell.
-    pub fn cell(&mut self, cell: &DraftCell<'_>) {
+    pub fn add_cell(&mut self, cell: &DraftCell<'_>) {
         let whole = |value: usize| Value::Integer(i64::try_from(value).unwrap_or(i64::MAX));
-        self.table("[[cell]]", cell.remark);
+        self.add_table_header("[[cell]]", cell.remark);
         self.set("bus", Value::Text(cell.bus));
         self.set("node", whole(cell.node));
         if let Some(serial) = cell.serial {
@@ -154,8 +154,8 @@ impl Draft {
         }
         self.set("position", Value::Numbers(&cell.position));
         match &cell.facing {
-            Facing::Normal(normal) => self.set("normal", Value::Numbers(normal)),
-            Facing::Orientation(turn) => self.set("orientation", Value::Numbers(turn)),
+            CellFacing::Normal(normal) => self.set("normal", Value::Numbers(normal)),
+            CellFacing::Orientation(turn) => self.set("orientation", Value::Numbers(turn)),
         }
         if let Some(neighbors) = &cell.neighbors {
             self.set("neighbors", Value::Nodes(neighbors));
@@ -172,7 +172,7 @@ impl Draft {
     }
 }
 
-fn inline(values: &[(&str, Value<'_>)]) -> String {
+fn inline_table(values: &[(&str, Value<'_>)]) -> String {
     let all: Vec<_> = values.iter().map(|(key, value)| format!("{key} = {value}")).collect();
     format!("{{ {} }}", all.join(", "))
 }

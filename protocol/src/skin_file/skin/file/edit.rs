@@ -33,14 +33,14 @@ pub enum EditError {
 /// All bytes outside the changed values are kept: comments, order, spelling, spaces, line endings and a byte
 /// order mark. Without changes the text is the original.
 #[derive(Debug)]
-pub struct Edit<'a> {
+pub struct SkinEdit<'a> {
     text: &'a str,
     document: Document<&'a str>,
     /// Replacements of byte ranges, in any order and without overlap.
     changes: Vec<(Range<usize>, String)>,
 }
 
-impl<'a> Edit<'a> {
+impl<'a> SkinEdit<'a> {
     /// Parses a skin's text.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! Writers of skin files: an [`Edit`] changes values in an existing text and keeps all other bytes; a [`Draft`] creates
+//! Writers of skin files: an [`SkinEdit`] changes values in an existing text and keeps all other bytes; a [`SkinDraft`] creates
 //! a new text.
 
 mod draft;
@@ -7,6 +7,6 @@ mod edit;
 mod tests;
 mod value;
 
-pub use draft::{Draft, DraftBus, DraftCell, Facing};
-pub use edit::{Edit, EditError};
+pub use draft::{CellFacing, DraftBus, DraftCell, SkinDraft};
+pub use edit::{EditError, SkinEdit};
 pub use value::Value;

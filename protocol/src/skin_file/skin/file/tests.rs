@@ -56,14 +56,14 @@ fn a_text_without_changes_is_the_given_one() {
     let example = std::fs::read_to_string(example).unwrap();
     for text in [HAND, INLINE, &example].into_iter().flat_map(forms) {
         let skin = parsed(&text);
-        assert_eq!(Edit::new(&skin, &text).unwrap().text(), text);
+        assert_eq!(SkinEdit::new(&skin, &text).unwrap().text(), text);
     }
 }
 
 #[test]
 fn values_change_and_no_other_byte() {
     for text in forms(HAND) {
-        let mut edit = Edit::new(&parsed(&text), &text).unwrap();
+        let mut edit = SkinEdit::new(&parsed(&text), &text).unwrap();
         edit.set(0, "node", Value::Integer(50));
         edit.set(0, "joint", Value::Integer(1));
         edit.set(0, "position", Value::Numbers(&[0.5, -0.25, 1.0]));
@@ -87,7 +87,7 @@ fn values_change_and_no_other_byte() {
 #[test]
 fn a_new_key_has_a_line_of_its_own() {
     for (text, end) in forms(HAND).iter().zip(["\n", "\r\n", "\n", "\n"]) {
-        let mut edit = Edit::new(&parsed(text), text).unwrap();
+        let mut edit = SkinEdit::new(&parsed(text), text).unwrap();
         edit.insert(0, "serial", Value::Integer(12), "node");
         edit.insert(1, "root", Value::Flag(true), "orientation");
         edit.insert(1, "serial", Value::Integer(13), "nothing");
@@ -103,7 +103,7 @@ fn a_new_key_has_a_line_of_its_own() {
 
 #[test]
 fn cells_in_an_array_are_edited_in_their_places() {
-    let mut edit = Edit::new(&parsed(INLINE), INLINE).unwrap();
+    let mut edit = SkinEdit::new(&parsed(INLINE), INLINE).unwrap();
     edit.set(0, "node", Value::Integer(3));
     edit.insert(0, "serial", Value::Integer(1), "node");
     edit.set_element(1, "neighbors", 0, Value::Integer(3));
@@ -120,7 +120,7 @@ fn cells_in_an_array_are_edited_in_their_places() {
 #[test]
 fn a_text_of_another_skin_is_refused() {
     let skin = parsed(HAND);
-    let said = |text: &str| Edit::new(&skin, text).unwrap_err().to_string();
+    let said = |text: &str| SkinEdit::new(&skin, text).unwrap_err().to_string();
     assert_eq!(said("[[cell]]\nnode = 1\n"), "1 cells, not 2");
     assert_eq!(said("cell = 1\n"), "its cells are not [[cell]] tables");
     assert_eq!(said("version = 1\n"), "its cells are not [[cell]] tables");
@@ -152,14 +152,14 @@ fn texts_of_any_letters_are_read_back() {
 
 #[test]
 fn a_draft_is_a_skin() {
-    let mut draft = Draft::default();
-    draft.comment("made\nby a test");
-    draft.comment("");
-    draft.table("[robot]", Some("of one joint"));
+    let mut draft = SkinDraft::default();
+    draft.add_comment("made\nby a test");
+    draft.add_comment("");
+    draft.add_table_header("[robot]", Some("of one joint"));
     draft.set_rows("joints", None, [vec![("d", Value::Number(0.1))]].into_iter());
-    draft.paper(50.0);
-    draft.bus(&DraftBus { name: "can0", chain: None, slot_us: Some(900), format: Format::Classic });
-    draft.cell(&DraftCell {
+    draft.add_paper_settings(50.0);
+    draft.add_bus(&DraftBus { name: "can0", chain: None, slot_us: Some(900), format: Format::Classic });
+    draft.add_cell(&DraftCell {
         remark: Some("on a link"),
         bus: "can0",
         node: 3,
@@ -167,7 +167,7 @@ fn a_draft_is_a_skin() {
         joint: 1,
         row: None,
         position: [0.0, 0.1, 0.2],
-        facing: Facing::Normal([0.0, 0.0, 1.0]),
+        facing: CellFacing::Normal([0.0, 0.0, 1.0]),
         neighbors: Some([0; 4]),
         root: true,
     });

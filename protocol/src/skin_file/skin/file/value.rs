@@ -28,14 +28,14 @@ impl fmt::Display for Value<'_> {
             Self::Number(value) => write!(f, "{value:?}"),
             Self::Numbers(values) => write!(f, "{values:?}"),
             Self::Nodes(values) => write!(f, "{values:?}"),
-            Self::Text(text) => quoted(f, text),
+            Self::Text(text) => write_quoted(f, text),
             Self::Flag(value) => write!(f, "{value}"),
         }
     }
 }
 
 /// Writes a basic string of TOML, whose escapes differ from Rust's.
-fn quoted(f: &mut fmt::Formatter<'_>, text: &str) -> fmt::Result {
+fn write_quoted(f: &mut fmt::Formatter<'_>, text: &str) -> fmt::Result {
     f.write_char('"')?;
     for letter in text.chars() {
         match letter {

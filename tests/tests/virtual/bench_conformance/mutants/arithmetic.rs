@@ -74,7 +74,7 @@ pub(crate) const ARITHMETIC: &[FaultCase] = &[
     ("another torque format is sent in Q3.12", "TORQUE-1", |it| {
         it.say = |memory, message| {
             retorqued(memory, message, |memory, of| {
-                let bits = 30 - of.torque_format.fraction();
+                let bits = 30 - of.torque_format.fraction_bits();
                 memory.torque_of(of, right_force, move |exact, _| {
                     rounded(exact, if bits == 20 { 18 } else { bits })
                 })

@@ -103,7 +103,7 @@ pub(crate) const COUNTERS: &[FaultCase] = &[
     ("torques have no bit-rate switch and are classic at times", "SEND-1", |it| {
         it.put = |memory, packet, format| {
             memory.count += 1;
-            let format = if memory.count.is_multiple_of(50) { format.other() } else { format };
+            let format = if memory.count.is_multiple_of(50) { format.other_format() } else { format };
             packet.frames(format).collect()
         };
     }),

@@ -13,7 +13,7 @@ pub(crate) const STIMULI: &[FaultCase] = &[
             Some(Message::Stimulus { to, page, .. }) => {
                 vec![fd(&Message::Stimulus {
                     to: *to,
-                    from: protocol::message::AppliesFrom::Next,
+                    from: protocol::message::StimulusStart::Next,
                     page: *page,
                 })]
             }
@@ -23,12 +23,12 @@ pub(crate) const STIMULI: &[FaultCase] = &[
     ("epochs of stimuli are compared without a corner", "STIM-3", |it| {
         it.hear = |memory, message, frame| match (message, memory.last) {
             (
-                Some(Message::Stimulus { to, from: protocol::message::AppliesFrom::Epoch(first), page }),
+                Some(Message::Stimulus { to, from: protocol::message::StimulusStart::Epoch(first), page }),
                 Some((last, _)),
             ) if first.0 < last.0 => {
                 vec![fd(&Message::Stimulus {
                     to: *to,
-                    from: protocol::message::AppliesFrom::Next,
+                    from: protocol::message::StimulusStart::Next,
                     page: *page,
                 })]
             }
@@ -37,10 +37,10 @@ pub(crate) const STIMULI: &[FaultCase] = &[
     }),
     ("stimuli from the next joints on have an epoch", "STIM-4", |it| {
         it.hear = |_, message, frame| match message {
-            Some(Message::Stimulus { to, from: protocol::message::AppliesFrom::Next, page })
+            Some(Message::Stimulus { to, from: protocol::message::StimulusStart::Next, page })
                 if frame.data()[12] != 0 =>
             {
-                let from = protocol::message::AppliesFrom::Epoch(Epoch(frame.data()[12]));
+                let from = protocol::message::StimulusStart::Epoch(Epoch(frame.data()[12]));
                 vec![fd(&Message::Stimulus { to: *to, from, page: *page })]
             }
             _ => vec![frame],
@@ -49,7 +49,7 @@ pub(crate) const STIMULI: &[FaultCase] = &[
     ("late stimuli are dropped", "STIM-5", |it| {
         it.hear = |memory, message, frame| match (message, memory.last) {
             (
-                Some(Message::Stimulus { from: protocol::message::AppliesFrom::Epoch(first), .. }),
+                Some(Message::Stimulus { from: protocol::message::StimulusStart::Epoch(first), .. }),
                 Some((last, _)),
             ) if last.epochs_since(*first) >= 0 => Vec::new(),
             _ => vec![frame],
@@ -75,7 +75,7 @@ pub(crate) const STIMULI: &[FaultCase] = &[
                 let own = protocol::id::Node::Cell(protocol::id::CellId::new(NODE.into()).unwrap());
                 let page = SensorPage::Skin(protocol::message::SkinSensors::default());
                 vec![
-                    fd(&Message::Stimulus { to: own, from: protocol::message::AppliesFrom::Next, page }),
+                    fd(&Message::Stimulus { to: own, from: protocol::message::StimulusStart::Next, page }),
                     frame,
                 ]
             }

@@ -6,10 +6,10 @@ use super::super::bus_figures::BusFigures;
 use super::facts::micros;
 use super::{PageDraft, without_empty_series};
 use crate::paper;
-use crate::report::figure::{Axis, Figure, LowerDiagram, Mark, Section, Shape, Table, quantity};
+use crate::report::figure::{Axis, Figure, LowerDiagram, MarkLine, Section, Shape, Table, quantity};
 use crate::report::thin::ThinnedLine;
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, Errors};
+use model::table::{Accuracy, TorqueErrors};
 use protocol::fixed::TorqueFormat;
 use protocol::skin::{JointKind, SkinReply};
 
@@ -29,8 +29,9 @@ impl PageDraft<'_> {
         let errors: Vec<_> =
             self.run.bus_figures.iter().filter(|bus_figures| bus_figures.lines.error.count() > 0).collect();
         let error = (!errors.is_empty()).then(|| {
-            let papers =
-                |format: &str, mean| Mark::y(mean, format!("paper, {format}: {}", quantity(mean, "Nm")));
+            let papers = |format: &str, mean| {
+                MarkLine::at_y(mean, format!("paper, {format}: {}", quantity(mean, "Nm")))
+            };
             let title = "Mean absolute error of an epoch that all cells answered in time";
             self.figure("torque-error", title, Axis::new("error", "Nm").log())
                 .series(errors.iter().map(|bus_figures| {
@@ -38,7 +39,7 @@ impl PageDraft<'_> {
                     series.points.iter_mut().for_each(|(_, error)| *error = without_rounding(*error));
                     series
                 }))
-                .marks([papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)])
+                .marks([papers("Q3.12", paper::SINGLE_CELL_ERROR_NM), papers("Q7.8", paper::SUMMED_ERROR_NM)])
         });
         let mut section = Section::new("torque", "Torque, and its difference from the central one");
         if !loaded.is_empty() {
@@ -75,18 +76,18 @@ impl PageDraft<'_> {
     }
 
     /// Returns the size of one step of the torque words of a bus, in Nm or N.
-    fn step(&self, bus: usize) -> f64 {
+    fn torque_step(&self, bus: usize) -> f64 {
         let bus = self.run.skin.buses.get(bus);
         let format = bus.map_or_else(TorqueFormat::default, |bus| match bus.reply {
             SkinReply::Torque => bus.torque_format,
             SkinReply::Sum { .. } => TorqueFormat::Q7_8,
         });
-        format.step()
+        format.step_size()
     }
 
     /// Returns true if a joint had a torque of at least half a step of the words.
     fn is_loaded(&self, joint: usize) -> bool {
-        let step = self.buses_of(joint).map(|(bus, ..)| self.step(bus)).fold(f64::INFINITY, f64::min);
+        let step = self.buses_of(joint).map(|(bus, ..)| self.torque_step(bus)).fold(f64::INFINITY, f64::min);
         let largest = |line: Option<&ThinnedLine>| {
             let points = line.map(ThinnedLine::points).unwrap_or_default();
             points.iter().map(|point| point.1.abs()).fold(0.0, f64::max)
@@ -116,14 +117,14 @@ impl PageDraft<'_> {
         let series: Vec<_> = self.buses_of(joint).filter_map(of_bus).collect();
         let figure = self
             .figure(format!("torque-joint{}", joint + 1), title, Axis::new(quantity, unit))
-            .half()
+            .half_width()
             .series(distributed);
         if series.is_empty() {
             return figure;
         }
-        let step = self.buses_of(joint).map(|(bus, ..)| self.step(bus)).fold(0.0, f64::max);
-        let marks = vec![Mark::y(step, "one step"), Mark::y(-step, "")];
-        figure.below(LowerDiagram { y: Axis::new("difference", unit), series, marks })
+        let step = self.buses_of(joint).map(|(bus, ..)| self.torque_step(bus)).fold(0.0, f64::max);
+        let marks = vec![MarkLine::at_y(step, "one step"), MarkLine::at_y(-step, "")];
+        figure.with_lower_diagram(LowerDiagram { y: Axis::new("difference", unit), series, marks })
     }
 
     /// Returns a joint's name in the skin's file, with its number unless the name contains it.
@@ -144,7 +145,7 @@ impl PageDraft<'_> {
     /// Creates the table of torque errors by joint.
     fn error_table(&self) -> Option<Table> {
         let skin = &self.run.skin;
-        let mut by_joint = vec![[Errors::default(); 2]; skin.robot.joints.len()];
+        let mut by_joint = vec![[TorqueErrors::default(); 2]; skin.robot.joints.len()];
         let mut accuracy = Accuracy::default();
         for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
             let here = bus_figures.table.accuracy();
@@ -154,14 +155,14 @@ impl PageDraft<'_> {
                     (*sum, *of_whole) = (sum.merged(*single), of_whole.merged(*whole));
                 }
             }
-            accuracy = accuracy.with(here);
+            accuracy = accuracy.merged(here);
         }
         let single = by_joint.iter().map(|[single, whole]| (single, whole));
-        let text = |errors: &Errors, unit: &str| {
+        let text = |errors: &TorqueErrors, unit: &str| {
             let [mean, max] = [errors.mean().unwrap_or(f64::NAN), errors.max()].map(without_rounding);
             [quantity(mean, unit), quantity(max, unit), errors.count().to_string()]
         };
-        let row = |name: String, unit: &str, single: &Errors, whole: &Errors| {
+        let row = |name: String, unit: &str, single: &TorqueErrors, whole: &TorqueErrors| {
             [name].into_iter().chain(text(single, unit)).chain(text(whole, unit)).collect::<Vec<_>>()
         };
         if accuracy.single.count() == 0 {
@@ -172,7 +173,8 @@ impl PageDraft<'_> {
                 row(self.joint_name(joint), described.kind.torque_unit(), single, whole)
             });
         let all = row("all".to_owned(), self.torque_unit(), &accuracy.single, &accuracy.whole);
-        let [single, whole] = [paper::SINGLE_NM, paper::SUMMED_NM].map(|mean| quantity(mean, "Nm"));
+        let [single, whole] =
+            [paper::SINGLE_CELL_ERROR_NM, paper::SUMMED_ERROR_NM].map(|mean| quantity(mean, "Nm"));
         let papers = ["paper", &single, "", "", &whole, "", ""].map(str::to_owned).into();
         Some(Table::new(
             "Absolute errors, joint by joint: single cells where the joint carries them, and the whole skin's sum",
@@ -222,7 +224,7 @@ impl PageDraft<'_> {
                     chain.joints.contains(joint) && robot.joints.get(*joint).is_some_and(|it| it.kind == kind)
                 };
                 let joints: Vec<_> = rest.extract_if(.., is_in).collect();
-                groups.extend(joints.chunks(Figure::COLOURS).map(|joints| (kind, joints.to_vec())));
+                groups.extend(joints.chunks(Figure::COLOUR_COUNT).map(|joints| (kind, joints.to_vec())));
             }
         }
         groups

@@ -4,7 +4,9 @@ use super::super::bus_figures::{BusFigures, Latency};
 use super::{PageDraft, without_empty_series};
 use crate::fit::limits::MAX_NODES;
 use crate::fit::verdict::{FitSummary, percent};
-use crate::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table, number, quantity};
+use crate::report::figure::{
+    Axis, Figure, Finding, MarkLine, Section, Series, Shape, Table, number, quantity,
+};
 use crate::report::svg::stairs;
 use crate::report::thin::{BinnedSums, ThinnedLine};
 use crate::shadow::BusShadow;
@@ -16,7 +18,7 @@ const MAX_WORST_CELLS: usize = 12;
 
 impl PageDraft<'_> {
     pub(super) fn replies(&self) -> Section {
-        let due = self.run.bus_figures.iter().filter(|bus_figures| bus_figures.account().due > 0);
+        let due = self.run.bus_figures.iter().filter(|bus_figures| bus_figures.reply_counts().due > 0);
         let mut section = Section::new("replies", "Replies")
             .text(
                 "A reply is due from every cell that is configured, awake and in contact; it is in time before the next \
@@ -25,9 +27,9 @@ impl PageDraft<'_> {
             .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)).filter_map(without_empty_series))
             .tables([self.account_table()])
             .tables(self.worst_cells_table());
-        let none_due = |bus_figures: &&BusFigures| bus_figures.account().due == 0;
+        let none_due = |bus_figures: &&BusFigures| bus_figures.reply_counts().due == 0;
         let complete = |bus_figures: &&BusFigures| {
-            let account = bus_figures.account();
+            let account = bus_figures.reply_counts();
             account.due > 0 && account.late + account.missing == 0
         };
         for (which, sentence) in [
@@ -48,10 +50,12 @@ impl PageDraft<'_> {
         let unit = if bus_figures.sums { "cells in sums" } else { "replies" };
         let steps = |figure: &str, title: &str, y: Axis, of: [(&str, &ThinnedLine); 2]| {
             let of = of.map(|(caption, thinned)| Series::new(caption, Shape::Steps, self.points(thinned)));
-            self.figure(format!("{figure}-{name}"), format!("{name}: {unit} {title}"), y).half().series(of)
+            self.figure(format!("{figure}-{name}"), format!("{name}: {unit} {title}"), y)
+                .half_width()
+                .series(of)
         };
         let y = Axis::new(unit, "");
-        let lost = bus_figures.account().late + bus_figures.account().missing;
+        let lost = bus_figures.reply_counts().late + bus_figures.reply_counts().missing;
         let slowest = format!("{name}: from joints to the last reply for them, epoch by epoch");
         let [due, late] = [
             [("due", &bus_figures.lines.due), ("in time", &bus_figures.lines.in_time)],
@@ -61,13 +65,13 @@ impl PageDraft<'_> {
         figures.extend((lost > 0).then(|| steps("late", "late and missing, once known", y, late)));
         let slowest = self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
         let slowest = slowest.series([self.line("", &bus_figures.lines.slowest)]);
-        figures.push(if lost > 0 { slowest } else { slowest.half() });
+        figures.push(if lost > 0 { slowest } else { slowest.half_width() });
         figures
     }
 
     fn account_table(&self) -> Table {
         let row = |bus_figures: &BusFigures| {
-            let account = bus_figures.account();
+            let account = bus_figures.reply_counts();
             let counters = bus_figures.table.counters();
             let reply = Quantiles::from_histogram(bus_figures.table.delays().last_replies(), 1.0);
             let numbers = [
@@ -184,7 +188,7 @@ impl PageDraft<'_> {
             for answer in bus.this_run.iter().chain(&bus.worst_case) {
                 let FitSummary { load, rates, cells, verdict } = answer;
                 let what = format!("{} at {rates}, {}: {verdict} ({cells})", bus.bus, answer.case_name());
-                let finding = Finding::stated(what, (tenths(100.0 * load), "%"));
+                let finding = Finding::new_unrated(what, (round_to_tenths(100.0 * load), "%"));
                 findings.push(match origin {
                     Some(origin) => {
                         finding.with_requirement(limits.as_str(), verdict.fits()).with_origin(origin)
@@ -205,7 +209,7 @@ impl PageDraft<'_> {
             self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
                 .draw("load of a real bus", Shape::Steps, self.load_percent(load))
                 .draw("including bench-only frames", Shape::Dashed, stairs(&self.load_percent(load_of_all)))
-                .marks([Mark::y(100.0, "full load")])
+                .marks([MarkLine::at_y(100.0, "full load")])
         };
         let text = "On this bus a frame took no time. On a real bus it takes the time of its bits, including its stuff bits. \
                     This run is rated by its second with the highest load; the worst case assumes that all cells answer \
@@ -274,7 +278,7 @@ fn load_table(bus: &BusShadow) -> Table {
     }
     if let Some(run) = &bus.this_run {
         let mean = bus.answering.and_then(|it| it.mean).unwrap_or(0.0);
-        let cells = format!("{}, {} on average", run.cells, number(tenths(mean)));
+        let cells = format!("{}, {} on average", run.cells, number(round_to_tenths(mean)));
         let [second, short] = [run.load, bus.load.worst_16_ms.value].map(percent);
         row([run.case_name(), &run.verdict.to_string(), &share(bus.load.mean), &second, &short, &cells]);
     }
@@ -291,6 +295,6 @@ fn load_table(bus: &BusShadow) -> Table {
 }
 
 /// Rounds to one decimal.
-fn tenths(value: f64) -> f64 {
+fn round_to_tenths(value: f64) -> f64 {
     (value * 10.0).round() / 10.0
 }

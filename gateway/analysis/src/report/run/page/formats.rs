@@ -45,7 +45,7 @@ impl FormatComparison<'_> {
             (false, _) => Some(format!(
                 "{bus}: {name} would have fitted better: {beyond} torques are beyond {}, the range of {}. It rounds by \
                  {costs} instead of {instead} on average.",
-                quantity(used.bound(), "Nm"),
+                quantity(used.upper_bound(), "Nm"),
                 used.name(),
             )),
         }
@@ -69,7 +69,7 @@ impl PageDraft<'_> {
     pub(super) fn beyond_range(&self) -> impl Iterator<Item = Finding> {
         self.choices().map(|choice| {
             let (bus, used) = (choice.bus, choice.used);
-            let bound = quantity(used.bound(), "Nm");
+            let bound = quantity(used.upper_bound(), "Nm");
             let what = format!("{bus}: torques beyond the range of {}, {bound}", used.name());
             super::zero_required(what, choice.rounding(used).beyond).with_origin("skin: torque_format")
         })
@@ -88,7 +88,7 @@ impl PageDraft<'_> {
                 let used = if format == choice.used { ", used" } else { "" };
                 [
                     format!("{} {}{used}", choice.bus, format.name()),
-                    quantity(format.bound(), unit),
+                    quantity(format.upper_bound(), unit),
                     rounded.beyond.to_string(),
                     quantity(rounded.errors.mean().unwrap_or(f64::NAN), unit),
                     quantity(rounded.errors.max(), unit),

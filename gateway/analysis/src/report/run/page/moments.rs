@@ -10,7 +10,7 @@ use crate::report::figure::{Table, quantity};
 const MAX_ROWS: usize = 25;
 
 /// The headings of a table of times.
-const HEAD: [&str; 3] = ["at", "what", "command"];
+const MOMENT_TABLE_HEAD: [&str; 3] = ["at", "what", "command"];
 
 /// An event in the recording: its time, its weight by which it is selected, and its description.
 struct WeightedMoment {
@@ -105,7 +105,7 @@ impl PageDraft<'_> {
         let rows = all.into_iter().map(|WeightedMoment { at, what, .. }| {
             vec![format!("{:.3}\u{a0}s", at - self.zero), what, self.view_command(at)]
         });
-        Some(Table::new(title, HEAD, rows).with_commands())
+        Some(Table::new(title, MOMENT_TABLE_HEAD, rows).with_commands())
     }
 }
 

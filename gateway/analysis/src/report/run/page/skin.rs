@@ -7,7 +7,7 @@ use model::surface::lay_flat;
 use super::super::bus_figures::BusFigures;
 use super::PageDraft;
 use crate::report::figure::{
-    Drawing, Legend, Map, MapCell, Panel, Section, Strip, StripGroup, StripRow, quantity,
+    CellMap, CellStrip, Drawing, Legend, MapCell, Panel, Section, StripGroup, StripRow, quantity,
 };
 
 /// Maximum number of rows of the strip of touched cells.
@@ -20,10 +20,10 @@ impl PageDraft<'_> {
     /// Creates the section on touches, with their times and forces.
     pub(super) fn skin(&self) -> Section {
         let section = Section::new("skin", "The skin");
-        let forces = self.by_cell(|bus, place| {
+        let forces = self.values_by_cell(|bus, place| {
             self.run.bus_figures.get(bus).and_then(|it| it.touched.max.get(place)).copied().flatten()
         });
-        let losses = self.by_cell(|bus, place| {
+        let losses = self.values_by_cell(|bus, place| {
             let cell = self.run.bus_figures.get(bus)?.table.cells().get(place)?;
             Some((cell.replies.late + cell.replies.missing + cell.uplink().lost) as f64)
         });
@@ -64,7 +64,7 @@ impl PageDraft<'_> {
     }
 
     /// Creates the strip of touched cells over time.
-    fn strip(&self) -> Option<Strip> {
+    fn strip(&self) -> Option<CellStrip> {
         let mut rows = Vec::new();
         for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
             let nodes: Vec<_> = self.run.skin.cells_on_bus(bus).collect();
@@ -109,12 +109,12 @@ impl PageDraft<'_> {
         }
         let groups = groups.into_iter().map(|(_, group)| group).collect();
         let seconds = (0.0, self.run.motion.seconds());
-        Some(Strip { name: "touches".to_owned(), title, seconds, legend, groups })
+        Some(CellStrip { name: "touches".to_owned(), title, seconds, legend, groups })
     }
 
     /// Returns one value for each cell in the skin's order. `value` computes it from the index of the bus and the index
     /// of the cell on the bus.
-    fn by_cell(&self, value: impl Fn(usize, usize) -> Option<f64>) -> Vec<Option<f64>> {
+    fn values_by_cell(&self, value: impl Fn(usize, usize) -> Option<f64>) -> Vec<Option<f64>> {
         let mut places = vec![0; self.run.skin.buses.len()];
         let of = |cell: &protocol::skin::Cell| {
             let place = places.get_mut(cell.bus)?;
@@ -125,7 +125,14 @@ impl PageDraft<'_> {
     }
 
     /// Creates a map of the cells with their values; `None` if all of them are 0.
-    fn map(&self, name: &str, title: &str, caption: &str, unit: &str, values: &[Option<f64>]) -> Option<Map> {
+    fn map(
+        &self,
+        name: &str,
+        title: &str,
+        caption: &str,
+        unit: &str,
+        values: &[Option<f64>],
+    ) -> Option<CellMap> {
         let skin = &self.run.skin;
         let legend = Legend::for_values(caption, unit, values.iter().copied().flatten());
         if legend.max <= 0.0 {
@@ -146,7 +153,7 @@ impl PageDraft<'_> {
             Panel { title: self.link_name(link, None), radius: flat.radius, cells: spots.collect() }
         });
         let panels = panels.collect();
-        Some(Map { name: name.to_owned(), title: title.to_owned(), legend, panels })
+        Some(CellMap { name: name.to_owned(), title: title.to_owned(), legend, panels })
     }
 
     /// Returns the direction from the previous link to this one, in this link's frame.

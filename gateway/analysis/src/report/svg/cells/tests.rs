@@ -40,12 +40,12 @@ fn a_strip_has_each_value_at_its_time_in_its_row_and_colour() {
         },
         StripGroup { title: "link 3".to_owned(), rows: vec![row("9", &[(2.5, 5.0, 4.0)])] },
     ];
-    let strip = Strip {
+    let strip = CellStrip {
         title: "a < b".to_owned(),
         seconds: (0.0, 10.0),
         legend: newtons(4.0),
         groups,
-        ..Strip::default()
+        ..CellStrip::default()
     };
     let text = draw(&Drawing::Strip(strip));
     let document = Document::parse(&text).unwrap();
@@ -81,9 +81,9 @@ fn a_map_has_each_cell_once_apart_and_inside() {
     });
     let tube = Panel { title: "link 2".to_owned(), radius: Some(0.05), cells: cells.collect() };
     let plate = Panel { title: "link 3".to_owned(), radius: None, cells: vec![spot([0.3, -0.2], Some(0.0))] };
-    let map = Map { legend: newtons(29.0), panels: vec![tube, plate], ..Map::default() };
+    let map = CellMap { legend: newtons(29.0), panels: vec![tube, plate], ..CellMap::default() };
     for width in [960, 470] {
-        let text = inline(&Drawing::Map(map.clone()), width, "both");
+        let text = draw_inline(&Drawing::Map(map.clone()), width, "both");
         let document = Document::parse(&text).unwrap();
         let high: f64 =
             document.root_element().attribute("viewBox").unwrap().split(' ').nth(3).unwrap().parse().unwrap();

@@ -74,7 +74,11 @@ impl RecordedContact {
 
     /// Returns true if the contact was over before a recorded end that came late. This is so if the recorded stimuli
     /// rule out a contact at these joints and at those before, or if the contact began before the replayed part.
-    pub(in super::super) const fn was_over(self, begins_later: bool, may_answer: bool) -> bool {
+    pub(in super::super) const fn was_over_before_late_end(
+        self,
+        begins_later: bool,
+        may_answer: bool,
+    ) -> bool {
         match self {
             Self::Unknown => begins_later,
             Self::Lasts => !may_answer,
@@ -115,7 +119,7 @@ mod tests {
             ],
             RecordedContact::next,
         );
-        let over = |later, may_answer| all.map(|it| it.was_over(later, may_answer));
+        let over = |later, may_answer| all.map(|it| it.was_over_before_late_end(later, may_answer));
         assert_eq!([over(false, false), over(false, true)], [[false, true, false], [false, false, false]]);
         assert_eq!([over(true, false), over(true, true)], [[true, true, false], [true, false, false]]);
     }

@@ -28,7 +28,7 @@ pub(in super::super) enum FirstJoints {
 
 /// Evidence that a packet gives about a cell's first joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(in super::super) enum Input {
+pub(in super::super) enum JointsEvidence {
     /// Counters that show no joints since the start.
     CountsNone {
         epoch: Epoch,
@@ -42,7 +42,7 @@ pub(in super::super) enum Input {
     },
 }
 
-impl Input {
+impl JointsEvidence {
     /// Returns the sender of a message, and the evidence about that cell's first joints.
     pub(in super::super) const fn from_message(message: &Message) -> Option<(CellId, Self)> {
         if let Message::Torque { from, .. } = *message {
@@ -59,18 +59,22 @@ impl Input {
 
 impl FirstJoints {
     /// Returns the state after an input.
-    pub(in super::super) fn next(self, input: Input) -> Self {
+    pub(in super::super) fn next(self, input: JointsEvidence) -> Self {
         match (self, input) {
-            (Self::Taken | Self::Awaited { .. }, Input::CountsNone { epoch }) => Self::Awaited { epoch },
-            (Self::Taken | Self::Awaited { .. }, Input::CountsSome | Input::Torque) => Self::Taken,
-            (Self::Awaited { epoch: reported }, Input::Sends { epoch }) => {
+            (Self::Taken | Self::Awaited { .. }, JointsEvidence::CountsNone { epoch }) => {
+                Self::Awaited { epoch }
+            }
+            (Self::Taken | Self::Awaited { .. }, JointsEvidence::CountsSome | JointsEvidence::Torque) => {
+                Self::Taken
+            }
+            (Self::Awaited { epoch: reported }, JointsEvidence::Sends { epoch }) => {
                 if reported == epoch {
                     self
                 } else {
                     Self::Taken
                 }
             }
-            (Self::Taken, Input::Sends { .. }) => self,
+            (Self::Taken, JointsEvidence::Sends { .. }) => self,
         }
     }
 }
@@ -80,15 +84,16 @@ mod tests {
     use super::*;
     use crate::replay::comparator::states::check_table;
     use FirstJoints::Taken;
-    use Input::{CountsSome, Torque};
+    use JointsEvidence::{CountsSome, Torque};
 
     const AWAITED: FirstJoints = FirstJoints::Awaited { epoch: Epoch(5) };
 
     #[test]
     fn a_cell_has_taken_joints_when_its_counters_a_torque_or_its_epoch_show_it() {
         let (none, none_later) =
-            (Input::CountsNone { epoch: Epoch(5) }, Input::CountsNone { epoch: Epoch(6) });
-        let (same, other) = (Input::Sends { epoch: Epoch(5) }, Input::Sends { epoch: Epoch(6) });
+            (JointsEvidence::CountsNone { epoch: Epoch(5) }, JointsEvidence::CountsNone { epoch: Epoch(6) });
+        let (same, other) =
+            (JointsEvidence::Sends { epoch: Epoch(5) }, JointsEvidence::Sends { epoch: Epoch(6) });
         check_table(
             (&[Taken, AWAITED], &[none, none_later, CountsSome, Torque, same, other]),
             &[

@@ -16,7 +16,7 @@ pub(in super::super) enum BusCondition {
 
 /// An event of a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(in super::super) enum Input {
+pub(in super::super) enum BusConditionEvent {
     /// A message of another sender arrived.
     Message,
     /// The bus refused messages or was closed.
@@ -25,10 +25,10 @@ pub(in super::super) enum Input {
 
 impl BusCondition {
     /// Returns the state after an input.
-    pub(in super::super) const fn next(self, input: Input) -> Self {
+    pub(in super::super) const fn next(self, input: BusConditionEvent) -> Self {
         match (self, input) {
-            (Self::Up | Self::Down, Input::Lost) => Self::Down,
-            (Self::Up | Self::Down, Input::Message) => Self::Up,
+            (Self::Up | Self::Down, BusConditionEvent::Lost) => Self::Down,
+            (Self::Up | Self::Down, BusConditionEvent::Message) => Self::Up,
         }
     }
 }
@@ -42,10 +42,10 @@ mod tests {
     #[test]
     fn a_message_shows_that_the_bus_is_back() {
         check_table(
-            (&[Up, Down], &[Input::Message, Input::Lost]),
+            (&[Up, Down], &[BusConditionEvent::Message, BusConditionEvent::Lost]),
             &[
-                ("lost", &[Up, Down], &[Input::Lost], |_| Down),
-                ("back", &[Up, Down], &[Input::Message], |_| Up),
+                ("lost", &[Up, Down], &[BusConditionEvent::Lost], |_| Down),
+                ("back", &[Up, Down], &[BusConditionEvent::Message], |_| Up),
             ],
             BusCondition::next,
         );

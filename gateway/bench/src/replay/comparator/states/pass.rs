@@ -17,7 +17,7 @@ use protocol::packet::Epoch;
 
 /// A pass over the capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(in super::super) enum Pass {
+pub(in super::super) enum CapturePass {
     /// No message of the capture has been read in this pass.
     #[default]
     Fresh,
@@ -32,7 +32,7 @@ pub(in super::super) enum Pass {
 
 /// An event of reading the capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(in super::super) enum Input {
+pub(in super::super) enum ReadEvent {
     /// The capture starts again.
     Begins,
     /// A message that is not resent, because it is before the replayed part or excluded from it.
@@ -41,23 +41,23 @@ pub(in super::super) enum Input {
     Joints { last: Option<Epoch> },
 }
 
-impl Pass {
+impl CapturePass {
     /// Returns the state after an input, and true for the first joints of the pass.
-    pub(in super::super) const fn next(self, input: Input) -> (Self, bool) {
+    pub(in super::super) const fn next(self, input: ReadEvent) -> (Self, bool) {
         match (self, input) {
-            (Self::Fresh | Self::Before | Self::Whole | Self::Part { .. }, Input::Begins) => {
+            (Self::Fresh | Self::Before | Self::Whole | Self::Part { .. }, ReadEvent::Begins) => {
                 (Self::Fresh, false)
             }
-            (Self::Fresh | Self::Before, Input::NotSent) => (Self::Before, false),
-            (Self::Whole | Self::Part { .. }, Input::NotSent) => (self, false),
-            (Self::Fresh, Input::Joints { .. }) => (Self::Whole, true),
-            (Self::Before, Input::Joints { last }) => (Self::Part { earlier: last }, true),
-            (Self::Whole | Self::Part { .. }, Input::Joints { .. }) => (self, false),
+            (Self::Fresh | Self::Before, ReadEvent::NotSent) => (Self::Before, false),
+            (Self::Whole | Self::Part { .. }, ReadEvent::NotSent) => (self, false),
+            (Self::Fresh, ReadEvent::Joints { .. }) => (Self::Whole, true),
+            (Self::Before, ReadEvent::Joints { last }) => (Self::Part { earlier: last }, true),
+            (Self::Whole | Self::Part { .. }, ReadEvent::Joints { .. }) => (self, false),
         }
     }
 
     /// Returns true if other messages came before the first joints that are resent.
-    pub(in super::super) const fn begins_later(self) -> bool {
+    pub(in super::super) const fn has_earlier_messages(self) -> bool {
         matches!(self, Self::Before | Self::Part { .. })
     }
 
@@ -76,11 +76,11 @@ impl Pass {
 mod tests {
     use super::*;
     use crate::replay::comparator::states::check_table;
-    use Input::{Begins, NotSent};
-    use Pass::{Before, Fresh, Whole};
+    use CapturePass::{Before, Fresh, Whole};
+    use ReadEvent::{Begins, NotSent};
 
-    const PART: Pass = Pass::Part { earlier: Some(Epoch(7)) };
-    const JOINTS: Input = Input::Joints { last: Some(Epoch(9)) };
+    const PART: CapturePass = CapturePass::Part { earlier: Some(Epoch(7)) };
+    const JOINTS: ReadEvent = ReadEvent::Joints { last: Some(Epoch(9)) };
 
     #[test]
     fn a_pass_begins_later_if_something_came_before_its_first_joints() {
@@ -91,10 +91,12 @@ mod tests {
                 ("before", &[Fresh, Before], &[NotSent], |_| (Before, false)),
                 ("between", &[Whole, PART], &[NotSent], |state| (state, false)),
                 ("first_of_all", &[Fresh], &[JOINTS], |_| (Whole, true)),
-                ("first_of_part", &[Before], &[JOINTS], |_| (Pass::Part { earlier: Some(Epoch(9)) }, true)),
+                ("first_of_part", &[Before], &[JOINTS], |_| {
+                    (CapturePass::Part { earlier: Some(Epoch(9)) }, true)
+                }),
                 ("further", &[Whole, PART], &[JOINTS], |state| (state, false)),
             ],
-            Pass::next,
+            CapturePass::next,
         );
     }
 
@@ -102,6 +104,6 @@ mod tests {
     fn replies_to_earlier_joints_are_those_to_the_last_ones_before() {
         let (last, all) = (Some(Epoch(9)), [Fresh, Before, Whole, PART]);
         assert_eq!(all.map(|pass| pass.earlier_epoch(last)), [None, last, None, Some(Epoch(7))]);
-        assert_eq!(all.map(Pass::begins_later), [false, true, false, true]);
+        assert_eq!(all.map(CapturePass::has_earlier_messages), [false, true, false, true]);
     }
 }

@@ -20,7 +20,7 @@
 
 /// Progress of a cell with the joints announced last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(in super::super) enum Progress {
+pub(in super::super) enum CellProgress {
     /// The cell has processed the joints, or no joints have been announced.
     #[default]
     Done,
@@ -32,7 +32,7 @@ pub(in super::super) enum Progress {
 
 /// An event of a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(in super::super) enum Input {
+pub(in super::super) enum CellEvent {
     /// Joints were announced, or a sync that confirms them.
     Announced,
     /// The cell sent a heartbeat with the epoch of the joints announced last.
@@ -43,28 +43,28 @@ pub(in super::super) enum Input {
     TimesOut,
 }
 
-impl Progress {
+impl CellProgress {
     /// Returns the initial state of a newly found cell.
-    pub(in super::super) const fn found(has_announced: bool) -> Self {
+    pub(in super::super) const fn initial_state(has_announced: bool) -> Self {
         if has_announced { Self::Awaited { heard: false } } else { Self::Done }
     }
 
     /// Returns the state after an input.
-    pub(in super::super) const fn next(self, input: Input) -> Self {
+    pub(in super::super) const fn next(self, input: CellEvent) -> Self {
         match (self, input) {
-            (Self::Done | Self::Awaited { .. }, Input::Announced) => Self::Awaited { heard: false },
-            (Self::GivenUp { .. }, Input::Announced) => Self::GivenUp { heard: false },
-            (Self::Awaited { .. } | Self::GivenUp { .. }, Input::ReportsLast) => Self::Done,
-            (Self::Awaited { heard } | Self::GivenUp { heard }, Input::ReportsOther) => {
+            (Self::Done | Self::Awaited { .. }, CellEvent::Announced) => Self::Awaited { heard: false },
+            (Self::GivenUp { .. }, CellEvent::Announced) => Self::GivenUp { heard: false },
+            (Self::Awaited { .. } | Self::GivenUp { .. }, CellEvent::ReportsLast) => Self::Done,
+            (Self::Awaited { heard } | Self::GivenUp { heard }, CellEvent::ReportsOther) => {
                 if heard {
                     Self::Done
                 } else {
                     Self::Awaited { heard: true }
                 }
             }
-            (Self::Awaited { heard }, Input::TimesOut) => Self::GivenUp { heard },
-            (Self::Done, Input::ReportsLast | Input::ReportsOther | Input::TimesOut)
-            | (Self::GivenUp { .. }, Input::TimesOut) => self,
+            (Self::Awaited { heard }, CellEvent::TimesOut) => Self::GivenUp { heard },
+            (Self::Done, CellEvent::ReportsLast | CellEvent::ReportsOther | CellEvent::TimesOut)
+            | (Self::GivenUp { .. }, CellEvent::TimesOut) => self,
         }
     }
 }
@@ -73,11 +73,13 @@ impl Progress {
 mod tests {
     use super::*;
     use crate::replay::comparator::states::check_table;
-    use Input::{Announced, ReportsLast, ReportsOther, TimesOut};
-    use Progress::Done;
+    use CellEvent::{Announced, ReportsLast, ReportsOther, TimesOut};
+    use CellProgress::Done;
 
-    const AWAITED: [Progress; 2] = [Progress::Awaited { heard: false }, Progress::Awaited { heard: true }];
-    const GIVEN_UP: [Progress; 2] = [Progress::GivenUp { heard: false }, Progress::GivenUp { heard: true }];
+    const AWAITED: [CellProgress; 2] =
+        [CellProgress::Awaited { heard: false }, CellProgress::Awaited { heard: true }];
+    const GIVEN_UP: [CellProgress; 2] =
+        [CellProgress::GivenUp { heard: false }, CellProgress::GivenUp { heard: true }];
 
     #[test]
     fn a_cell_is_waited_for_until_it_reports_the_last_joints_or_sends_two_heartbeats() {
@@ -95,8 +97,8 @@ mod tests {
                 ("already", &[Done], &[ReportsLast, ReportsOther, TimesOut], |_| Done),
                 ("already_given_up", &[late, late_heard], &[TimesOut], |state| state),
             ],
-            Progress::next,
+            CellProgress::next,
         );
-        assert_eq!([false, true].map(Progress::found), [Done, new]);
+        assert_eq!([false, true].map(CellProgress::initial_state), [Done, new]);
     }
 }

@@ -12,7 +12,7 @@ use protocol::packet::Epoch;
 
 /// State of sending the joints of a round, with the epoch under which they were sent last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(in super::super) enum Sending {
+pub(in super::super) enum SendState {
     /// The joints have not been sent, and nothing is compared.
     #[default]
     Recorded,
@@ -35,25 +35,25 @@ pub(in super::super) enum Sending {
 
 /// An event of sending joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(in super::super) enum Input {
+pub(in super::super) enum SendEvent {
     /// The joints are sent under this epoch.
     Sent { under: Epoch },
     /// The bus refused the joints.
     Refused,
 }
 
-impl Sending {
+impl SendState {
     /// Returns the state after an input.
-    pub(in super::super) const fn next(self, input: Input) -> Self {
+    pub(in super::super) const fn next(self, input: SendEvent) -> Self {
         match (self, input) {
-            (Self::Recorded, Input::Sent { under }) => Self::Sent { under },
+            (Self::Recorded, SendEvent::Sent { under }) => Self::Sent { under },
             (
                 Self::Sent { .. } | Self::Repeated { .. } | Self::Unsent { .. } | Self::RepeatedUnsent { .. },
-                Input::Sent { under },
+                SendEvent::Sent { under },
             ) => Self::Repeated { under },
-            (Self::Sent { under }, Input::Refused) => Self::Unsent { under },
-            (Self::Repeated { under }, Input::Refused) => Self::RepeatedUnsent { under },
-            (Self::Recorded | Self::Unsent { .. } | Self::RepeatedUnsent { .. }, Input::Refused) => self,
+            (Self::Sent { under }, SendEvent::Refused) => Self::Unsent { under },
+            (Self::Repeated { under }, SendEvent::Refused) => Self::RepeatedUnsent { under },
+            (Self::Recorded | Self::Unsent { .. } | Self::RepeatedUnsent { .. }, SendEvent::Refused) => self,
         }
     }
 
@@ -88,12 +88,12 @@ impl Sending {
 mod tests {
     use super::*;
     use crate::replay::comparator::states::check_table;
-    use Input::Refused;
-    use Sending::{Recorded, Repeated, RepeatedUnsent, Sent, Unsent};
+    use SendEvent::Refused;
+    use SendState::{Recorded, Repeated, RepeatedUnsent, Sent, Unsent};
 
     const OLD: Epoch = Epoch(3);
     const NEW: Epoch = Epoch(4);
-    const ALL: [Sending; 5] = [
+    const ALL: [SendState; 5] = [
         Recorded,
         Sent { under: OLD },
         Repeated { under: OLD },
@@ -104,7 +104,7 @@ mod tests {
     #[test]
     fn joints_are_sent_and_refused_as_often_as_it_takes() {
         let [recorded, sent, repeated, unsent, twice_unsent] = ALL;
-        let send = Input::Sent { under: NEW };
+        let send = SendEvent::Sent { under: NEW };
         check_table(
             (&ALL, &[send, Refused]),
             &[
@@ -114,11 +114,11 @@ mod tests {
                 ("refused_again", &[repeated], &[Refused], |_| RepeatedUnsent { under: OLD }),
                 ("refused_already", &[recorded, unsent, twice_unsent], &[Refused], |state| state),
             ],
-            Sending::next,
+            SendState::next,
         );
-        assert_eq!(ALL.map(Sending::is_announced), [false, true, true, true, true]);
-        assert_eq!(ALL.map(Sending::is_unsent), [false, false, false, true, true]);
-        assert_eq!(ALL.map(Sending::is_repeated), [false, false, true, false, true]);
-        assert_eq!(ALL.map(Sending::sent_epoch), [None, Some(OLD), Some(OLD), Some(OLD), Some(OLD)]);
+        assert_eq!(ALL.map(SendState::is_announced), [false, true, true, true, true]);
+        assert_eq!(ALL.map(SendState::is_unsent), [false, false, false, true, true]);
+        assert_eq!(ALL.map(SendState::is_repeated), [false, false, true, false, true]);
+        assert_eq!(ALL.map(SendState::sent_epoch), [None, Some(OLD), Some(OLD), Some(OLD), Some(OLD)]);
     }
 }

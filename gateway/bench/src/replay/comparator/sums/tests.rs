@@ -9,8 +9,8 @@ fn cell(node: u8) -> CellId {
 type Contact = Vec<Option<[i16; 6]>>;
 
 /// Builds the sums of a tree, given the parent of each cell, 0 for the gateway's side. Parents precede their children.
-fn sums(contact: &Contact, parents: &[u8]) -> (SumsByCell, Trees) {
-    let (mut sums, mut trees) = (SumsByCell::default(), Trees::default());
+fn sums(contact: &Contact, parents: &[u8]) -> (SumsByCell, ParentHistory) {
+    let (mut sums, mut trees) = (SumsByCell::default(), ParentHistory::default());
     let mut totals = vec![([0_i32; 6], 0_u8); contact.len()];
     for place in (0..contact.len()).rev() {
         if let Some(own) = contact[place] {
@@ -32,7 +32,11 @@ fn sums(contact: &Contact, parents: &[u8]) -> (SumsByCell, Trees) {
     (sums, trees)
 }
 
-fn outcomes(then: &(SumsByCell, Trees), today: &(SumsByCell, Trees), cells: usize) -> Vec<SumComparison> {
+fn outcomes(
+    then: &(SumsByCell, ParentHistory),
+    today: &(SumsByCell, ParentHistory),
+    cells: usize,
+) -> Vec<SumComparison> {
     let (then, today) = (EpochSums::new(&then.0, &then.1, 5), EpochSums::new(&today.0, &today.1, 5));
     (1..=u8::try_from(cells).unwrap())
         .map(|node| compare(&then, &today, cell(node), 0, TorqueFormat::Q3_12))
@@ -53,7 +57,7 @@ fn the_same_contributions_are_equal_in_any_tree() {
         [SumComparison::Equal, SumComparison::Nothing, SumComparison::Equal]
     );
     let side = EpochSums::new(&both.0.0, &both.0.1, 5);
-    let own = side.own_term(cell(1)).unwrap();
+    let own = side.own_contribution(cell(1)).unwrap();
     assert_eq!((own.steps[0], own.cells, own.children), (Some(10), 1, vec![cell(2)]));
     assert_eq!((own.sum.as_slice()[0], own.count), (40, 2));
 }
@@ -122,7 +126,7 @@ fn a_child_with_a_late_page_is_no_difference_unless_it_is_counted_twice() {
         (&[2, 4], false, SumComparison::Different),
         (&[2, 1], true, SumComparison::Different),
     ] {
-        let mut today = (SumsByCell(today.0.0.clone()), Trees::default());
+        let mut today = (SumsByCell(today.0.0.clone()), ParentHistory::default());
         for node in 1..=4 {
             today.1.set_parent(cell(node), Some([0, 1, 2, 0][usize::from(node) - 1]), 0);
         }
@@ -187,7 +191,7 @@ fn of_two_sums_the_one_with_more_cells_counts() {
 #[test]
 fn saturated_words_are_compared_as_saturated() {
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
-    let saturate = |mut side: (SumsByCell, Trees), node| {
+    let saturate = |mut side: (SumsByCell, ParentHistory), node| {
         let sum = side.0.0.get_mut(&cell(node)).unwrap();
         let [_, b, c, d, e, f] = sum.torque.first_six();
         sum.torque = [i16::MAX, b, c, d, e, f].into();
@@ -210,7 +214,7 @@ fn saturated_words_are_compared_as_saturated() {
 
 #[test]
 fn trees_drop_past_rounds() {
-    let mut trees = Trees::default();
+    let mut trees = ParentHistory::default();
     for round in 0..1_000_u64 {
         trees.set_parent(cell(1), Some((round % 2).to_le_bytes()[0]), round);
         trees.forget_before(round.saturating_sub(100));

@@ -55,7 +55,7 @@ fn a_claim_of_a_taken_node_id_is_no_packet_and_no_silence_of_its_owner() {
     let surveyed = |said: &[Message]| {
         let mut survey = Survey::new(TimeRange::default());
         for (at, message) in (1_u64..).zip(said) {
-            let time = Timestamp::six_digits(at * MS);
+            let time = Timestamp::with_six_digits(at * MS);
             for frame in message.encode().frames(Format::Fd) {
                 survey.add_frame(&Record { time, interface: "vcan0", frame, direction: None });
             }

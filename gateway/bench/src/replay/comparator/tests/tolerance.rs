@@ -19,7 +19,7 @@ fn torques_within_the_tolerance_are_equal_and_counted() {
     let comparator = rated_within(2, &run(), &off([1, -2]));
     assert_eq!((counts(&comparator), comparator.tally.tolerated), ([3, 0, 0, 0], 2));
     assert_eq!(steps(&comparator.tally.torque_words), ([16, 1, 1, 0], 2));
-    assert!(comparator.tally.is_good() && comparator.first().is_none());
+    assert!(comparator.tally.has_only_equal_replies() && comparator.first().is_none());
     // Without a tolerance, with one that is too small, and without a difference.
     for (tolerance, by, equal, tolerated, words) in [
         (0, [1, -2], 1, 0, ([16, 1, 1, 0], 2)),

@@ -149,7 +149,7 @@ fn each_state_does_with_each_evidence_what_its_row_says() {
                 New => Some(new),
                 Owner => lives[0],
             });
-            let (next, means) = ownership.next(evidence, new);
+            let (next, means) = ownership.after_heartbeat(evidence, new);
             assert_eq!(means, word, "{name}: {from:?}, {evidence:?}");
             assert!(places(&next, evidence).0.contains(&to.unwrap_or(from)), "{name}: {next:?}");
             let lives = [next.owner(), next.former()].map(Option::<&Incarnation>::copied);
