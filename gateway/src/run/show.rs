@@ -1,5 +1,7 @@
 //! Table at the end of a run: the verdict and all unusual values; in verbose mode, all values.
 
+mod frames;
+
 use std::cmp::Reverse;
 use std::fmt::Display;
 
@@ -93,7 +95,7 @@ fn rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
     add_control_rows(&mut rows, summary, is_verbose);
     for bus in &summary.buses {
         add_reply_rows(&mut rows, bus, is_verbose);
-        add_frame_rows(&mut rows, bus, is_verbose);
+        frames::add_frame_rows(&mut rows, bus, is_verbose);
         add_noteworthy_cell_rows(&mut rows, bus, &summary.cells);
     }
     add_cost_rows(&mut rows, summary, is_verbose);
@@ -442,54 +444,6 @@ fn add_noteworthy_cell_rows(rows: &mut KeyValueTable, bus: &BusSummary, all: &[C
     }
     let more = worst.len().saturating_sub(MAX_CELLS);
     rows.row_unless_zero("further cells that stand out", more as u64, "--summary has each cell");
-}
-
-fn add_frame_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
-    let up = &bus.uplink;
-    let lost = up.dropped + up.backlog + up.outage + up.hosts + up.unknown;
-    let odd = up.rejected + up.surplus + up.outsiders + up.in_doubt + u64::from(up.restarts);
-    if is_verbose || lost + odd > 0 {
-        add_packet_rows(rows, bus, lost);
-    } else {
-        rows.add_row("packets of cells", up.sent, "none lost");
-    }
-    if is_verbose {
-        rows.add_row("received", counts_by_kind(&bus.received), "");
-    }
-    let sensors = &bus.sensors;
-    if let (Some(min), Some(mean), Some(max)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
-        let touches = comma_separated([
-            count_with_noun(sensors.touches, "touch"),
-            count_with_noun(sensors.releases, "release"),
-        ]);
-        rows.add_row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
-    }
-    if is_verbose {
-        rows.add_row("sent", counts_by_kind(&bus.sent), "");
-    }
-    if !bus.events.is_empty() {
-        rows.add_row("anomalies", counts_by_kind(&bus.events), "");
-    }
-}
-
-/// Adds rows on the packets from the cells, by what became of them.
-fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
-    let up = &bus.uplink;
-    rows.add_row("packets sent by cells", up.sent, "by their own count");
-    rows.add_row("  delivered", up.delivered, format!("{} rejected", up.rejected));
-    rows.row_unless_zero("  for other cells", up.unheard, "sums that the gateway does not take");
-    let reasons = [
-        (up.dropped, "dropped by the bus"),
-        (up.backlog, "by the kernel's backlog"),
-        (up.outage, "with the bus"),
-        (up.hosts, "between hosts"),
-    ];
-    add_unexplained_row(rows, "  lost", lost, reasons_text(&reasons, up.unknown), up.unknown);
-    rows.row_unless_zero("  surplus", up.surplus, "");
-    rows.row_unless_zero("  of other senders", up.outsiders, "");
-    rows.row_unless_zero("  in doubt", up.in_doubt, "");
-    rows.row_unless_zero("  after the last heartbeat", up.unsettled, "");
-    rows.row_unless_zero("  restarts of cells", up.restarts, "what they sent last is in doubt");
 }
 
 fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {

@@ -11,15 +11,17 @@
 //! the exact one that gives this word. Information that the capture lacks is listed in [`Explanation::missing`].
 
 mod not_found;
+mod observed;
 mod read;
 mod row;
 pub mod series;
 mod watch;
 
 pub use not_found::{NotFound, other_robot_text};
+pub use observed::{ContactOrigin, ObservedCellState, ObservedJoints, RequestedJoints};
 pub use read::{FoundJoints, read_to_joints};
 pub use row::{MAX_JACOBIAN_ERROR_STEPS, TorqueRow, WordVerdict};
-pub use watch::{ContactOrigin, JointsWatcher, ObservedCellState, ObservedJoints, RequestedJoints};
+pub use watch::JointsWatcher;
 
 use protocol::fixed::{Q, is_saturated};
 use protocol::message::{SkinSensors, State};

@@ -6,7 +6,8 @@ use protocol::time::Micros;
 use trace::capture::{CaptureEntry, CaptureError, NoteKind, Reader};
 
 use super::NotFound;
-use super::watch::{JointsWatcher, ObservedJoints, RequestedJoints};
+use super::observed::{ObservedJoints, RequestedJoints};
+use super::watch::JointsWatcher;
 
 /// The content of a capture up to the requested joints.
 #[derive(Debug)]

@@ -12,7 +12,8 @@ use protocol::time::Micros;
 use thiserror::Error;
 use trace::capture::{CaptureEntry, CaptureError, CaptureNote, Reader};
 
-use super::watch::{JointsWatcher, ObservedJoints};
+use super::observed::ObservedJoints;
+use super::watch::JointsWatcher;
 use super::{Explainer, Explanation, NotFound};
 
 /// Number of epochs that a bus may be behind the others before they no longer wait for it.

@@ -4,6 +4,8 @@
 //! After an error the file is closed, and it is repaired at the end of the recording. Another file is begun at once; if
 //! that fails, it is tried again every few seconds. Messages that arrive meanwhile are counted as lost.
 
+mod event;
+
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter};
@@ -22,6 +24,8 @@ use super::repair::{self, RepairResult};
 use super::sink::{FileGauge, ReservedFile};
 use super::window::ReorderWindow;
 use crate::files::parent_folder;
+
+pub use event::RecordingEvent;
 
 /// The size of the write buffer in bytes. Chunks are larger and are written without it.
 const WRITE_BUFFER_BYTES: usize = 64 << 10;
@@ -87,37 +91,6 @@ impl FileHead {
             writer.attach(name, media_type, self.nanos, bytes)?;
         }
         Ok(())
-    }
-}
-
-/// An event of a recording that is to be reported.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub enum RecordingEvent {
-    /// A file could not be written further. The run continues.
-    BrokeOff(String),
-    /// Any other event, such as a finished file.
-    Other(String),
-}
-
-impl RecordingEvent {
-    /// Returns the text of the event without its consequences, for the summary of the run.
-    #[must_use]
-    pub fn description(&self) -> &str {
-        match self {
-            Self::BrokeOff(what) | Self::Other(what) => what,
-        }
-    }
-}
-
-impl core::fmt::Display for RecordingEvent {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        let more = match self {
-            Self::BrokeOff(_) => {
-                ": the run goes on without it; what was recorded so far stays readable, what comes now is counted"
-            }
-            Self::Other(_) => "",
-        };
-        write!(f, "{}{more}", self.description())
     }
 }
 
