@@ -95,7 +95,8 @@ impl RootWires {
         self.is_sending = true;
     }
 
-    /// Roots that started (true) or stopped (false) feeding the gateway since the last call.
+    /// Returns the roots that have started (true) or stopped (false) sending their sums to the gateway since the last
+    /// call. At first none does.
     pub fn uplink_changes(&mut self) -> impl Iterator<Item = (CellId, bool)> {
         let uplinks = &self.uplinks;
         self.roots.iter_mut().enumerate().filter_map(|(place, (root, _, feeds))| {

@@ -294,6 +294,10 @@ fn start_receiver(
     if !ReceiveFilter::for_bus(skin, index, outlet.is_some()).all_sums {
         table.receive_root_sums_only();
     }
+    let root_wires = RootWires::for_bus(skin, index);
+    if root_wires.is_some() {
+        table.follow_root_wires();
+    }
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; MAX_JOINTS])>::new(64);
     let format = skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
@@ -303,7 +307,7 @@ fn start_receiver(
         index,
         receive_end,
         follower: Follower::new(
-            RootWires::for_bus(skin, index),
+            root_wires,
             Duration::from_nanos(skin.timing.tick_nanos()).min(MAX_GATHER_TIME),
         ),
         check_interval: check_interval(skin.cells.len()),

@@ -214,6 +214,10 @@ impl BusTable {
                 );
             } else if let NetworkPage::Rejected(_) = page {
                 cell.said.counters = true;
+            } else if let (NetworkPage::Tree(tree), true, false) = (page, cell.root, self.follows_root_wires)
+            {
+                let root = cell.node;
+                self.set_root_feeds_gateway(root, tree.parent == Some(0));
             }
         } else if let Message::Sensors { epoch, page, .. } = *message {
             let is_newest = self.broadcast.as_ref().is_none_or(|broadcast| broadcast.epoch == epoch);

@@ -146,6 +146,8 @@ pub struct BusTable {
     difference: Option<[f64; MAX_JOINTS]>,
     delays: Delays,
     notices: VecDeque<Notice>,
+    /// True if the wires to the roots, and not their tree pages, tell which root sends its sums to the gateway.
+    follows_root_wires: bool,
 }
 
 /// The torque format and the chain length of a bus.
@@ -198,6 +200,7 @@ impl BusTable {
             difference: None,
             delays: Delays::default(),
             notices: VecDeque::new(),
+            follows_root_wires: false,
         }
     }
 
@@ -205,6 +208,17 @@ impl BusTable {
     /// counted.
     pub fn receive_root_sums_only(&mut self) {
         self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.tracked.account.exclude_sums());
+    }
+
+    /// Declares that [`set_root_feeds_gateway`](Self::set_root_feeds_gateway) tells for each root whether it sends its
+    /// sums to the gateway; until then none does. Without this, all roots do until a tree page of theirs names another
+    /// parent.
+    pub fn follow_root_wires(&mut self) {
+        self.follows_root_wires = true;
+        self.cells
+            .iter_mut()
+            .filter_map(|cell| cell.sums.as_mut())
+            .for_each(|sums| sums.is_for_gateway = false);
     }
 
     /// Sets whether a root sends its sums to the gateway. If it does not, the sum of another root contains them, and

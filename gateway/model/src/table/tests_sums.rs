@@ -228,6 +228,38 @@ fn a_root_below_another_cell_is_in_that_ones_sum() {
 }
 
 #[test]
+fn a_root_that_found_a_parent_before_the_gateway_is_not_counted_twice() {
+    for by_wire in [true, false] {
+        let mut bench = Bench::new(&[1, 2, 3, 4]);
+        let tree = |parent| {
+            let page = NetworkPage::Tree(TreePage { parent: Some(parent), ..TreePage::default() });
+            Message::Network { from: Node::Cell(cell(2)), epoch: Epoch(0), page }
+        };
+        if by_wire {
+            bench.table.follow_root_wires();
+            bench.table.set_root_feeds_gateway(cell(1), true);
+        }
+        bench.say(false, tree(3));
+        bench.joints(0);
+        bench.sum(2, 0, 1, 10);
+        assert_eq!(first(&bench.sum(1, 0, 4, 41)), (41.0, 4), "its sum is in that of root 1");
+        assert_eq!(bench.counts().overheard, 1);
+        bench.say(false, tree(0));
+        if by_wire {
+            bench.joints(1);
+            bench.sum(1, 1, 3, 31);
+            assert_eq!(first(&bench.sum(2, 1, 1, 10)), (31.0, 3), "its wire counts, and not its page");
+            bench.table.set_root_feeds_gateway(cell(2), true);
+        }
+        bench.joints(2);
+        bench.sum(1, 2, 3, 31);
+        assert_eq!(first(&bench.sum(2, 2, 1, 10)), (41.0, 4));
+        bench.table.finish();
+        assert_eq!(bench.contributions().unasked, 0);
+    }
+}
+
+#[test]
 fn a_halt_releases_sums_and_no_cell_is_due() {
     let mut bench = Bench::new(&[1, 3, 4]);
     bench.joints(0);
