@@ -45,7 +45,7 @@ fn main() {
     let rounded = Errors::of(|case| real(case).map(|torque| Q3_12::nearest(torque).to_f64()));
     print_torque_errors("the same, rounded to Q3.12", rounded);
     let (poses, Errors { torques, omitted, .. }) = (Case::all().len(), wrench);
-    println!("\n{torques} torques in {poses} poses; {omitted} poses left out, beyond Q3.12");
+    println!("\n{torques} torques in {poses} poses; {omitted} poses left out because a torque exceeds Q3.12");
 }
 
 fn kernel_errors<W: Word + Scalar, K: Kernel<W>>() -> Errors {

@@ -77,7 +77,7 @@ struct HostedCell {
 pub enum StopReason {
     /// Another cell uses the node id of a cell.
     #[error(
-        "cell {cell} is on {bus} already, with serial number {serial}: stop that one or give this one another number"
+        "cell {cell} is already on {bus}, with serial number {serial}: stop it, or give this cell another node id"
     )]
     NodeIdTaken {
         /// The name of the bus.

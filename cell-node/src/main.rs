@@ -26,31 +26,31 @@ Examples:
   cell-node --bus vcan0 --node 12 --skin skin.toml --fresh --flash /tmp/flash"
 )]
 struct Arguments {
-    /// The bus, one of the skin's
+    /// Name of the bus, one of the skin's buses
     #[arg(long, value_name = "NAME")]
     bus: String,
     /// The cell's node id on the bus, 1 to 254
     #[arg(long, value_name = "N", required_unless_present = "nodes")]
     node: Option<u8>,
-    /// Several cells in one process over one socket: the first and the last node id
+    /// Run several cells in one process over one socket: first and last node id
     #[arg(long, value_name = "A-B", conflicts_with = "node", value_parser = parse_range)]
     nodes: Option<(u8, u8)>,
     /// The skin's description; a cell whose flash is empty takes its parameters from it
     #[arg(long, value_name = "FILE")]
     skin: PathBuf,
-    /// Keep parameters in files of this directory; without it a cell forgets them when it ends
+    /// Keep parameters in files in this directory; without it, cells forget them when they end
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
-    /// As from the factory: without parameters, and on a bus with sums without a node id, which the network and
-    /// `skinbus commission` assign; what flash holds is used
+    /// Start as from the factory: without parameters and, on a bus with sums, without a node id; the network and
+    /// `skinbus commission` assign these. What --flash already contains is used
     #[arg(long)]
     fresh: bool,
-    /// Open the bus again when it is gone, and wait for it at the start, instead of ending
+    /// Reopen the bus when it is lost, and wait for it at the start, instead of exiting
     #[arg(long)]
     reconnect: bool,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
-    /// End when this process, the parent, ends
+    /// Exit when this parent process ends
     #[arg(long, value_name = "PID")]
     with_parent: Option<i32>,
 }

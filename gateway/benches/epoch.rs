@@ -122,7 +122,7 @@ fn compile() -> PathBuf {
     let done = command.args(["-O2", "-Wall", "-Werror", "-o"]).arg(&program).arg(&source).status();
     if !done.is_ok_and(|status| status.success()) {
         eprintln!(
-            "epoch: {compiler} does not compile {}; install gcc, or name another with CC",
+            "epoch: {compiler} cannot compile {}; install gcc, or name another compiler with CC",
             source.display()
         );
         exit(1);

@@ -65,10 +65,10 @@ fn main() {
     }
     let size = |path: &Path| std::fs::metadata(path).unwrap().len() as f64 / lines as f64;
     println!(
-        "bytes a frame                  {:.1} in the log, {:.1} in the recording",
+        "bytes per frame                {:.1} in the log, {:.1} in the recording",
         size(&log),
         size(&mcap)
     );
     let same = std::fs::read(&log).unwrap() == std::fs::read(&back).unwrap();
-    println!("there and back                 {}", if same { "the same bytes" } else { "NOT the same bytes" });
+    println!("round trip                     {}", if same { "the same bytes" } else { "NOT the same bytes" });
 }

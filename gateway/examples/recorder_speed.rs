@@ -46,7 +46,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(log) => log_frames(&std::fs::read_to_string(log)?)?,
         None => run_frames(&skin, 60),
     };
-    println!("{} frames, {:.1} s of a bus", frames.len(), seconds(&frames));
+    println!("{} frames, {:.1} s of bus traffic", frames.len(), seconds(&frames));
     measure_speed(&skin, &folder, &frames)?;
     measure_size(&frames)
 }
@@ -149,7 +149,7 @@ fn measure_speed(
     let took = began.elapsed().as_secs_f64();
     let bytes: u64 = recording.files.iter().map(|file| file.bytes).sum();
     println!(
-        "recorder alone: {:.0} frames/s to disk, {} of {count} frames, {} lost, {:.2} us of processor a frame, {:.1} bytes a frame",
+        "recorder alone: {:.0} frames/s to disk, {} of {count} frames, {} lost, {:.2} us of processor time per frame, {:.1} bytes per frame",
         recording.frames as f64 / took,
         recording.frames,
         recording.lost,
@@ -197,7 +197,7 @@ fn measure_size(frames: &[LatchedFrame]) -> Result<(), Box<dyn Error>> {
     let took = began.elapsed().as_secs_f64();
     let (count, bytes) = (frames.len() as f64, writer.into_inner().0);
     println!(
-        "frames alone, handed on {flushes} times: {:.1} bytes a frame, {:.2} us a frame",
+        "frames alone, flushed {flushes} times: {:.1} bytes per frame, {:.2} us per frame",
         bytes as f64 / count,
         took / count * 1e6,
     );

@@ -96,7 +96,7 @@ pub(crate) fn environment_number(name: &str, allowed: RangeInclusive<u32>) -> Re
     let number = given.to_str().and_then(|text| text.parse().ok()).filter(|number| allowed.contains(number));
     number.map(Some).ok_or_else(|| {
         let (given, [min, max]) = (given.display(), [allowed.start(), allowed.end()]);
-        Failure::usage(format!("the environment variable {name}={given}: {min} to {max} is possible"))
+        Failure::usage(format!("the environment variable {name}={given}: {min} to {max} is allowed"))
     })
 }
 
@@ -132,7 +132,7 @@ pub(crate) fn find_cell(skin: &Skin, name: &CellName, option: &str) -> Result<us
     let CellName { bus, node } = name;
     let names = || comma_separated(bus_names(skin));
     if bus.as_ref().is_some_and(|bus| skin.bus_named(bus).is_none()) {
-        return Err(Failure::usage(format!("{option} {name}: the skin's buses are {}", names())));
+        return Err(Failure::usage(format!("{option} {name}: the skin has no such bus; it has {}", names())));
     }
     let there: Vec<_> = skin
         .cells

@@ -55,7 +55,7 @@ pub(crate) struct CalibrateCommand {
     /// Write a copy of the skin with the poses found
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Use a recording or candump log instead of a run; name all parts of a split one
+    /// Use a recording or candump log instead of a run; name all parts of a split recording
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["record", "no_spawn", "dry_run"])]
     recording: Vec<PathBuf>,
     /// Keep the recording of the run
@@ -201,9 +201,9 @@ impl CalibrateCommand {
         let mut options = self.options(skin, text, settings, motion, path.clone())?;
         let seconds = options.scenario.duration.0 / 1_000_000;
         let within = self.within;
-        options
-            .announced
-            .push(format!("the robot moves for {seconds} s about its start, each joint by {within} at most"));
+        options.announced.push(format!(
+            "the robot moves for {seconds} s around its start pose, each joint by {within} at most"
+        ));
         let summary =
             run::run(&options, None).map_err(|error| Failure::with_code(error.exit_code(), error))?;
         let mut complaints = summary.end_messages(self.quiet);
@@ -315,7 +315,7 @@ fn calibrate_capture(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Res
 fn report_text(skin: &Skin, calibration: &Calibration) -> String {
     let summary = &calibration.summary;
     let mut lines = vec![format!(
-        "{}: {}, {} found, {} not to be trusted",
+        "{}: {}, {} poses found, {} cells not to be trusted",
         skin.name,
         count_with_noun(summary.cells, "cell"),
         summary.determined,
@@ -325,7 +325,7 @@ fn report_text(skin: &Skin, calibration: &Calibration) -> String {
         (summary.position_mm, summary.orientation_deg, summary.noise_mg)
     {
         lines.push(format!(
-            "certain within {mm:.2} mm and {degrees:.2} degrees (median; 95 of 100 times); readings scatter by {mg:.1} mg"
+            "uncertainty {mm:.2} mm and {degrees:.2} degrees (median of the 95 % limits); readings scatter by {mg:.1} mg"
         ));
     }
     lines.push(summary.joints.to_string());
@@ -335,7 +335,9 @@ fn report_text(skin: &Skin, calibration: &Calibration) -> String {
     moved.sort_by(|one, other| one.0.total_cmp(&other.0));
     if let (Some(middle), Some(most)) = (moved.get(moved.len() / 2), moved.last()) {
         let (middle, most) = (middle.0, most.0);
-        lines.push(format!("from where the skin has them: median {middle:.2} mm, at most {most:.2} mm"));
+        lines.push(format!(
+            "distance from the poses in the skin: median {middle:.2} mm, at most {most:.2} mm"
+        ));
     }
     if summary.wires > 0 {
         lines.push(format!("{} made positions better", count_with_noun(summary.wires, "wire")));

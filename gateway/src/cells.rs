@@ -60,7 +60,7 @@ impl CellsCommand {
         let format = known.as_ref().map(|known| known.format);
         if Path::new(&self.bus).is_file() {
             return Err(Failure::usage(format!(
-                "{} is a file: name a bus, and a skin with --skin",
+                "{} is a file: give the name of a bus here, and a skin with --skin",
                 self.bus
             )));
         }
@@ -103,7 +103,7 @@ impl CellsCommand {
                 others => format!(" ({others} frames are not from cells; `skinbus dump` shows them)"),
             };
             return Err(Failure::run(format!(
-                "no cell sent anything on {name} for {seconds:.1} s{others}: start them, or switch them on"
+                "no cell sent anything on {name} for {seconds:.1} s{others}: start the cells, or switch them on"
             )));
         }
         print_text(&show(&watch)?)

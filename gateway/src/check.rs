@@ -36,7 +36,7 @@ pub(crate) struct CheckCommand {
     /// List only this cell
     #[arg(long, value_name = "[BUS:]NODE", conflicts_with = "list")]
     cell: Option<CellName>,
-    /// Print one JSON object per file; numbers have the names of the files' keys
+    /// Print one JSON object per file, with the names of the files' keys
     #[arg(long, short)]
     json: bool,
 }
@@ -87,9 +87,7 @@ impl CheckCommand {
 
 fn ambiguous_skin(file: &Path, found: &str) -> Failure {
     let file = file.display();
-    Failure::usage(format!(
-        "{file} is a scenario, and {found} among the files: name the skin that it is for with --skin"
-    ))
+    Failure::usage(format!("{file} is a scenario, and {found} among the files: name its skin with --skin"))
 }
 
 /// Reads a skin, or recognises a scenario by its tables, which differ from those of a skin. A file without any of these

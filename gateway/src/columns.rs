@@ -57,14 +57,14 @@ impl<'a> CsvTable<'a> {
             let optional = if columns.optional.is_empty() {
                 String::new()
             } else {
-                format!(", with {} if they are given", columns.optional.join(","))
+                format!(", optionally with {}", columns.optional.join(","))
             };
             let is_row = !names.iter().any(|name| columns.needed.contains(&name));
             let hint = if is_row { "write the header above it" } else { "correct it" };
             let got: String =
                 names.iter().collect::<Vec<_>>().join(",").chars().take(MAX_REPEATED_CHARS).collect();
             return Err(Failure::usage(format!(
-                "{file}: line {line}: the first line must be the header {header}{optional}, and it is {got:?}: {hint}"
+                "{file}: line {line}: the first line must be the header {header}{optional}, not {got:?}: {hint}"
             )));
         }
         Ok(Self { file: file.to_owned(), names, rows: reader.into_records(), lines })
@@ -80,7 +80,7 @@ impl<'a> CsvTable<'a> {
         if values.len() != self.names.len() {
             let (got, names) = (count_with_noun(values.len(), "value"), comma_separated(&self.names));
             return Err(Failure::usage(format!(
-                "{file}: line {line} has {got}: one is needed for each of the columns {names}"
+                "{file}: line {line} has {got}: write one value for each of the columns {names}"
             )));
         }
         Ok(Some(CsvRow { file, names: &self.names, values, line }))
@@ -152,8 +152,7 @@ mod tests {
 
     #[test]
     fn a_header_has_each_column_once() {
-        let must =
-            "t.csv: line 1: the first line must be the header a,b, with c if they are given, and it is";
+        let must = "t.csv: line 1: the first line must be the header a,b, optionally with c, not";
         assert_eq!(refused("1,2\n"), format!("{must} \"1,2\": write the header above it"));
         assert_eq!(refused(""), format!("{must} \"\": write the header above it"));
         for wrong in ["a", "a,b,b", "a,b,d", "a,c"] {
@@ -168,7 +167,7 @@ mod tests {
     fn values_are_named_with_their_line() {
         let mut table = CsvTable::new("t.csv", "a,b\n1\n# x\n2,inf\n", COLUMNS).unwrap();
         let short = table.next_row().err().unwrap().to_string();
-        assert_eq!(short, "t.csv: line 2 has 1 value: one is needed for each of the columns a, b");
+        assert_eq!(short, "t.csv: line 2 has 1 value: write one value for each of the columns a, b");
         let row = table.next_row().unwrap().unwrap();
         let infinite = row.number("b").unwrap_err().to_string();
         assert_eq!(infinite, "t.csv: line 4: b = \"inf\": a finite number is needed");

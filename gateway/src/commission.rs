@@ -143,13 +143,13 @@ fn check_reached(file: &str, done: &[CommissionedBus], interrupted: bool) -> Res
     let unknown_nodes: Vec<_> = done.iter().flat_map(|done| &done.report.unknown_nodes).collect();
     let buses = comma_separated(done.iter().map(|done| &done.name));
     Err(Failure::run(if unknown_nodes.is_empty() {
-        format!("no cells are on {buses}: start them, or switch them on, and run this again")
+        format!("no cells were found on {buses}: start them or switch them on, then run the command again")
     } else {
         let serials: Vec<_> =
             unknown_nodes.iter().map(|unknown_node| unknown_node.serial.to_string()).collect();
         format!(
-            "none of the cells on {buses} is one of {file}: their serial numbers are {}; name the description \
-             that has them",
+            "none of the cells on {buses} is in {file}: their serial numbers are {}; name the skin file \
+             with these numbers",
             abbreviated(&serials)
         )
     }))

@@ -62,7 +62,7 @@ pub(crate) struct CompareCommand {
     /// The skin [default: the skin in a recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Accept differences between torque words of up to this many steps of 1/4096 Nm, and between sums of 1/256 Nm
+    /// Accept differences of up to this many steps: for torque words 1/4096 Nm each, for sums 1/256 Nm each
     #[arg(long, value_name = "STEPS", default_value_t = 0)]
     tolerance: u16,
     /// Accept differences between joint words of up to this many steps of 1/16384 quarter turn or m
@@ -164,7 +164,7 @@ impl CompareCommand {
         check_distinct([("--junit", self.junit.as_deref())], read)?;
         if [&self.a, &self.b].iter().all(|file| is_standard_input(file)) {
             return Err(Failure::usage(
-                "- and -: standard input is read once: name a file for one of the two",
+                "- and -: standard input can be read only once: name a file instead of one -",
             ));
         }
         let files = PerCapture { a: recording_parts(&self.a)?, b: recording_parts(&self.b)? };
@@ -256,7 +256,7 @@ impl CompareCommand {
             }
         }
         let (a, b) = (self.a.display(), self.b.display());
-        Err(Failure::usage(format!("neither {a} nor {b} has a skin in it: name one with --skin")))
+        Err(Failure::usage(format!("neither {a} nor {b} contains a skin: name one with --skin")))
     }
 
     /// Refuses a capture without frames or joints, or of another skin.
@@ -285,7 +285,7 @@ impl CompareCommand {
         }
         comparison.other_configurations(which).map_or(Ok(()), |(all, same)| {
             Err(Failure::usage(format!(
-                "{name} belongs to another skin than {}: of {}, {same} have its parameters; name the right one with --skin",
+                "{name} does not match the skin {}: of {}, only {same} have its parameters; name the right skin with --skin",
                 skin.name,
                 count_with_noun(all, "cell")
             )))
@@ -301,7 +301,7 @@ fn check_same_skin(
     let Some((what, is, was)) = difference(skin, own) else { return Ok(()) };
     let (one, other) = (one.as_ref().display(), other.as_ref().display());
     Err(Failure::usage(format!(
-        "{one} and {other} have two skins: {what} {is}, in the other {was}; compare captures of one skin"
+        "{one} and {other} have different skins ({what}: {is}, in the other: {was}): compare captures of one skin"
     )))
 }
 

@@ -48,7 +48,7 @@ impl ManCommand {
         }
         if !self.folder.is_dir() {
             let folder = self.folder.display();
-            return Err(Failure::usage(format!("{folder}: there is no such folder; make it first")));
+            return Err(Failure::usage(format!("the folder {folder} does not exist: create it first")));
         }
         program.build();
         let mut pages = Vec::new();

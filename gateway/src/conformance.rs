@@ -49,13 +49,13 @@ pub(crate) struct ConformanceCommand {
     /// Frame format of the bus [default: the format of the cell's heartbeats]
     #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
-    /// Test only these requirements: CONF-7, or CONF for all that begin so
+    /// Test only these requirements: CONF-7, or CONF for all whose ids begin with CONF
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     requirement: Vec<String>,
-    /// Shell command that switches the cell off and on, for requirements that only a start shows
+    /// Shell command that switches the cell off and on, for requirements that can be tested only at a start
     #[arg(long, value_name = "COMMAND")]
     restart: Option<String>,
-    /// Continue although other cells are on the bus: joints and halts of the test reach them too
+    /// Test even if other cells are on the bus: they receive the joints and halts of the test too
     #[arg(long)]
     others_will_stop: bool,
     /// File for the cell's saved configuration [default: conformance-BUS-NODE.json]
@@ -86,7 +86,7 @@ impl ConformanceCommand {
             (None, None) => return Err(Failure::usage("--bus is missing: name the bus of the cell")),
             (Some(bus), Some(other)) if bus != other => {
                 return Err(Failure::usage(format!(
-                    "--cell {} is not on {bus}: leave out one of the two",
+                    "--cell {} is not on {bus}: correct --cell, or leave out --bus",
                     self.cell
                 )));
             }
@@ -98,8 +98,8 @@ impl ConformanceCommand {
         if self.restore.is_none() && path.exists() {
             let path = path.display();
             return Err(Failure::usage(format!(
-                "{path} is left from an earlier test that did not restore the cell: do that with --restore {path}, \
-                 or delete it"
+                "{path} was left by an earlier test that did not restore the cell: restore it with --restore {path}, \
+                 or delete the file"
             )));
         }
         let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;

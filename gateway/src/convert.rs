@@ -65,7 +65,7 @@ pub(crate) struct ConvertCommand {
     /// Digits of a second in a log [default: as many as IN has]
     #[arg(long, value_parser = one_of_values(DIGITS), value_name = "N")]
     digits: Option<TimeDigits>,
-    /// Write the direction, T or R, behind each frame of a log, which Wireshark cannot read. Without this option, only
+    /// Write the direction, T or R, after each frame of a log, which Wireshark cannot read. Without this option, only
     /// a log that has directions keeps them
     #[arg(long, conflicts_with = "plain")]
     direction: bool,
@@ -89,7 +89,7 @@ impl ConvertCommand {
         }
         if let Some(skin) = &self.skin {
             return Err(Failure::usage(format!(
-                "--skin {} is for torques: name an OUT that ends in .csv",
+                "--skin {} is only for CSV output: name an OUT that ends in .csv",
                 skin.display()
             )));
         }
@@ -99,7 +99,7 @@ impl ConvertCommand {
             [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
         if let Some((option, _)) = options.iter().find(|(_, given)| *given && !text) {
             return Err(Failure::usage(format!(
-                "{option} is for a candump log: a recording keeps everything"
+                "{option} is only for a candump log: leave it out, because a recording keeps everything"
             )));
         }
         let to = self.to.display();
@@ -118,7 +118,7 @@ impl ConvertCommand {
         let name = reader.name().to_owned();
         let of_log = reader.format() == CaptureFormat::Candump;
         if !text && !of_log && !reader.has_foreign_frames() {
-            return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
+            return Err(Failure::usage(format!("{name} is already an MCAP recording: copy it instead")));
         }
         let digits = self.digits.unwrap_or(if self.plain { TimeDigits::Six } else { TimeDigits::Own });
         let directions = !self.plain && (self.direction || reader.is_from_log());
@@ -142,13 +142,13 @@ impl ConvertCommand {
             named += 1;
             let place = location(&name, line.line);
             if self.strict {
-                return Err(format!("{place}: {why}; without --strict it would be kept as it is"));
+                return Err(format!("{place}: {why}; without --strict, the line would be kept as it is"));
             }
             if named <= MAX_NAMED_LINES {
                 bar.suspend(|| print_note(format_args!("{place}: {why}")));
             }
             if named == MAX_NAMED_LINES {
-                bar.suspend(|| print_note(format_args!("{name}: further lines of that kind are counted")));
+                bar.suspend(|| print_note(format_args!("{name}: further unreadable lines are only counted")));
             }
             Ok(())
         });
@@ -227,7 +227,9 @@ impl ConvertCommand {
         let options =
             [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
         if let Some((option, _)) = options.iter().find(|(_, given)| *given) {
-            return Err(Failure::usage(format!("{option} is for a candump log, and {to} is a CSV file")));
+            return Err(Failure::usage(format!(
+                "{option} is only for a candump log, but {to} is a CSV file: leave it out"
+            )));
         }
         check_distinct([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
         self.overwrite.check("", &self.to)?;
@@ -288,9 +290,9 @@ impl ConvertCommand {
     /// Returns the format of OUT, according to its name.
     fn format(&self) -> Result<CaptureFormat, Failure> {
         if is_standard_output(&self.to) && io::stdout().is_terminal() {
-            let why = "standard output is a terminal, and a log may have anything in it";
+            let why = "standard output is a terminal, and a log may contain control characters";
             return Err(Failure::usage(format!(
-                "-: {why}: pipe it on, name a file, or look at it with `skinbus dump`"
+                "-: {why}: pipe it to a program, name a file, or view it with `skinbus dump`"
             )));
         }
         let other = fs::metadata(&self.to).is_ok_and(|there| !there.is_file() && !there.is_dir());
@@ -299,7 +301,7 @@ impl ConvertCommand {
             Some("log" | "txt") => Ok(CaptureFormat::Candump),
             _ if is_standard_output(&self.to) || other => Ok(CaptureFormat::Candump),
             _ => Err(Failure::usage(format!(
-                "{}: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
+                "{}: unknown file type: use .mcap for a recording, .log or .txt for a candump log, .csv for torques, or - for \
                  standard output",
                 self.to.display()
             ))),
@@ -429,8 +431,8 @@ fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: boo
     }
     match other_contents(reader) {
         others if others.is_empty() => {}
-        others if text => lines.push(format!("a log has no place for {others}")),
-        others => lines.push(format!("frames alone are written, without {others}")),
+        others if text => lines.push(format!("a candump log cannot hold {others}")),
+        others => lines.push(format!("only frames are written, without {others}")),
     }
     lines
 }

@@ -49,38 +49,38 @@ use super::print::{comma_separated, json};
   skinbus dump can0 --stats --to 10
   candump -L can0 | skinbus dump - -n 100")]
 pub(crate) struct DumpCommand {
-    /// Buses; or a candump log or MCAP recording if a file has this name, - for standard input. The parts of a split
-    /// recording count as one, in any order
+    /// Buses; or a candump log or MCAP recording, if a file has this name; - for standard input. The parts of a split
+    /// recording are read as one, in any order
     #[arg(required = true, value_name = "BUS|FILE")]
     sources: Vec<PathBuf>,
-    /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt, joints,
-    /// sync, resume and report alone, wire, foreign (includes damaged), and damaged
+    /// Show only these kinds of frames: command (or only its halt, joints, sync, resume, report), sum, torque, sensors,
+    /// network, configure, configured, stimulus, wire, foreign (includes damaged), damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<Selector>,
-    /// Only packets from or to these cells; also gateway and everyone
+    /// Show only packets from or to these nodes: cells, gateway or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_delimiter = ',')]
     cell: Vec<NodeSelector>,
-    /// Only frames of these buses
+    /// Show only frames of these buses
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
-    /// Only frames with this identifier, in hexadecimal: 3 digits for 11 bits, 8 digits for 29. A second number masks
-    /// the bits to compare
+    /// Show only frames with this identifier, in hexadecimal: 3 digits for 11 bits, 8 digits for 29. A second number
+    /// is the mask of the bits to compare
     #[arg(long, value_name = "ID[:MASK]", value_delimiter = ',')]
     id: Vec<IdMask>,
-    /// Only traffic of touches: torques and sums other than zero, stimuli and sensors with a contact force or a
+    /// Show only traffic of touches: torques and sums other than zero, stimuli and sensors with a contact force or a
     /// proximity, heartbeats of active cells
     #[arg(long)]
     contact: bool,
-    /// Only from this second of the run on; counted from the first frame if there is no run
+    /// Show frames from this second of the run on; without a run, seconds count from the first frame
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     from: Option<u64>,
-    /// Only before this second, counted like --from; ends a live dump
+    /// Show frames before this second, counted like --from; ends a live dump
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     to: Option<u64>,
-    /// End after this many frames that are shown or counted
+    /// End after showing or counting this many frames
     #[arg(long, short = 'n', value_name = "COUNT")]
     count: Option<u64>,
-    /// Replace the raw frame by the seconds of the run, or since the first frame, and the bus
+    /// Print the bus and the seconds of the run (or since the first frame) instead of the raw frame
     #[arg(long, conflicts_with_all = ["json", "stats"])]
     brief: bool,
     /// Print one JSON object per line; with --stats, one in total
@@ -89,7 +89,7 @@ pub(crate) struct DumpCommand {
     /// Print tables at the end instead of lines: frames and rates by kind, gaps, losses, damaged frames, a line for
     /// each cell and for each foreign identifier
     ///
-    /// Counts a live bus until --to, --count or Ctrl-C. Excluded frames would not be counted, which falsifies losses
+    /// Counts a live bus until --to, --count or Ctrl-C. Excluded frames would falsify the numbers of losses
     /// and unanswered joints; so of the filters only --bus, --from, --to and --count are allowed.
     #[arg(long, conflicts_with_all = ["kind", "cell", "id", "contact"])]
     stats: bool,
@@ -142,14 +142,18 @@ impl DumpCommand {
             let names: Vec<_> = self.sources.iter().map(|source| source.display().to_string()).collect();
             if let Some(other) = pick.bus_names().find(|bus| !names.iter().any(|name| name == bus)) {
                 let names = comma_separated(&names);
-                return Err(Failure::usage(format!("{other} is not shown: name it beside {names}")));
+                return Err(Failure::usage(format!(
+                    "bus {other} is not among the dumped buses: name it in addition to {names}"
+                )));
             }
             if let Some(file) = self.sources.iter().find(|source| self.wait && is_path(source)) {
                 let file = file.display();
-                return Err(Failure::usage(format!("--wait is for buses, and there is no file {file}")));
+                return Err(Failure::usage(format!("--wait is only for buses, and there is no file {file}")));
             }
         } else if self.wait {
-            return Err(Failure::usage(format!("--wait is for buses, and {title} is a file")));
+            return Err(Failure::usage(format!(
+                "--wait is only for buses, but {title} is a file: leave it out"
+            )));
         }
         let max = self.count.unwrap_or(u64::MAX);
         let to_out = BufWriter::new(InterruptibleWriter::new(&out));
@@ -203,7 +207,7 @@ impl DumpCommand {
         if let (Some(bus), Some(file)) = (other, sources.iter().find(|source| is_file(source))) {
             let (bus, file) = (bus.display(), file.display());
             return Err(Failure::usage(format!(
-                "there is no file {bus}, and {file} is one: name the parts of one recording, or buses"
+                "{file} is a file, but there is no file {bus}: name only the parts of one recording, or only buses"
             )));
         }
         if let Some(folder) = sources.iter().find(|source| source.is_dir()) {

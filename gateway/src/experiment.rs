@@ -45,7 +45,7 @@ use folder::ResultFolder;
   skinbus experiment fig9 fig10 -o laws
   skinbus experiment all -o experiments")]
 pub(crate) struct ExperimentCommand {
-    /// Experiments, or all, or list
+    /// Names of experiments; all runs every experiment, and list describes them
     #[arg(value_name = "NAME", required = true)]
     names: Vec<ExperimentArgument>,
     /// Directory for the results; created if it does not exist
@@ -53,7 +53,7 @@ pub(crate) struct ExperimentCommand {
     output: Option<PathBuf>,
     #[command(flatten)]
     overwrite: OverwriteOption,
-    /// Measure little: a few cells for a few seconds, to see that everything works
+    /// Measure with few cells for a few seconds, to check that everything works
     #[arg(long)]
     quick: bool,
     /// Show no progress and no findings
@@ -76,7 +76,10 @@ impl FromStr for ExperimentArgument {
         match word {
             "all" => Ok(Self::All),
             "list" => Ok(Self::List),
-            _ => word.parse().map(Self::One).map_err(|error| format!("{error}; list describes each")),
+            _ => word
+                .parse()
+                .map(Self::One)
+                .map_err(|error| format!("{error}; `skinbus experiment list` describes them")),
         }
     }
 }
@@ -210,7 +213,7 @@ fn machine() -> String {
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
     let name = name.map_or("unknown processor", |(_, name)| name.trim());
     format!(
-        "{name}, {} in use, {} {} {}",
+        "{name}, {} processors in use, {} {} {}",
         fact("processors"),
         fact("sysname"),
         fact("release"),
@@ -263,7 +266,7 @@ fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
     let worse = if worse == 0 {
         String::new()
     } else {
-        format!("worse than the paper's or than required: {worse}\n")
+        format!("results worse than in the paper or than required: {worse}\n")
     };
     print_text(&format!("{}{worse}{}\n", rows.to_text(), report.display()))
 }

@@ -46,13 +46,13 @@ pub(crate) struct ExplainCommand {
     /// or --batch: a skin or a recording
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Epoch of the joints: their number modulo 256
+    /// Epoch of the joint broadcast: its number modulo 256
     #[arg(long, value_name = "E", required_unless_present_any = ["force", "batch"])]
     epoch: Option<u8>,
-    /// Only joints from this second of the run on; counted from the first frame if there is no run
+    /// Explain joints from this second of the run on; without a run, seconds count from the first frame
     #[arg(long, value_name = "S", value_parser = parse_time_ns, default_value = "0", conflicts_with_all = ["force", "batch"])]
     at: u64,
-    /// Use the Nth joints of this epoch, if there are several
+    /// Explain the Kth joint broadcast of this epoch, if there are several
     #[arg(long, value_name = "K", default_value_t = 1, conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u32).range(1..))]
     occurrence: u32,
     /// Show all steps of one cell

@@ -37,23 +37,23 @@ use super::print::comma_separated;
   skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct FitCommand {
-    /// A skin; a candump log or MCAP recording, all parts of a split recording in any order; or buses. - for standard
-    /// input, which is traffic unless an option is for a skin
+    /// A skin; a candump log or MCAP recording (all parts of a split one, in any order); or buses. - is standard
+    /// input: a skin if an option for a skin is given, else traffic
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
-    /// Bit rate of identifiers, and of classic frames as a whole, in bit/s: 1000000, 500k or 1M
+    /// Nominal bit rate (of identifiers and of whole classic frames) in bit/s: 1000000, 500k or 1M
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     nominal: Option<u32>,
-    /// Bit rate of the data of CAN FD frames that switch rates
+    /// Data bit rate of CAN FD frames that switch rates
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
-    /// For a skin: a table over common bit rates, whatever rates the skin has
+    /// For a skin: a table for common bit rates, regardless of the skin's rates
     #[arg(long, conflicts_with = "nominal")]
     table: bool,
-    /// For a skin: frame format of packets on all buses, whatever format the skin has
+    /// For a skin: frame format of packets on all buses, instead of the skin's formats
     #[arg(long, value_parser = one_of_values(FORMATS))]
     format: Option<Format>,
-    /// For a skin: longest time of a cell from joints to its answer, in µs [the paper's cell: 68.5]
+    /// For a skin: longest time that a cell needs to compute its answer, in µs [the paper's cell: 68.5]
     #[arg(long, value_name = "US", value_parser = parse_computation_ns)]
     computation: Option<u64>,
     /// For traffic: bit rates of one bus; repeat the option for further buses: can0=500k/2M, can1=1M
@@ -65,11 +65,11 @@ pub(crate) struct FitCommand {
     /// For traffic: also count bench-only frames: stimuli, sync and report with their answers, simulated wires
     #[arg(long)]
     bench_traffic: bool,
-    /// For traffic: share of bits that arrive damaged, 0 to 0.01 [default: 0]. Each costs an error frame, and its frame
-    /// is sent again
+    /// For traffic: share of bits that arrive damaged, 0 to 0.01 [default: 0]. Each causes an error frame and a
+    /// retransmission
     #[arg(long, value_name = "SHARE", allow_negative_numbers = true)]
     ber: Option<f64>,
-    /// For traffic: seed of the damaged bits [default: 1]
+    /// For traffic: random seed for the damaged bits [default: 1]
     #[arg(long, value_name = "N", requires = "ber")]
     seed: Option<u64>,
     /// For live buses: end after this time
@@ -99,11 +99,11 @@ impl FitCommand {
         let file = skin.display();
         if let Some((option, _)) = of_traffic.iter().find(|(_, given)| *given) {
             return Err(Failure::usage(format!(
-                "{option} is for traffic, and {file} is a skin: leave it out"
+                "{option} is only for traffic, but {file} is a skin: leave the option out"
             )));
         }
         if self.data.is_some() && self.nominal.is_none() {
-            return Err(Failure::usage("--data of a skin needs --nominal beside it"));
+            return Err(Failure::usage("--data for a skin also needs --nominal"));
         }
         let skin = read_skin(skin)?;
         self.print_skin_fit(&skin)
@@ -124,7 +124,7 @@ impl FitCommand {
             Some(option) if !is_skin => {
                 let names = comma_separated(self.sources.iter().map(|source| source.display()));
                 Err(Failure::usage(format!(
-                    "{option} is for a skin, and {names} is not a skin: leave it out"
+                    "{option} is only for a skin, but {names} is not a skin: leave the option out"
                 )))
             }
             _ => Ok(is_skin.then_some(source)),
@@ -154,9 +154,9 @@ fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
 /// Parses a time in µs with up to three decimals, and returns it in ns.
 fn parse_computation_ns(text: &str) -> Result<u64, String> {
     let allowed = "0 to 65000 µs";
-    let us: f64 = text.parse().map_err(|_| format!("not a number; allowed is {allowed}"))?;
+    let us: f64 = text.parse().map_err(|_| format!("not a number: use {allowed}"))?;
     if !(0.0..=65_000.0).contains(&us) {
-        return Err(format!("allowed is {allowed}"));
+        return Err(format!("out of range: use {allowed}"));
     }
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 65 000 000")]
     let ns = (us * 1e3).ceil() as u64;

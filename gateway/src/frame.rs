@@ -113,7 +113,7 @@ impl FrameCommand {
             targets.retain(|(name, _)| name == bus);
             if targets.is_empty() {
                 return Err(Failure::usage(format!(
-                    "--cell {bus}:{node} is not on --bus {names}: name one of the two"
+                    "--cell {bus}:{node} is not on --bus {names}: correct --cell or --bus"
                 )));
             }
         }
@@ -201,7 +201,7 @@ fn verdict(
         )));
     }
     if tag.is_some() && lines.is_empty() {
-        let why = format!("{who} is on {bus} and did not answer for {waited} s: send it again");
+        let why = format!("{who} is on {bus}, but did not answer within {waited} s: send the frame again");
         return Err(Failure::run(why));
     }
     Ok(())

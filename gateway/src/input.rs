@@ -58,11 +58,9 @@ pub(crate) fn no_such_source(name: &str, error: &BusError) -> Failure {
             | BusError::NoSocketCan(_)
     );
     if is_path(Path::new(name)) && is_absent {
-        return Failure::usage(format!(
-            "there is no file {name}, and no bus of that name: name the path of the file"
-        ));
+        return Failure::usage(format!("there is no file {name}, and no bus of this name: correct the path"));
     }
-    Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
+    Failure::usage(format!("there is no file {name}, and it does not open as a bus: {error}"))
 }
 
 /// Returns the named skin, or else that of a recording. Prints a note if the named skin differs from the recording's.
@@ -83,7 +81,7 @@ pub(crate) fn note_other_skin(files: &[PathBuf], path: &Path, skin: &Skin) {
     if let Some((what, is, was)) = difference(skin, &own) {
         let (path, name) = (path.display(), reader.name());
         output::print_note(format_args!(
-            "--skin {path} is not the skin that {name} was recorded with: {what} {is}, recorded {was}"
+            "--skin {path} is not the skin that {name} was recorded with ({what}: {is}, recorded: {was})"
         ));
     }
 }
@@ -110,7 +108,7 @@ pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, St
     Some((
         format!("parameters of cell {} on {bus}", changed.node),
         "as described".to_owned(),
-        "others".to_owned(),
+        "different".to_owned(),
     ))
 }
 
@@ -143,7 +141,7 @@ fn capture_error(file: &Path) -> Option<Failure> {
     let name = file.display();
     Some(match reader.has_frame().ok()? {
         true => Failure::usage(format!(
-            "{name} is a capture ({}), and a skin is needed: name the skin's own file",
+            "{name} is a capture ({}), but a skin is needed: name the skin's own file",
             format_name(&reader)
         )),
         false if reader.text_kind().is_some_and(|(kind, _)| kind == SKIN_OR_SCENARIO) => return None,
@@ -154,7 +152,7 @@ fn capture_error(file: &Path) -> Option<Failure> {
 /// Returns the skin attached to a recording.
 pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
     if files.iter().any(|file| is_standard_input(file)) {
-        return Err(Failure::usage("standard input is read once: name the skin with --skin"));
+        return Err(Failure::usage("standard input can be read only once: name the skin with --skin"));
     }
     if let Some(pipe) =
         files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
@@ -186,8 +184,8 @@ fn attached_skin(
         None => {
             check()?;
             Err(match &reader.extras().unfinished {
-                Some(why) => Failure::run(format!("{name} has no skin in it, and {why}: {hint}")),
-                None => Failure::usage(format!("{name} has no skin in it: {hint}")),
+                Some(why) => Failure::run(format!("{name} contains no skin, and {why}: {hint}")),
+                None => Failure::usage(format!("{name} contains no skin: {hint}")),
             })
         }
     }
@@ -224,12 +222,12 @@ pub(crate) fn location(name: &str, line: u64) -> String {
 pub(crate) fn no_frame(reader: &Reader) -> Failure {
     let name = reader.name();
     if let Some((what, hint)) = reader.text_kind() {
-        return Failure::usage(format!("{name} is {what}, and no candump log or MCAP recording: {hint}"));
+        return Failure::usage(format!("{name} is {what}, not a candump log or MCAP recording: {hint}"));
     }
     let what = match (reader.format(), reader.line_count()) {
         (CaptureFormat::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
         (CaptureFormat::Candump, lines) => format!(
-            "there is no frame in {}; the output of candump is expected: lines like \
+            "there is no frame in {}; expected the output of candump, with lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
             count_with_noun(lines, "line")
         ),

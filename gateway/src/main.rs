@@ -141,7 +141,7 @@ fn usage_error(wrong: &clap::Error) -> String {
     }
     match text(ContextKind::InvalidArg) {
         Some(file) if first == "run" && file.ends_with(".toml") => {
-            format!("{file} comes after the skin: a scenario is given by --scenario {file}")
+            format!("unexpected argument {file} after the skin: to use a scenario, write --scenario {file}")
         }
         Some(option) => former::former_option(&words, option)
             .unwrap_or_else(|| one_line_error(&wrong.render().to_string())),

@@ -113,7 +113,9 @@ pub(crate) fn check_distinct<'a>(
             )));
         }
         if let Some((other, _)) = before.iter().find(|(_, place)| *place == there) {
-            return Err(Failure::usage(format!("{option} and {other} name the same file: name two")));
+            return Err(Failure::usage(format!(
+                "{option} and {other} name the same file: name two different files"
+            )));
         }
         before.push((option, there));
     }

@@ -37,7 +37,9 @@ impl RecoverCommand {
             return Err(Failure::usage(format!("{name} is being recorded: wait for the run's end")));
         }
         if self.output.is_none() && self.file.as_os_str() == "-" {
-            return Err(Failure::usage("-: standard input has no name for a new file: name one with -o"));
+            return Err(Failure::usage(
+                "-: standard input has no name to derive the new file from: name the new file with -o",
+            ));
         }
         let output = self.output.unwrap_or_else(|| names::recovered_name(&names::final_name(&self.file)));
         let out = output.display();

@@ -47,7 +47,7 @@ const SEND_TIMEOUT_MS: u32 = 100;
   skinbus replay run.mcap run-*.mcap --expect --spawn --lockstep
   skinbus replay foreign.log --map can0=vcan0 --speed max --loop 10")]
 pub(crate) struct ReplayCommand {
-    /// A candump log or an MCAP recording; the parts of a split recording count as one, in any order
+    /// A candump log or an MCAP recording; the parts of a split recording are read as one, in any order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     #[command(flatten)]
@@ -57,10 +57,10 @@ pub(crate) struct ReplayCommand {
     /// Repeat N times; 0 repeats until Ctrl-C
     #[arg(long = "loop", value_name = "N", default_value_t = 1)]
     passes: u32,
-    /// Speed factor, 0.1 to 100; or max for as fast as the bus accepts frames, whatever their times
+    /// Speed factor, 0.1 to 100; or max to send as fast as the bus accepts frames, whatever their times
     #[arg(long, value_name = "X", default_value = "1", value_parser = speed, allow_negative_numbers = true)]
     speed: ReplaySpeed,
-    /// Send joints only after every cell has answered the last ones: gives the same result on any machine, however slow
+    /// Send joints only after every cell has answered the previous ones: gives the same result on any machine
     #[arg(long)]
     lockstep: bool,
     /// Compare the answers with the recorded ones; --speed max then implies --lockstep
@@ -75,7 +75,7 @@ pub(crate) struct ReplayCommand {
     /// The skin of the started cells [default: the recording's own]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Let measuring cells obey stimuli during the replay, and measure again afterwards
+    /// Switch measuring cells to test mode for the replay, so that they obey stimuli
     #[arg(long)]
     test_mode: bool,
     /// Write the final figures as JSON, - for standard output; docs/how-to/replay.md explains the keys
@@ -108,8 +108,8 @@ struct FrameOptions {
     /// --lockstep or --spawn, else all
     #[arg(long, value_parser = one_of_values(SENDER_FILTERS))]
     only: Option<SenderFilter>,
-    /// Begin at this second of the run, counted from the first frame if there is no run; with inputs only, in the state
-    /// that was latched there
+    /// Begin at this second of the run, counted from the first frame if there is no run; if only inputs are
+    /// sent, begin in the state that was latched then
     #[arg(long, value_name = "S", value_parser = parse_time_ns, allow_negative_numbers = true)]
     from: Option<u64>,
     /// End before this second, counted like --from
@@ -167,8 +167,8 @@ impl ReplayCommand {
         let only = match (self.frames.only, needs) {
             (Some(SenderFilter::Replies | SenderFilter::All), Some(name)) => {
                 return Err(Failure::usage(format!(
-                    "{name} lets cells answer, and --only sends recorded answers in their place: leave out one of the \
-                     two"
+                    "{name} makes cells answer, but --only would send recorded answers too: leave out one of the \
+                     two options"
                 )));
             }
             (None, Some(_)) => SenderFilter::Inputs,
@@ -289,6 +289,6 @@ fn difference_rows(rows: &mut KeyValueTable, what: &str, steps: &StepHistogram, 
     let of = format!("of {}, at most {} steps off", steps.by_steps.iter().sum::<u64>(), steps.max);
     for (by, count) in &found {
         let more = if *by == last { " or more" } else { "" };
-        rows.add_row(format!("{what} words {by}{more} off"), count, if by == worst { &of } else { "" });
+        rows.add_row(format!("{what} words off by {by}{more}"), count, if by == worst { &of } else { "" });
     }
 }

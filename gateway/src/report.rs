@@ -27,23 +27,23 @@ use super::output::{OverwriteOption, check_distinct, is_standard_output, print_n
   skinbus report run.mcap run-*.mcap -o all.html
   skinbus report run.log --skin skin.toml -o - > log.html")]
 pub(crate) struct ReportCommand {
-    /// The recording of a run, as written by `skinbus run SKIN --record FILE`; all parts of a split one in any order.
+    /// The recording of a run, as written by `skinbus run SKIN --record FILE`; all parts of a split one, in any order.
     /// Or frames only: a candump log, or another program's MCAP file
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// The skin of a log; a recording contains its own
+    /// The skin, for a candump log; a recording contains its own
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// The page; - for standard output [default: the recording's name with .html]
+    /// The HTML page to write; - for standard output [default: the recording's name with .html]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Also write each figure as an SVG file into this directory, which is created if necessary
     #[arg(long, value_name = "DIR")]
     svg: Option<PathBuf>,
-    /// Bit rate of all buses for their load: 500k, 1M [default: the skin's, else 1M]
+    /// Nominal bit rate of all buses, for the bus load: 500k, 1M [default: the skin's, else 1M]
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     nominal: Option<u32>,
-    /// Bit rate of FD data: 2M, 5M [default: the skin's, else 5M]
+    /// Data bit rate of FD frames: 2M, 5M [default: the skin's, else 5M]
     #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
     #[command(flatten)]
@@ -75,7 +75,7 @@ impl ReportCommand {
                 if folder.is_dir() {
                     if path.is_file() && !self.overwrite.overwrite {
                         return Err(Failure::usage(format!(
-                            "--svg {}: {name} is in it: name another folder, or overwrite it with --overwrite",
+                            "--svg {}: it already contains {name}: name another folder, or overwrite the file with --overwrite",
                             folder.display()
                         )));
                     }
@@ -126,9 +126,9 @@ fn refused(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
         (ReportError::OtherSkin { name, recorded }, Some((file, skin))) => {
             let first = difference(skin, &recorded);
             let first =
-                first.map_or_else(String::new, |(what, is, was)| format!(": {what} {is}, recorded {was}"));
+                first.map_or_else(String::new, |(what, is, was)| format!(" ({what}: {is}, recorded: {was})"));
             Failure::usage(format!(
-                "{name} was recorded with another skin than {file}{first}; leave --skin out: the recording has its own"
+                "{name} was recorded with another skin than {file}{first}; leave --skin out: the recording contains its skin"
             ))
         }
         (error, _) => Failure::usage(error),

@@ -59,8 +59,8 @@ struct CommonOptions {
     /// Print all rows of the table, including those with usual values
     #[arg(long, short)]
     verbose: bool,
-    /// Show the skin live in a browser, on a page that is served until the run ends; docs/how-to/view.md. Without
-    /// --duration, only Ctrl-C ends the run then
+    /// Show the skin live in a browser, on a page that is served until the run ends; see docs/how-to/view.md. Without
+    /// --duration, the run then ends only with Ctrl-C
     #[arg(long)]
     view: bool,
     /// Address of the page [default: any free port of this machine]
@@ -241,7 +241,9 @@ impl DemoCommand {
         let place = options.directory.as_ref();
         let place = place.map(|path| format!("SKINBUS_DIR={} ", shell_quoted_os(path.as_os_str())));
         let place = place.filter(|_| !kind.is_interface()).unwrap_or_default();
-        options.announced.push(format!("its frames in words: {place}skinbus dump vcan0 --bus-kind {kind}"));
+        options
+            .announced
+            .push(format!("to see its frames decoded: {place}skinbus dump vcan0 --bus-kind {kind}"));
         let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());

@@ -47,7 +47,7 @@ struct GenerateCommand {
     /// Number of cells, 1 to 254 per bus
     #[arg(long, default_value_t = 253)]
     cells: usize,
-    /// Number of buses; cells of one bus lie together
+    /// Number of buses; cells of one bus are placed together
     #[arg(long, default_value_t = 1)]
     buses: usize,
     /// Joint broadcasts per second; must divide the 500 Hz of the control loop

@@ -53,7 +53,7 @@ fn parts(
     let found = skin.robot.chains.iter().map(|chain| {
         chain_of(urdf, chain).ok_or_else(|| {
             format!(
-                "{} has no chain with the rows of {}: import the skin from it again",
+                "{} has no chain that matches the rows of {} in the skin: import the skin from it again",
                 urdf.file, chain.name
             )
         })

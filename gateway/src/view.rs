@@ -55,14 +55,14 @@ const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHO
   skinbus view run.log --skin skin.toml
   skinbus view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
 pub(crate) struct ViewCommand {
-    /// A skin, for its buses; or some of its buses, with --skin; or a candump log or MCAP recording, or all parts of a
-    /// split one in any order
+    /// A skin, to show all its buses; or some of its buses, with --skin; or a candump log or MCAP recording (all parts
+    /// of a split one, in any order)
     #[arg(required = true, value_name = "SKIN|BUS|FILE")]
     sources: Vec<PathBuf>,
     /// The skin of named buses or of a recording [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Show this second of the recorded run, counted from the first frame of a log, instead of playing
+    /// Show this second of the recorded run (of a log: since the first frame) instead of playing it
     #[arg(long, value_name = "S", value_parser = parse_time_ns)]
     at: Option<u64>,
     /// Address of the page; port 0 is any free port
@@ -170,7 +170,7 @@ impl ViewCommand {
         let Some(file) = &self.skin else {
             let name = self.sources.first().map(|it| it.display().to_string()).unwrap_or_default();
             return Err(Failure::usage(format!(
-                "there is no file {name}: name a skin, to show its buses, a recording, or a bus and its --skin"
+                "there is no file {name}: name a skin (to show its buses), a recording, or a bus with --skin"
             )));
         };
         if self.at.is_some() {
@@ -264,7 +264,7 @@ fn bind_error(listen: SocketAddr, error: &io::Error) -> Failure {
         "name another port"
     };
     Failure::usage(format!(
-        "--listen {listen}: {error}; {hint}, or leave it out for a free port of this machine"
+        "--listen {listen}: {error}; {hint}, or leave --listen out for a free port of this machine"
     ))
 }
 

@@ -74,10 +74,10 @@ impl<'a> Visuals<'a> {
             Geometry::Sphere { radius } => plain(Mesh::sphere(*radius))?,
             Geometry::Other { element } => {
                 return Err(format!(
-                    "visual {element:?}: mesh, box, cylinder and sphere are known; make it a mesh"
+                    "visual {element:?} is not supported: use mesh, box, cylinder or sphere"
                 ));
             }
-            other => return Err(format!("visual {other:?} is not known; make it a mesh")),
+            other => return Err(format!("visual {other:?} is not supported: use a mesh")),
         };
         Ok(LinkMesh { pose: shape.origin, ..part })
     }
@@ -123,7 +123,10 @@ impl<'a> Visuals<'a> {
             .map_or_else(String::new, |path| path.display().to_string());
         let hint = match given {
             Some((_, folder)) if folder.is_dir() => {
-                format!("{} is not the package, or lacks this file: correct one of them", folder.display())
+                format!(
+                    "{} is not the directory of the package, or lacks this file: correct --package, or add the file",
+                    folder.display()
+                )
             }
             Some((_, folder)) => format!("{} is not a folder: correct --package {name}=", folder.display()),
             None if self.packages.only_beside => {

@@ -44,7 +44,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let took = began.elapsed().as_secs_f64();
     let (echo, query) = ((cpu() - before) / took, (processor_seconds(std::process::id()) - own) / took);
     println!("{processes} processes, {cycles} cycles: {:.3} cores", echo + query);
-    println!("the processes {echo:.3}, whoever asks them {query:.3}");
+    println!("echoing processes {echo:.3}, querying process {query:.3}");
     for (child, socket) in &mut echoes {
         rustix::net::shutdown(&*socket, rustix::net::Shutdown::Both)?;
         child.wait()?;

@@ -149,7 +149,7 @@ impl MachineFacts {
         let hints = || self.kernel.hints(*can_raw);
         match (self.choice, has_can) {
             (KindChoice::Only(kind), _) if !kind.is_interface() => {
-                Finding::ok(format!("{} was chosen, which needs nothing of the kernel", kind.display_name()))
+                Finding::ok(format!("{} was chosen, which needs no support by the kernel", kind.display_name()))
             }
             (KindChoice::Auto | KindChoice::Only(_), true) => {
                 Finding::ok(format!("the kernel ({release}) has CAN"))
@@ -193,10 +193,11 @@ impl MachineFacts {
                 ))
             }
             (true, 0) => Some(
-                Finding::fault(format!("no cell sends on {on}, and --no-spawn needs cells that run already"))
-                    .hint(format!(
+                Finding::fault(format!("no cell sends on {on}, but --no-spawn needs running cells")).hint(
+                    format!(
                         "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
-                    )),
+                    ),
+                ),
             ),
             (true, 1..) if absent().is_empty() => Some(Finding::ok(format!("{count} cells are on {on}"))),
             (true, 1..) => {
@@ -221,18 +222,18 @@ impl MachineFacts {
         let hint = self.with_sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
         Some(if granted >= needed {
             Finding::ok(format!(
-                "receive buffers of {has} KiB hold all answers, {frames} frames, {BUFFERED_ANSWERS} times over"
+                "receive buffers of {has} KiB hold all answers ({frames} frames) {BUFFERED_ANSWERS} times"
             ))
         } else if granted >= frames * FRAME_BYTES {
             Finding::note(format!(
-                "receive buffers are limited to {has} KiB; to hold all answers, {frames} frames, {BUFFERED_ANSWERS} times over \
-                 takes {wants} KiB, and a gateway that is held up loses some"
+                "receive buffers are limited to {has} KiB; to hold all answers ({frames} frames) {BUFFERED_ANSWERS} times, they need \
+                 {wants} KiB, else a delayed gateway loses answers"
             ))
             .hint(hint)
         } else {
             Finding::fault(format!(
-                "receive buffers are limited to {has} KiB and do not hold all answers, {frames} frames, even once; \
-                 {wants} KiB are right"
+                "receive buffers are limited to {has} KiB and cannot hold all answers ({frames} frames) even once; \
+                 {wants} KiB are needed"
             ))
             .hint(hint)
         })
@@ -250,10 +251,10 @@ impl MachineFacts {
             None => Finding::note("the kernel's backlog cannot be seen from this network namespace")
                 .hint("sysctl net.core.netdev_max_backlog  # in the first one"),
             Some(backlog) if backlog >= frames => Finding::ok(format!(
-                "the kernel's backlog of {backlog} holds an answer of all cells, {frames} frames"
+                "the kernel's backlog of {backlog} holds the answers of all cells ({frames} frames)"
             )),
             Some(backlog) => Finding::fault(format!(
-                "the kernel's backlog of {backlog} does not hold an answer of all cells, {frames} frames: some would \
+                "the kernel's backlog of {backlog} does not hold the answers of all cells ({frames} frames): some would \
                  be lost silently"
             ))
             .hint(self.with_sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
@@ -270,7 +271,7 @@ impl MachineFacts {
     fn check_cell_node(&self) -> Option<Finding> {
         let Program { path, there } = &self.cell_node;
         let absent =
-            format!("cell-node is not at {}: the gateway starts it from beside itself", path.display());
+            format!("cell-node is not at {}: the gateway starts it from its own directory", path.display());
         match (self.no_spawn, there) {
             (true, _) => None,
             (false, true) => Some(Finding::ok("cell-node is beside vcan-setup")),

@@ -74,9 +74,9 @@ impl Kernel {
             ModuleState::Available => None,
             ModuleState::Loadable => Some(modprobe.to_owned()),
             ModuleState::Missing => Some(self.other_kernel_hint(modprobe)),
-            ModuleState::Unknown => {
-                Some(format!("{modprobe}  # on the host, if this is a container: its modules are not here"))
-            }
+            ModuleState::Unknown => Some(format!(
+                "{modprobe}  # on the host, if this is a container: the modules are on the host"
+            )),
         };
         let lab = "tests/lab/run COMMAND  # in the project's folder: runs it in a machine that has vcan";
         here.into_iter().chain([lab.to_owned()]).collect()

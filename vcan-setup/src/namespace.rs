@@ -28,7 +28,7 @@ pub enum Namespace {
 pub enum NamespaceError {
     /// There is no namespace of this name.
     #[error(
-        "there is no network namespace {name} in {NAMESPACE_DIRECTORY}: `sudo ip netns add {name}` makes it, `ip netns` lists them; a process' number or a path is taken too"
+        "there is no network namespace {name} in {NAMESPACE_DIRECTORY}: `sudo ip netns add {name}` makes it, `ip netns` lists them; a process id or a path is accepted too"
     )]
     Name {
         /// The name.

@@ -271,7 +271,7 @@ impl Netlink {
         let nearest =
             self.query(link_message(index, []))?.and_then(|it| it.hardware().map(CanHardware::rates));
         match nearest.filter(|nearest| !nearest.matches(target)) {
-            Some(nearest) => Err(io::Error::other(format!("the nearest that its clock gives is {nearest}"))),
+            Some(nearest) => Err(io::Error::other(format!("the nearest that its clock allows is {nearest}"))),
             None => Ok(()),
         }
     }

@@ -86,7 +86,7 @@ impl InterfaceTarget {
         let own = self.hardware()?;
         let mut skins = others.iter().filter(|other| other.name == self.name).filter_map(Self::hardware);
         let other = skins.find(|skin| skin.rates != own.rates)?;
-        let says = |skin: &SkinBus| format!("{} says {}", skin.file, skin.rates);
+        let says = |skin: &SkinBus| format!("{} requires {}", skin.file, skin.rates);
         Some(PlanRefusal::AtOdds { name: self.name.clone(), one: says(other), other: says(own) })
     }
 
@@ -255,7 +255,7 @@ impl Plan {
             (true, true, ours) => {
                 let whose = if ours { "" } else { ", made by another program" };
                 self.add_unchanged(format!(
-                    "{name} is there already, and fits ({}{whose})",
+                    "{name} already exists and is suitable ({}{whose})",
                     interface.description()
                 ));
                 return Ok(());
@@ -283,7 +283,7 @@ impl Plan {
         let agrees = before.matches(rates);
         let wide = target.carried_by(interface.mtu);
         if agrees && wide && interface.up {
-            let checked = if rates.bitrate.is_some() { ", as the skin says" } else { "" };
+            let checked = if rates.bitrate.is_some() { ", as the skin requires" } else { "" };
             self.add_unchanged(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
             return Ok(());
         }

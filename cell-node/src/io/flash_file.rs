@@ -129,7 +129,8 @@ fn lock_file(file: &File) -> io::Result<()> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
         Err(Errno::WOULDBLOCK) => {
             let who = holder(file).unwrap_or_else(|| "another process".to_owned());
-            let why = format!("{who} uses it: end that one first, or name another --flash directory");
+            let why =
+                format!("{who} is using it: stop that process first, or choose another --flash directory");
             Err(io::Error::new(io::ErrorKind::ResourceBusy, why))
         }
         _ => Ok(()),

@@ -50,8 +50,8 @@ pub enum RunError {
     NoFlash(PathBuf),
     /// A scenario asks for a fault that only a simulated bus can make.
     #[error(
-        "the fault {kind:?} of {bus} at {at_s} s: a run with processes cannot make it; kill, stop, continue, restart, \
-         link_down, link_up, stuck and drift it can"
+        "the fault {kind:?} of {bus} at {at_s} s works only in virtual time; a run with processes supports kill, stop, \
+         continue, restart, link_down, link_up, stuck and drift"
     )]
     BusFault {
         /// Kind of the fault, as in the file.
@@ -63,8 +63,8 @@ pub enum RunError {
     },
     /// Simulated wires must not be used on a real bus.
     #[error(
-        "{0} is real hardware, and the wires between cells that answer with sums are simulated by frames that may not \
-         go there: use a vcan or the embedded bus, or reply = \"torque\""
+        "{0} is real hardware, but cells that answer with sums simulate their wires with frames that must not be sent \
+         there: use a vcan or the embedded bus, or reply = \"torque\""
     )]
     RealWires(String),
     /// Signals cannot be caught.
@@ -115,7 +115,7 @@ pub enum RunError {
     },
     /// Cells are configured for another skin.
     #[error(
-        "cells that are configured for another skin than {}: {cells}; write it into them with `skinbus commission`, or \
+        "cells that are not configured for {}: {cells}; configure them with `skinbus commission`, or \
          delete their flash files",
         .skin.display()
     )]
@@ -142,7 +142,7 @@ pub enum RunError {
     #[error("{0}")]
     BrokenTree(String),
     /// Cells do not answer with sums.
-    #[error("cells that do not switch to sums (parameter 6): {0}; give them firmware that does")]
+    #[error("cells that do not switch to sums (parameter 6): {0}; install firmware that supports sums")]
     NoSums(String),
     /// A thread panicked.
     #[error("the {0} panicked")]

@@ -41,7 +41,7 @@ pub enum SensingError {
     #[error(transparent)]
     Bus(#[from] BusError),
     /// No cell answered.
-    #[error("{who} answers on {bus}: start it, or name the bus' format with --format {other}")]
+    #[error("{who} answers on {bus}: start it, or give the bus's format with --format {other}")]
     NoAnswer {
         /// Description of the addressed cells.
         who: String,
@@ -61,7 +61,9 @@ pub enum SensingError {
         reason: i16,
     },
     /// Some cells are present but did not answer.
-    #[error("{cells} on {bus} did not answer, {done} did: switch them again when they are back")]
+    #[error(
+        "{cells} on {bus} did not answer, but {done} did: switch the silent ones again when they are back"
+    )]
     Silent {
         /// The cells as text.
         cells: String,
@@ -189,7 +191,8 @@ mod tests {
         }
         assert!(!are_complete(&answers, None, true));
         assert_eq!(answers.missing(), [cell(3)].into(), "the answer to another sender does not count");
-        let why = "cell 3 on vcan0 did not answer, 2 did: switch them again when they are back";
+        let why =
+            "cell 3 on vcan0 did not answer, but 2 did: switch the silent ones again when they are back";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
         answers.record(&confirms(3, REQUEST_TAG));
         assert!(!are_complete(&answers, None, false) && are_complete(&answers, None, true));
@@ -202,7 +205,7 @@ mod tests {
         let mut answers = Answers::new(only, Some(REQUEST_TAG));
         answers.record(&confirms(1, REQUEST_TAG));
         assert_eq!(answers.missing(), [cell(7)].into());
-        let why = "no cell 7 answers on vcan0: start it, or name the bus' format with --format classic";
+        let why = "no cell 7 answers on vcan0: start it, or give the bus's format with --format classic";
         assert_eq!(says(&answers, only), Err(why.to_owned()));
         answers.record(&confirms(7, REQUEST_TAG));
         assert!(are_complete(&answers, only, false));

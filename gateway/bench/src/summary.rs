@@ -144,7 +144,7 @@ impl Summary {
         let hint = |path: &String| match errors.iter().find(|error| error.contains(path.as_str())) {
             Some(error) if error == first => String::new(),
             Some(error) => format!("; {error}"),
-            None => format!("; what was recorded is in {path}: repair it with `skinbus recover {path}`"),
+            None => format!("; the recorded part is in {path}: repair it with `skinbus recover {path}`"),
         };
         let parts: String = parts.map(hint).collect();
         (!errors.is_empty() || *lost_write > 0).then(|| match lost_write {

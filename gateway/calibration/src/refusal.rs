@@ -78,7 +78,7 @@ impl core::fmt::Display for GapSummary {
 pub enum Refusal {
     /// The joints on a bus are those of another robot.
     #[error(
-        "{bus}: its frames carry {got} joints, the skin has {joints}: calibrate with the skin that was recorded"
+        "{bus}: its frames carry {got} joints, but the skin has {joints}: calibrate with the skin that was recorded"
     )]
     Joints {
         /// The bus.
@@ -90,7 +90,7 @@ pub enum Refusal {
     },
     /// The broadcast rate of joints differs from the skin's.
     #[error(
-        "{bus}: joints were broadcast {got} times a second, the skin says {hz}: correct joint_broadcast_hz"
+        "{bus}: joints were broadcast {got} times a second, but the skin has {hz}: correct joint_broadcast_hz"
     )]
     Rate {
         /// The bus.
@@ -113,7 +113,7 @@ pub enum Refusal {
     /// The readings scatter more than the data sheet allows for sensors on this robot.
     #[error(
         "readings scatter {times} times as much as the data sheet says ({noise_mg} mg; its noise is {sheet_mg} mg), so no pose can \
-         be trusted; {disturbance}; record again with a loop that skips no ticks, or give the sensors' own --data-sheet"
+         be trusted; {disturbance}; record again with a loop that skips no ticks, or name the sensors' data sheet with --data-sheet"
     )]
     Scatter {
         /// The ratio of the scatter to the value that the data sheet predicts.
@@ -127,7 +127,7 @@ pub enum Refusal {
     },
     /// Readings before and after a gap were not taken at the times of their joints.
     #[error(
-        "{bus}: after {at_s} s readings are {ms} ms older against their joints than elsewhere, so no pose can be trusted; \
+        "{bus}: after {at_s} s readings lag {ms} ms more behind their joints than elsewhere, so no pose can be trusted; \
          {disturbance}; record again with a loop that skips no ticks"
     )]
     Shifted {

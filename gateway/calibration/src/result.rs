@@ -171,13 +171,13 @@ impl core::fmt::Display for Diagnosis {
             Self::Dead => f.write_str("dead: it sent no acceleration; its description is kept"),
             Self::Stuck => f.write_str("stuck: it sent one acceleration only; its description is kept"),
             Self::Silent { share } => {
-                write!(f, "silent: {:.0} % of its readings came; check its wires", share * 100.0)
+                write!(f, "silent: only {:.0} % of its readings arrived; check its wires", share * 100.0)
             }
             Self::Still => f.write_str("no joint moves it; its description is kept"),
             Self::Joint { joint } => {
                 write!(
                     f,
-                    "joint {joint} explains its readings little better than another: move that joint more"
+                    "joint {joint} explains its readings only slightly better than another joint: move joint {joint} more"
                 )
             }
             Self::Loose { times } => {
@@ -192,7 +192,7 @@ impl core::fmt::Display for Diagnosis {
             Self::Elsewhere { node } => write!(f, "it sits where the skin has node {node}"),
             Self::NotObservable { position_mm, orientation_deg, help } => write!(
                 f,
-                "not observable: certain within {position_mm} mm and {orientation_deg} degrees; {help}; its description is kept"
+                "not observable: pose known only within {position_mm} mm and {orientation_deg} degrees; {help}; its description is kept"
             ),
         }
     }

@@ -10,7 +10,7 @@ use crate::result::{Calibration, FoundPlace};
 #[derive(Debug, Error)]
 pub enum WriteError {
     /// The text differs from that of the skin that was read.
-    #[error("the skin's text is not that of the skin that was read: {0}; calibrate again")]
+    #[error("the text of the skin file does not match the skin that was read: {0}; calibrate again")]
     Text(String),
 }
 
@@ -112,7 +112,7 @@ orientation = [0.0, 0.0, 0.0, 1.0]
         let error = calibrated_text(&skin, one, &calibration).unwrap_err();
         assert_eq!(
             error.to_string(),
-            "the skin's text is not that of the skin that was read: 1 cells, not 2; calibrate again"
+            "the text of the skin file does not match the skin that was read: it has 1 cells, not 2; calibrate again"
         );
     }
 }

@@ -52,7 +52,7 @@ impl core::fmt::Display for ZeroOffset {
             Some(offset) => write!(f, "{joint}: zero offset {offset} {unit}, standard deviation {deviation}"),
             None => write!(
                 f,
-                "{joint}: its zero offset is not observable: cells mounted differently would show the same"
+                "{joint}: its zero offset is not observable: cells mounted differently would give the same readings"
             ),
         }
     }

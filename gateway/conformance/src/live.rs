@@ -99,7 +99,9 @@ impl TestBus for SocketBus {
             let now = self.now();
             if self.inbox.dropped() > 0 {
                 let name = self.socket.name();
-                return Err(StopReason::Bus(format!("{name}: frames came faster than they were read")));
+                return Err(StopReason::Bus(format!(
+                    "{name}: frames were lost because they came faster than they were read"
+                )));
             }
             if count == 0 {
                 self.late = self.late.max(now.elapsed_since(before + wait));

@@ -124,9 +124,9 @@ impl Survey {
                 return Err(format!("cell {cell} on {name} fails SEND-1: {damaged}"));
             }
             let there = if others.is_empty() {
-                "nor any other".to_owned()
+                "nor does any other cell".to_owned()
             } else {
-                format!("only {}", others.join(", "))
+                format!("unlike {}", others.join(", "))
             };
             return Err(format!(
                 "cell {cell} sends nothing on {name}, {there}: switch it on, or give its actual node id"
@@ -142,14 +142,14 @@ impl Survey {
         }
         if !others.is_empty() && !tolerated {
             return Err(format!(
-                "other cells are on {name}: {}; joints and halts of the test reach them too: remove them, or say \
+                "other cells are on {name}: {}; joints and halts of the test reach them too: remove them, or use \
                  --others-will-stop",
                 others.join(", ")
             ));
         }
         match (present.format, asked) {
             (Some(sent), Some(asked)) if sent != asked => Err(format!(
-                "cell {cell} sends {} frames on {name}, not {}: say --format {}",
+                "cell {cell} sends {} frames on {name}, not {}: use --format {}",
                 sent.name(),
                 asked.name(),
                 sent.name()

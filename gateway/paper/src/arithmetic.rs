@@ -178,8 +178,8 @@ pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
     });
     Section::new("kernels", "Operations of one cell's Jacobian")
         .text(format!(
-            "Counted by running the cells' code on words that count what is done to them, on a {robot}. The wrench kernel \
-             carries the contact's force and moment down to the base; the paper carries frames up to the cell.",
+            "Counted by running the cells' code with numbers that count their operations, on a {robot}. The wrench kernel \
+             transforms the contact's force and moment down to the base; the paper transforms frames up to the cell.",
         ))
         .figures([figure
             .draw("wrench", Shape::Line, products(&costs.wrench))

@@ -135,7 +135,7 @@ fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     let ratio = ours.value / (paper_s * 1e9);
     [
         Finding::less_is_better(what, paper_s * 1e9, ours),
-        Finding::new_unrated(format!("{what}: ours by the paper's"), ratio),
+        Finding::new_unrated(format!("{what}: ratio of ours to the paper's"), ratio),
     ]
 }
 
@@ -160,7 +160,7 @@ fn logarithmic_figure(
     law: impl Fn(f64) -> f64,
 ) -> Figure {
     let law = (0..=100).map(|step| most * f64::from(step) / 100.0).map(|x| (x, law(x) * 1e6));
-    let title = format!("The same beside the paper's law ({equation})");
+    let title = format!("The same, compared with the paper's law ({equation})");
     let y = Axis::new("T_skin", "µs").log().with_ends(0.1, 10_000.0);
     Figure::new(format!("{}-paper", figure.name), title, figure.x.clone(), y)
         .draw("measured", Shape::Points, measured)
@@ -197,16 +197,16 @@ pub fn fig9(over: &TimesOverCells) -> Section {
              many rounds in random order, with the middle half of the measurements as a band.",
         )
         .text(format!(
-            "T_skin(N) = {} ns · N + {} ns, R² = {:.4}. The paper's law is 827 ns · N + 10730 ns, on a computer \
-             and in a program of its own: that the line is straight is the claim; its slope shows how fast \
-             the computer and the loop are.",
+            "T_skin(N) = {} ns · N + {} ns, R² = {:.4}. The paper's law is 827 ns · N + 10730 ns, on another \
+             computer with another program: the claim is that the line is straight; its slope depends on the speed of \
+             the computer and of the loop.",
             number(line.slope),
             number(line.intercept),
             line.quality
         ))
         .text(format!(
-            "By the paper's reasoning, (2 ms - 0.2 ms - start) / slope, this computer would hold {cells} cells; its law \
-             leads to 2163, which the paper rounds to 2160.",
+            "By the paper's reasoning, (2 ms - 0.2 ms - start) / slope, this computer could handle {cells} cells; the paper's law \
+             gives 2163, which the paper rounds to 2160.",
         ))
         .figures([fig9, papers])
         .findings(cost("T_skin for each cell (slope of Eq. 29)", line.slope_in("ns"), paper::CENTRAL_PER_CELL_S))
@@ -228,7 +228,7 @@ pub fn fig10(over: &TimesOverActive, cells: &TimesOverCells) -> Section {
         },
     );
     let micros: Vec<_> = points.iter().map(|point| (point.x, point.y * 1e-3)).collect();
-    let fig10 = figure("fig10", format!("T_skin over active cells, of {of}"), "active cells")
+    let fig10 = figure("fig10", format!("T_skin over the number of active cells, of {of}"), "active cells")
         .draw("median of touches", Shape::Points, micros.clone())
         .draw("linear fit", Shape::Line, line_points(line, most));
     let papers = logarithmic_figure(&fig10, "Eq. 30", micros, most, |active| {
@@ -253,8 +253,8 @@ pub fn fig10(over: &TimesOverActive, cells: &TimesOverCells) -> Section {
     });
     Section::new("fig10", "Fig. 10: central computation over the number of active cells")
         .text(format!(
-            "{of} cells, {touches} touches, each of a patch of cells of random size at a random place; the line is \
-             weighted with the number of touches, as the paper's is with the number of samples."
+            "{of} cells, {touches} touches, each on a patch of cells of random size at a random place; the line is \
+             weighted by the number of touches, as the paper's is by the number of samples."
         ))
         .text(format!(
             "T_skin(N_act, N) = {} ns · N_act + {} ns · N + {} ns (Eq. 31; the paper: 798, 827 and 10730 ns).",
@@ -296,7 +296,7 @@ mod tests {
         let active = TimesOverActive { cells: 253, points: points.to_vec(), line: over };
         let (nine, ten) = (fig9(&cells), fig10(&active, &cells));
         let all = || nine.findings.iter().chain(&ten.findings);
-        for finding in all().filter(|finding| finding.what.ends_with("ours by the paper's")) {
+        for finding in all().filter(|finding| finding.what.ends_with("ratio of ours to the paper's")) {
             assert!((finding.ours.value - 1.0).abs() < 1e-9, "{finding:?}");
         }
         let limits: Vec<_> = all().filter(|finding| finding.what.starts_with("most cells")).collect();

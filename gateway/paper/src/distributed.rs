@@ -191,7 +191,7 @@ pub(super) fn slope_findings(what: &str, over: &TickTimes) -> [Finding; 3] {
         Finding::new_unrated(format!("distributed tick for each {what}"), distributed.slope_in("ns"))
             .with_paper_value(0.0),
         Finding::new_unrated(
-            format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
+            format!("distributed slope over {what}s, upper 95 % limit, relative to the central slope"),
             (over.slope_ratio_at_most() * 100.0, "%"),
         )
         .with_requirement(
@@ -234,21 +234,21 @@ pub fn section(measured: &DistributedTimes) -> Section {
     ];
     Section::new("distributed", "The distributed way over cells and active cells")
         .text(format!(
-            "Up to {of} cells on {BUSES} buses. Of the distributed way the whole tick is timed: sums of all buses, controller, \
-             robot, joints. Of the central way only T_skin, the part that computes torques. Both in the same run, \
-             in random order. The robot is held where it is.",
+            "Up to {of} cells on {BUSES} buses. For the distributed way the whole tick is timed: sums of all buses, controller, \
+             robot, joints; for the central way only T_skin, the part that computes torques. Both are timed in the same run, \
+             in random order. The robot does not move.",
         ))
         .text(format!(
-            "A tick of the distributed way is given one sum of each bus and nothing of its cells, so only buses make it \
-             longer: {} ns each, whether they have cells or not. What becomes more with the cells is the receivers' work, in \
-             threads of their own: {} ns for a torque that came, once an epoch, and only of cells in contact. What the \
-             kernel takes to bring a frame to the receiver is not in that.",
+            "A tick of the distributed way receives one sum per bus and no data of single cells, so only more buses make it \
+             longer: {} ns each, with or without cells. More cells mean more work for the receivers, which run in \
+             threads of their own: {} ns per received torque, once per epoch, and only for cells in contact. The time that the \
+             kernel needs to deliver a frame to the receiver is not included.",
             number(buses.slope),
             number(*receiving)
         ))
         .figures([
             figure("distributed-cells", "Over cells, none active".to_owned(), "cells", cells),
-            figure("distributed-active", format!("Over active cells, of {of}"), "active cells", active),
+            figure("distributed-active", format!("Over the number of active cells, of {of}"), "active cells", active),
         ])
         .findings(slope_findings("cell", cells))
         .findings(slope_findings("active cell", active))

@@ -158,7 +158,7 @@ impl FromStr for Experiment {
         let found = Self::ALL.into_iter().find(|experiment| experiment.name() == name);
         found.ok_or_else(|| {
             let names: Vec<_> = Self::ALL.iter().map(|experiment| experiment.name()).collect();
-            format!("there is no experiment of this name; there are all, {}", names.join(", "))
+            format!("there is no experiment of this name: choose all, {}", names.join(", "))
         })
     }
 }

@@ -48,8 +48,8 @@ pub fn section() -> Section {
              numbers of skinbus fit, which shows more about one skin.",
         )
         .text(format!(
-            "The paper asks for time only. Transceivers drive about {MAX_NODES} nodes, one of which is the gateway: so the table has \
-             the buses that {cells} cells need by time, and how many they need by all limits, with what asks for so many."
+            "The paper considers time only. Transceivers can drive about {MAX_NODES} nodes, one of which is the gateway: so the table has \
+             the number of buses that {cells} cells need for time alone, and the number for all limits, with the limit that decides."
         ))
         .figures([figure.series(rows.iter().map(series)).marks(marks)])
         .findings(rows.iter().map(finding))
@@ -80,7 +80,7 @@ fn table(rows: &[RatesRow], cells: usize) -> Table {
         "buses needed",
     ];
     let title = format!(
-        "Worst case: load of one bus with {cells} cells, cells that a bus has time for, buses for {cells} cells"
+        "Worst case: load of one bus with {cells} cells, maximum cells per bus in time, and buses needed for {cells} cells"
     );
     Table::new(title, head, rows.iter().map(row))
 }

@@ -59,7 +59,7 @@ impl BenchRun {
     fn replies(&self) -> Finding {
         let due = self.summary_number(&["buses", "0", "replies", "due"]);
         let in_time = self.summary_number(&["buses", "0", "replies", "in_time"]);
-        Finding::new_unrated(format!("replies in time, of {due}"), in_time)
+        Finding::new_unrated(format!("replies in time, of {due} due"), in_time)
     }
 }
 
@@ -107,8 +107,8 @@ pub fn fig6(single: &BenchRun, summed: &BenchRun) -> Section {
     ];
     Section::new("fig6", title)
         .text(format!(
-            "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm yields to touches; up to {:.1} s \
-             the loop computes the torques itself as well.",
+            "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm yields to touches; until {:.1} s \
+             the loop also computes the torques itself.",
             single.cells(),
             single.switch_off_time_s().unwrap_or(f64::NAN)
         ))
@@ -124,7 +124,7 @@ pub fn fig6(single: &BenchRun, summed: &BenchRun) -> Section {
             cell.with_requirement("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
             sum,
             single.replies(),
-            Finding::new_unrated(format!("cells' torques that were in sums in time, of {summed_due}"), summed_in),
+            Finding::new_unrated(format!("cells' torques that arrived in sums in time, of {summed_due} due"), summed_in),
         ])
         .tables([Table::new(
             "Errors against the central computation, Nm",
@@ -141,7 +141,7 @@ fn joints_without_torque(run: &BenchRun) -> String {
     if bare.is_empty() {
         "Every joint has a torque.".to_owned()
     } else {
-        format!("No torque in joints {}, beyond which no cell sits.", bare.join(", "))
+        format!("No torque on joints {}, because no cell is mounted beyond them.", bare.join(", "))
     }
 }
 
@@ -232,8 +232,8 @@ pub fn fig8(run: &BenchRun) -> Section {
              it. Unlike the paper's, T_total does not hold the robot's own driver: the robot is simulated.",
         )
         .text(format!(
-            "The axis ends at twice the 99th percentile; {beyond} of {} ticks, in which the machine did something else, lie \
-             beyond and are in the data.",
+            "The axis ends at twice the 99th percentile; {beyond} of {} ticks, in which the machine was busy otherwise, lie \
+             beyond it, but are in the data.",
             run.rows.len()
         ))
         .figures([

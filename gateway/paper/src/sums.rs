@@ -159,7 +159,9 @@ pub fn section(skin: &Skin, errors: &[SumErrors]) -> Section {
     let of = skin.cells.len();
     let figure = Figure::new(
         "sums",
-        format!("Mean error of the summed torque over active cells of {of}, Q7.8, loaded joints"),
+        format!(
+            "Mean error of the summed torque over the number of active cells, of {of}, Q7.8, loaded joints"
+        ),
         Axis::new("active cells", "").log().with_ends(0.9, 300.0),
         Axis::new("mean absolute error", "Nm").log().with_ends(1e-5, 1.0),
     );
@@ -188,7 +190,7 @@ pub fn section(skin: &Skin, errors: &[SumErrors]) -> Section {
              carries what rounding took away into its next value errs more in one epoch and not at all in the long run.",
         )
         .text(format!(
-            "The paper's {} Nm is what cutting off gives for about twenty active cells.",
+            "The paper's {} Nm is the error that cutting off causes with about twenty active cells.",
             number(paper::SUMMED_ERROR_NM)
         ))
         .figures([figure.series(series)])

@@ -93,7 +93,7 @@ pub enum ImportError {
     },
     /// Cells on two different chains are assigned to the same bus.
     #[error(
-        "{}bus {bus:?} carries chain {first:?} already, and this cell sits on chain {second:?}: name another bus",
+        "{}bus {bus:?} already carries chain {first:?}, but this cell is on chain {second:?}: choose another bus",
         line_prefix(*line)
     )]
     Bus {
@@ -107,7 +107,7 @@ pub enum ImportError {
         second: String,
     },
     /// A bus has no node id left for a cell.
-    #[error("{}bus {bus:?} has no node id left: it has 254", line_prefix(*line))]
+    #[error("{}bus {bus:?} has no free node id: all 254 are used; choose another bus", line_prefix(*line))]
     Full {
         /// The line of the file of cells.
         line: usize,
@@ -115,7 +115,7 @@ pub enum ImportError {
         bus: String,
     },
     /// Two cells on one bus have the same node id.
-    #[error("{}node {node} of bus {bus:?} is that of line {first} already: give it another one, or none", line_prefix(*line))]
+    #[error("{}node {node} of bus {bus:?} is already used in line {first}: give this cell another node id, or none", line_prefix(*line))]
     Taken {
         /// The line of the file of cells.
         line: usize,
@@ -127,7 +127,7 @@ pub enum ImportError {
         first: usize,
     },
     /// The name of a bus is not valid for a network interface.
-    #[error("{}bus {bus:?}: its name has 1 to 15 letters, digits, `-`, `_` or `.`, and does not begin with `.`", line_prefix(*line))]
+    #[error("{}bus {bus:?}: its name must have 1 to 15 letters, digits, `-`, `_` or `.`, and must not begin with `.`", line_prefix(*line))]
     BusName {
         /// The line of the file of cells.
         line: usize,
@@ -136,7 +136,7 @@ pub enum ImportError {
     },
     /// A cell is too far from the joints that move it.
     #[error(
-        "{}position px,py,pz = {x},{y},{z} of link {link:?} can come {reach:.3} m from a frame of the rows below \
+        "{}position px,py,pz = {x},{y},{z} of link {link:?} can be up to {reach:.3} m from a frame of the rows below \
          it, if all joints turn freely; less than {MAX_REACH} m is possible: correct it, or choose a root nearer to the link",
         line_prefix(*line)
     )]

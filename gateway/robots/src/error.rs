@@ -34,14 +34,14 @@ pub enum RobotProblem {
     #[error("the file is empty; a URDF has a robot element with links and joints")]
     Empty,
     /// The file does not begin like an XML file.
-    #[error("not XML: a URDF begins with <?xml or <robot, and this does not; name the robot's URDF")]
+    #[error("not XML: a URDF begins with <?xml or <robot; name the robot's URDF")]
     NotXml,
     /// The file is not readable XML. The text says what is wrong and what to do.
     #[error("{0}")]
     Xml(String),
     /// The file is a xacro template, from which a URDF must be generated first.
     #[error(
-        "{what} is left: this is a xacro file, a template of a URDF. Make one with `xacrodoc {file} -o NEW.urdf` (pip install xacrodoc), and name that"
+        "{what} is not expanded: this is a xacro file, a template of a URDF. Generate the URDF with `xacrodoc {file} -o NEW.urdf` (pip install xacrodoc), and name that file"
     )]
     Xacro {
         /// The xacro element or expression.
@@ -53,7 +53,7 @@ pub enum RobotProblem {
     #[error("the outermost element is {0}; a URDF has `robot`: name the robot's URDF")]
     NotARobot(String),
     /// The file is an SRDF, which defines groups of a robot's joints.
-    #[error("an SRDF file, of MoveIt, which has no links: name the robot's URDF")]
+    #[error("this is an SRDF file (MoveIt), which has no links: name the robot's URDF")]
     Srdf,
     /// The robot has no links.
     #[error("the robot has no links; a URDF has at least one")]
@@ -111,7 +111,7 @@ pub enum RobotProblem {
         second: String,
     },
     /// A link is its own ancestor. The text names the link.
-    #[error("link {0:?} is above itself; links must be a tree: remove a joint of the cycle")]
+    #[error("link {0:?} is its own ancestor; links must form a tree: remove a joint of the cycle")]
     Cycle(String),
     /// Two links have no parent, so that the links form more than one tree.
     #[error(
@@ -132,7 +132,7 @@ pub enum RobotProblem {
         nearest: String,
     },
     /// The requested joint does not exist, or does not move by itself.
-    #[error("no joint {joint:?} moves; the nearest are {nearest}")]
+    #[error("there is no moving joint {joint:?}; the nearest are {nearest}")]
     NoSuchJoint {
         /// The requested name.
         joint: String,
@@ -141,7 +141,7 @@ pub enum RobotProblem {
     },
     /// The rows of a chain in a skin differ from those of the same chain in the file.
     #[error(
-        "behind joint {joint:?} it is not where chain {chain:?} of the skin has it: import the skin from this file again, or correct the rows"
+        "the link behind joint {joint:?} is not where chain {chain:?} of the skin has it: import the skin from this file again, or correct the rows"
     )]
     OtherRows {
         /// Name of the first joint that differs.
@@ -150,7 +150,7 @@ pub enum RobotProblem {
         chain: String,
     },
     /// The tip of the chain is not below its root.
-    #[error("link {tip:?} is not below {root:?}; the path to it is {path}: choose a root on it")]
+    #[error("link {tip:?} is not below {root:?}; the path to it is {path}: choose a root on that path")]
     NotBelow {
         /// Name of the tip link.
         tip: String,
@@ -171,7 +171,7 @@ pub enum RobotProblem {
     },
     /// The chain has too many joints.
     #[error(
-        "{count} joints move between {root:?} and {tip:?}; {MAX_JOINTS} are possible: choose a root or a tip nearer to the other"
+        "{count} joints move between {root:?} and {tip:?}; at most {MAX_JOINTS} are possible: choose a root or a tip nearer to the other"
     )]
     TooManyJoints {
         /// Number of joints of the chain.
@@ -183,7 +183,7 @@ pub enum RobotProblem {
     },
     /// The chain needs too many rows.
     #[error(
-        "the chain to {tip:?} needs {count} rows; {MAX_ROWS} are possible: choose a root or a tip nearer to the other"
+        "the chain to {tip:?} needs {count} rows; at most {MAX_ROWS} are possible: choose a root or a tip nearer to the other"
     )]
     TooManyRows {
         /// Number of rows that the chain needs.
@@ -193,7 +193,7 @@ pub enum RobotProblem {
     },
     /// A joint of the chain is of a type with several degrees of freedom.
     #[error(
-        "joint {joint:?} is {kind}; a chain has revolute, continuous, prismatic and fixed joints: choose a root below it, or a tip above it"
+        "joint {joint:?} is {kind}; a chain may only have revolute, continuous, prismatic and fixed joints: choose a root below it, or a tip above it"
     )]
     Kind {
         /// Name of the joint.
@@ -203,7 +203,7 @@ pub enum RobotProblem {
     },
     /// A joint of the chain mimics another joint.
     #[error(
-        "joint {joint:?} mimics {of:?}; the joints of a chain move by themselves: choose a tip above it, or make it fixed"
+        "joint {joint:?} mimics {of:?}; the joints of a chain must move independently: choose a tip above it, or make it fixed"
     )]
     Mimic {
         /// Name of the joint.
@@ -249,7 +249,7 @@ pub enum RobotProblem {
     },
     /// A cell on the chain can be farther from a joint than a cell can compute.
     #[error(
-        "link {link:?} can come {reach:.3} m from a frame of the rows below it, if all joints turn freely; less than {MAX_REACH} m is possible: choose a tip or a root nearer to the other"
+        "link {link:?} can be up to {reach:.3} m from a frame of the rows below it, if all joints turn freely; less than {MAX_REACH} m is possible: choose a tip or a root nearer to the other"
     )]
     Reach {
         /// Name of the link.
@@ -269,7 +269,7 @@ pub enum RobotProblem {
     },
     /// A requested link does not move, because it is before the first joint of the chain.
     #[error(
-        "link {link:?} is before the chain's first joint {joint:?} and moves with none; a cell needs a link behind it"
+        "link {link:?} is before the chain's first joint {joint:?}, so no joint moves it: put the cell on a link behind that joint"
     )]
     BeforeFirstJoint {
         /// Name of the link.

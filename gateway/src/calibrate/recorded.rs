@@ -8,7 +8,7 @@ use protocol::usage::Failure;
 pub(super) fn check_same_skin(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Failure> {
     let Some((what, is, was)) = difference(skin, recorded) else { return Ok(()) };
     Err(Failure::usage(format!(
-        "{name} was recorded with another skin: {what} {is}, recorded {was}; calibrate with the skin that was recorded"
+        "{name} was recorded with another skin: {what} {is}, but {was} in the recording; calibrate with the skin that was recorded"
     )))
 }
 

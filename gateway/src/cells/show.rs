@@ -136,15 +136,15 @@ impl<'a> CellList<'a> {
         text += if self.gateway_heard { ", and a gateway\n" } else { "\n" };
         let shared = self.cells.iter().filter_map(|cell| {
             let (node, one, other) = (cell.node, cell.other_serial?, cell.serial?);
-            Some(format!("{node} by the serial numbers {one} and {other}"))
+            Some(format!("{node} (serial numbers {one} and {other})"))
         });
         let shared: Vec<_> = shared.collect();
         if !shared.is_empty() {
-            text += &format!("node ids that two cells use: {}\n", abbreviated(&shared));
+            text += &format!("node ids used by two cells: {}\n", abbreviated(&shared));
         }
         let missing: Vec<_> = self.missing.iter().flatten().map(u8::to_string).collect();
         if !missing.is_empty() {
-            text += &format!("cells of {} that are missing: {}\n", self.file, abbreviated(&missing));
+            text += &format!("missing cells of {}: {}\n", self.file, abbreviated(&missing));
         }
         text
     }

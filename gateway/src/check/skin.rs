@@ -44,7 +44,7 @@ pub(super) fn summary(
     {
         let (file, buses) = (file.display(), comma_separated(bus_names(skin)));
         return Err(Failure::usage(format!(
-            "--cell {named}: {file} has no such cell on {buses}; --list lists all"
+            "--cell {named}: {file} does not have this cell on {buses}; --list lists all cells"
         )));
     }
     if as_json {
@@ -123,9 +123,12 @@ fn describe(skin: &Skin) -> String {
     }
     for [first, second] in coincident_cells(skin) {
         let name = |cell: &Cell| format!("{} on {}", cell.node, bus_name(skin, cell));
-        text += &format!("remark: cells {} and {} sit at the same place\n", name(first), name(second));
+        text += &format!("remark: cells {} and {} have the same position\n", name(first), name(second));
     }
-    text + &format!("hash: {:04X} over the parameters of all cells; --list lists each cell's\n", hash(skin))
+    text + &format!(
+        "hash: {:04X} over the parameters of all cells; --list shows the hash of each cell\n",
+        hash(skin)
+    )
 }
 
 /// Returns pairs of cells that have the same position.

@@ -76,8 +76,8 @@ impl<'a> DisplayedBus<'a> {
         let cells = format!("{} described", count_with_noun(self.cells.len(), "cell"));
         let others = match self.unknown_nodes.len() {
             0 => String::new(),
-            1 => "1 other, left alone".to_owned(),
-            count => format!("{count} others, left alone"),
+            1 => "1 other cell, left alone".to_owned(),
+            count => format!("{count} other cells, left alone"),
         };
         rows.add_section(format!("{} ({})", self.name, self.kind), cells, others);
         let compared = "read back, and compared word by word";
@@ -122,22 +122,23 @@ impl CommissionResult<'_> {
                 match belongs {
                     None => unknown_nodes.push(format!("{node} (serial number {serial})")),
                     Some(other) => elsewhere.push(format!(
-                        "cell {node} on {name} (serial number {serial}) belongs to {other} by {file}; left alone"
+                        "cell {node} on {name} (serial number {serial}) belongs to {other} according to {file}; left alone"
                     )),
                 }
             }
             if !unknown_nodes.is_empty() {
                 let unknown_nodes = abbreviated(&unknown_nodes);
-                notes.push(format!("cells on {name} that {file} does not have, left alone: {unknown_nodes}"));
+                notes.push(format!("cells on {name} that are not in {file}, left alone: {unknown_nodes}"));
             }
             notes.extend(elsewhere);
             let moved = bus.renumbered_cells().count();
             if moved > MAX_CELL_LINES {
-                let copy = if has_copy { "" } else { "; --node-ids FILE writes a copy with theirs" };
-                notes.push(format!("{moved} cells have other node ids on {name} than in {file}{copy}"));
+                let copy =
+                    if has_copy { "" } else { "; --node-ids FILE writes a copy of the skin with their ids" };
+                notes.push(format!("{moved} cells have different node ids on {name} than in {file}{copy}"));
             } else {
                 notes.extend(bus.renumbered_cells().map(|(node, CellReport { serial, described, .. })| {
-                    format!("the cell with serial number {serial} is {node} on {name}, {described} in {file}")
+                    format!("the cell with serial number {serial} has node id {node} on {name}, but {described} in {file}")
                 }));
             }
         }
@@ -169,8 +170,10 @@ impl CommissionResult<'_> {
         }
         match (self.interrupted, failed) {
             (_, 0) => Ok(()),
-            (true, _) => Err(Failure::run(format!("interrupted: {what}; run it again to go on"))),
-            (false, _) => Err(Failure::run(format!("{what}, see the table; fix that and run it again"))),
+            (true, _) => Err(Failure::run(format!("interrupted: {what}; run the command again to continue"))),
+            (false, _) => {
+                Err(Failure::run(format!("{what}: see the table, fix the causes and run the command again")))
+            }
         }
     }
 }

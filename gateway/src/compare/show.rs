@@ -197,7 +197,7 @@ impl ComparisonText<'_> {
         let cell = first.cell.map_or_else(String::new, |cell| format!(" of cell {cell}"));
         let joint = first.joint.map_or_else(String::new, |joint| format!(", joint {joint}"));
         let mut text = format!(
-            "the first difference: {what}{cell} on {}{joint}, epoch {epoch} (number {number})\n",
+            "the first difference: {what}{cell} on {}{joint}, epoch {epoch} (joint broadcast {number})\n",
             printable(bus)
         );
         for (letter, which) in [("A", CaptureSide::A), ("B", CaptureSide::B)] {
@@ -223,12 +223,12 @@ impl ComparisonText<'_> {
             let inputs = match (first.inputs.as_slice(), first.unknown_inputs.as_slice()) {
                 ([], []) => "the inputs are the same: joints, halt, stimulus, configuration".to_owned(),
                 ([], unknown) => {
-                    format!("no input is known to differ; not known: {}", comma_separated(unknown))
+                    format!("no known input differs; unknown inputs: {}", comma_separated(unknown))
                 }
-                (inputs, []) => format!("other inputs: {}", comma_separated(inputs)),
+                (inputs, []) => format!("different inputs: {}", comma_separated(inputs)),
                 (inputs, unknown) => {
                     format!(
-                        "other inputs: {}; not known: {}",
+                        "different inputs: {}; unknown inputs: {}",
                         comma_separated(inputs),
                         comma_separated(unknown)
                     )

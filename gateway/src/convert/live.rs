@@ -136,9 +136,9 @@ impl GrowingCapture {
         match &self.part {
             Some(_) => {
                 let part = format!("{}.part", self.path.display());
-                format!("the part written before is in {part}: `skinbus recover {part}` repairs it")
+                format!("the data written so far is in {part}: `skinbus recover {part}` repairs it")
             }
-            None => format!("{} holds the part written before", self.path.display()),
+            None => format!("{} holds the data written so far", self.path.display()),
         }
     }
 
@@ -215,7 +215,7 @@ pub(super) fn check_part_file(path: &Path) -> io::Result<()> {
             part.display()
         ))),
         Ok(_) => Err(io::Error::other(format!(
-            "{0} was left by a program that was killed: `skinbus recover {0}`, then move it away",
+            "{0} was left by a program that was killed: recover it with `skinbus recover {0}`, then move it away",
             part.display()
         ))),
         Err(_) => Ok(()),

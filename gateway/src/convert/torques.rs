@@ -61,7 +61,7 @@ fn format_number(value: f64) -> String {
 }
 
 struct TorqueRows<W: Write> {
-    /// True for each joint that a chain of a bus with sums moves.
+    /// True for each joint whose chain belongs to a bus with sums.
     summed: Vec<bool>,
     out: Writer<W>,
 }

@@ -66,7 +66,7 @@ pub(super) struct FrameOutput<W> {
     remaining: u64,
     /// Buses named by the filters from which no frame has come.
     absent: Vec<String>,
-    /// Time in ns since 1970 from which seconds count; `None` until it is known or the first frame comes.
+    /// Start of the counted seconds, in ns since 1970; `None` until it is known or the first frame comes.
     zero: Option<u64>,
     raw: String,
 }

@@ -36,7 +36,7 @@ impl ResultFolder {
         if taken && !overwrite.overwrite {
             let path = path.display();
             return Err(Failure::usage(format!(
-                "-o {path}: there is something in it: name another folder, or overwrite files in it with --overwrite"
+                "-o {path}: the folder is not empty: name another folder, or overwrite files in it with --overwrite"
             )));
         }
         let inside = path.join(format!(".experiment.{}.part", std::process::id()));
@@ -120,7 +120,7 @@ mod tests {
             assert_eq!(fs::read_to_string(path.join("report.html")).unwrap(), text);
         }
         let refused = ResultFolder::create(&path, kept).unwrap_err();
-        assert!(format!("{refused:?}").contains("there is something in it"), "{refused:?}");
+        assert!(format!("{refused:?}").contains("the folder is not empty"), "{refused:?}");
         let folder = ResultFolder::create(&path, forced).unwrap();
         folder.write("report.html", "third").unwrap();
         drop(folder);

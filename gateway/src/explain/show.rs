@@ -124,7 +124,7 @@ fn format_one_line_per_cell(cells: &[CellExplained], is_finest: bool) -> String 
     let joints = |cell: &CellExplained| cell.rows.iter().map(|row| row.joint).collect::<Vec<_>>();
     let tables = cells.chunk_by(|one, other| joints(one) == joints(other)).map(torques);
     format!(
-        "\ntorques of the cells{unit}, and the largest difference in steps of {steps}; --cell shows each step\n{}",
+        "\ntorques of the cells{unit}, with the largest difference in steps of {steps}; --cell shows the whole computation\n{}",
         tables.collect::<String>()
     )
 }
@@ -209,7 +209,7 @@ fn verdict_info(verdict: &WordVerdict) -> (u8, &'static str, Option<String>) {
     match verdict {
         WordVerdict::Nearest => (0, "nearest", None),
         WordVerdict::Rounded { .. } => {
-            let means = "a J so many steps of 2^-14 m from the exact one gives this word";
+            let means = "a J this many steps of 2^-14 m from the exact one gives this word";
             (1, "16 bits", Some(means.to_owned()))
         }
         WordVerdict::Saturated => {
@@ -219,7 +219,7 @@ fn verdict_info(verdict: &WordVerdict) -> (u8, &'static str, Option<String>) {
         WordVerdict::Open => (3, "open", None),
         WordVerdict::Unexplained => {
             let means = format!(
-                "no J within {MAX_JACOBIAN_ERROR_STEPS} steps, and one for each row after the sixth, of the exact one gives this word"
+                "no J within {MAX_JACOBIAN_ERROR_STEPS} steps of the exact one, plus one step for each row after the sixth, gives this word"
             );
             (4, "NOT EXPLAINED", Some(means))
         }
@@ -288,15 +288,15 @@ fn force_steps(force: &ForceSteps, zero: u64) -> String {
 fn format_force_origin(origin: &ContactOrigin, zero: u64) -> String {
     let at = |nanos: u64| format!("{:.6}", seconds_since(zero, nanos));
     match *origin {
-        ContactOrigin::Start { at_ns } => format!("it started at {} s", at(at_ns)),
-        ContactOrigin::Mode { at_ns } => format!("its mode was written at {} s", at(at_ns)),
-        ContactOrigin::Said { at_ns } => format!("it reported so itself at {} s", at(at_ns)),
+        ContactOrigin::Start { at_ns } => format!("its start at {} s", at(at_ns)),
+        ContactOrigin::Mode { at_ns } => format!("the write of its mode at {} s", at(at_ns)),
+        ContactOrigin::Said { at_ns } => format!("its own report at {} s", at(at_ns)),
         ContactOrigin::Stimulus { at_ns, from_epoch: None, .. } => {
-            format!("stimulus of {} s, from the next joints on", at(at_ns))
+            format!("the stimulus at {} s, in effect from the next joints on", at(at_ns))
         }
         ContactOrigin::Stimulus { at_ns, from_epoch: Some(epoch), late } => {
             let late = if late { ", late" } else { "" };
-            format!("stimulus of {} s, from epoch {epoch} on{late}", at(at_ns))
+            format!("the stimulus at {} s, in effect from epoch {epoch} on{late}", at(at_ns))
         }
     }
 }
@@ -362,7 +362,7 @@ fn totals(total: &[JointTotal], is_finest: bool) -> String {
         ]
     });
     format!(
-        "\nthe whole skin: the words of the frames added up, beside the central computation\n{}",
+        "\nthe whole skin: sums of the words in the frames, and the central computation\n{}",
         table(head.map(str::to_owned).to_vec(), lines, false)
     )
 }

@@ -63,7 +63,7 @@ impl TorqueOptions {
         as_json: bool,
     ) -> Result<(), Failure> {
         let [file] = files else {
-            return Err(Failure::usage("--force and --batch are for one skin: name one file"));
+            return Err(Failure::usage("--force and --batch need exactly one skin: name one file"));
         };
         let skin = skin_in(file)?;
         let calculator = Calculator::new(&skin);
@@ -118,7 +118,9 @@ impl<'a> Calculator<'a> {
             );
         }
         if rows.is_empty() {
-            return Err(Failure::usage(format!("{file}: there is no row in it: write a line for each")));
+            return Err(Failure::usage(format!(
+                "{file}: it contains no rows: write a line for each computation"
+            )));
         }
         Ok(rows)
     }
@@ -143,7 +145,7 @@ impl<'a> Calculator<'a> {
         let joints: Vec<_> = skin.joints_on_bus(cell.bus).map(|(_, joint)| joint).collect();
         if !(0.0..=MAX_FORCE_N).contains(&force) {
             return Err(format!(
-                "force {force} N: a force presses against the outward normal with 0 to {MAX_FORCE_N:.3} N, the range of \
+                "force {force} N: the force against the outward normal can be 0 to {MAX_FORCE_N:.3} N, the range of \
                  three contact words"
             ));
         }
@@ -152,7 +154,7 @@ impl<'a> Calculator<'a> {
             let names = joints.iter().map(|joint| joint.name.as_str()).collect::<Vec<_>>().join(", ");
             let (got, needed) =
                 (count_with_noun(given.len(), "position"), count_with_noun(joints.len(), "joint"));
-            return Err(format!("{got} given: one is needed for each of the chain's {needed}, {names}"));
+            return Err(format!("{got} given, but one is needed for each of the chain's {needed}: {names}"));
         }
         let mut q = Vec::with_capacity(given.len());
         let mut words = [Q1_14::ZERO; MAX_JOINTS];
@@ -175,7 +177,7 @@ impl<'a> Calculator<'a> {
             };
             if !(min..=max).contains(&position) {
                 return Err(format!(
-                    "position {text} {unit}: {} takes {min:.4} to {max:.4} {unit}",
+                    "position {text} {unit}: {} allows {min:.4} to {max:.4} {unit}",
                     joint.name
                 ));
             }

@@ -53,7 +53,7 @@ impl FitCommand {
         };
         if self.data.is_some() && !formats.contains(&Format::Fd) {
             return Err(Failure::usage(
-                "--data is for CAN FD, and here all buses are classic: leave it out, or add --format fd",
+                "--data is only for CAN FD, but all buses are classic: leave it out, or add --format fd",
             ));
         }
         let rates = |format| match (format, self.data) {
@@ -62,7 +62,7 @@ impl FitCommand {
             (Format::Fd, None) => {
                 BitRates::classic(nominal).map_err(Failure::usage)?;
                 Err(Failure::usage(format!(
-                    "CAN FD needs a data bit rate: add --data, {nominal} to {}, or --format classic",
+                    "CAN FD needs a data bit rate: add --data with {nominal} to {} bit/s, or --format classic",
                     BitRates::MAX_DATA_BIT_RATE
                 )))
             }

@@ -44,15 +44,18 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
     let cells = skin.cells.len();
     let bus = match skin.buses.len() {
         1 => format!("{cells} cells on one bus"),
-        buses => format!("{cells} cells on {buses} buses, here the fullest with {}", case.answers.cells()),
+        buses => format!(
+            "{cells} cells on {buses} buses, here for the fullest bus (cells: {})",
+            case.answers.cells()
+        ),
     };
     format!(
         "{}: {bus}, joints every {} ms, a cell computes {} µs\n{table}\n\
          load    worst case: all cells answer; joints, {}, heartbeats{}\n\
-         last    from the joints' turn on the bus to the end of the last answer at most\n\
-         cells   that a bus has time for; transceivers drive about {}\n\
-         buses   for {cells} cells, and what asks for so many: time or nodes\n\
-         roots   sums with only the roots on this bus; sums of all cells save no frame\n",
+         last    longest time from when the joints are due to the end of the last answer\n\
+         cells   number that a bus has time for; transceivers drive about {}\n\
+         buses   number needed for {cells} cells, and the limit that decides it: time or nodes\n\
+         roots   sums if only roots are on this bus; with all cells on it, sums save no frames\n",
         printable(&skin.name),
         millis(case.period_ns),
         micros(case.computation_ns),

@@ -87,13 +87,15 @@ impl FitCommand {
             0 => return Ok(false),
             files if files < self.sources.len() => {
                 return Err(Failure::usage(format!(
-                    "{name}: name one file, the parts of one recording, or buses without a file"
+                    "{name}: name one file, the parts of one recording, or only buses"
                 )));
             }
             _ => {}
         }
         if self.duration.is_some() {
-            return Err(Failure::usage(format!("--duration is for live buses, and {name} is a file")));
+            return Err(Failure::usage(format!(
+                "--duration is only for live buses, but {name} is a file: leave it out"
+            )));
         }
         self.sources.iter().find(|source| source.is_dir()).map_or(Ok(true), |folder| {
             Err(Failure::usage(format!(

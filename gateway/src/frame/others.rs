@@ -79,7 +79,7 @@ impl Args for OtherPageOptions {
                     .conflicts_with_all(
                         SKIN_PAGE_OPTIONS.into_iter().chain(pages.map(|(_, field)| field.bare_name())),
                     )
-                    .help(format!("{}{rest}{unit}, instead of a touch", first.to_uppercase())),
+                    .help(format!("{}{rest}{unit}; sent instead of a touch", first.to_uppercase())),
             )
         })
     }

@@ -39,7 +39,7 @@ pub(super) enum PacketCommand {
   skinbus frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
   skinbus frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
 pub(super) struct JointsCommand {
-    /// Number of this broadcast, 0 to 255; cells drop a repetition of the last one
+    /// Number of this broadcast, 0 to 255; cells ignore a repetition of the last number
     #[arg(long, value_name = "E")]
     epoch: u8,
     #[command(flatten)]
@@ -73,7 +73,7 @@ pub(super) struct StimulusCommand {
     /// Force of the touch in N, divided among the three contact words
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<String>,
-    /// From 0 (nothing near) to 1
+    /// Proximity from 0 (nothing near) to 1
     #[arg(long, value_name = "P", allow_negative_numbers = true)]
     proximity: Option<String>,
     /// The two temperatures in degrees Celsius
@@ -81,7 +81,7 @@ pub(super) struct StimulusCommand {
     temperature: Option<Vec<String>>,
     #[command(flatten)]
     others: OtherPageOptions,
-    /// Take effect with the joints of this epoch [default: with the next joints]
+    /// Epoch of the joints with which the stimulus takes effect [default: the next joints]
     #[arg(long, value_name = "E")]
     epoch: Option<u8>,
 }
@@ -237,7 +237,7 @@ fn parse_option_value<T>(
 /// Parses a value of a sensor field.
 fn sensor_value<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
     let field = layouts().flat_map(|layout| &layout.fields).find(|field| field.name == name);
-    let field = field.ok_or_else(|| format!("{option}: cells measure no {name}"))?;
+    let field = field.ok_or_else(|| format!("{option}: cells do not measure {name}"))?;
     let word = parse_option_value(option, text, |text| {
         parameter::parse_finite(text).and_then(|_| parameter::parse_value(field, text))
     })?;
@@ -264,7 +264,7 @@ fn force_words(text: &str) -> Result<[Q5_10; 3], String> {
     let sum: f64 = words.into_iter().map(Q::to_f64).sum();
     if (sum - force).abs() > 1.0 / 1_024.0 {
         let [min, max] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
-        return Err(format!("--force {text}: three contact words hold {min} to {max:.3} N"));
+        return Err(format!("--force {text}: use {min} to {max:.3} N, the range of three contact words"));
     }
     Ok(words)
 }
@@ -299,7 +299,7 @@ mod tests {
         );
         assert_eq!(
             says("stimulus --cell 12 --force 96"),
-            "--force 96: three contact words hold -96 to 95.997 N"
+            "--force 96: use -96 to 95.997 N, the range of three contact words"
         );
         assert_eq!(says("stimulus --cell 12 --force nan"), "--force nan: it must be a number");
         assert_eq!(says("stimulus --cell 12 --proximity -0.1"), "--proximity -0.1: proximity is 0 to 1");

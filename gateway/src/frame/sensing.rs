@@ -25,7 +25,7 @@ use model::decode::pick::NodeSelector;
   skinbus frame sensing continuous 62.5 --cell 12 --bus vcan0
   skinbus frame sensing off --skin skin.toml")]
 pub(super) struct SensingCommand {
-    /// Times at which cells send their sensor values
+    /// Mode in which cells send their sensor values
     #[arg(value_parser = one_of_values(MODES))]
     mode: SensingMode,
     /// Rate in continuous mode: frames per second of each cell
@@ -78,7 +78,7 @@ impl SensingCommand {
                 Err("continuous needs a rate, such as `continuous 62.5`".to_owned())
             }
             (SensingMode::Off | SensingMode::Event, Some(hz)) => {
-                Err(format!("HZ = {hz}: only continuous has a rate; leave it out"))
+                Err(format!("HZ = {hz}: only the mode continuous has a rate: leave it out"))
             }
         }
     }

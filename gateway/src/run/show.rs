@@ -318,13 +318,16 @@ fn add_sum_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     }
     if is_verbose {
         let on_the_bus = counts.received + bus.uplink.unheard;
-        let taken =
-            format!("the gateway took {}: the tree saves it frames, but not a shared bus", counts.received);
+        let taken = format!(
+            "the gateway received {}: the tree relieves the gateway, but not a shared bus",
+            counts.received
+        );
         rows.add_row("sums on the bus, of all cells", on_the_bus, taken);
     }
     let Some(network) = &bus.network else { return };
     if is_verbose || network.tree_ready_s.is_none() {
-        let tree_ready = or_else_text(network.tree_ready_s.map(|s| format!("in {s:.2} s")), "never complete");
+        let tree_ready =
+            or_else_text(network.tree_ready_s.map(|s| format!("complete in {s:.2} s")), "never complete");
         let changes = count_with_noun(network.parent_changes, "change");
         rows.add_row("tree, wires deep", network.deepest, format!("{tree_ready}, {changes} of parents"));
     }
@@ -459,12 +462,12 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
             rows.add_row("private memory of a cell process", format!("{kib} KiB"), "the largest");
         }
         if let Some(kib) = summary.memory.gateway_private_kib {
-            let buses = summary.memory.buses_private_kib.map(|kib| format!("its servers of buses {kib} KiB"));
+            let buses = summary.memory.buses_private_kib.map(|kib| format!("its bus servers {kib} KiB"));
             rows.add_row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
         }
         rows.add_row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
     } else {
-        rows.add_section("processor", format!("{cores} cores"), format!("of them {cells:.3} for cells"));
+        rows.add_section("processor", format!("{cores} cores"), format!("{cells:.3} of them for cells"));
     }
     let Some(recording) = &summary.recording else { return };
     for file in &recording.files {

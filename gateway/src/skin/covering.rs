@@ -20,10 +20,10 @@ pub(super) struct CoverArguments {
     /// Distance between the centers of neighbouring cells in m, 0.001 to 1
     #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = parse_pitch, allow_negative_numbers = true)]
     pitch: f64,
-    /// Treat these links as absent: their visuals are not read, and cells may lie where they are
+    /// Treat these links as absent: their visuals are not read, and cells may be placed where they are
     #[arg(long, value_name = "LINK,..", requires = "cover", value_delimiter = ',', value_parser = parse_link_name)]
     leave_out: Vec<String>,
-    /// A box in the frame of a covered link that holds no cell, in m; may be given several times
+    /// A box without cells, in m in the frame of a covered link; may be given several times
     #[arg(long, value_name = "LINK:MINX,MINY,MINZ,MAXX,MAXY,MAXZ", requires = "cover", value_parser = keep_out)]
     keep_out: Vec<ExcludedBox>,
     /// Random seed: the same seed gives the same cells
@@ -50,7 +50,7 @@ const PITCH: RangeInclusive<f64> = MIN_PITCH..=MAX_PITCH;
 
 fn parse_pitch(text: &str) -> Result<f64, String> {
     let pitch = text.parse().ok().filter(|pitch| PITCH.contains(pitch));
-    pitch.ok_or_else(|| format!("a length from {MIN_PITCH} to {MAX_PITCH} m"))
+    pitch.ok_or_else(|| format!("use a length from {MIN_PITCH} to {MAX_PITCH} m"))
 }
 
 /// Parses the name of a link, and removes surrounding blanks.
@@ -114,7 +114,7 @@ impl CoverArguments {
         {
             let file = &urdf.file;
             return Err(Failure::usage(format!(
-                "--cover {bare}: {file} has no visual of this link: add one, or take the link out of --cover"
+                "--cover {bare}: {file} has no visual for this link: add one, or take the link out of --cover"
             )));
         }
         let mut covered = CoverResult { cells: Vec::new(), figures: Vec::new() };
@@ -176,9 +176,9 @@ impl CoverArguments {
             }
             urdf.pose(name, &|_| 0.0).map_err(|error| wrong(error.to_string()))?;
             let owner = chains.iter().position(|chain| chain.link(name).is_ok());
-            owners.push(owner.ok_or_else(|| {
-                wrong(format!("no chain moves this link: those that a chain moves are {}", moved()))
-            })?);
+            owners.push(
+                owner.ok_or_else(|| wrong(format!("no chain moves this link: use one of {}", moved())))?,
+            );
         }
         for name in &self.leave_out {
             let wrong = |why: String| Failure::usage(format!("--leave-out {name}: {why}"));
@@ -244,9 +244,7 @@ fn no_cells_reason(LinkFigures { name, outer_area, kept_out, .. }: &LinkFigures,
         "the boxes of --keep-out leave nothing of it: make them smaller, or take the link out of --cover"
             .to_owned()
     } else {
-        format!(
-            "there is no room for a cell on its {outer_area:.4} m2: lower the pitch, or take the link out of --cover"
-        )
+        format!("no cell fits on its {outer_area:.4} m2: lower the pitch, or take the link out of --cover")
     };
     format!("--cover {name}: {why}")
 }
@@ -257,7 +255,7 @@ pub(super) fn figures_text(figures: &LinkFigures) -> String {
     let spacing =
         spacing.map_or_else(String::new, |metres| format!("; {:.1} mm from cell to cell", metres * 1e3));
     format!(
-        "{name}: {}, {:.1} % of {outer_area:.4} m2 covered{spacing}; tilted by {:.1} degrees at most",
+        "{name}: {}, {:.1} % of {outer_area:.4} m2 covered{spacing}; cells tilted by at most {:.1} degrees",
         count_with_noun(*cells, "cell"),
         covered * 100.0,
         tilt.to_degrees()

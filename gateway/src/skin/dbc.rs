@@ -54,7 +54,7 @@ impl DbcCommand {
             (None, buses) => {
                 let many = buses.len();
                 return Err(Failure::usage(format!(
-                    "{file} has {many} buses, and a DBC describes one: add --bus with one of {}",
+                    "{file} has {many} buses, but a DBC file describes one: add --bus with one of {}",
                     names()
                 )));
             }
@@ -63,8 +63,8 @@ impl DbcCommand {
         match (description.format, self.joined) {
             (Format::Classic, false) => {
                 return Err(Failure::usage(format!(
-                    "bus {} is classic: a packet is several frames under one identifier, which a DBC cannot \
-                     tell apart; --joined describes their bytes joined, for a program that joins them first",
+                    "bus {} is classic: a packet consists of several frames with one identifier, which a DBC cannot \
+                     tell apart; --joined describes the joined bytes of these frames, for a program that joins them first",
                     description.name
                 )));
             }

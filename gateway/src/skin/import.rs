@@ -43,7 +43,7 @@ pub(super) struct ImportCommand {
     /// First link of all chains [default: the robot's root]
     #[arg(long, value_name = "LINK")]
     root: Option<String>,
-    /// Places of the cells
+    /// CSV file with the positions of the cells
     #[arg(long, value_name = "CELLS.csv")]
     places: Option<PathBuf>,
     #[command(flatten)]
@@ -134,7 +134,7 @@ fn chain_text(chain: &UrdfChain) -> String {
         (count_with_noun(chain.joints.len(), "joint"), count_with_noun(chain.rows.len(), "row"));
     let names = comma_separated(chain.joints.iter().map(|joint| &joint.name));
     format!(
-        "{} to {}: {joints} ({names}) in {rows}; rows and URDF differ by {:.1e} m or rad at most",
+        "{} to {}: {joints} ({names}) in {rows}; rows and URDF differ by at most {:.1e} m or rad",
         chain.root, chain.tip, chain.residual
     )
 }
@@ -149,7 +149,7 @@ fn suspicious_limits(chain: &UrdfChain) -> impl Iterator<Item = String> {
     wide.map(|joint| {
         let [lower, upper] = joint.limits;
         format!(
-            "joint {}: limits of {lower} to {upper} rad, more than four turns each way: if these are degrees, correct them",
+            "joint {}: limits of {lower} to {upper} rad are more than four turns: if they are in degrees, convert them to rad",
             joint.name
         )
     })
@@ -188,7 +188,7 @@ fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
     }
     if cells.is_empty() {
         return Err(Failure::usage(format!(
-            "{file}: there is no cell in it: write a line for each, or leave --places out"
+            "{file}: it contains no cells: write a line for each, or leave --places out"
         )));
     }
     Ok(cells)

@@ -34,8 +34,11 @@ pub(super) fn required_token(
     match chosen {
         Some(token) => Ok(Some(token)),
         None if acts || !listen.ip().is_loopback() => {
-            let failed =
-                |error| Failure::run(format!("no random token for the page: {error}; give a --token-file"));
+            let failed = |error| {
+                Failure::run(format!(
+                    "cannot create a random token for the page: {error}; give one with --token-file"
+                ))
+            };
             Token::random().map(Some).map_err(failed)
         }
         None => Ok(None),

@@ -245,7 +245,10 @@ fn wrong_use_is_one_line_and_exit_code_2() {
             "invalid value '300' for '--cell <[BUS:]NODE>': a node id, 1 to 254, BUS:NODE, or everyone is possible; \
              try '--help'",
         ),
-        ("frame stimulus --cell 12 --force 100", "--force 100: three contact words hold -96 to 95.997 N"),
+        (
+            "frame stimulus --cell 12 --force 100",
+            "--force 100: use -96 to 95.997 N, the range of three contact words",
+        ),
         (
             "frame stimulus",
             "the following required arguments were not provided: --cell <[BUS:]NODE>; try '--help'",
@@ -267,20 +270,17 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         ("check /nowhere.toml", "/nowhere.toml: No such file or directory (os error 2)"),
         (
             "run skin.toml scenario.toml",
-            "scenario.toml comes after the skin: a scenario is given by --scenario scenario.toml",
+            "unexpected argument scenario.toml after the skin: to use a scenario, write --scenario scenario.toml",
         ),
         ("skin chek", "unrecognized subcommand 'chek'; try '--help'"),
-        (
-            "dump nosuch.mcap",
-            "there is no file nosuch.mcap, and no bus of that name: name the path of the file",
-        ),
-        ("dump a/b.log", "there is no file a/b.log, and no bus of that name: name the path of the file"),
+        ("dump nosuch.mcap", "there is no file nosuch.mcap, and no bus of this name: correct the path"),
+        ("dump a/b.log", "there is no file a/b.log, and no bus of this name: correct the path"),
     ] {
         assert_eq!(refusal(arguments, 2), format!("skinbus: {expected}"), "{arguments}");
     }
     for command in ["dump", "fit"] {
         let said = refusal(&format!("{command} nosuch --bus-kind embedded"), 2);
-        let expected = "skinbus: there is no file nosuch, and as a bus: no embedded bus nosuch is served in ";
+        let expected = "skinbus: there is no file nosuch, and it does not open as a bus: no embedded bus nosuch is served in ";
         assert!(said.starts_with(expected), "{said}");
     }
     let said = refusal("list", 2);
@@ -330,7 +330,7 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
     assert!(line.ends_with(&format!(" ports - - - - root serial 200001 hash {hash:04X}")), "{line}");
     assert_eq!(output(gateway(&format!("check --cell 2 {}", file.display()))).lines().count(), 1);
     let said = refusal(&format!("check --cell 9 {}", file.display()), 2);
-    assert!(said.ends_with("has no such cell on vcan0, vcan1; --list lists all"), "{said}");
+    assert!(said.ends_with("does not have this cell on vcan0, vcan1; --list lists all cells"), "{said}");
 }
 
 #[test]
@@ -344,7 +344,7 @@ fn a_check_shows_bit_rates_and_cells_at_one_place() {
     std::fs::write(&file, format!("{text}\n{another}")).unwrap();
     let shown = output(gateway(&format!("check {}", file.display())));
     assert!(shown.contains("bus vcan0 (fd, 500000 bit/s, torque): 2 cells"), "{shown}");
-    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 sit at the same place"), "{shown}");
+    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 have the same position"), "{shown}");
 }
 
 /// Checks a scenario file beside a skin of three cells. Returns the output.
@@ -411,7 +411,10 @@ fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
     );
     let drop = "[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\n";
     let refused = said(drop);
-    assert!(refused.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s: a run"), "{refused}");
+    assert!(
+        refused.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s works only in virtual time"),
+        "{refused}"
+    );
 }
 
 #[test]
@@ -434,7 +437,7 @@ fn a_report_says_that_it_is_no_recording_before_that_the_page_is_there() {
     std::fs::write(&file, "{}").unwrap();
     std::fs::write(file.with_extension("html"), "").unwrap();
     let said = refusal(&format!("report {}", file.display()), 2);
-    assert!(said.contains("x.json is a log, and frames alone are not enough"), "{said}");
+    assert!(said.contains("x.json is a log, which has only frames"), "{said}");
 }
 
 fn names(directory: &Path) -> Vec<String> {

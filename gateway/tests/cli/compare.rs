@@ -189,7 +189,7 @@ fn standard_input_is_one_of_the_two() {
     let Output { status, stderr, .. } = child.stdin(Stdio::from(file)).output().unwrap();
     let said = String::from_utf8(stderr).unwrap();
     assert_eq!(status.code(), Some(2), "{said}");
-    assert!(said.contains("have two skins"), "{said}");
+    assert!(said.contains("have different skins"), "{said}");
 }
 
 #[test]
@@ -214,20 +214,20 @@ fn two_skins_and_what_is_no_capture_are_refused_in_one_line() {
     );
     fs::write(folder.join("moved.toml"), moved).unwrap();
     for (arguments, code, begin) in [
-        ("fd.mcap sums.mcap", 2, "fd.mcap and sums.mcap have two skins: cells 3, in the other 5"),
-        ("fd.mcap fd.log --skin sums.toml", 2, "sums.toml and fd.mcap have two skins: "),
-        ("fd.log fd.log --skin moved.toml", 2, "fd.log belongs to another skin than "),
-        ("fd.log fd.log", 2, "neither fd.log nor fd.log has a skin in it: name one with --skin"),
-        ("fd.toml fd.log", 2, "fd.toml is a skin or a scenario, and no candump log or MCAP recording: "),
-        ("fd.mcap other.log", 2, "other.log: none of its buses (can7) is one of the skin's (vcan0)"),
-        ("fd.mcap quiet.log", 1, "quiet.log: there are no joints on vcan0"),
+        ("fd.mcap sums.mcap", 2, "fd.mcap and sums.mcap have different skins (cells: 3, in the other: 5)"),
+        ("fd.mcap fd.log --skin sums.toml", 2, "sums.toml and fd.mcap have different skins ("),
+        ("fd.log fd.log --skin moved.toml", 2, "fd.log does not match the skin "),
+        ("fd.log fd.log", 2, "neither fd.log nor fd.log contains a skin: name one with --skin"),
+        ("fd.toml fd.log", 2, "fd.toml is a skin or a scenario, not a candump log or MCAP recording: "),
+        ("fd.mcap other.log", 2, "other.log: the skin has none of the capture's buses (can7); it has vcan0"),
+        ("fd.mcap quiet.log", 1, "quiet.log: the capture has no joints messages on vcan0"),
         ("fd.mcap empty.log", 1, "empty.log: it is empty: there is no frame in it"),
         ("empty.log fd.mcap", 1, "empty.log: it is empty: there is no frame in it"),
         ("fd.mcap notes.txt", 1, "notes.txt: there is no frame in 1 line"),
         ("fd.mcap x.zip", 2, "x.zip is "),
         ("fd.mcap nowhere.mcap", 2, "nowhere.mcap: "),
         ("fd.mcap .", 2, ". is a directory: "),
-        ("- -", 2, "- and -: standard input is read once"),
+        ("- -", 2, "- and -: standard input can be read only once"),
         (
             "fd.mcap fd.mcap --junit fd.mcap --overwrite",
             2,

@@ -151,7 +151,7 @@ fn what_is_no_capture_is_refused_by_its_name() {
     let folder = Folder::new(&files);
     assert_eq!(
         folder.refuses("convert run.zip run.mcap", 2),
-        "skinbus: run.zip is a zip archive, and no candump log or MCAP recording: unpack it first"
+        "skinbus: run.zip is a zip archive, not a candump log or MCAP recording: unpack it first"
     );
     assert_eq!(
         folder.refuses("convert empty.log run.mcap", 1),
@@ -159,7 +159,7 @@ fn what_is_no_capture_is_refused_by_its_name() {
     );
     assert_eq!(
         folder.refuses("convert words.txt run.mcap", 1),
-        "skinbus: words.txt: there is no frame in 3 lines; the output of candump is expected: \
+        "skinbus: words.txt: there is no frame in 3 lines; expected the output of candump, with \
          lines like `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
     );
     assert!(folder.refuses("convert run.pcapng run.mcap", 2).contains("is a packet capture"));
@@ -201,7 +201,7 @@ fn a_bad_line_is_named_and_kept_and_with_strict_it_is_the_end() {
     let folder = Folder::new(&[("run.log", log.as_bytes())]);
     assert_eq!(
         folder.refuses("convert run.log run.mcap --strict", 1),
-        "skinbus: run.log:2: column 4: digits of a second; without --strict it would be kept as it is"
+        "skinbus: run.log:2: column 4: digits of a second; without --strict, the line would be kept as it is"
     );
     assert_eq!(
         folder.says("convert run.log run.mcap", 0),
@@ -229,7 +229,9 @@ fn times_that_run_backwards_are_said_once() {
         Folder::new(&[("run.log", b"(2.000000) can0 123#\n(1.000000) can0 123#\n(0.000000) can0 123#\n")]);
     let said = folder.says("convert run.log run.mcap", 0);
     assert!(
-        said.starts_with("run.log: times run backwards 2 times, first at frame 2; the order is kept\n"),
+        said.starts_with(
+            "run.log: the time runs backwards 2 times, first at frame 2; the order of the frames is kept\n"
+        ),
         "{said}"
     );
     assert_eq!(said.lines().count(), 2, "{said}");
@@ -244,7 +246,7 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
     );
     assert_eq!(
         folder.refuses("convert run.log . --overwrite", 2),
-        "skinbus: .: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
+        "skinbus: .: unknown file type: use .mcap for a recording, .log or .txt for a candump log, .csv for torques, or - for \
          standard output"
     );
     folder.says("convert run.log run.mcap --overwrite", 0);
@@ -256,19 +258,20 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
 fn what_makes_no_sense_is_refused() {
     let folder = Folder::new(&[("run.log", LOG.as_bytes())]);
     let usage = |arguments| folder.refuses(arguments, 2);
-    assert!(usage("convert run.log run.asc").starts_with("skinbus: run.asc: a name that ends in .mcap"));
+    assert!(usage("convert run.log run.asc").starts_with("skinbus: run.asc: unknown file type: use .mcap"));
     assert_eq!(
         usage("convert run.log run.mcap --plain"),
-        "skinbus: --plain is for a candump log: a recording keeps everything"
+        "skinbus: --plain is only for a candump log: leave it out, because a recording keeps everything"
     );
     assert!(
-        usage("convert run.log run.mcap --digits 9").starts_with("skinbus: --digits is for a candump log")
+        usage("convert run.log run.mcap --digits 9")
+            .starts_with("skinbus: --digits is only for a candump log")
     );
     assert!(usage("convert run.log run.txt --digits 7").contains("[possible values: 6, 9]"));
     folder.says("convert run.log run.mcap", 0);
     assert_eq!(
         folder.refuses("convert run.mcap again.mcap", 2),
-        "skinbus: run.mcap is an MCAP recording already: copy it"
+        "skinbus: run.mcap is already an MCAP recording: copy it instead"
     );
 }
 
@@ -290,8 +293,10 @@ fn of_a_recording_without_its_end_all_that_is_there_is_converted_and_that_is_sai
     let segment = whole.get(..whole.len() / 2).unwrap();
     fs::write(folder.path("cut.mcap"), segment).unwrap();
     let said = folder.says("convert cut.mcap cut.log", 0);
-    let expected =
-        format!("cut.mcap: it has no end: after {} bytes it was cut off, or never finished\n", segment.len());
+    let expected = format!(
+        "cut.mcap: its end is missing: it was cut off after {} bytes, or never finished\n",
+        segment.len()
+    );
     assert!(said.starts_with(&expected), "{said}");
     let (long, link_down) = (folder.text("long.log"), folder.text("cut.log"));
     assert!(
@@ -313,7 +318,8 @@ fn a_damaged_recording_is_refused_and_leaves_nothing() {
     fs::write(folder.path("bad.mcap"), &bytes).unwrap();
     let said = folder.refuses("convert bad.mcap bad.log", 1);
     assert!(
-        said.starts_with("skinbus: bad.mcap is damaged: ") && said.contains(" notes before that were read; "),
+        said.starts_with("skinbus: bad.mcap is damaged: ")
+            && said.contains(" notes before the damage were read; "),
         "{said}"
     );
     // The part before the damage can be converted to text.

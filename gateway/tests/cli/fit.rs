@@ -88,10 +88,13 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
             "--nominal 1M --data 9M",
             "data bit rate 9000000 bit/s: CAN FD allows 1000000 (the nominal one) to 8000000 (8M)",
         ),
-        ("--nominal 1M", "CAN FD needs a data bit rate: add --data, 1000000 to 8000000, or --format classic"),
+        (
+            "--nominal 1M",
+            "CAN FD needs a data bit rate: add --data with 1000000 to 8000000 bit/s, or --format classic",
+        ),
         (
             "--nominal 1M --data 5M --format classic",
-            "--data is for CAN FD, and here all buses are classic: leave it out, or add --format fd",
+            "--data is only for CAN FD, but all buses are classic: leave it out, or add --format fd",
         ),
     ] {
         assert_eq!(refusal(&format!("fit {skin} {arguments}")), format!("skinbus: {said}"));
@@ -100,11 +103,12 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
         assert!(refusal(&format!("fit {skin} {arguments}")).ends_with("try '--help'"));
     }
     let alone = refusal(&format!("fit {skin} --data 5M"));
-    assert_eq!(alone, "skinbus: --data of a skin needs --nominal beside it");
+    assert_eq!(alone, "skinbus: --data for a skin also needs --nominal");
     assert!(refusal("fit nothing.toml").contains("nothing.toml"));
     for option in ["--rates vcan0=1M/5M", "--skin x.toml", "--bench-traffic", "--ber 0.001", "--duration 3"] {
         let (name, file) = (option.split(' ').next().unwrap(), skin);
-        let expected = format!("skinbus: {name} is for traffic, and {file} is a skin: leave it out");
+        let expected =
+            format!("skinbus: {name} is only for traffic, but {file} is a skin: leave the option out");
         assert_eq!(refusal(&format!("fit {skin} {option}")), expected);
     }
 }

@@ -65,7 +65,7 @@ fn a_recording_without_a_skin_is_refused() {
     std::fs::write(folder.path().join("run.log"), "(1.000000) vcan0 123#00\n").unwrap();
     assert!(gateway(folder.path(), "convert run.log run.mcap").status.success());
     let said = refusal(folder.path(), "skin dbc run.mcap", 2);
-    assert_eq!(said, "skinbus: run.mcap has no skin in it: name the skin's own file");
+    assert_eq!(said, "skinbus: run.mcap contains no skin: name the skin's own file");
 }
 
 #[test]
@@ -74,7 +74,7 @@ fn of_several_buses_one_is_chosen() {
     let folder = folder.path();
     let said = refusal(folder, "skin dbc two.toml", 2);
     let expected =
-        "skinbus: two.toml has 2 buses, and a DBC describes one: add --bus with one of vcan0, vcan1";
+        "skinbus: two.toml has 2 buses, but a DBC file describes one: add --bus with one of vcan0, vcan1";
     assert_eq!(said, expected);
     let said = refusal(folder, "skin dbc two.toml --bus can7", 2);
     assert_eq!(said, "skinbus: two.toml has no bus \"can7\"; its buses are vcan0, vcan1");
@@ -89,8 +89,8 @@ fn a_classic_bus_is_described_only_as_joined_packets() {
     let folder = skins();
     let folder = folder.path();
     let said = refusal(folder, "skin dbc classic.toml", 2);
-    let expected = "skinbus: bus vcan0 is classic: a packet is several frames under one identifier, which a \
-                    DBC cannot tell apart; --joined describes their bytes joined, for a program that joins them \
+    let expected = "skinbus: bus vcan0 is classic: a packet consists of several frames with one identifier, which a \
+                    DBC cannot tell apart; --joined describes the joined bytes of these frames, for a program that joins them \
                     first";
     assert_eq!(said, expected);
     let said = refusal(folder, "skin dbc one.toml --joined", 2);
@@ -253,13 +253,13 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
     for line in [
         "run.log: joints of epoch 7 on vcan0, 0.200000 s after the first frame",
         "  contact    1.0000 + 1.0000 + 1.0000 N, proximity 0.0000",
-        "  since      stimulus of 0.100000 s, from the next joints on",
+        "  since      the stimulus at 0.100000 s, in effect from the next joints on",
         "  F_c        3.0000 N, not below 0.1006 N: counts",
         "  F_p        0.0000, below 0.0500: none",
         "  F_z        1.0000 F_c + 0.0000 F_p = 3.000000 N, not below 0.1006 N",
         "  in words   196608 steps of 2^-16 N = 3.000000 N",
         "  answered   0.500 ms after the joints",
-        "  vcan0 12: it did not report its configuration; assumed to be the skin's, 266D",
+        "  vcan0 12: it did not report its configuration, which is assumed to be the skin's, 266D",
         "  vcan0: 1 cells sent nothing, and their contact state is not in the capture; they are assumed not to be in contact",
     ] {
         assert!(text.lines().any(|there| there == line), "{line}\n{text}");
@@ -267,7 +267,7 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
     let words: Vec<_> = text.lines().filter(|line| line.contains("-1075") || line.contains("3195")).collect();
     assert_eq!(words.len(), 2, "{text}");
     let all = output(folder, "explain run.log --skin skin.toml --epoch 7");
-    assert!(all.contains("the whole skin: the words of the frames added up"), "{all}");
+    assert!(all.contains("the whole skin: sums of the words in the frames"), "{all}");
     let joint = output(folder, "explain run.log --skin skin.toml --epoch 7 --joint 2");
     assert!(joint.contains("3195") && !joint.contains("-1075"), "{joint}");
 }
@@ -293,16 +293,16 @@ fn what_cannot_be_explained_is_one_line() {
     let folder = folder.path();
     std::fs::write(folder.join("empty.log"), "# nothing\n").unwrap();
     for (arguments, code, expected) in [
-        ("explain run.log --epoch 7", 2, "run.log has no skin in it: name one with --skin"),
+        ("explain run.log --epoch 7", 2, "run.log contains no skin: name one with --skin"),
         (
             "explain run.log --skin skin.toml --epoch 8",
             1,
-            "run.log: there are no joints of epoch 8; there are those of epoch 7 at 0.200 s",
+            "run.log: the capture has no joints message of epoch 8; it has one of epoch 7 at 0.200 s",
         ),
         (
             "explain run.log --skin skin.toml --epoch 7 --at 0.3 --occurrence 2",
             1,
-            "run.log: there are no joints of epoch 7 (occurrence 2) at 0.300 s or later; there are those of epoch 7 at \
+            "run.log: the capture has no joints message of epoch 7 (occurrence 2) at 0.300 s or later; it has one of epoch 7 at \
              0.200 s",
         ),
         (
@@ -313,7 +313,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain run.log --skin skin.toml --epoch 7 --cell can0:12",
             2,
-            "--cell can0:12: the skin's buses are vcan0",
+            "--cell can0:12: the skin has no such bus; it has vcan0",
         ),
         (
             "explain run.log --skin skin.toml --epoch 7 --cell 300",
@@ -323,7 +323,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain empty.log --skin skin.toml --epoch 7",
             1,
-            "empty.log: there is no frame in 1 line; the output of candump is expected: lines like \
+            "empty.log: there is no frame in 1 line; expected the output of candump, with lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
         ),
         (
@@ -347,7 +347,7 @@ fn the_skin_is_the_one_in_the_recording() {
     let folder = folder.path();
     assert_eq!(gateway(folder, "convert run.log run.mcap").status.code(), Some(0));
     let said = refusal(folder, "explain run.mcap --epoch 7", 2);
-    assert_eq!(said, "skinbus: run.mcap has no skin in it: name one with --skin");
+    assert_eq!(said, "skinbus: run.mcap contains no skin: name one with --skin");
     let mcap = output(folder, "explain run.mcap --skin skin.toml --epoch 7 --json");
     let log = output(folder, "explain run.log --skin skin.toml --epoch 7 --json");
     assert_eq!(mcap.replace("run.mcap", "run.log"), log);
@@ -359,7 +359,7 @@ fn a_hint_does_not_lead_to_the_next_refusal() {
     let folder = folder.path();
     std::fs::write(folder.join("words.txt"), "nothing\n").unwrap();
     // No skin, sensing mode or option would help here.
-    let description = "skinbus: skin.toml is a skin or a scenario, and no candump log or MCAP recording: there are no frames in \
+    let description = "skinbus: skin.toml is a skin or a scenario, not a candump log or MCAP recording: there are no frames in \
                        it: name a capture";
     let nothing = "skinbus: words.txt: there is no frame in 1 line; ";
     let read = "skinbus: --node-ids skin.toml is a file that this command reads: name another file";

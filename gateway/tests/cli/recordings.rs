@@ -95,11 +95,11 @@ fn another_skin_than_the_recorded_one_is_remarked() {
         let end = start + moved.get(start..).unwrap().find(", ").unwrap() + 2;
         let moved = [moved.get(..start).unwrap(), moved.get(end..).unwrap()].concat();
         let parameters = said(&moved, command);
-        assert!(parameters.contains("was recorded with: parameters of cell"), "{command}: {parameters}");
+        assert!(parameters.contains("was recorded with (parameters of cell"), "{command}: {parameters}");
         let without_wires = |line: &&str| !line.starts_with("neighbors") && !line.starts_with("root");
         let cells = own.rsplit_once("[[cell]]").unwrap().0.lines().filter(without_wires);
         let cells: String = cells.map(|line| format!("{line}\n")).collect();
         let fewer = said(&cells, command);
-        assert!(fewer.contains("was recorded with: cells 2, recorded 3"), "{command}: {fewer}");
+        assert!(fewer.contains("was recorded with (cells: 2, recorded: 3)"), "{command}: {fewer}");
     }
 }

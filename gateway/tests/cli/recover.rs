@@ -452,7 +452,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
         says("recover a.zip", 1)
             .starts_with("skinbus: a.zip: it is not an MCAP file: it begins with 50 4b 03 04")
     );
-    assert!(says("recover -", 2).ends_with("name one with -o"));
+    assert!(says("recover -", 2).ends_with("name the new file with -o"));
     assert!(says("recover gone.mcap", 2).contains("gone.mcap: No such file"));
     let nowhere = "skinbus: -o none/new.mcap: No such file or directory (os error 2); name a file in a folder that can be \
                    written";

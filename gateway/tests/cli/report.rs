@@ -46,23 +46,23 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
     write("picture.mcap", b"PK\x03\x04 and more");
     assert!(gateway(folder.path(), "convert run.log foreign.mcap").status.success());
     let made =
-        "`skinbus run SKIN --record run.mcap` makes what a report needs, and frames alone need their --skin";
-    assert_eq!(refuses(&folder, "empty.mcap", 2), format!("empty.mcap holds no run: it is empty; {made}"));
+        "record one with `skinbus run SKIN --record run.mcap`, or name the skin of a capture with --skin";
+    assert_eq!(refuses(&folder, "empty.mcap", 2), format!("empty.mcap contains no run: it is empty; {made}"));
     assert_eq!(
         refuses(&folder, "foreign.mcap", 2),
-        format!("foreign.mcap holds no run: skin.toml is not attached to it; {made}")
+        format!("foreign.mcap contains no run: skin.toml is not attached to it; {made}")
     );
     let begun = refuses(&folder, "begun.mcap", 1);
     assert!(
         begun.starts_with(
-            "begun.mcap holds no run that can be shown: skin.toml is not attached to it (it has no end"
+            "begun.mcap contains no run that can be shown: skin.toml is not attached to it (it has no end"
         ),
         "{begun}"
     );
     assert_eq!(
         refuses(&folder, "run.log", 2),
-        "run.log is a log, and frames alone are not enough: name their skin with --skin; a recording, `skinbus run SKIN \
-         --record run.mcap`, has it"
+        "run.log is a log, which has only frames: name their skin with --skin, or record with `skinbus run SKIN \
+         --record run.mcap`, which keeps the skin"
     );
     assert!(refuses(&folder, "picture.mcap", 2).contains("is a zip archive"));
     let mut damaged = fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/recordings/fd.mcap")).unwrap();
@@ -218,7 +218,7 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
     for (arguments, said) in [
         (
             "other.log",
-            "other.log has no frame of the skin's buses (vcan0): its frames are of can7; name the skin that has them",
+            "other.log has no frame of the skin's buses (vcan0): its frames are from can7; name the skin that has this bus",
         ),
         (
             "untimed.log",
@@ -227,18 +227,18 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
         ("words.log", "words.log has no frame in it: a log is what `candump -L` writes"),
         (
             "empty.log",
-            "empty.log holds no run: it is empty; `skinbus run SKIN --record run.mcap` makes what a report needs",
+            "empty.log contains no run: it is empty; record one with `skinbus run SKIN --record run.mcap`",
         ),
         ("nowhere.log", "nowhere.log: "),
         (
             "fd.mcap",
-            "fd.mcap was recorded with another skin than sums.toml: cells 5, recorded 3; leave --skin out: the recording has \
-             its own",
+            "fd.mcap was recorded with another skin than sums.toml (cells: 5, recorded: 3); leave --skin out: the recording contains \
+             its skin",
         ),
     ] {
         let refused = refuses(&folder, &format!("{arguments} --skin sums.toml -o out.html"), 2);
         assert!(refused.starts_with(said), "{arguments}: {refused}");
-        assert!(!refused.ends_with("need their --skin"), "it was given: {refused}");
+        assert!(!refused.ends_with("of a capture with --skin"), "it was given: {refused}");
     }
     // A skin would not help.
     write("a.dbc", "VERSION \"1.0\"\n\nNS_:\n\nBS_:\n");

@@ -83,7 +83,7 @@ fn a_recording_that_was_truncated_is_looked_at_as_far_as_it_goes() {
     let (code, text, said) = gateway(folder.path(), "fit cut.mcap");
     assert_eq!((code, said.matches('\n').count()), (Some(0), 1), "{said}");
     assert!(
-        said.starts_with("cut.mcap: it has no end: after ") && text.contains("can0 at 1M/5M"),
+        said.starts_with("cut.mcap: its end is missing: ") && text.contains("can0 at 1M/5M"),
         "{said}{text}"
     );
     // In the middle of a line.
@@ -111,18 +111,18 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
         (
             "fit notes.txt",
             1,
-            "skinbus: notes.txt: there is no frame in 1 line; the output of candump is expected",
+            "skinbus: notes.txt: there is no frame in 1 line; expected the output of candump",
         ),
         ("fit x.zip", 2, "skinbus: x.zip is "),
         ("fit .", 2, "skinbus: . is a directory"),
-        ("fit nowhere", 2, "skinbus: there is no file nowhere, and as a bus: "),
+        ("fit nowhere", 2, "skinbus: there is no file nowhere, and it does not open as a bus: "),
         ("fit run.log notes.txt", 2, "skinbus: notes.txt contains no frames: name only captures"),
         ("fit run.log vcan0", 2, "skinbus: run.log, vcan0: name one file, the parts of one recording"),
-        ("fit run.log --duration 3", 2, "skinbus: --duration is for live buses"),
+        ("fit run.log --duration 3", 2, "skinbus: --duration is only for live buses"),
         ("fit run.log --nominal 2M", 2, "skinbus: nominal bit rate 2000000 bit/s: CAN allows"),
         ("fit run.log --data 9M", 2, "skinbus: data bit rate 9000000 bit/s: CAN FD allows"),
         ("fit run.log --rates can0=1M/9M", 2, "skinbus: invalid value 'can0=1M/9M'"),
-        ("fit run.log --ber 2", 2, "skinbus: --ber: bit-error rate 2: 0 to 0.01"),
+        ("fit run.log --ber 2", 2, "skinbus: --ber: bit error rate 2: use 0 to 0.01"),
     ] {
         let (got, text, said) = gateway(folder.path(), arguments);
         assert_eq!(

@@ -159,18 +159,22 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
     fs::write(folder.path().join("foreign.log"), "(1.000001) can7 123#11\n").unwrap();
     fs::write(folder.path().join("mine.csv"), "mine").unwrap();
     for (arguments, code, line) in [
-        ("classic.log out.csv", 2, "skinbus: classic.log has no skin in it: name one with --skin"),
+        ("classic.log out.csv", 2, "skinbus: classic.log contains no skin: name one with --skin"),
         (
             "foreign.log out.csv --skin fd.toml",
             1,
-            "skinbus: foreign.log: none of its buses (can7) is one of the skin's (vcan0)",
+            "skinbus: foreign.log: the skin has none of the capture's buses (can7); it has vcan0",
         ),
-        ("- out.csv", 2, "skinbus: standard input is read once: name the skin with --skin"),
-        ("fd.mcap out.csv --plain", 2, "skinbus: --plain is for a candump log, and out.csv is a CSV file"),
+        ("- out.csv", 2, "skinbus: standard input can be read only once: name the skin with --skin"),
+        (
+            "fd.mcap out.csv --plain",
+            2,
+            "skinbus: --plain is only for a candump log, but out.csv is a CSV file: leave it out",
+        ),
         (
             "fd.mcap out.log --skin fd.toml",
             2,
-            "skinbus: --skin fd.toml is for torques: name an OUT that ends in .csv",
+            "skinbus: --skin fd.toml is only for CSV output: name an OUT that ends in .csv",
         ),
         (
             "fd.mcap mine.csv",
@@ -199,7 +203,7 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
     // A truncated recording gives its intact part.
     fs::write(folder.path().join("begun.mcap"), &bytes[..middle]).unwrap();
     let line = said(&folder, "convert begun.mcap strict.csv --strict --skin fd.toml", 1);
-    assert!(line.contains("it has no end") && !folder.path().join("strict.csv").exists(), "{line}");
+    assert!(line.contains("its end is missing") && !folder.path().join("strict.csv").exists(), "{line}");
     let Output { status, .. } = gateway(folder.path(), "convert begun.mcap begun.csv --skin fd.toml");
     assert_eq!(status.code(), Some(0));
     let cut = rows(&folder, "begun.csv");

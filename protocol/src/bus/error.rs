@@ -37,14 +37,12 @@ pub enum BusError {
     #[error("there is no interface {0}: make it with `vcan-setup up {0}`, or plug it in if it is hardware")]
     NoInterface(String),
     /// The interface is not a CAN interface.
-    #[error(
-        "{0} is an interface, but no CAN interface: name one that `ip -br link show type can` or `type vcan` lists"
-    )]
+    #[error("{0} is not a CAN interface: name one that `ip -br link show type can` or `type vcan` lists")]
     NotCan(String),
     /// CAN FD was requested on an interface for classic CAN.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs 72: set it with `ip link set {name} down && ip link set \
-         {name} mtu 72 up`, or use the classic format (CAN hardware: `vcan-setup doctor SKIN.toml` says how)"
+         {name} mtu 72 up`, or use the classic format (CAN hardware: `vcan-setup doctor SKIN.toml` shows how)"
     )]
     ClassicOnly {
         /// The interface.
@@ -111,7 +109,7 @@ pub enum BusError {
     },
     /// The embedded bus did not answer in time.
     #[error(
-        "the embedded bus {name} did not answer within {} ms: is its server stopped, or out of files (`ulimit -n`)?",
+        "the embedded bus {name} did not answer within {} ms: is its server stopped, or out of file descriptors (`ulimit -n`)?",
         waited.as_millis()
     )]
     NoAnswer {
@@ -122,8 +120,8 @@ pub enum BusError {
     },
     /// The server of the embedded bus cannot accept another client.
     #[error(
-        "the embedded bus {0} has no room for another client: its server may have no more files open; end other clients, or \
-         raise `ulimit -Hn` where it is started"
+        "the embedded bus {0} cannot accept another client: its server has no file descriptors left; end other clients, or \
+         raise `ulimit -Hn` where the server is started"
     )]
     NoRoom(String),
     /// The server of the embedded bus has ended. The bus must be opened again.
@@ -132,7 +130,7 @@ pub enum BusError {
     /// The server of the embedded bus has closed this connection, but still serves others. The bus must be
     /// opened again.
     #[error(
-        "the embedded bus {0} was closed: its server hung up on this program alone and serves others still; attach again"
+        "the embedded bus {0} was closed: its server disconnected only this program and still serves others; attach again"
     )]
     HungUp(String),
     /// The transmit queue of the bus stayed full until the send timeout.

@@ -165,7 +165,7 @@ pub enum FrameError {
         got: usize,
     },
     /// There is more data than the frame format can carry.
-    #[error("{got} data bytes do not fit: at most {max}")]
+    #[error("{got} data bytes do not fit: the maximum is {max}")]
     Length {
         /// Number of data bytes.
         got: usize,

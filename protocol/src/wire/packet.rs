@@ -155,10 +155,10 @@ pub enum PacketError {
         got: u16,
     },
     /// A classic frame does not form a packet with the segments before and after it.
-    #[error("no other segment")]
+    #[error("the other segments are missing")]
     Incomplete,
     /// Classic frames decode as packets of several lengths, although at most one of these was sent.
-    #[error("packets of several lengths have a right CRC")]
+    #[error("the CRC is correct for packets of several lengths")]
     Ambiguous,
 }
 

@@ -400,9 +400,9 @@ fn wrong_use_is_one_line() {
         let ended = host.start(&link_program(), &format!("link vcan0 --bus-kind embedded {words}")).end();
         ended.refusal(2).to_owned()
     };
-    assert!(refused("").contains("no endpoint: say where the other hosts are"));
+    assert!(refused("").contains("no endpoint: give the address of another host"));
     assert!(refused("--listen udp/127.0.0.1:1").contains("an endpoint is tcp/HOST:PORT or tls/HOST:PORT"));
     assert!(refused("--listen tcp/127.0.0.1:0 --host a/b").contains("it has one of"));
     let _link = host.link("--listen tcp/127.0.0.1:0");
-    assert!(refused("--listen tcp/127.0.0.1:0").contains("linked already by another process"));
+    assert!(refused("--listen tcp/127.0.0.1:0").contains("already linked by another process"));
 }

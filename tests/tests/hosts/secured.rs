@@ -134,7 +134,7 @@ fn a_listener_without_tls_beside_the_files_of_the_guide_is_refused() {
     for option in ["--listen tcp/127.0.0.1:0", "--connect tcp/127.0.0.1:1 --listen tls/127.0.0.1:0"] {
         let words = format!("link vcan0 --bus-kind embedded --config {} {option}", config.display());
         let refusal = host.start(&link_program(), &words).end();
-        assert!(refusal.refusal(2).contains("would be open to everyone beside tls/"), "{refusal:#?}");
+        assert!(refusal.refusal(2).contains("does not use TLS, but tls/"), "{refusal:#?}");
     }
 }
 

@@ -63,14 +63,15 @@ fn bit_rates_are_checked_and_set_only_on_request() {
 
     bench.write(WHOLE);
     let (code, out, err) = bench.run("up skin.toml");
-    let expected = "can0 is at 500 kbit/s and skin.toml says 1000 kbit/s: `sudo vcan-setup up skin.toml \
+    let expected = "can0 runs at 500 kbit/s, but skin.toml requires 1000 kbit/s: `sudo vcan-setup up skin.toml \
                     --set-bit-rates` sets them, or change skin.toml";
     assert_eq!((code, out.as_str(), err.as_str()), (1, "", expected));
     let (code, out, _) = bench.run("up skin.toml --set-bit-rates --dry-run");
     assert!(code == 0 && out.starts_with("would set can0 to 1000 kbit/s instead of 500 kbit/s"), "{out}");
     let named = bench.run("up can0");
     assert!(
-        named.0 == 2 && named.2.starts_with("can0 is real, CAN hardware (kvaser_pci), and is left alone"),
+        named.0 == 2
+            && named.2.starts_with("can0 is CAN hardware (kvaser_pci), which vcan-setup leaves alone"),
         "{named:?}"
     );
     assert_eq!(bench.run("down can0").0, 2);
@@ -82,7 +83,7 @@ fn bit_rates_are_checked_and_set_only_on_request() {
     assert_eq!(said, (0, "can0 is at 1000 kbit/s, and up\n".to_owned(), String::new()));
     assert_eq!(can0(), (true, 1_000_000.into()));
     let unchanged =
-        "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, as the skin says, and is left as it is\n";
+        "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, as the skin requires, and is left as it is\n";
     for again in ["up skin.toml --set-bit-rates", "up skin.toml"] {
         assert_eq!(bench.run(again), (0, unchanged.to_owned(), String::new()));
     }
@@ -117,7 +118,7 @@ fn what_the_hardware_cannot_do_leaves_it_as_it_was() {
     bench.write("format = \"classic\"\nbitrate = 930000");
     let (code, _, err) = bench.run("up skin.toml --set-bit-rates");
     assert!(code == 1 && err.starts_with("cannot set can0 to 930 kbit/s: "), "{err}");
-    assert!(err.contains("the nearest that its clock gives is 888888 bit/s"), "{err}");
+    assert!(err.contains("the nearest that its clock allows is 888888 bit/s"), "{err}");
     assert_eq!(can0(), before);
 }
 
@@ -136,7 +137,8 @@ fn the_doctor_knows_what_is_wrong_with_hardware() {
     ip("link set can0 down");
     ip("link set can0 up type can listen-only off");
     bench.write(WHOLE);
-    let fault = "fault can0 is CAN hardware (kvaser_pci) at 500 kbit/s, and the skin says 1000 kbit/s\n";
+    let fault =
+        "fault can0 is CAN hardware (kvaser_pci) with 500 kbit/s, but the skin requires 1000 kbit/s\n";
     assert!(doctor().contains(fault), "{}", doctor());
     bench.write("format = \"fd\"");
     assert!(doctor().contains("with MTU 16, and CAN FD needs 72"), "{}", doctor());

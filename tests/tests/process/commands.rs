@@ -89,7 +89,7 @@ fn wrong_use_is_said_in_one_line() {
         ("up vcan0 vcan1 --peer x", "--peer makes one pair: give one NAME with it"),
         (
             "up lo",
-            "lo is real, the loopback interface, and is left alone: choose another name, as `vcan-setup up vcan0` does",
+            "lo is the loopback interface, which vcan-setup leaves alone: choose another name, as in `vcan-setup up vcan0`",
         ),
         ("down lo", "lo is the loopback interface that vcan-setup has not made, and is left alone"),
         (
@@ -99,11 +99,11 @@ fn wrong_use_is_said_in_one_line() {
         ),
         (
             "up vcan%d",
-            "\"vcan%d\" is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0",
+            "\"vcan%d\" is not allowed as a name of an interface: use letters, digits, '-', '_' and '.', as in vcan0",
         ),
         (
             "up vcan0 --peer .x",
-            "\".x\" is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0",
+            "\".x\" is not allowed as a name of an interface: use letters, digits, '-', '_' and '.', as in vcan0",
         ),
         ("up nosuch.toml", "nosuch.toml: No such file or directory (os error 2)"),
         ("status ./broken.toml", "./broken.toml:1:1: key `robot` is missing"),
@@ -115,7 +115,7 @@ fn wrong_use_is_said_in_one_line() {
         ),
         (
             "up vcan0 --peer vcan1 --namespace nosuch",
-            "there is no network namespace nosuch in /run/netns: `sudo ip netns add nosuch` makes it, `ip netns` lists them; a process' number or a path is taken too",
+            "there is no network namespace nosuch in /run/netns: `sudo ip netns add nosuch` makes it, `ip netns` lists them; a process id or a path is accepted too",
         ),
     ] {
         let said = folder.run(arguments);
@@ -169,7 +169,7 @@ fn names_that_are_not_utf_8_are_files_and_no_buses() {
         let file = CommandOutput::run(folder.command(words).arg(skin.file_name().unwrap()));
         assert!(codes.contains(&file.code), "{words}: {file:?}");
         let name = CommandOutput::run(folder.command(words).arg(OsStr::from_bytes(b"vcan\xff")));
-        let said = r"vcan-setup: $'vcan\xff' is no bus name: it is not UTF-8";
+        let said = r"vcan-setup: $'vcan\xff' is not a bus name: it is not UTF-8";
         assert_eq!((name.code, name.err.trim_end()), (2, said), "{words}");
     }
     let space = CommandOutput::run(
@@ -226,8 +226,8 @@ fn status_shows_embedded_buses_and_which_are_served() {
     assert_eq!((code, embedded), (1, expected(false)), "its server was killed");
     assert_eq!(
         err,
-        "vcan-setup: not there: nosuchcan1; `vcan-setup serve nosuchcan1` serves an embedded bus, `vcan-setup doctor \
-         nosuchcan1` says what an interface needs\n"
+        "vcan-setup: not found: nosuchcan1; `vcan-setup serve nosuchcan1` serves an embedded bus, `vcan-setup doctor \
+         nosuchcan1` shows what an interface needs\n"
     );
     assert_eq!(status("nosuchcan2").1, serde_json::json!([]));
 }
@@ -248,7 +248,7 @@ fn the_doctor_wants_the_cells_program_and_a_private_directory() {
     let doctor = || folder.run("doctor skin.toml --bus-kind embedded --json");
     let beside = folder.0.path().join("cell-node");
     let missing =
-        format!("cell-node is not at {}: the gateway starts it from beside itself", beside.display());
+        format!("cell-node is not at {}: the gateway starts it from its own directory", beside.display());
     assert_eq!(findings(&doctor(), "fault"), [missing]);
     folder.write("cell-node", "");
     assert_eq!(findings(&doctor(), "fault"), Vec::<String>::new());
@@ -258,7 +258,7 @@ fn the_doctor_wants_the_cells_program_and_a_private_directory() {
     std::fs::create_dir(folder.buses()).unwrap();
     std::fs::set_permissions(folder.buses(), std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
     let said = doctor();
-    assert!(findings(&said, "fault")[0].contains("has mode 0755, and the bus is private"), "{said:?}");
+    assert!(findings(&said, "fault")[0].contains("has mode 0755, but the bus must be private"), "{said:?}");
     assert_eq!(folder.run("doctor skin.toml --bus-kind embedded").code, 1);
 }
 

@@ -409,7 +409,7 @@ fn a_client_that_alone_is_hung_up_on_is_not_told_that_the_server_ended() {
     rustix::net::shutdown(&bus, rustix::net::Shutdown::Write).unwrap();
     assert!(bus.wait(Some(FAILURE_TIMEOUT)).unwrap());
     let error = bus.receive(&mut Inbox::new()).unwrap_err();
-    let said = "the embedded bus vcan0 was closed: its server hung up on this program alone and serves others still; attach \
+    let said = "the embedded bus vcan0 was closed: its server disconnected only this program and still serves others; attach \
                 again";
     assert_eq!((error.to_string().as_str(), error.is_closed(), error.may_open_later()), (said, true, true));
     let sender = bench.open(&[]);
@@ -430,7 +430,7 @@ fn a_server_that_lets_nobody_in_is_given_up_on() {
         &BusOptions { directory, ..BusOptions::default() },
     );
     let error = error.unwrap_err().to_string();
-    let expected = "the embedded bus vcan0 did not answer within 2000 ms: is its server stopped, or out of files (`ulimit -n`)?";
+    let expected = "the embedded bus vcan0 did not answer within 2000 ms: is its server stopped, or out of file descriptors (`ulimit -n`)?";
     assert_eq!(error, expected);
     drop(server);
 }

@@ -26,7 +26,7 @@ use rustix::process::{Pid, Signal};
 /// vcan0 and vcan2 carry CAN FD, vcan1 classic frames.
 const BUSES: [(&str, Format); 3] = [("vcan0", Format::Fd), ("vcan1", Format::Classic), ("vcan2", Format::Fd)];
 const CELLS: usize = 12;
-const LOST: &str = "the embedded bus vcan1 was closed: its server ended; the others go on";
+const LOST: &str = "the embedded bus vcan1 was closed: its server ended; the other buses continue";
 
 /// Creates twelve cells on three buses, all pressed, and an arm that moves under the touch.
 fn place() -> TestDir {
@@ -95,7 +95,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
         let said =
             |words: &str| until(words, || (bench.stderr().matches(words).count() == times).then_some(()));
         said(LOST);
-        said("the process that served vcan1 ended (signal: 9 (SIGKILL)); it is served again");
+        said("the process that served vcan1 ended (signal: 9 (SIGKILL)); a new process serves it");
         said("vcan1 works again");
         test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     }
@@ -257,7 +257,7 @@ fn a_gateway_that_has_no_bus_left_ends() {
         server.signal(Signal::TERM);
         server.end().succeeded();
         bench.wait_for_stderr(&format!(
-            "the embedded bus {bus} was closed: its server ended; the others go on"
+            "the embedded bus {bus} was closed: its server ended; the other buses continue"
         ));
     }
     vcan1.signal(Signal::TERM);

@@ -33,7 +33,10 @@ fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
     place.write("skin.toml", &skin.replace("serial = 100001", "serial = 7"));
     let (refused, nothing, why) = calibrate(&place, "--recording run.mcap -o other.toml");
     assert_eq!((refused, nothing), (Some(2), None), "{why}");
-    assert!(why.contains("was recorded with another skin: serial numbers 100002, recorded 100001"), "{why}");
+    assert!(
+        why.contains("was recorded with another skin: serial numbers 100002, but 100001 in the recording"),
+        "{why}"
+    );
     assert!(!exists("other.toml"));
     place.write("skin.toml", &skin);
     let Some(found) = found else {

@@ -173,7 +173,7 @@ fn a_joint_that_slides_has_its_own_units() {
     // The skin of another robot is reported, and not used.
     fs::copy(example("panda.urdf"), place.path("panda.urdf")).unwrap();
     run(&place, "skin import panda.urdf --tip hand -o other.toml");
-    let another = "vcan0 carries 8 joints, but the skin's chain on it has 7: the skin is of another robot";
+    let another = "vcan0 carries 8 joints, but the skin's chain on it has 7: this skin is for another robot";
     let ended = run(&place, "dump run.log --skin other.toml --json --kind torque --from 1");
     assert!(ended.stderr.contains(another) && ended.stderr.lines().count() == 1, "{}", ended.stderr);
     let raw: Value = serde_json::from_str(ended.stdout.lines().last().unwrap()).unwrap();

@@ -200,7 +200,7 @@ fn cells_that_hang_delay_no_others_and_are_named() {
         assert!(why.starts_with("does not answer ") || why.starts_with("is not on the bus"), "{why}");
     }
     assert!(
-        ended.stderr.contains("skinbus: 3 of 12 cells are not commissioned, see the table;"),
+        ended.stderr.contains("skinbus: 3 of 12 cells are not commissioned: see the table,"),
         "{ended:#?}"
     );
     hung.signal(Signal::CONT);
@@ -236,7 +236,9 @@ fn node_ids_on_the_bus_are_written_into_a_copy_of_the_description() {
     let workshop = Workshop::with(&described, &older(&had), "");
     let ended = workshop.commission("--node-ids as-is.toml").end().succeeded();
     assert!(
-        ended.stderr.contains("the cell with serial number 100001 is 1 on vcan0, 6 in skin.toml"),
+        ended
+            .stderr
+            .contains("the cell with serial number 100001 has node id 1 on vcan0, but 6 in skin.toml"),
         "{ended:#?}"
     );
     assert_eq!(workshop.place.read("as-is.toml"), text, "node ids and neighbors, and nothing else");
@@ -335,7 +337,7 @@ fn unknown_nodes_are_named_and_left_alone_and_missing_cells_are_named() {
     workshop.place.write("skin.toml", &without);
     let ended = workshop.commission("").end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    let unknown_node = "cells on vcan0 that skin.toml does not have, left alone: 4 (serial number 100004)";
+    let unknown_node = "cells on vcan0 that are not in skin.toml, left alone: 4 (serial number 100004)";
     assert!(ended.stderr.contains(unknown_node), "{ended:#?}");
     assert!(ended.stdout.contains("is not on the bus: switch it on"), "{ended:#?}");
     let listed = workshop.list("--skin skin.toml").unwrap();
@@ -407,14 +409,17 @@ fn what_cannot_be_done_is_one_line() {
     let bus = place.start("vcan-setup", "serve vcan0");
     bus.wait_for_stdout("serving ");
     let line = said("commission skin.toml --quiet", 1);
-    assert_eq!(line, "skinbus: no cells are on vcan0: start them, or switch them on, and run this again");
+    assert_eq!(
+        line,
+        "skinbus: no cells were found on vcan0: start them or switch them on, then run the command again"
+    );
     let line = said("cells vcan0 --duration 0.4", 1);
     assert!(line.starts_with("skinbus: no cell sent anything on vcan0 for 0.4 s: "), "{line}");
 
     place.write("other.toml", &skin(4).replace("serial = 1000", "serial = 2000"));
     let _cells = place.start("cell-node", "--bus vcan0 --nodes 1-4 --skin other.toml --bus-kind embedded");
-    let expected = "skinbus: none of the cells on vcan0 is one of skin.toml: their serial numbers are 200001, \
-                    200002, 200003, 200004; name the description that has them";
+    let expected = "skinbus: none of the cells on vcan0 is in skin.toml: their serial numbers are 200001, \
+                    200002, 200003, 200004; name the skin file with these numbers";
     until("cells of another skin", || {
         let ended = place.start("skinbus", "commission skin.toml --bus-kind embedded --quiet").end();
         (ended.refusal(1) == expected).then_some(())

@@ -170,8 +170,8 @@ fn after_a_kill_the_file_puts_the_cell_back() {
     let refused = cell.conformance("").end();
     assert_eq!(
         refused.refusal(2),
-        "skinbus: conformance-vcan0-5.json is left from an earlier test that did not restore the cell: do that with \
-         --restore conformance-vcan0-5.json, or delete it"
+        "skinbus: conformance-vcan0-5.json was left by an earlier test that did not restore the cell: restore it with \
+         --restore conformance-vcan0-5.json, or delete the file"
     );
     cell.conformance("--restore conformance-vcan0-5.json").end().succeeded();
     assert_eq!(cell.has(), before);
@@ -204,7 +204,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
             2,
             "--requirement CONFI: no requirement has this id; CONF-7 and CONF are examples",
         ),
-        ("--format classic", 1, "cell 5 sends fd frames on vcan0, not classic: say --format fd"),
+        ("--format classic", 1, "cell 5 sends fd frames on vcan0, not classic: use --format fd"),
         ("--restart false --requirement CLAIM", 1, "the command of --restart failed: exit status: 1"),
     ];
     for (words, code, line) in refusals {
@@ -218,7 +218,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     };
     assert_eq!(
         of(6).refusal(1),
-        "skinbus: cell 6 sends nothing on vcan0, only 5: switch it on, or give its actual node id"
+        "skinbus: cell 6 sends nothing on vcan0, unlike 5: switch it on, or give its actual node id"
     );
     let words = "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml";
     let other = cell.place.start("cell-node", words);
@@ -229,7 +229,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     });
     assert_eq!(
         of(5).refusal(1),
-        "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: remove them, or say \
+        "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: remove them, or use \
          --others-will-stop"
     );
     // A busy machine may keep the cell waiting for longer than its time to answer.

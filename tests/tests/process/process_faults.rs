@@ -186,15 +186,15 @@ fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason
         assert_eq!(error["cells"], serde_json::json!([{ "bus": "vcan1", "nodes": [1, 2, 3, 4] }]));
         let why = error["reason"].as_str().unwrap();
         // The gateway itself may not search it either.
-        let given = ended.stderr.lines().filter(|line| !line.starts_with("vcan1 cannot be opened again yet"));
+        let given = ended.stderr.lines().filter(|line| !line.starts_with("vcan1 cannot be reopened yet"));
         assert_eq!(given.filter(|line| line.contains(why)).count(), 1, "{ended:#?}");
         let last = ended.stderr.lines().last().unwrap();
         if quiet {
             assert_eq!(ended.stderr.lines().count(), 1, "{ended:#?}");
-            let line = format!("skinbus: 4 cells ended by errors of their own: 1-4 on vcan1 ({why})");
+            let line = format!("skinbus: 4 cells ended with errors: 1-4 on vcan1 ({why})");
             assert_eq!(last, line);
         } else {
-            assert_eq!(last, "skinbus: 4 cells ended by errors of their own, given above: 1-4 on vcan1");
+            assert_eq!(last, "skinbus: 4 cells ended with errors, given above: 1-4 on vcan1");
             let note = format!("the process of cells 1 to 4 on vcan1 ended (exit status: 1: {why})\n");
             assert!(ended.stderr.contains(&note), "{ended:#?}");
         }
@@ -266,8 +266,8 @@ fn a_newcomer_with_a_taken_node_id_ends_with_one_line() {
         let bench = place.running_bench(600.0, "");
         let newcomer =
             place.start("cell-node", &format!("--bus vcan0 --bus-kind embedded --node 3 --skin {skin}"));
-        let said = "cell-node: cell 3 is on vcan0 already, with serial number 100003: stop that one or give \
-                    this one another number";
+        let said = "cell-node: cell 3 is already on vcan0, with serial number 100003: stop it, or give this \
+                    cell another node id";
         assert_eq!(newcomer.end().refusal(1), said);
         place.test_client().waits_for("a torque of cell 3", torque_of(3));
         bench.signal(Signal::TERM);

@@ -189,7 +189,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
     let said = place.start("skinbus", "experiment fig10 --quick -o results").end();
     assert_eq!(
         said.refusal(2),
-        "skinbus: -o results: there is something in it: name another folder, or overwrite files in it with --overwrite"
+        "skinbus: -o results: the folder is not empty: name another folder, or overwrite files in it with --overwrite"
     );
     assert_eq!(names(&place.path("results")), ["notes.txt"]);
 }
@@ -348,7 +348,7 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
         demo.wait_for_loop();
         let said = demo.stderr();
         // The printed command shows its frames.
-        let line = said.lines().find_map(|line| line.strip_prefix("its frames in words: ")).unwrap();
+        let line = said.lines().find_map(|line| line.strip_prefix("to see its frames decoded: ")).unwrap();
         let (directory, dump) = line.strip_prefix("SKINBUS_DIR=").unwrap().split_once(" skinbus ").unwrap();
         let mut dump = place.command("skinbus", &format!("{dump} --kind torque -n 3"));
         dump.env("SKINBUS_DIR", directory);

@@ -60,11 +60,11 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
     let mut said: Vec<_> = ended.stderr.lines().collect();
     said.sort_unstable();
     let expected = [
-        "cell-node: flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong; write it again or \
+        "cell-node: flash of cell 3 (flash/vcan0-3.flash) is not used: the CRC of the image is wrong; write it again or \
          delete the file"
             .to_owned(),
         format!(
-            "cell-node: flash of cell 5 (flash/vcan0-5.flash) is not used: 40 bytes, not {} to 445; write it again or \
+            "cell-node: flash of cell 5 (flash/vcan0-5.flash) is not used: the image has 40 bytes, not {} to 445; write it again or \
              delete the file",
             image.len()
         ),
@@ -103,7 +103,7 @@ fn a_cell_without_parameters_reports_it_and_sends_no_torque() {
     server.wait_for_stdout("serving vcan0 at ");
     let cells = place
         .start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-8 --skin skin.toml --flash flash");
-    cells.wait_for_stderr("flash of cell 3 (flash/vcan0-3.flash) is not used: its CRC is wrong");
+    cells.wait_for_stderr("flash of cell 3 (flash/vcan0-3.flash) is not used: the CRC of the image is wrong");
     place.test_client().waits_for("a heartbeat of cell 3 without parameters", |message| {
         matches!(message, Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. }
             if cell.get() == 3
@@ -131,8 +131,8 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
     let text = place.read("skin.toml");
     let other = text.replace("alpha_c = 1.0", "alpha_c = 1.5");
     place.write("skin.toml", &other);
-    let said = "skinbus: cells that are configured for another skin than skin.toml: 1, 2, 3, 4, 5, 6, 7, 8 on \
-                vcan0; write it into them with `skinbus commission`, or delete their flash files";
+    let said = "skinbus: cells that are not configured for skin.toml: 1, 2, 3, 4, 5, 6, 7, 8 on \
+                vcan0; configure them with `skinbus commission`, or delete their flash files";
     assert_eq!(place.bench(1.0, "--flash flash --quiet").end().refusal(1), said);
     place.is_left_clean();
 
@@ -141,7 +141,7 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
     let ended = place.bench(1.0, "--flash flash --quiet").end();
     assert_eq!(ended.code(), Some(1));
     assert!(
-        ended.stderr.contains("is not used: it belongs to cell 6 with serial number 100006"),
+        ended.stderr.contains("is not used: the image belongs to cell 6 with serial number 100006"),
         "{ended:#?}"
     );
     assert!(ended.stderr.contains("skinbus: cells without parameters: 6 on vcan0"), "{ended:#?}");
@@ -182,7 +182,7 @@ fn two_programs_do_not_use_one_cells_file_at_a_time() {
         format!("--bus vcan0 --bus-kind embedded --node {node} --skin skin.toml --flash {flash} --fresh")
     };
     let refused = other.start("cell-node", &words(2)).end();
-    assert!(refused.refusal(2).contains("(cell-node) uses it: end that one first"), "{refused:#?}");
+    assert!(refused.refusal(2).contains("(cell-node) is using it: stop that process first"), "{refused:#?}");
     assert_eq!(images(&place), before);
     running.signal(Signal::TERM);
     running.end();

@@ -146,7 +146,7 @@ fn links_are_covered_and_the_skin_runs() {
     refused(
         &place,
         "run skin.toml --bus-kind embedded --record no.mcap",
-        "robot.urdf: arm.urdf:1: not XML: a URDF begins with <?xml or <robot, and this does not; name the robot's URDF; correct the skin's path, or take the key out",
+        "robot.urdf: arm.urdf:1: not XML: a URDF begins with <?xml or <robot; name the robot's URDF; correct the skin's path, or take the key out",
     );
     fs::remove_file(place.path("arm.urdf")).unwrap();
     refused(
@@ -187,18 +187,15 @@ fn what_cannot_be_covered_is_said_in_a_line() {
         (cover("fore", ""), "is not a file: name its directory with --package arm_parts=DIR"),
         (cover("fore", "--package arm_parts=nowhere"), "nowhere is not a folder: correct --package"),
         (cover("fore", ""), "; or treat it as absent with --leave-out plate"),
-        (cover("fore", "--package arm_parts=."), ". is not the package, or lacks this file"),
+        (cover("fore", "--package arm_parts=."), ". is not the directory of the package, or lacks this file"),
         (cover("fore", "--leave-out fore"), "--leave-out fore: --cover names this link"),
         (
             cover("fore", "--leave-out plat"),
             "--leave-out plat: arm.urdf: there is no link \"plat\"; the nearest are",
         ),
-        (cover("bare", with), "--cover bare: arm.urdf has no visual of this link"),
+        (cover("bare", with), "--cover bare: arm.urdf has no visual for this link"),
         (cover("forearm", with), "--cover forearm: arm.urdf: there is no link \"forearm\"; the nearest are"),
-        (
-            cover("base", with),
-            "--cover base: no chain moves this link: those that a chain moves are upper, fore",
-        ),
+        (cover("base", with), "--cover base: no chain moves this link: use one of upper, fore"),
         (cover("fore,fore", with), "--cover fore: this link is named twice"),
         (cover("fore", "--pitch 2"), "a length from 0.001 to 1 m"),
         (cover("fore", "--nodes-per-bus 251"), "251 is not in 1..=250"),
@@ -242,22 +239,22 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
     for (text, expected) in [
         (
             "link,px,py,pz,nx,ny,up\nfore,0,0,0,0,0,1\n".to_owned(),
-            "cells.csv: line 1: the first line must be the header link,px,py,pz,nx,ny,nz, with bus,node if they are \
-             given, and it is \"link,px,py,pz,nx,ny,up\": correct it",
+            "cells.csv: line 1: the first line must be the header link,px,py,pz,nx,ny,nz, optionally with bus,node, \
+             not \"link,px,py,pz,nx,ny,up\": correct it",
         ),
-        ("fore,0,0,0,0,0,1\n".to_owned(), "it is \"fore,0,0,0,0,0,1\": write the header above it"),
+        ("fore,0,0,0,0,0,1\n".to_owned(), "not \"fore,0,0,0,0,0,1\": write the header above it"),
         (format!("{head}\nfore,0,0,x,0,0,1\n"), "cells.csv: line 2: pz = \"x\": a finite number is needed"),
         (format!("{head}\nfore,0,0,0,0,0,1\nfourth,0,0,0,0,0,1\n"), "cells.csv: line 3: "),
         (format!("{head}\nfore,0,0,0,0,0,0\n"), "line 2: the normal"),
         (
             format!("{head}\nfore,0,0\n"),
-            "cells.csv: line 2 has 3 values: one is needed for each of the columns link, ",
+            "cells.csv: line 2 has 3 values: write one value for each of the columns link, ",
         ),
-        (head.to_owned(), "there is no cell in it"),
+        (head.to_owned(), "it contains no cells"),
         // A defect that only the skin's check finds, reported with its line in the file.
         (
             format!("# mine\n{head}\nfore,0,0,0,0,0,1\n\nfore,3,0,0,0,0,1\n"),
-            "skinbus: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" can come 3.",
+            "skinbus: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" can be up to 3.",
         ),
         (
             format!("{head},bus,node\nfore,0,0,0,0,0,1,,300\n"),
@@ -265,11 +262,11 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         ),
         (
             format!("{head},bus,node\nfore,0,0,0,0,0,1,,\nupper,0,0,0,0,0,1,,1\n"),
-            "skinbus: cells.csv: line 3: node 1 of bus \"vcan0\" is that of line 2 already",
+            "skinbus: cells.csv: line 3: node 1 of bus \"vcan0\" is already used in line 2",
         ),
         (
             format!("{head},bus\nfore,0,0,0,0,0,1,my bus\n"),
-            "skinbus: cells.csv: line 2: bus \"my bus\": its name has 1 to 15 letters",
+            "skinbus: cells.csv: line 2: bus \"my bus\": its name must have 1 to 15 letters",
         ),
     ] {
         place.write("cells.csv", &text);
@@ -320,16 +317,8 @@ fn each_covered_link_has_a_cell() {
     };
     let boxes = "--keep-out fore:-1,-1,-1,1,1,1";
     for (links, more, expected) in [
-        (
-            "upper,bare",
-            "",
-            "skinbus: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
-        ),
-        (
-            "bare",
-            "",
-            "skinbus: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
-        ),
+        ("upper,bare", "", "skinbus: --cover bare: no cell fits on its 0.0001 m2: lower the pitch, or"),
+        ("bare", "", "skinbus: --cover bare: no cell fits on its 0.0001 m2: lower the pitch, or"),
         (
             "upper,fore",
             boxes,
@@ -383,43 +372,43 @@ fn torques_of_a_force_are_computed_in_both_ways() {
 
     for (words, expected) in [
         ("--cell 9 --force 1 --joints 0,0.5", "--cell 9: the skin has no such cell on vcan0"),
-        ("--cell 1 --force 1 --joints 0", "one is needed for each of the chain's 2 joints, shoulder, elbow"),
+        ("--cell 1 --force 1 --joints 0", "one is needed for each of the chain's 2 joints: shoulder, elbow"),
         ("--cell 1 --force 1 --joints 0,x", "position \"x\" of elbow: a number in rad is needed"),
-        ("--cell 1 --force -1 --joints 0,0.5", "force -1 N: a force presses against the outward normal"),
+        ("--cell 1 --force -1 --joints 0,0.5", "force -1 N: the force against the outward normal"),
         ("--cell 1 --force 95.998 --joints 0,0.5", "skinbus: --cell 1: force 95.998 N: "),
         (
             "--cell vcan0:1 --force 1 --joints 45,0.5",
-            "skinbus: --cell vcan0:1: position 45 rad: shoulder takes -6.2832 to 6.2832 rad",
+            "skinbus: --cell vcan0:1: position 45 rad: shoulder allows -6.2832 to 6.2832 rad",
         ),
         ("--cell 1 --joints 0,0.5", "--force"),
         ("--cell 1 --force 1 --joints 0,0.5 --batch rows.csv", "cannot be used with"),
         ("--batch nowhere.csv", "nowhere.csv: No such file"),
         (
             "--batch cells.csv",
-            "cells.csv: line 1: the first line must be the header cell,force_n,q, and it is \"link,",
+            "cells.csv: line 1: the first line must be the header cell,force_n,q, not \"link,",
         ),
     ] {
         refused(&place, &format!("explain skin.toml {words}"), expected);
     }
     for (text, expected) in [
-        ("cell,force_n,q\n", "there is no row in it"),
+        ("cell,force_n,q\n", "it contains no rows"),
         (
             "cell,force_n,q\n7,1,0 0.5\n",
             "skinbus: rows.csv, row 1: cell 7: the skin has no such cell on vcan0",
         ),
         (
             "cell,force_n,q\n1,1,0 0.5\nvcan5:1,1,0 0.5\n",
-            "skinbus: rows.csv, row 2: cell vcan5:1: the skin's buses are vcan0",
+            "skinbus: rows.csv, row 2: cell vcan5:1: the skin has no such bus; it has vcan0",
         ),
-        ("cell,force_n,q\n1,1,0\n", "skinbus: rows.csv, row 1: cell 1: 1 position given: one is needed"),
+        ("cell,force_n,q\n1,1,0\n", "skinbus: rows.csv, row 1: cell 1: 1 position given, but one is needed"),
         (
             "cell,force_n,q\n1,x,0 0.5\n",
             "skinbus: rows.csv: line 2: force_n = \"x\": a finite number is needed",
         ),
-        ("1,1,0 0.5\n2,1,0 0.5\n", "and it is \"1,1,0 0.5\": write the header above it"),
+        ("1,1,0 0.5\n2,1,0 0.5\n", ", not \"1,1,0 0.5\": write the header above it"),
         (
             "cell,force_n,q\n1,1,0 0.5\nvcan0:2,96,0 0.5\n",
-            "skinbus: rows.csv, row 2: cell vcan0:2: force 96 N: a force presses against the outward normal with 0 to \
+            "skinbus: rows.csv, row 2: cell vcan0:2: force 96 N: the force against the outward normal can be 0 to \
              95.997 N, the range of three contact words",
         ),
         (
@@ -439,7 +428,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
     run(&place, "skin import arm.urdf --tip bare -o skin.toml --overwrite").succeeded();
     run(&place, "explain skin.toml --cell 1 --force 1 --joints -3.14159,0.5").succeeded();
     for (joints, expected) in [
-        ("-6.3,0", "position -6.3 rad: shoulder takes -6.2832 to 6.2832 rad"),
+        ("-6.3,0", "position -6.3 rad: shoulder allows -6.2832 to 6.2832 rad"),
         ("0,0.6", "position 0.6 m: elbow takes 0.0000 to 0.5000 m"),
     ] {
         refused(&place, &format!("explain skin.toml --cell 1 --force 1 --joints {joints}"), expected);

@@ -85,9 +85,8 @@ fn a_program_that_cannot_be_run_is_named() {
     let found = Running::start(command(&place, &copy(&place), "link vcan0")).end();
     let expected = format!("vcan-setup: cannot run {}: Permission denied (os error 13)", file.display());
     assert_eq!(found.refusal(1), expected);
-    let expected =
-        "vcan-setup: cannot run ./vcan-link: Permission denied (os error 13); SKINBUS_VCAN_LINK names it";
+    let expected = "vcan-setup: cannot run ./vcan-link: Permission denied (os error 13); correct SKINBUS_VCAN_LINK, which names it";
     assert_eq!(named("vcan-link").refusal(1), expected);
-    let expected = "vcan-setup: cannot run '/no where': No such file or directory (os error 2); SKINBUS_VCAN_LINK names it";
+    let expected = "vcan-setup: cannot run '/no where': No such file or directory (os error 2); correct SKINBUS_VCAN_LINK, which names it";
     assert_eq!(named("/no where").refusal(1), expected);
 }

@@ -131,7 +131,7 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     let epoch = &torque["epoch"];
     let ended = place.start("skinbus", &format!("explain {last} --epoch {epoch} --cell 1")).end().succeeded();
     assert!(
-        ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus of -0.0"),
+        ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus at -0.0"),
         "{ended:#?}"
     );
     assert!(!ended.stdout.contains("not known"), "{ended:#?}");
@@ -192,7 +192,7 @@ fn files_that_are_not_the_parts_of_one_recording_are_named() {
     recorded(&place);
     let refused = |files: &str| place.start("skinbus", &format!("dump {files}")).end().refusal(2).to_owned();
     let said = "skinbus: part 1 of the recording is missing between run.mcap and run-2.mcap: name all parts from the \
-                first to the last, or one alone";
+                first to the last, or only one part";
     assert_eq!(refused("run-2.mcap run.mcap run-3.mcap"), said);
     fs::copy(place.path("run-1.mcap"), place.path("again.mcap")).unwrap();
     let said = "skinbus: run-1.mcap and again.mcap are both part 1 of the recording: name one of them";
@@ -200,7 +200,7 @@ fn files_that_are_not_the_parts_of_one_recording_are_named() {
     let line = refused("run.mcap run-1.mcap run.log");
     assert_eq!(line, "skinbus: run.mcap is a part of a recording, but run.log is not: name only the parts");
     let line = refused("run.mcap nothing.mcap");
-    assert!(line.starts_with("skinbus: there is no file nothing.mcap, and run.mcap is one: "), "{line}");
+    assert!(line.starts_with("skinbus: run.mcap is a file, but there is no file nothing.mcap: "), "{line}");
     fs::rename(place.path("run.mcap"), place.path("run-recovered.mcap")).unwrap();
     place.bench(0.1, "--record other.mcap").end().succeeded();
     let line = refused("other.mcap run-1.mcap");
@@ -234,7 +234,7 @@ fn parts_of_a_killed_run_come_back_recovered_or_as_they_are() {
     let whole = parts(&place).join(" ");
     let (ended, replayed) = place.replayed(&format!("{whole} {last}"), "--expect --spawn --speed max");
     let as_it_is = replayed.all_came_back(&ended);
-    assert!(ended.stderr.contains("it has no end"), "{ended:#?}");
+    assert!(ended.stderr.contains("its end is missing"), "{ended:#?}");
     place.start("skinbus", &format!("recover {last} -o z-recovered.mcap")).end().succeeded();
     let (ended, replayed) = place.replayed(&format!("z-recovered.mcap {whole}"), route);
     assert_eq!(replayed.all_came_back(&ended), as_it_is);

@@ -429,7 +429,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
             let run = "run skin.toml --bus-kind embedded --duration 0.01 --record other.mcap --quiet";
             let ended = place.start("skinbus", run).end().succeeded();
             let says =
-                "run.mcap.part was left by a run that was killed; repaired, it is run-recovered.mcap: ";
+                "run.mcap.part was left by a run that was killed; it was repaired as run-recovered.mcap: ";
             assert!(ended.stderr.lines().any(|line| line.starts_with(says)), "{ended:#?}");
             assert!(!part.exists(), "{ended:#?}");
             fs::remove_file(place.path("other.mcap")).unwrap();

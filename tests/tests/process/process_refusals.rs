@@ -38,21 +38,21 @@ fn skin_refusal(old: &str, new: &str, expected: &str) {
 #[test]
 fn an_invalid_skin_is_refused_with_line_key_value_and_what_is_allowed() {
     for (old, new, expected) in [
-        ("node = 2\n", "node = 1\n", "cell[1].node = 1: cell[0] has this node on \"vcan0\" already"),
+        ("node = 2\n", "node = 1\n", "cell[1].node = 1: cell[0] already has this node id on \"vcan0\""),
         ("node = 2\n", "node = 255\n", "cell[1].node = 255: a cell's node is 1 to 254"),
         ("joint = 2\n", "joint = 7\n", "cell[0].joint = 7: the robot has joints 1 to 6"),
         ("joint = 2\n", "joint = 0\n", "cell[0].joint = 0: the robot has joints 1 to 6"),
         (
             "orientation = [0.0, 0.0, 0.0, 1.0]",
             "orientation = [0.0, 0.0, 0.0, 0.9]",
-            "cell[0].orientation = [0, 0, 0, 0.9]: this quaternion has length 0.900000; it must be 1 within \
+            "cell[0].orientation = [0, 0, 0, 0.9]: this quaternion has length 0.900000; it must be 1 to within \
              0.001",
         ),
         (
             "position = [",
             "position = [2.0, 0.0, 0.0]#[",
-            "cell[0].position = [2, 0, 0]: node 1 can come 2.000 m from a frame of its rows, 0.001 m more than the \
-             1.999 m that Q1.14 holds",
+            "cell[0].position = [2, 0, 0]: node 1 can be 2.000 m away from a frame of its rows, 0.001 m more than the \
+             1.999 m that Q1.14 can hold",
         ),
         (
             "[controller]",
@@ -80,7 +80,10 @@ fn a_fault_that_processes_cannot_make_is_refused() {
         "{PRESSED}\n[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\nbus = \"vcan0\"\n"
     ));
     let said = refusal(&place, "skinbus", "run skin.toml --scenario scenario.toml --bus-kind embedded", 2);
-    assert!(said.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s: a run with processes"), "{said}");
+    assert!(
+        said.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s works only in virtual time"),
+        "{said}"
+    );
 }
 
 #[test]
@@ -238,7 +241,7 @@ fn buses_are_not_kept_where_others_may_look() {
     command.env("SKINBUS_DIR", place.path("open"));
     let ended = process::Running::start(command).end();
     let said = ended.refusal(2);
-    assert!(said.contains("and the bus is private: `chmod 700` it, or set SKINBUS_DIR"), "{said}");
+    assert!(said.contains("but the bus must be private: `chmod 700` it, or set SKINBUS_DIR"), "{said}");
     assert_eq!(place.files(), ["open", "scenario.toml", "skin.toml"]);
 }
 
@@ -256,9 +259,9 @@ fn an_unusable_socket_of_an_external_controller_is_named_before_cells_are_starte
     };
     refused("nowhere/c.sock", "cannot listen on this socket: No such file or directory (os error 2)");
     place.write("plain", "");
-    refused("plain", "exists and is no socket; it is left alone");
+    refused("plain", "exists and is not a socket, so it was left unchanged; choose another path");
     let _live = UnixDatagram::bind(place.path("live.sock")).unwrap();
-    refused("live.sock", "another program listens on this socket; end it, or name another path");
+    refused("live.sock", "another program listens on this socket; stop it, or choose another path");
 }
 
 #[test]

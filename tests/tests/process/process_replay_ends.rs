@@ -108,8 +108,8 @@ fn invalid_input_is_refused_in_one_line() {
         ("none.log", 1, "skinbus: none.log: there is no frame in it"),
         ("nothing.log", 2, "skinbus: nothing.log: No such file"),
         ("some.zip", 2, "skinbus: some.zip is a zip"),
-        ("-", 2, "skinbus: a replay reads its capture twice, but standard input only once"),
-        ("some.log --from 5", 2, "skinbus: nothing remains to be sent: some.log ends at 2.000 s"),
+        ("-", 2, "skinbus: a replay reads its capture twice, which standard input does not allow"),
+        ("some.log --from 5", 2, "skinbus: --from and --to leave nothing to send: some.log ends at 2.000 s"),
         ("some.log --map can0=can1", 2, "skinbus: --map can0=can1: some.log has no bus can0; it has vcan0"),
         ("some.log --bus can0", 2, "skinbus: --bus can0: some.log has no bus can0; it has vcan0"),
         (
@@ -130,13 +130,13 @@ fn invalid_input_is_refused_in_one_line() {
         (
             "some.log --only replies --expect",
             2,
-            "skinbus: --expect lets cells answer, and --only sends recorded",
+            "skinbus: --expect makes cells answer, but --only would send recorded",
         ),
         ("some.log --expect --spawn", 2, "skinbus: --spawn: some.log has no skin attached"),
         (
             "some.log --map vcan0=can9 --spawn --skin skin.toml",
             2,
-            "skinbus: --spawn: the capture goes to can9, and the",
+            "skinbus: --spawn: the capture is sent to can9, but the",
         ),
         ("some.log --spawn --skin nothing.toml", 2, "skinbus: nothing.toml: "),
         ("some.log", 2, "skinbus: no embedded bus vcan0 is served"),
@@ -175,9 +175,9 @@ fn an_unreadable_line_is_named_and_omitted_and_times_that_run_backwards_are_repo
         said[..4],
         [
             "odd.log:2: column 4: digits of a second",
-            "odd.log: lines that could not be read and are left out: 1",
-            "odd.log: 7 frames are missing: they were lost while it was recorded",
-            "odd.log: times run backwards, first at frame 3 by 4.100 s: what is older than what was sent before it is \
+            "odd.log: lines skipped because they could not be read: 1",
+            "odd.log: 7 frames are missing: they were lost during recording",
+            "odd.log: times run backwards, first at frame 3 by 4.100 s: a frame older than one already sent is \
              sent at once",
         ]
     );

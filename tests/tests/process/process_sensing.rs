@@ -92,7 +92,8 @@ fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
     (1..=CELLS).for_each(tells);
     assert_eq!(switches(&place, "off"), "8 cells on vcan0 (embedded): off\n");
 
-    let why = "skinbus: no cell 99 answers on vcan0: start it, or name the bus' format with --format classic";
+    let why =
+        "skinbus: no cell 99 answers on vcan0: start it, or give the bus's format with --format classic";
     assert_eq!(refusal(&place, "event --cell 99", 1), why);
     ends(bench);
     place.is_left_clean();
@@ -193,10 +194,13 @@ fn an_invalid_request_is_refused_in_one_line() {
         refusal(&place, "continuous", 2),
         "skinbus: continuous needs a rate, such as `continuous 62.5`"
     );
-    assert_eq!(refusal(&place, "event 10", 2), "skinbus: HZ = 10: only continuous has a rate; leave it out");
+    assert_eq!(
+        refusal(&place, "event 10", 2),
+        "skinbus: HZ = 10: only the mode continuous has a rate: leave it out"
+    );
     assert_eq!(
         refusal(&place, "continuous 60", 2),
-        "skinbus: HZ = 60: its period must be a whole number of ms; the nearest are 58.8235 and 62.5000 Hz"
+        "skinbus: HZ = 60: its period must be a whole number of ms; the nearest rates are 58.8235 and 62.5000 Hz"
     );
     let nowhere = refusal(&place, "event", 2);
     assert!(nowhere.starts_with("skinbus: ") && nowhere.contains("vcan0"), "{nowhere}");

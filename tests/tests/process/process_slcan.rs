@@ -186,7 +186,7 @@ fn an_adapter_that_was_deaf_when_it_was_opened_is_opened_again_at_its_first_refu
     pty.peer.write_bytes(b"\x07");
     pty.peer.wait_for_text("\rC\rS6\rY0\rO\r");
     bridge.wait_for_stderr("its adapter refuses frames (BEL)");
-    bridge.wait_for_stderr("1 more frames to the line lost, in all 1 dropped (1 refused by the adapter)");
+    bridge.wait_for_stderr("1 more frames to the line lost, in total 1 dropped (1 refused by the adapter)");
     // It is open now.
     pty.peer.write_bytes(b"\r\r\r");
     bench.client.send(&frames[1..]).unwrap();
@@ -292,10 +292,10 @@ fn goes_and_returns(
         bench.client.send(&[frame]).unwrap();
         assert_eq!(peer.receives(1), [frame], "{address}");
         peer.write_bytes(b"t12");
-        let before = bridge.stderr().matches(": away (").count();
+        let before = bridge.stderr().matches(": unavailable (").count();
         gone(peer);
         until("the end to be noticed", || {
-            (bridge.stderr().matches(": away (").count() > before).then_some(())
+            (bridge.stderr().matches(": unavailable (").count() > before).then_some(())
         });
         bench.client.send(&[frame]).unwrap();
     }
@@ -398,7 +398,7 @@ fn a_bus_goes_and_returns() {
     let mut pty = Pty::new();
     let bridge = bench.joined(&pty.path.display().to_string());
     bench.server.signal(Signal::TERM);
-    bridge.wait_for_stderr("its bus is away (the embedded bus vcan0 was closed: its server ended)");
+    bridge.wait_for_stderr("its bus is unavailable (the embedded bus vcan0 was closed: its server ended)");
     let frame = Frame::classic(0x123, &[5]).unwrap();
     pty.peer.sends(&[frame]);
     let server = bench.place.start("vcan-setup", "serve vcan0");
@@ -419,7 +419,7 @@ fn what_cannot_be_is_refused_in_one_line() {
     let _listener = UnixListener::bind(&socket).unwrap();
     let refused = |words: &str, code| bench.slcan(words).end().refusal(code).to_owned();
     let cannot = |what: &str, why: &str| {
-        format!("vcan-setup: cannot open {what}: {why}; with --wait it is opened when it is there")
+        format!("vcan-setup: cannot open {what}: {why}; with --wait it is opened when it is available")
     };
     assert_eq!(refused("/dev/none", 1), cannot("/dev/none", "No such file or directory (os error 2)"));
     assert_eq!(refused("unix:/none", 1), cannot("unix:/none", "No such file or directory (os error 2)"));
@@ -433,13 +433,16 @@ fn what_cannot_be_is_refused_in_one_line() {
     );
     assert_eq!(
         refused(&format!("{tty} {tty}"), 2),
-        format!("vcan-setup: {tty} is named twice: each line is one participant")
+        format!("vcan-setup: {tty} is named twice: name each line once")
     );
     assert_eq!(
         refused(&format!("{tty} --cell 1 --cell 2"), 2),
-        "vcan-setup: 2 --cell for 1 lines: give one for each, or write /dev/ttyACM0,cell=12"
+        "vcan-setup: 2 --cell for 1 lines: give one for each line, or write /dev/ttyACM0,cell=12"
     );
-    assert!(refused("ttyACM0", 2).contains("\"ttyACM0\" is no line: /dev/ttyACM0, unix:/path/to/socket"));
+    assert!(
+        refused("ttyACM0", 2)
+            .contains("\"ttyACM0\" is not a line: use a form such as /dev/ttyACM0, unix:/path/to/socket")
+    );
     assert!(
         refused(&format!("{tty} --bit-rates 300k"), 2)
             .contains("--bit-rates 300k: slcan has the bit rates 10k")

@@ -25,7 +25,7 @@ fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
     bench.wait_for_loop();
     holds(&TestClient::on(&place, "vcan0", Format::Fd), CELLS.into());
     let said = end(&place, bench).stderr;
-    assert!(said.contains("the cells of vcan0 are a tree of depth "), "{said}");
+    assert!(said.contains("the cells of vcan0 formed a tree of depth "), "{said}");
     let summary = place.summary();
     let sums = |key: &str| summary.of_bus(&format!("/sums/{key}"));
     let broadcasts = summary.number("/loop/broadcasts");
@@ -138,9 +138,9 @@ fn cells_that_are_wired_otherwise_than_described_are_named() {
     assert_eq!(
         lines,
         [
-            "port 3 of cell 6 leads to port 2 of cell 11 and should lead to port 2 of cell 10: plug it there, or \
+            "port 3 of cell 6 is wired to port 2 of cell 11 instead of port 2 of cell 10: move the plug, or \
              change the description",
-            "port 3 of cell 7 leads to port 2 of cell 10 and should lead to port 2 of cell 11: plug it there, or \
+            "port 3 of cell 7 is wired to port 2 of cell 10 instead of port 2 of cell 11: move the plug, or \
              change the description",
             "the wire from port 3 of cell 8 to port 2 of cell 12 does not work: check its plugs",
         ]

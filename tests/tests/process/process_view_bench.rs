@@ -75,7 +75,7 @@ fn a_page_kills_stops_and_restarts_cells() {
             "link down between cell 1 and cell 2 on vcan0: ",
         ),
         (r#""on":"bus","down":true,"bus":7"#, "the skin has no such bus"),
-        (r#""on":"bus","down":false,"bus":0"#, "bus vcan0 up: it is not down by a command"),
+        (r#""on":"bus","down":false,"bus":0"#, "bus vcan0 up: no command has brought it down"),
     ] {
         page.command(command);
         assert!(!page.answer(why), "{why}");
@@ -138,7 +138,7 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
     assert!(run.stderr().contains(&format!("the robot is halted: {};", why(&said).unwrap())), "{said}");
     assert!(!served(), "it is not served again by itself");
     page.command(r#""on":"bus","down":true,"bus":0"#);
-    assert!(!page.answer("it is not up by a command"));
+    assert!(!page.answer("no command has brought it up"));
 
     page.command(r#""on":"bus","down":false,"bus":0"#);
     assert!(page.answer("bus vcan0 up"));
@@ -193,7 +193,7 @@ fn a_cell_that_a_page_restarts_while_its_node_id_is_taken_ends_by_an_error_of_it
     let other = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin other.toml");
     page.wait_for_snapshot("another cell 3", |it| it.cells[2].0 == 1);
     page.act("restart", 3);
-    let why = "cell 3 is on vcan0 already, with serial number ";
+    let why = "cell 3 is already on vcan0, with serial number ";
     run.wait_for_stderr(&format!("the process of cell 3 on vcan0 ended (exit status: 1: {why}"));
     drop(other);
     assert_eq!(end(&place, run), Some(5));
@@ -269,7 +269,7 @@ fn a_server_that_hangs_or_ends_does_not_hold_the_run_up() {
     run.wait_for_stderr(
         "--view: the process that served the page has ended; the run goes on without a page\n",
     );
-    run.wait_for_stderr("the process that served vcan0 ended (exit status: 0); it is served again");
+    run.wait_for_stderr("the process that served vcan0 ended (exit status: 0); a new process serves it");
     run.wait_for_stderr("vcan0 works again");
     goes_on(&run);
     assert_eq!(end(&place, run), Some(0));

@@ -122,7 +122,7 @@ fn a_log_needs_a_skin_and_is_shown_with_it() {
     let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings");
     std::fs::copy(from.join("classic.log"), place.path("classic.log")).unwrap();
     let ended = place.start("skinbus", "view classic.log").end();
-    assert_eq!(ended.refusal(2), "skinbus: classic.log has no skin in it: name one with --skin");
+    assert_eq!(ended.refusal(2), "skinbus: classic.log contains no skin: name one with --skin");
 }
 
 #[test]
@@ -133,13 +133,10 @@ fn what_cannot_be_shown_is_named() {
     for (words, expected) in [
         (
             "view nothing.mcap",
-            "there is no file nothing.mcap: name a skin, to show its buses, a recording, or a bus and its --skin",
+            "there is no file nothing.mcap: name a skin (to show its buses), a recording, or a bus with --skin",
         ),
         ("view /dev/null", "/dev/null is not a regular file: name a skin, to show its buses, or a recording"),
-        (
-            "view -",
-            "there is no file -: name a skin, to show its buses, a recording, or a bus and its --skin",
-        ),
+        ("view -", "there is no file -: name a skin (to show its buses), a recording, or a bus with --skin"),
         ("view text.log text.log", "text.log is named twice: name it once"),
     ] {
         let ended = place.start("skinbus", words).end();

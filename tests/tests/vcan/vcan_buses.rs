@@ -109,9 +109,9 @@ fn an_interface_that_is_removed_and_made_again_is_opened_again() {
     let removed =
         |name: &str| format!("{name} was removed while it was in use: make it again and open it again");
     vcan2.remove();
-    bench.wait_for_stderr(&format!("{}; the others go on", removed("vcan2")));
+    bench.wait_for_stderr(&format!("{}; the other buses continue", removed("vcan2")));
     vcan1.remove();
-    bench.wait_for_stderr(&format!("{}; the others go on", removed("vcan1")));
+    bench.wait_for_stderr(&format!("{}; the other buses continue", removed("vcan1")));
     for cell in 1..=2 {
         bench.wait_for_event_on("vcan1", cell, "fallen silent");
         bench.wait_for_event_on("vcan2", cell, "fallen silent");
@@ -123,7 +123,7 @@ fn an_interface_that_is_removed_and_made_again_is_opened_again() {
     answers(&place, 1);
     // First with the wrong setting, which is reported, and then with the right one.
     let narrow = Vcan::with_mtu("vcan2", 16);
-    bench.wait_for_stderr("vcan2 cannot be opened again yet: vcan2 has MTU 16 and CAN FD needs 72");
+    bench.wait_for_stderr("vcan2 cannot be reopened yet: vcan2 has MTU 16 and CAN FD needs 72");
     narrow.remove();
     let _vcan2 = Vcan::make("vcan2");
     bench.wait_for_stderr("vcan2 works again");

@@ -196,7 +196,7 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
     let log = Log::read(&place.read("run.log"), Format::Fd);
     assert!(!log.torques().is_empty());
     assert!(
-        stderr.contains(&format!("{} frames received until then are in run.log", log.frames.len())),
+        stderr.contains(&format!("{} frames received before the failure are in run.log", log.frames.len())),
         "{stderr}"
     );
 
@@ -238,7 +238,7 @@ fn a_bus_that_cannot_be_used_is_refused_with_its_hint() {
     let _narrow = Vcan::with_mtu("vcan6", 16);
     says("vcan6", "vcan6 has MTU 16 and CAN FD needs 72: set it with `");
     says("vcan7", "there is no interface vcan7: make it with `");
-    says("lo", "lo is an interface, but no CAN interface");
+    says("lo", "lo is not a CAN interface");
 }
 
 #[test]

@@ -106,14 +106,14 @@ fn a_vcan_is_made_once_carries_fd_frames_and_is_removed() {
 
     assert_eq!(
         done("up vcan20 vcan21"),
-        "vcan20 is made, a vcan with MTU 72, and up\nvcan21 is made, a vcan with MTU 72, and up\n"
+        "made vcan20, a vcan with MTU 72, and brought it up\nmade vcan21, a vcan with MTU 72, and brought it up\n"
     );
     let first = link("vcan20").unwrap();
     assert_ours(&first, "vcan");
     assert_ours(&link("vcan21").unwrap(), "vcan");
     passes(&open("vcan20"), &open("vcan20"));
 
-    assert_eq!(done("up vcan20"), "vcan20 is there already, and fits (a vcan)\n");
+    assert_eq!(done("up vcan20"), "vcan20 already exists and is suitable (a vcan)\n");
     assert_eq!(link("vcan20").unwrap()["ifindex"], first["ifindex"], "the same one");
     assert_eq!(done("down vcan20 vcan21"), "vcan20 is removed\nvcan21 is removed\n");
     assert_eq!(links("").len(), before);
@@ -138,7 +138,7 @@ fn the_commands_of_a_plan_do_the_same() {
     let command = plan.lines().nth(1).unwrap().trim();
     assert!(Command::new("sh").args(["-c", command]).status().unwrap().success(), "{command}");
     assert_eq!(of(link("vcan20").unwrap()), by_us);
-    assert_eq!(done("up vcan20"), "vcan20 is there already, and fits (a vcan)\n");
+    assert_eq!(done("up vcan20"), "vcan20 already exists and is suitable (a vcan)\n");
 }
 
 #[test]
@@ -179,8 +179,10 @@ fn what_is_not_ours_is_never_touched() {
         "vcan20 is a vcan that vcan-setup has not made, and is left alone: if it is yours, `sudo ip link del \
          vcan20` removes it"
     );
-    assert!(fails("up vcan21 lo", 2).starts_with("lo is real, the loopback interface, and is left alone"));
-    assert_eq!(done("up vcan0"), "vcan0 is there already, and fits (a vcan, made by another program)\n");
+    assert!(
+        fails("up vcan21 lo", 2).starts_with("lo is the loopback interface, which vcan-setup leaves alone")
+    );
+    assert_eq!(done("up vcan0"), "vcan0 already exists and is suitable (a vcan, made by another program)\n");
     let same = |links: Vec<Value>| -> Vec<_> {
         links
             .into_iter()
@@ -199,7 +201,10 @@ fn what_is_not_ours_is_never_touched() {
 
     // The hint works.
     assert!(Command::new("sh").args(["-c", &repairs["sudo ".len()..]]).status().unwrap().success());
-    assert_eq!(done("up vcan20"), "vcan20 is there already, and fits (a vcan, made by another program)\n");
+    assert_eq!(
+        done("up vcan20"),
+        "vcan20 already exists and is suitable (a vcan, made by another program)\n"
+    );
 }
 
 #[test]
@@ -217,7 +222,7 @@ fn a_skins_buses_are_made_and_removed_and_what_others_made_stays() {
     let said = done(&format!("up {path}"));
     assert_eq!(
         said,
-        "vcan0 is there already, and fits (a vcan, made by another program)\nvcan20 is made, a vcan with MTU 72, and up\n"
+        "vcan0 already exists and is suitable (a vcan, made by another program)\nmade vcan20, a vcan with MTU 72, and brought it up\n"
     );
     let doctor = run_as(0, &format!("doctor {path} --json"));
     let json: Value = serde_json::from_str(&doctor.out).unwrap();
@@ -244,7 +249,7 @@ fn who_makes_interfaces_at_the_same_time_as_others_makes_them() {
             all.map(|one| one.join().unwrap())
         });
         for (name, said) in NAMES.iter().zip(said) {
-            assert_eq!(said, format!("{name} is made, a vcan with MTU 72, and up\n"));
+            assert_eq!(said, format!("made {name}, a vcan with MTU 72, and brought it up\n"));
             assert_ours(&link(name).unwrap(), "vcan");
         }
         done(&format!("down {}", NAMES.join(" ")));
@@ -289,7 +294,7 @@ fn a_pair_leads_into_another_namespace() {
     assert_eq!((link("vcan20"), link_in("blue", "vcan0")), (None, None));
     assert_eq!(
         done(up),
-        "vcan20 is made, and its other end vcan0 in blue, a vxcan pair with MTU 72, both up\n"
+        "made vcan20 and its other end vcan0 in blue, a vxcan pair with MTU 72, and brought both up\n"
     );
     assert_ours(&link("vcan20").unwrap(), "vxcan");
     assert_ours(&link_in("blue", "vcan0").unwrap(), "vxcan");
@@ -297,10 +302,10 @@ fn a_pair_leads_into_another_namespace() {
     passes(&here, &there);
     passes(&there, &here);
 
-    assert_eq!(done(up), "vcan20 is there already, and fits (a vxcan)\n");
+    assert_eq!(done(up), "vcan20 already exists and is suitable (a vxcan)\n");
     assert_eq!(
         done("up vcan20 --peer vcan0 --namespace /run/netns/blue"),
-        "vcan20 is there already, and fits (a vxcan)\n"
+        "vcan20 already exists and is suitable (a vxcan)\n"
     );
     let status: Value = serde_json::from_str(&done("status vcan20 --json")).unwrap();
     let peer = &status["interfaces"][0]["peer"];
@@ -308,11 +313,10 @@ fn a_pair_leads_into_another_namespace() {
     assert!(done("status").contains("vxcan to vcan0 in blue"));
     let other = "up vcan20 --peer vcan1 --namespace blue";
     assert!(
-        fails(other, 1)
-            .starts_with("vcan20 is there already and is a vxcan, not one end of a pair with vcan1")
+        fails(other, 1).starts_with("vcan20 already exists and is a vxcan, not one end of a pair with vcan1")
     );
     let taken = "up vcan21 --peer vcan0 --namespace blue";
-    assert!(fails(taken, 1).starts_with("vcan0 is there already and is a vxcan in blue"));
+    assert!(fails(taken, 1).starts_with("vcan0 already exists and is a vxcan in blue"));
     ip("-n blue link set vcan0 down");
     let said = fails(up, 1);
     assert!(
@@ -361,7 +365,10 @@ fn what_was_made_is_taken_back_when_a_later_step_fails() {
     ip("link property add dev vcan20 altname vcan22");
     let said = run_as(0, "up vcan20 vcan21 vcan22");
     assert_eq!((said.code, said.out.as_str()), (1, ""), "{said:?}");
-    assert!(said.err.starts_with("vcan-setup: cannot make vcan22: an interface has that name"), "{said:?}");
+    assert!(
+        said.err.starts_with("vcan-setup: cannot make vcan22: another interface now has this name"),
+        "{said:?}"
+    );
     assert!(links("").iter().all(|link| link["ifname"] != "vcan21"), "taken back");
     let vcan20 = link("vcan20").unwrap();
     assert!(vcan20["mtu"] == 16 && !flag(&vcan20, "UP"), "as it was: {vcan20}");
@@ -424,7 +431,7 @@ fn status_agrees_with_ip() {
     assert_eq!((&vcan20["sent"], &vcan20["received"]), (&3.into(), &3.into()));
     assert_eq!(done("status vcan21").lines().count(), 2, "a head and the one that was named");
     let said = run_as(0, "status vcan20 vcan77");
-    assert!(said.code == 1 && said.err.starts_with("vcan-setup: not there: vcan77;"), "{said:?}");
+    assert!(said.code == 1 && said.err.starts_with("vcan-setup: not found: vcan77;"), "{said:?}");
     assert_eq!(run_as(0, "status vcan77").out, "", "nothing that is untrue of the others");
 }
 

@@ -63,7 +63,7 @@ fn main() -> Outcome<()> {
     });
     println!("round trip on one bus    p50 {:.0?}, p99 {:.0?}", one_bus[0], one_bus[1]);
     println!("round trip over the link p50 {:.0?}, p99 {:.0?}", linked[0], linked[1]);
-    println!("added, p50               {:.0?}", linked[0].saturating_sub(one_bus[0]));
+    println!("added by the link, p50   {:.0?}", linked[0].saturating_sub(one_bus[0]));
 
     let far = open(&there)?;
     let answer = |node, epoch| -> Outcome<Frame> {
@@ -80,7 +80,7 @@ fn main() -> Outcome<()> {
     let took = links.processor() - before;
     println!("{CELLS} frames every {EPOCH:?}: {received} of {} arrived", EPOCHS * CELLS);
     println!(
-        "processor, both links    {:.1} us a frame",
+        "CPU time of both links   {:.1} us per frame",
         took * 1e6 / f64::from(u32::try_from(received.max(1))?)
     );
     drop(links);

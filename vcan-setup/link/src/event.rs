@@ -34,9 +34,9 @@ impl fmt::Display for LinkEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Joined(host) => write!(f, "host '{host}' has joined"),
-            Self::Gone(host) => write!(f, "host '{host}' is gone, or not reached"),
+            Self::Gone(host) => write!(f, "host '{host}' is gone or cannot be reached"),
             Self::Transport(what) => f.write_str(what),
-            Self::BusAway(why) => write!(f, "the bus is away ({why}); it is opened when it is there"),
+            Self::BusAway(why) => write!(f, "the bus is unavailable ({why}); it is opened when it is available"),
             Self::BusBack => f.write_str("the bus is back"),
             Self::Garbage(host, why) => write!(f, "host '{host}' sent {why}"),
             Self::Circle => f.write_str(
@@ -44,7 +44,7 @@ impl fmt::Display for LinkEvent {
                  such as a second link or an adapter; take one of them away",
             ),
             Self::SameName(host) => {
-                write!(f, "two hosts call themselves '{host}': give each --host a name of its own")
+                write!(f, "two hosts have the name '{host}': give each its own name with --host")
             }
             Self::Lost { from_here, from_others } => {
                 write!(f, "lost: {from_here} frames from here, {from_others} from other hosts")

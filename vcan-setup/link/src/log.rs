@@ -55,7 +55,7 @@ fn event_text(is_warning: bool, text: &str) -> Option<String> {
     if let Some(failed) = text.strip_prefix(FAILED) {
         let failed = failed.split(". Retry in").next().unwrap_or(failed);
         let (endpoint, why) = failed.split_once("! ").unwrap_or((failed, ""));
-        return Some(format!("cannot connect to {endpoint}, and tries again: {}", plain(why)));
+        return Some(format!("cannot connect to {endpoint}, retrying: {}", plain(why)));
     }
     let is_expected = EXPECTED.iter().any(|expected| text.starts_with(expected));
     (is_warning && !is_expected)
@@ -119,7 +119,7 @@ mod tests {
                       tcp/10.0.0.1:7447: [[Connection refused (os error 111)]] at /x/unicast.rs:9.. Retry in 100ms.";
         assert_eq!(
             event_text(false, failed).unwrap(),
-            "cannot connect to tcp/10.0.0.1:7447, and tries again: Can not create a new TCP link bound to tcp/10.0.0.1:7447: \
+            "cannot connect to tcp/10.0.0.1:7447, retrying: Can not create a new TCP link bound to tcp/10.0.0.1:7447: \
              [[Connection refused (os error 111)]]"
         );
         assert_eq!(event_text(false, "Try to connect: tcp/10.0.0.1:7447"), None);

@@ -76,12 +76,12 @@ fn json(report: &LinkReport) -> Result<String, Failure> {
 fn text(report: &LinkReport) -> String {
     let LinkReport { sent, hosts, returned, .. } = report;
     let mut text = format!(
-        "from here: {} frames taken, {} sent in {} messages, {} dropped, {} missed\n",
+        "from here: {} frames read, {} sent in {} messages, {} dropped, {} missed\n",
         sent.taken, sent.sent, sent.messages, sent.dropped, sent.missed
     );
     for (host, HostReport { heard, .. }) in hosts {
         text += &format!(
-            "from '{host}': {} frames taken, {} sent to the bus; lost {} on the way, {} there, {} here; {} from before\n",
+            "from '{host}': {} frames received, {} sent to the bus; lost: {} on the way, {} there, {} here; {} sent before the link began\n",
             heard.taken,
             heard.sent,
             heard.lost,

@@ -48,7 +48,7 @@ pub(crate) enum LinkError {
     Zenoh(String),
     /// The link neither listens nor connects.
     #[error(
-        "no endpoint: say where the other hosts are (--connect), or where they find this one (--listen); or both in a \
+        "no endpoint: give the address of another host (--connect) or an address of this host (--listen), or both in a \
          file for --config"
     )]
     Alone,
@@ -56,7 +56,7 @@ pub(crate) enum LinkError {
     #[error("{0} {1}: an endpoint is tcp/HOST:PORT or tls/HOST:PORT")]
     Endpoint(String, String),
     /// Some endpoints use TLS and others do not.
-    #[error("{plain} would be open to everyone beside {secure}: make all endpoints tls/, or none of them")]
+    #[error("{plain} does not use TLS, but {secure} does: use tls/ for all endpoints or for none")]
     PlainBesideTls {
         /// An endpoint without TLS.
         plain: String,
@@ -64,10 +64,12 @@ pub(crate) enum LinkError {
         secure: String,
     },
     /// The name of the bus or the host contains characters that a Zenoh key cannot have.
-    #[error("'{0}' cannot be a part of a key of Zenoh: {1}")]
+    #[error("'{0}' cannot be part of a Zenoh key: {1}")]
     Name(String, String),
     /// Another process of this machine already links the bus.
-    #[error("the bus '{0}' is linked already by another process here: one link carries it to all hosts")]
+    #[error(
+        "the bus '{0}' is already linked by another process on this host: one link serves all other hosts"
+    )]
     Twice(String),
     /// The system call that waits for frames failed.
     #[error("cannot wait for frames: {0}")]

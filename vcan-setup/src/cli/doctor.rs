@@ -28,7 +28,7 @@ pub(crate) struct DoctorOptions {
     what: Vec<OsString>,
     #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
-    /// Expect cells that run already, or real ones, as `skinbus run --no-spawn` does
+    /// Expect cells that are already running, or real ones, as `skinbus run --no-spawn` does
     #[arg(long)]
     no_spawn: bool,
     /// Print JSON

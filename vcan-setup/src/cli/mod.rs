@@ -103,7 +103,7 @@ fn parse_argument(word: &OsStr) -> Result<BusArgument, Failure> {
         return Ok(BusArgument::File(Box::new(skin)));
     }
     let name = word.to_str().ok_or_else(|| {
-        Failure::usage(format!("{} is no bus name: it is not UTF-8", shell_quoted_os(word)))
+        Failure::usage(format!("{} is not a bus name: it is not UTF-8", shell_quoted_os(word)))
     })?;
     parse_bus_name(name).map(BusArgument::Name).map_err(Failure::usage)
 }
@@ -137,5 +137,5 @@ fn query_interfaces() -> Result<(Netlink, Vec<Interface>), Failure> {
 }
 
 fn query_error(error: io::Error) -> Failure {
-    Failure::run(format!("cannot ask the kernel for its interfaces: {error}"))
+    Failure::run(format!("cannot query the interfaces of the kernel: {error}"))
 }

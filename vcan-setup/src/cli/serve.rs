@@ -79,20 +79,20 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     if garbage > 0 || refused > 0 {
         print_to_stderr(&format!(
             "{name}: ignored {garbage} datagrams that were neither frames nor filters, and refused {refused} clients: \
-             check their program against docs/reference/embedded-bus.md"
+             check the client programs against docs/reference/embedded-bus.md"
         ));
     }
     if turned_away > 0 {
         let limit =
             getrlimit(Resource::Nofile).current.map_or_else(String::new, |limit| format!(" of {limit}"));
         print_to_stderr(&format!(
-            "{name}: turned away {turned_away} clients for which there was no file{limit} or memory: end other clients, or \
+            "{name}: turned away {turned_away} clients, because no file descriptor{limit} or memory was left: end other clients, or \
              raise `ulimit -Hn`"
         ));
     }
     if let Some(failure) = failure {
         print_to_stderr(&format!(
-            "{name}: gave up {failed} clients whose sockets failed, the last one with: {failure}"
+            "{name}: disconnected {failed} clients whose sockets failed; the last error was: {failure}"
         ));
     }
     Ok(())

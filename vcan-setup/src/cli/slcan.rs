@@ -36,19 +36,19 @@ pub(crate) struct SlcanOptions {
     /// The lines: PATH, unix:PATH or tcp:HOST:PORT, followed by options after commas
     #[arg(value_name = "LINE", required = true)]
     lines: Vec<LineOptions>,
-    /// The cell behind a line: one for each LINE, in their order
+    /// The cell behind each LINE, in the order of the lines
     #[arg(long, value_name = "N", value_parser = parse_cell_id)]
     cell: Vec<CellId>,
-    /// Bit rates to set in adapters, as 500k or 1M/5M; by default they keep theirs
+    /// Bit rates to set in the adapters, such as 500k or 1M/5M [default: unchanged]
     #[arg(long, value_name = "RATES")]
     bit_rates: Option<BitRates>,
-    /// Speed of terminals in bit/s; by default they keep theirs
+    /// Speed of the terminals in bit/s [default: unchanged]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
     /// The adapters have no CAN FD: drop FD frames
     #[arg(long)]
     classic: bool,
-    /// Seconds from opening a line to setting its adapter, for boards that are reset by opening (Arduino, ESP32)
+    /// Seconds to wait between opening a line and setting its adapter, for boards that opening resets (Arduino, ESP32)
     #[arg(long, value_name = "SECONDS", value_parser = parse_settle)]
     settle: Option<Duration>,
     /// Begin without unavailable lines, and open them later
@@ -116,7 +116,7 @@ impl SlcanOptions {
         let mut lines = self.lines.clone();
         if !self.cell.is_empty() && self.cell.len() != lines.len() {
             return Err(Failure::usage(format!(
-                "{} --cell for {} lines: give one for each, or write /dev/ttyACM0,cell=12",
+                "{} --cell for {} lines: give one for each line, or write /dev/ttyACM0,cell=12",
                 self.cell.len(),
                 lines.len()
             )));

@@ -71,7 +71,7 @@ impl StatusOptions {
         let (names, words) = (absent.join(", "), absent.join(" "));
         let first = absent.first().unwrap_or(&"vcan0");
         Err(Failure::run(format!(
-            "not there: {names}; `vcan-setup serve {first}` serves an embedded bus, `vcan-setup doctor {words}` says what \
+            "not found: {names}; `vcan-setup serve {first}` serves an embedded bus, `vcan-setup doctor {words}` shows what \
              an interface needs"
         )))
     }

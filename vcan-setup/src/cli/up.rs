@@ -85,7 +85,7 @@ impl UpOptions {
         };
         let BusArgument::Name(name) = parse_argument(given)? else {
             return Err(Failure::usage(format!(
-                "--peer goes with the NAME of an interface, and {} is a skin",
+                "--peer needs the NAME of an interface, but {} is a skin",
                 shell_quoted_os(given)
             )));
         };
@@ -121,7 +121,7 @@ fn check_plain_name(name: &str) -> Result<(), Failure> {
     super::parse_bus_name(name).map_err(Failure::usage)?;
     if !is_plain_name(name) || name.starts_with(['-', '.']) {
         return Err(Failure::usage(format!(
-            "{name:?} is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0"
+            "{name:?} is not allowed as a name of an interface: use letters, digits, '-', '_' and '.', as in vcan0"
         )));
     }
     Ok(())
@@ -147,7 +147,7 @@ fn open_namespace(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Fa
         match Errno::from_io_error(&error) {
             Some(Errno::PERM) => not_allowed(),
             Some(Errno::INVAL) => Failure::usage(format!(
-                "{} is no network namespace: name one that `ip netns` lists, a process, or a file like /proc/1/ns/net",
+                "{} is not a network namespace: name one that `ip netns` lists, a process, or a file like /proc/1/ns/net",
                 path.display()
             )),
             _ => Failure::run(format!("cannot enter the network namespace {}: {error}", path.display())),
@@ -159,7 +159,7 @@ fn open_namespace(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Fa
 fn permission_error(what: &str) -> Failure {
     if rustix::process::geteuid().is_root() {
         return Failure::run(format!(
-            "not allowed to {what}: this root has no CAP_NET_ADMIN; in a container, start that with `--cap-add \
+            "not allowed to {what}: root has no CAP_NET_ADMIN here; in a container, start the container with `--cap-add \
              NET_ADMIN`"
         ));
     }
@@ -239,8 +239,8 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
         };
         let release = &kernel.release;
         Failure::run(format!(
-            "cannot {doing}: the kernel ({release}) has no {kind}: {command}{why}; or use the embedded bus, which \
-             needs none"
+            "cannot {doing}: the kernel ({release}) has no {kind}: {command}{why}; or use the embedded bus, which does \
+             not need it"
         ))
     };
     let data = if let StepAction::SetRates { rates, .. } = step.action { rates.data_bitrate } else { None };
@@ -256,13 +256,13 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
             missing.map_or_else(|| permission_error(&doing), |kind| unknown(kind, &kernel))
         }
         (Some(Errno::OPNOTSUPP), None) => {
-            Failure::run(format!("cannot {doing}: this hardware cannot ({error})"))
+            Failure::run(format!("cannot {doing}: this hardware does not support it ({error})"))
         }
         (Some(Errno::INVAL), None) => {
-            Failure::run(format!("cannot {doing}: its driver does not take that ({error})"))
+            Failure::run(format!("cannot {doing}: its driver rejects these settings ({error})"))
         }
         (Some(Errno::EXIST), Some(_)) => Failure::run(format!(
-            "cannot {doing}: an interface has that name since just now, or as an altname; `ip link show` lists them"
+            "cannot {doing}: another interface now has this name or altname; `ip link show` lists them"
         )),
         _ => Failure::run(format!("cannot {doing}: {error}")),
     }

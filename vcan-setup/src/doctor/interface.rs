@@ -28,7 +28,7 @@ impl MachineFacts {
                 Some(Finding::note(text).hint(self.with_sudo("modprobe vcan")))
             }
             ModuleState::Missing => {
-                let text = format!("the kernel ({}) has CAN and no vcan", self.kernel.release);
+                let text = format!("the kernel ({}) has CAN but no vcan", self.kernel.release);
                 Some(Finding::fault(text).hints(hints))
             }
         });
@@ -114,8 +114,9 @@ impl MachineFacts {
             if interface.is_virtual() && bus.target.hardware().is_some() {
                 let command =
                     if interface.ours { self.own_command("down") } else { self.with_sudo("ip link del") };
-                let text =
-                    format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has");
+                let text = format!(
+                    "{name} is {what} and has no bit rate; the skin gives it one, as if it were hardware"
+                );
                 let hint = format!("{command} {name}  # if hardware is to have this name");
                 findings.push(Finding::note(text).hint(hint));
             }
@@ -161,7 +162,7 @@ impl MachineFacts {
         let mut findings = Vec::new();
         let has = hardware.rates();
         if let Some(skin) = skin.filter(|skin| !has.matches(skin.rates)) {
-            let text = format!("{name} is {what} at {has}, and the skin says {}", skin.rates);
+            let text = format!("{name} is {what} with {has}, but the skin requires {}", skin.rates);
             findings.push(Finding::fault(text).hint(set()));
         } else if !bus.target.carried_by(*mtu) {
             let text = format!("{name} is {what} with MTU {mtu}, and CAN FD needs {FD_MTU}");
@@ -172,8 +173,8 @@ impl MachineFacts {
         }
         if bus.sums {
             let text = format!(
-                "{name} is {what}, and the wires between cells that answer with sums are simulated by frames that may \
-                 not go there"
+                "{name} is {what}, but cells that answer with sums simulate their wires with frames that must \
+                 not be sent there"
             );
             let hint = "reply = \"torque\"  # in the skin; or name a vcan or the embedded bus";
             findings.push(Finding::fault(text).hint(hint));
@@ -205,12 +206,12 @@ impl MachineFacts {
         if would_run(&findings) {
             findings.push(match skin {
                 Some(skin) if skin.rates.bitrate.is_some() => {
-                    Finding::ok(format!("{name} is at {has}, as the skin says"))
+                    Finding::ok(format!("{name} is at {has}, as the skin requires"))
                 }
-                Some(_) => {
-                    Finding::note(format!("{name} is at {has}; the skin does not say whether that is right"))
-                        .hint("bitrate = ...  # under its [[bus]] in the skin")
-                }
+                Some(_) => Finding::note(format!(
+                    "{name} is at {has}; the skin states no bit rate to compare it with"
+                ))
+                .hint("bitrate = ...  # under its [[bus]] in the skin"),
                 None => Finding::ok(format!("{name} is at {has}")),
             });
         }

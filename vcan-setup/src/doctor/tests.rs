@@ -159,7 +159,8 @@ fn hardware_of_a_skin_that_is_a_vcan_is_noted() {
             bus.interface.as_mut().unwrap().ours = ours;
         })
     };
-    let text = "note: vcan0 is a vcan and has no bit rate; the skin gives it one, as hardware has | sudo";
+    let text =
+        "note: vcan0 is a vcan and has no bit rate; the skin gives it one, as if it were hardware | sudo";
     let why = "vcan0  # if hardware is to have this name";
     assert_eq!(note(true), [format!("{text} vcan-setup down {why}")]);
     assert_eq!(note(false), [format!("{text} ip link del {why}")]);
@@ -217,7 +218,7 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     assert_eq!(missing(admin, ModuleState::Loadable)[0], loadable);
     assert!(
         missing(admin, ModuleState::Missing)[0]
-            .starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
+            .starts_with("fault: the kernel (6.1.0) has CAN but no vcan | ")
     );
     assert!(
         missing(admin, ModuleState::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan")
@@ -274,7 +275,7 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
     assert_eq!(
         about_hardware(same, |_, hardware| hardware.data_bitrate = Some(2_000_000)),
         [format!(
-            "fault: can0 is CAN hardware (kvaser_pci) at 1000 kbit/s, data 2000 kbit/s, and the skin says 1000 \
+            "fault: can0 is CAN hardware (kvaser_pci) with 1000 kbit/s, data 2000 kbit/s, but the skin requires 1000 \
              kbit/s, data 5000 kbit/s | {set}"
         )]
     );
@@ -288,7 +289,7 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
     };
     let unsaid = about_hardware(open, fine);
     assert_eq!(unsaid.len(), 1);
-    assert!(unsaid[0].starts_with("note: can0 is at 1000 kbit/s, data 5000 kbit/s; the skin does not say"));
+    assert!(unsaid[0].starts_with("note: can0 is at 1000 kbit/s, data 5000 kbit/s; the skin states no"));
     let narrow = about_hardware(open, |can0, _| can0.mtu = CLASSIC_MTU);
     assert!(
         narrow[0].starts_with("fault: can0 is CAN hardware (kvaser_pci) with MTU 16, and CAN FD needs 72")
@@ -351,16 +352,16 @@ fn a_receive_buffer_holds_one_answer_at_least_and_should_hold_four() {
     assert_eq!(
         granted((400 << 10) - 1),
         [format!(
-            "note: receive buffers are limited to 399 KiB; to hold all answers, 100 frames, 4 times over takes 400 \
-             KiB, and a gateway that is held up loses some | {hint}"
+            "note: receive buffers are limited to 399 KiB; to hold all answers (100 frames) 4 times, they need 400 \
+             KiB, else a delayed gateway loses answers | {hint}"
         )]
     );
     assert!(granted(100 << 10)[0].starts_with("note"));
     assert_eq!(
         granted((100 << 10) - 1),
         [format!(
-            "fault: receive buffers are limited to 99 KiB and do not hold all answers, 100 frames, even once; 400 \
-             KiB are right | {hint}"
+            "fault: receive buffers are limited to 99 KiB and cannot hold all answers (100 frames) even once; 400 \
+             KiB are needed | {hint}"
         )]
     );
     let classic = about(|facts| {
@@ -368,7 +369,7 @@ fn a_receive_buffer_holds_one_answer_at_least_and_should_hold_four() {
         facts.buses[0].target.format = Format::Classic;
     });
     assert!(
-        classic[0].contains("to hold all answers, 200 frames, 4 times over takes 800 KiB"),
+        classic[0].contains("to hold all answers (200 frames) 4 times, they need 800 KiB"),
         "{classic:?}"
     );
 }
@@ -380,7 +381,7 @@ fn the_backlog_holds_an_answer_of_every_cell_of_every_bus() {
     assert_eq!(
         backlog(Some(99)),
         [
-            "fault: the kernel's backlog of 99 does not hold an answer of all cells, 100 frames: some would be lost \
+            "fault: the kernel's backlog of 99 does not hold the answers of all cells (100 frames): some would be lost \
           silently | sudo sysctl -w net.core.netdev_max_backlog=200"
         ]
     );
@@ -426,8 +427,8 @@ fn sums_run_wherever_nothing_real_is() {
         facts.buses = vec![bus(Some(interface("can0", InterfaceKind::Hardware(hardware))))];
         sums(facts);
     });
-    let expected = "fault: can0 is CAN hardware, and the wires between cells that answer with sums are simulated by \
-                    frames that may not go there | reply = \"torque\"  # in the skin; or name a vcan or the \
+    let expected = "fault: can0 is CAN hardware, but cells that answer with sums simulate their wires with \
+                    frames that must not be sent there | reply = \"torque\"  # in the skin; or name a vcan or the \
                     embedded bus";
     assert_eq!(said.iter().filter(|line| line.starts_with("fault")).collect::<Vec<_>>(), [expected]);
 }

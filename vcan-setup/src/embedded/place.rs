@@ -35,7 +35,7 @@ pub enum BusSocketError {
         path: PathBuf,
     },
     /// A file that is not a socket exists at the path.
-    #[error("{} is in the way and is no socket: move it away", .0.display())]
+    #[error("{} exists and is not a socket: move it away", .0.display())]
     InTheWay(PathBuf),
     /// Another system error.
     #[error("cannot {doing} {}: {source}", path.display())]

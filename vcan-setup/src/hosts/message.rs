@@ -57,7 +57,7 @@ pub enum MessageError {
     )]
     Version(u8),
     /// The message is shorter or longer than its frames require. The field is its length in bytes.
-    #[error("a message of {0} bytes does not hold the frames that it names")]
+    #[error("a message of {0} bytes has the wrong length for its frames")]
     Length(usize),
     /// A frame is invalid.
     #[error("frame {index} of a message: {error}")]

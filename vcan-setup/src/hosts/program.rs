@@ -36,7 +36,7 @@ pub enum ProgramError {
     )]
     Missing,
     /// The system cannot run the file that [`PATH_VARIABLE`] names.
-    #[error("cannot run {}: {source}; {PATH_VARIABLE} names it", shell_quoted_os(path.as_os_str()))]
+    #[error("cannot run {}: {source}; correct {PATH_VARIABLE}, which names it", shell_quoted_os(path.as_os_str()))]
     Named {
         /// The file.
         path: PathBuf,
@@ -53,7 +53,7 @@ pub enum ProgramError {
     },
     /// `vcan-link` and the `vcan-setup` that runs it have different versions.
     #[error(
-        "vcan-link {VERSION} was run by vcan-setup {0}: both have to be of one version; in the project's folder: \
+        "vcan-link {VERSION} was run by vcan-setup {0}: both must have the same version; in the project's folder: \
          `cargo install --locked --path vcan-setup/link`"
     )]
     Version(String),

@@ -11,7 +11,9 @@ use crate::link::{FD_MTU, HardwareRates, Interface};
 #[non_exhaustive]
 pub enum PlanRefusal {
     /// The interface does not carry CAN.
-    #[error("{name} is real, {what}, and is left alone: choose another name, as `vcan-setup up vcan0` does")]
+    #[error(
+        "{name} is {what}, which vcan-setup leaves alone: choose another name, as in `vcan-setup up vcan0`"
+    )]
     NotCan {
         /// The name of the interface.
         name: String,
@@ -20,7 +22,7 @@ pub enum PlanRefusal {
     },
     /// The named interface is CAN hardware, but the command makes virtual interfaces.
     #[error(
-        "{name} is real, {what}, and is left alone: to check its bit rates put it into a skin and run `vcan-setup up SKIN.toml`, to see it `vcan-setup status {name}`"
+        "{name} is {what}, which vcan-setup leaves alone: to check its bit rates, add it to a skin and run `vcan-setup up SKIN.toml`; `vcan-setup status {name}` shows it"
     )]
     Hardware {
         /// The name of the interface.
@@ -45,7 +47,7 @@ pub enum PlanRefusal {
     )]
     Down(String),
     /// The name belongs to an interface that is not an end of the requested pair.
-    #[error("{name} is there already and is {what}, not one end of a pair with {peer}: {hint}")]
+    #[error("{name} already exists and is {what}, not one end of a pair with {peer}: {hint}")]
     OtherPair {
         /// The name of the interface.
         name: String,
@@ -58,7 +60,7 @@ pub enum PlanRefusal {
     },
     /// The other end of an existing pair is down or has too small an MTU, and is in another namespace.
     #[error(
-        "the other end of {name}, {end}, and vcan-setup changes nothing there: `sudo {command}` fixes it"
+        "the other end of {name}, {end}; vcan-setup changes nothing in another namespace: `sudo {command}` fixes it"
     )]
     OtherEnd {
         /// The name of the end in this namespace.
@@ -84,7 +86,9 @@ pub enum PlanRefusal {
         file: String,
     },
     /// Two skins state different bit rates for the same bus.
-    #[error("of {name} {one} and {other}: run `vcan-setup up` with one of them, or make them agree")]
+    #[error(
+        "two skins differ on the bit rates of {name}: {one}, {other}; run `vcan-setup up` with one of them, or make them agree"
+    )]
     AtOdds {
         /// The name of the bus.
         name: String,
@@ -95,7 +99,7 @@ pub enum PlanRefusal {
     },
     /// The hardware has other bit rates than the skin states.
     #[error(
-        "{name} is at {has} and {file} says {wants}: `sudo vcan-setup up {file} --set-bit-rates` sets them, or change {file}"
+        "{name} runs at {has}, but {file} requires {wants}: `sudo vcan-setup up {file} --set-bit-rates` sets them, or change {file}"
     )]
     Rates {
         /// The name of the interface.
@@ -121,7 +125,7 @@ pub enum PlanRefusal {
     },
     /// The hardware is set to classic CAN, but the skin requires CAN FD.
     #[error(
-        "{name} is {what} with MTU {mtu}, and {file} says format = \"fd\", which needs {FD_MTU}: `sudo vcan-setup up {file} --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
+        "{name} is {what} with MTU {mtu}, but {file} has format = \"fd\", which needs {FD_MTU}: `sudo vcan-setup up {file} --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
     )]
     HardwareNarrow {
         /// The name of the interface.

@@ -78,11 +78,11 @@ impl Step {
     pub fn done_message(&self) -> String {
         let name = &self.name;
         match &self.action {
-            StepAction::MakeVcan => format!("{name} is made, a vcan with MTU {FD_MTU}, and up"),
+            StepAction::MakeVcan => format!("made {name}, a vcan with MTU {FD_MTU}, and brought it up"),
             StepAction::MakePair { peer, namespace } => {
                 let at = namespace.as_ref().map(|namespace| format!(" in {namespace}")).unwrap_or_default();
                 format!(
-                    "{name} is made, and its other end {peer}{at}, a vxcan pair with MTU {FD_MTU}, both up"
+                    "made {name} and its other end {peer}{at}, a vxcan pair with MTU {FD_MTU}, and brought both up"
                 )
             }
             StepAction::BringUp { .. } => format!("{name} is up"),

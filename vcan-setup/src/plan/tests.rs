@@ -41,7 +41,7 @@ fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
     let world = SimulatedKernel::of(vec![interface("vcan0", 2, InterfaceKind::Vcan)]);
     let plan = plan_up(&target, &world.here, false).unwrap();
     assert_eq!(plan.steps, [Step { name: "vcan1".into(), action: StepAction::MakeVcan }]);
-    assert_eq!(plan.unchanged, ["vcan0 is there already, and fits (a vcan, made by another program)"]);
+    assert_eq!(plan.unchanged, ["vcan0 already exists and is suitable (a vcan, made by another program)"]);
     let again = plan_up(&target, &world.carry_out_all(&plan).here, false).unwrap();
     assert_eq!(again.steps, []);
 }
@@ -68,13 +68,13 @@ fn a_real_bus_is_never_touched_because_it_was_named() {
     ];
     assert_eq!(
         refused(&InterfaceTarget::named("can0"), &present),
-        "can0 is real, CAN hardware (kvaser_pci), and is left alone: to check its bit rates put it into a \
-         skin and run `vcan-setup up SKIN.toml`, to see it `vcan-setup status can0`"
+        "can0 is CAN hardware (kvaser_pci), which vcan-setup leaves alone: to check its bit rates, add it to a \
+         skin and run `vcan-setup up SKIN.toml`; `vcan-setup status can0` shows it"
     );
     assert_eq!(
         refused(&InterfaceTarget::named("eth0"), &present),
-        "eth0 is real, a network interface (ether), and is left alone: choose another name, as `vcan-setup \
-         up vcan0` does"
+        "eth0 is a network interface (ether), which vcan-setup leaves alone: choose another name, as in `vcan-setup \
+         up vcan0`"
     );
     assert!(
         plan_up(&[InterfaceTarget::named("can0")], &present, true).is_err(),
@@ -109,7 +109,7 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
     let right = can0(kvaser(Some(1_000_000), Some(5_000_000)), true);
     let plan = plan_up(std::slice::from_ref(&target), std::slice::from_ref(&right), false).unwrap();
     assert_eq!(plan.steps, []);
-    let line = "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, data 5000 kbit/s, as the skin says, and is \
+    let line = "can0 is CAN hardware (kvaser_pci), at 1000 kbit/s, data 5000 kbit/s, as the skin requires, and is \
                 left as it is";
     assert_eq!(plan.unchanged, [line]);
     assert_eq!(plan_up(std::slice::from_ref(&target), &[right], true).unwrap().steps, [], "nor set again");
@@ -117,20 +117,23 @@ fn hardware_of_a_skin_is_compared_and_left_as_it_is() {
     let other = [can0(kvaser(Some(500_000), None), true)];
     assert_eq!(
         refused(&target, &other),
-        "can0 is at 500 kbit/s and skin.toml says 1000 kbit/s, data 5000 kbit/s: `sudo vcan-setup up skin.toml \
+        "can0 runs at 500 kbit/s, but skin.toml requires 1000 kbit/s, data 5000 kbit/s: `sudo vcan-setup up skin.toml \
          --set-bit-rates` sets them, or change skin.toml"
     );
     let unset = [can0(kvaser(None, None), false)];
-    assert!(refused(&target, &unset).starts_with("can0 is at no bit rate and skin.toml says 1000 kbit/s"));
+    assert!(
+        refused(&target, &unset).starts_with("can0 runs at no bit rate, but skin.toml requires 1000 kbit/s")
+    );
     let open = in_skin("can0", Format::Fd, None, None);
     assert_eq!(
         refused(&open, &other),
-        "can0 is CAN hardware (kvaser_pci) with MTU 16, and skin.toml says format = \"fd\", which needs 72: \
+        "can0 is CAN hardware (kvaser_pci) with MTU 16, but skin.toml has format = \"fd\", which needs 72: \
          `sudo vcan-setup up skin.toml --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
     );
     let classic = CanHardware { fd: false, ..kvaser(Some(1_000_000), Some(5_000_000)) };
     assert!(
-        refused(&target, &[can0(classic, true)]).starts_with("can0 is at 1000 kbit/s and skin.toml says"),
+        refused(&target, &[can0(classic, true)])
+            .starts_with("can0 runs at 1000 kbit/s, but skin.toml requires"),
         "a rate for data that is not in use is none"
     );
     let down = [can0(kvaser(Some(1_000_000), Some(5_000_000)), false)];
@@ -186,7 +189,7 @@ fn two_skins_that_give_a_bus_two_bit_rates_are_refused() {
             let refusal = plan_up(&[skin(Some(500_000)), skin(Some(250_000))], &present, set).unwrap_err();
             assert_eq!(
                 refusal.to_string(),
-                "of can0 skin.toml says 500 kbit/s and skin.toml says 250 kbit/s: run `vcan-setup up` with one of \
+                "two skins differ on the bit rates of can0: skin.toml requires 500 kbit/s, skin.toml requires 250 kbit/s; run `vcan-setup up` with one of \
                  them, or make them agree"
             );
             assert!(refusal.is_usage());
@@ -248,13 +251,13 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     let error = plan_pair_up(&other, &world.here).unwrap_err().to_string();
     assert_eq!(
         error,
-        "vcan1 is there already and is a vxcan, not one end of a pair with vcan1: `sudo vcan-setup down vcan1` \
+        "vcan1 already exists and is a vxcan, not one end of a pair with vcan1: `sudo vcan-setup down vcan1` \
          removes it, or choose another name"
     );
     let error = plan_pair_up(&TargetPair { name: "vcan5", ..again }, &world.here).unwrap_err().to_string();
     assert_eq!(
         error,
-        "vcan1 is there already and is a vxcan in blue, not one end of a pair with vcan5: `sudo ip -n blue link \
+        "vcan1 already exists and is a vxcan in blue, not one end of a pair with vcan5: `sudo ip -n blue link \
          del vcan1` removes it, or choose another name"
     );
     world.there[0].up = false;
@@ -262,7 +265,7 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
     let error = plan_pair_up(&TargetPair { there: Some(&there), ..again }, &world.here).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "the other end of vcan1, vcan1 in blue, is down, and vcan-setup changes nothing there: `sudo ip -n blue \
+        "the other end of vcan1, vcan1 in blue, is down; vcan-setup changes nothing in another namespace: `sudo ip -n blue \
          link set vcan1 up` fixes it"
     );
     let same = TargetPair { name: "vcan3", peer: "vcan3", there: None };

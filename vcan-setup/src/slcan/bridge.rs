@@ -25,7 +25,7 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 #[non_exhaustive]
 pub enum BridgeError {
     /// Two lines have the same address.
-    #[error("{0} is named twice: each line is one participant")]
+    #[error("{0} is named twice: name each line once")]
     Twice(String),
     /// The bus cannot be opened.
     #[error(transparent)]
@@ -195,7 +195,7 @@ fn line_error(line: String, source: io::Error) -> BridgeError {
     } else if source.kind() == io::ErrorKind::PermissionDenied {
         "; join the group that may use it (`ls -l` names it, often dialout)"
     } else {
-        "; with --wait it is opened when it is there"
+        "; with --wait it is opened when it is available"
     };
     BridgeError::Line { line, source, hint }
 }

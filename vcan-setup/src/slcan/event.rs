@@ -38,13 +38,13 @@ impl fmt::Display for LineEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::LineUp => f.write_str("open"),
-            Self::LineAway(why) => write!(f, "away ({why}); it is opened when it is there"),
+            Self::LineAway(why) => write!(f, "unavailable ({why}); it is opened when it is available"),
             Self::BusUp => f.write_str("its bus is back"),
-            Self::BusAway(why) => write!(f, "its bus is away ({why}); it is opened when it is there"),
+            Self::BusAway(why) => write!(f, "its bus is unavailable ({why}); it is opened when it is available"),
             Self::Lost { to_line, to_bus, account } => {
                 let one = |count: u64, what, so_far: String| {
                     let so_far = so_far.trim_start_matches(", ");
-                    (count > 0).then(|| format!("{count} more {what} lost, in all {so_far}"))
+                    (count > 0).then(|| format!("{count} more {what} lost, in total {so_far}"))
                 };
                 let lost = [
                     one(*to_line, "frames to the line", account.to_line.losses()),
@@ -54,7 +54,7 @@ impl fmt::Display for LineEvent {
             }
             Self::SettingRefused(commands) => write!(
                 f,
-                "its adapter refused a command of {commands} (BEL): its bit rates may be others; give rates that it has, and \
+                "its adapter refused a command of {commands} (BEL): it may not have these bit rates; give rates that it supports, and \
                  classic if it has no CAN FD"
             ),
             Self::Reopened => f.write_str(

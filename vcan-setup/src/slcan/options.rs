@@ -51,11 +51,13 @@ pub struct LineOptions {
 #[non_exhaustive]
 pub enum LineError {
     /// The address has none of the supported forms.
-    #[error("{0:?} is no line: /dev/ttyACM0, unix:/path/to/socket and tcp:localhost:3333 are")]
+    #[error(
+        "{0:?} is not a line: use a form such as /dev/ttyACM0, unix:/path/to/socket or tcp:localhost:3333"
+    )]
     Address(String),
     /// The option is unknown.
     #[error(
-        "{line}: {got:?} is no option of a line: cell=12, cell=1-8, filter=100:700, rates=1M/5M, baud=115200, settle=2 and classic are"
+        "{line}: {got:?} is not an option of a line: use cell=12, cell=1-8, filter=100:700, rates=1M/5M, baud=115200, settle=2 or classic"
     )]
     Unknown {
         /// The address of the line.
@@ -214,7 +216,7 @@ impl LineOptions {
                     .for_each(|cell| self.add_cell(cell));
                 if self.filters.len() > Filter::MAX_COUNT {
                     return Err(wrong(&format!(
-                        "these need {} filters, and a bus has {} for a line: name fewer cells, or none",
+                        "these cells need {} filters, but a line can have {}: name fewer cells, or none",
                         self.filters.len(),
                         Filter::MAX_COUNT
                     )));
@@ -330,7 +332,9 @@ mod tests {
         {
             assert_eq!(
                 wrong(text),
-                format!("{text:?} is no line: /dev/ttyACM0, unix:/path/to/socket and tcp:localhost:3333 are")
+                format!(
+                    "{text:?} is not a line: use a form such as /dev/ttyACM0, unix:/path/to/socket or tcp:localhost:3333"
+                )
             );
         }
     }
@@ -404,7 +408,7 @@ mod tests {
             ("/dev/x,cell=8-1", "/dev/x: \"cell=8-1\": node ids are 1 to 254: cell=12, or cell=1-8"),
             (
                 "/dev/x,cell=1-254",
-                "/dev/x: \"cell=1-254\": these need 769 filters, and a bus has 512 for a line: name fewer cells, or none",
+                "/dev/x: \"cell=1-254\": these cells need 769 filters, but a line can have 512: name fewer cells, or none",
             ),
             (
                 "/dev/x,filter=100",
@@ -426,7 +430,7 @@ mod tests {
         );
         assert!(wrong("/dev/x,rates=500k/2500k").contains("for data 500k and whole Mbit/s up to 8M"));
         for option in ["", "cel=1", "classic=yes", "listen"] {
-            let expected = format!("/dev/x: {option:?} is no option of a line: cell=12, cell=1-8, ");
+            let expected = format!("/dev/x: {option:?} is not an option of a line: use cell=12, cell=1-8, ");
             assert!(wrong(&format!("/dev/x,{option}")).starts_with(&expected), "{option}");
         }
     }

@@ -56,5 +56,7 @@ mod start {
 /// Prints that this program is for microcontrollers.
 #[cfg(not(target_os = "none"))]
 fn main() {
-    eprintln!("cell: built for this machine, where it does nothing: docs/how-to/firmware.md");
+    eprintln!(
+        "cell: this program runs only on a microcontroller; docs/how-to/firmware.md explains how to build it"
+    );
 }

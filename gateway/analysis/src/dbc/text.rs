@@ -122,8 +122,8 @@ fn write_file_comment(out: &mut impl Write, skin: &Skin, bus: &SkinBus) -> fmt::
     // A quotation mark would end the comment.
     let [skin, bus_name] = [&skin.name, &bus.name].map(|name| name.replace('"', "'"));
     let travels = if describes_packets(bus) {
-        "Classic: a packet travels in frames of up to 8 bytes under one identifier; this describes their bytes joined, \
-         which no frame of the bus has."
+        "Classic: a packet travels in frames of up to 8 bytes under one identifier; this file describes the joined \
+         bytes, which no single frame on the bus contains."
     } else {
         "A packet is one CAN FD frame with bit-rate switch."
     };

@@ -186,15 +186,15 @@ fn explain_with(
         let Some(moment) = moment else {
             if skin.cells_on_bus(index).next().is_some() {
                 explanation.missing.push(format!(
-                    "{name}: these joints are not in the capture; the total does not include them"
+                    "{name}: the capture has no joints of this epoch; the total does not include this bus"
                 ));
             }
             continue;
         };
         if bus.reply != SkinReply::Torque {
-            explanation
-                .missing
-                .push(format!("{name} answers with sums, which do not contain the torques of single cells"));
+            explanation.missing.push(format!(
+                "{name}: its cells answer with sums, which do not show the torques of single cells"
+            ));
         }
         let positions = moment.joints.positions;
         let [central, _] = both;
@@ -231,7 +231,7 @@ fn explain_with(
                 };
                 let node = cell.node;
                 explanation.missing.push(format!(
-                    "{name} {node}: no torque of this epoch arrived in time: {why}; the sum of words does not contain it"
+                    "{name} {node}: no torque of this epoch arrived in time: {why}; the sum of received words does not include it"
                 ));
             }
             let newtons = force.map_or(0.0, |force| force.effective_fused_n());
@@ -315,7 +315,7 @@ impl JointSum {
 #[expect(clippy::cast_precision_loss, reason = "for display")]
 fn too_late_text(nanos: u64) -> String {
     let ms = nanos as f64 / 1e6;
-    format!("it came {ms:.3} ms after the joints, after four more joints, and is not used")
+    format!("it arrived {ms:.3} ms after its joints and after four newer joints, so it is not used")
 }
 
 /// Returns the likely reason why a cell in contact sent nothing.
@@ -349,21 +349,21 @@ fn usable_contact(
         Some(hash) if hash != target => {
             if answered || touched {
                 missing.push(format!(
-                    "{bus} {node}: it computes with configuration {hash:04X}, the skin has {target:04X}: its force \
-                     and its torque cannot be computed from this skin"
+                    "{bus} {node}: its configuration is {hash:04X}, but the skin's is {target:04X}: its force \
+                     and torque cannot be computed from this skin"
                 ));
             }
             return None;
         }
         None if answered || touched => missing.push(format!(
-            "{bus} {node}: it did not report its configuration; assumed to be the skin's, {target:04X}"
+            "{bus} {node}: it did not report its configuration, which is assumed to be the skin's, {target:04X}"
         )),
         Some(_) | None => {}
     }
     if answered && said.contact_state.is_none() {
         let why = match said.test_mode {
-            Some(false) => "it measures, and sent no sensors page in this epoch",
-            Some(true) | None => "no stimulus, start or sensors page of it came before",
+            Some(false) => "it uses its own sensors, and sent no sensors page in this epoch",
+            Some(true) | None => "no stimulus, start or sensors page of this cell came before",
         };
         missing.push(format!("{bus} {node}: its contact state is not in the capture: {why}"));
     }

@@ -7,7 +7,7 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum NotFound {
     /// The capture has none of the skin's buses.
-    #[error("none of its buses ({capture}) is one of the skin's ({skin})")]
+    #[error("the skin has none of the capture's buses ({capture}); it has {skin}")]
     Buses {
         /// Names of the buses in the capture.
         capture: String,
@@ -15,7 +15,7 @@ pub enum NotFound {
         skin: String,
     },
     /// The capture has no joints on the skin's buses.
-    #[error("there are no joints on {buses}, and cells answer only joints")]
+    #[error("the capture has no joints messages on {buses}, and cells answer only those")]
     Joints {
         /// Names of the skin's buses that are in the capture.
         buses: String,
@@ -31,7 +31,7 @@ pub enum NotFound {
         chain: usize,
     },
     /// The requested epoch does not occur, occurs less often than requested, or occurs only before the requested time.
-    #[error("there are no joints {requested}; there are {runs}")]
+    #[error("the capture has no joints message {requested}; it has {runs}")]
     Epoch {
         /// Description of the requested joints.
         requested: String,
@@ -44,6 +44,6 @@ pub enum NotFound {
 #[must_use]
 pub fn other_robot_text(bus: &str, came: usize, chain: usize) -> String {
     format!(
-        "{bus} carries {came} joints, but the skin's chain on it has {chain}: the skin is of another robot, name the right one"
+        "{bus} carries {came} joints, but the skin's chain on it has {chain}: this skin is for another robot; name the right one"
     )
 }

@@ -133,7 +133,7 @@ fn another_configuration_is_named_and_nothing_computed() {
     let skin = skin();
     let said = [heartbeat(0x1234), press(StimulusStart::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
-    let expected = "vcan0 12: it computes with configuration 1234, the skin has 266D: its force and its torque cannot \
+    let expected = "vcan0 12: its configuration is 1234, but the skin's is 266D: its force and torque cannot \
                     be computed from this skin";
     assert_eq!(explanation.missing, [expected]);
     assert!(explanation.cells[0].force.is_none());
@@ -142,7 +142,7 @@ fn another_configuration_is_named_and_nothing_computed() {
     let said = [press(StimulusStart::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
     assert_eq!(explained(&skin, &said, first(7)).unwrap().missing, [expected]);
     let without = explained(&skin, &said[..3], first(7)).unwrap();
-    let expected = "vcan0 12: it did not report its configuration; assumed to be the skin's, 266D";
+    let expected = "vcan0 12: it did not report its configuration, which is assumed to be the skin's, 266D";
     assert_eq!(without.missing, [expected]);
     assert!(without.cells[0].force.is_some());
 }
@@ -166,7 +166,7 @@ fn a_measuring_cell_is_known_by_its_own_page_of_that_epoch_only() {
     // A measuring cell refuses a stimulus.
     let said = [measuring, press(StimulusStart::Next, 9.0), page(6), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
-    let expected = "vcan0 12: its contact state is not in the capture: it measures, and sent no sensors page in this epoch";
+    let expected = "vcan0 12: its contact state is not in the capture: it uses its own sensors, and sent no sensors page in this epoch";
     assert_eq!(explanation.missing, [expected]);
     let with_page = [&said[..], &[page(7)]].concat();
     let explanation = explained(&skin, &with_page, first(7)).unwrap();
@@ -185,7 +185,7 @@ fn joints_are_found_by_epoch_time_and_occurrence() {
     assert_eq!(at(RequestedJoints { occurrence: 2, ..first(7) }), Ok(264));
     assert_eq!(at(RequestedJoints { from_ns: 100_000_000, ..first(7) }), Ok(264));
     let error = at(RequestedJoints { occurrence: 2, ..first(21) }).unwrap_err().to_string();
-    let expected = "there are no joints of epoch 21 (occurrence 2); there are 277 joints in a row, from epoch 0 at \
+    let expected = "the capture has no joints message of epoch 21 (occurrence 2); it has 277 in a row, from epoch 0 at \
                     0.000 s to epoch 20 at 0.276 s";
     assert_eq!(error, expected);
 }
@@ -195,15 +195,15 @@ fn what_is_not_there_is_named_with_what_is() {
     let skin = skin();
     let said = [joints(1), joints(2), joints(9)];
     let error = explained(&skin, &said, first(5)).unwrap_err().to_string();
-    let expected = "there are no joints of epoch 5; there are 2 joints in a row, from epoch 1 at 0.000 s to epoch 2 at \
-                    0.001 s; those of epoch 9 at 0.002 s";
+    let expected = "the capture has no joints message of epoch 5; it has 2 in a row, from epoch 1 at 0.000 s to epoch 2 at \
+                    0.001 s; one of epoch 9 at 0.002 s";
     assert_eq!(error, expected);
     let error = explained(&skin, &[heartbeat(0)], first(5)).unwrap_err().to_string();
-    assert_eq!(error, "there are no joints on vcan0, and cells answer only joints");
+    assert_eq!(error, "the capture has no joints messages on vcan0, and cells answer only those");
     let mut watch = JointsWatcher::new(&skin, first(5));
     watch.receive(0, "can7", None);
     let error = watch.moments().unwrap_err().to_string();
-    assert_eq!(error, "none of its buses (can7) is one of the skin's (vcan0)");
+    assert_eq!(error, "the skin has none of the capture's buses (can7); it has vcan0");
     // Memory is bounded for any input.
     let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
     let error =
@@ -231,8 +231,8 @@ fn a_torque_after_four_more_joints_is_named_and_not_used() {
     let in_time = explained(&skin, &said(3), first(7)).unwrap();
     assert_eq!((in_time.cells[0].answered_after_ns, in_time.missing), (Some(4_000_000), Vec::new()));
     let late = explained(&skin, &said(4), first(7)).unwrap();
-    let expected = "vcan0 12: no torque of this epoch arrived in time: it came 5.000 ms after the joints, \
-                    after four more joints, and is not used; the sum of words does not contain it";
+    let expected = "vcan0 12: no torque of this epoch arrived in time: it arrived 5.000 ms after its joints \
+                    and after four newer joints, so it is not used; the sum of received words does not include it";
     assert_eq!((late.cells[0].answered_after_ns, late.missing), (None, vec![expected.to_owned()]));
 }
 

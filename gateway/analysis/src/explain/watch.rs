@@ -213,9 +213,9 @@ impl EpochRun {
         let [from, to] = [first, last].map(|(_, at)| format!("{:.3}", seconds_since(zero, at)));
         let (first, last) = (first.0, last.0);
         if joints == 1 {
-            return format!("those of epoch {first} at {from} s");
+            return format!("one of epoch {first} at {from} s");
         }
-        format!("{joints} joints in a row, from epoch {first} at {from} s to epoch {last} at {to} s")
+        format!("{joints} in a row, from epoch {first} at {from} s to epoch {last} at {to} s")
     }
 }
 

@@ -98,7 +98,7 @@ impl Display for AnsweringCells {
                 write!(f, "at most {most} of {cells} cells answered")
             }
             Self::Some { most, cells, described: false } => {
-                write!(f, "at most {most} of {cells} cells seen answered")
+                write!(f, "at most {most} of {cells} observed cells answered")
             }
             Self::Foreign => f.write_str("another protocol"),
         }

@@ -62,7 +62,7 @@ pub enum EmulateError {
     Path(PathBuf),
     /// Cells of another run keep their flash in this directory.
     #[error(
-        "--flash {0}: emulated cells of another run use it: end that one first, or name another directory"
+        "--flash {0}: emulated cells of another run are using it: stop that run first, or choose another directory"
     )]
     FlashInUse(PathBuf),
     /// A line or a process does not start.
@@ -329,7 +329,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let held = lock_directory(folder.path()).unwrap();
         let error = lock_directory(folder.path()).unwrap_err();
-        assert!(error.to_string().contains("emulated cells of another run use it"), "{error}");
+        assert!(error.to_string().contains("emulated cells of another run are using it"), "{error}");
         assert_eq!(error.exit_code(), 2);
         drop(held);
         lock_directory(folder.path()).unwrap();

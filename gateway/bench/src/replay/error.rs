@@ -65,11 +65,11 @@ pub enum ReplayError {
     Kinds(#[from] KindsError),
     /// Standard input cannot be read twice.
     #[error(
-        "a replay reads its capture twice, but standard input only once: write it to a file, and name that"
+        "a replay reads its capture twice, which standard input does not allow: write it to a file, and name that file"
     )]
     StandardInput,
     /// A pipe cannot be read twice.
-    #[error("{} is not a regular file, but a replay reads its capture twice: write it to a file, and name that", .0.display())]
+    #[error("{} is not a regular file, but a replay reads its capture twice: copy it to a file, and name that file", .0.display())]
     Pipe(PathBuf),
     /// The capture does not open.
     #[error(transparent)]
@@ -81,16 +81,16 @@ pub enum ReplayError {
     #[error("{0}")]
     Line(String),
     /// The capture has too many buses.
-    #[error("{0} has frames of more than {MAX_BUSES} buses: a replay sends to no more than that")]
+    #[error("{0} has frames of more than {MAX_BUSES} buses, which is the maximum for a replay")]
     Buses(String),
     /// The capture has nothing to send.
-    #[error("{0}: there is no frame in it")]
+    #[error("{0} contains no frame")]
     Empty(String),
     /// The bus does not exist, so no cell on it can answer.
     #[error("{0}; or start fresh cells on an embedded bus with --spawn")]
     BusAbsent(BusError),
     /// The requested part has nothing to send.
-    #[error("nothing remains to be sent: {name} ends at {ends_s:.3} s, and --from and --to leave none of it")]
+    #[error("--from and --to leave nothing to send: {name} ends at {ends_s:.3} s")]
     NothingLeft {
         /// Display name of the capture.
         name: String,
@@ -110,21 +110,23 @@ pub enum ReplayError {
         buses: String,
     },
     /// A bus of the capture is mapped to two buses.
-    #[error("--map names {0} twice: a bus goes to one other bus")]
+    #[error("--map names {0} twice: each bus can be mapped only once")]
     MapTwice(String),
     /// Two buses of the capture are mapped to one.
     #[error(
-        "two buses of the capture go to one, so replies cannot be assigned: give each a bus of its own, or leave out --expect, \
+        "two buses of the capture are mapped to one, so replies cannot be told apart: map each to its own bus, or leave out --expect, \
          --lockstep and --only inputs"
     )]
     Merged,
     /// The skin of the cells to start is unknown.
     #[error(
-        "--spawn: {0} has no skin attached, as recordings of `skinbus run --record` have: name it with --skin SKIN.toml"
+        "--spawn: {0} has no skin attached, unlike recordings of `skinbus run --record`: name the skin with --skin SKIN.toml"
     )]
     NoSkin(String),
     /// The skin does not have a bus of the capture.
-    #[error("--spawn: the capture goes to {bus}, and the skin {skin} has {buses}: send it there with --map")]
+    #[error(
+        "--spawn: the capture is sent to {bus}, but the skin {skin} has {buses}: map it to one of these with --map"
+    )]
     NotOfSkin {
         /// Name of the bus.
         bus: String,
@@ -161,12 +163,12 @@ pub enum ReplayError {
     #[error(transparent)]
     Mismatch(#[from] Mismatch),
     /// Cells do not confirm that they are in test mode.
-    #[error("cells do not go into test mode: {0}")]
+    #[error("cells do not enter test mode: {0}")]
     NoTestMode(String),
     /// Cells measure and ignore stimuli.
     #[error(
-        "cells measure and do not obey stimuli, as they did in the recording: {0}; --test-mode lets them obey while the \
-         replay lasts"
+        "cells use their own sensors and ignore stimuli, unlike in the recording: {0}; --test-mode makes them obey during the \
+         replay"
     )]
     Measuring(String),
 }

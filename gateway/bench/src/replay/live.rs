@@ -97,7 +97,7 @@ impl PlayerBackend for LiveBackend {
         if let Err(SendError { cause: error @ BusError::Down(_), .. }) = &sent {
             if self.down.insert(index) {
                 self.shared_state.comparator().mark_down(index);
-                self.notify(format!("{error}; frames due meanwhile are lost, and counted"));
+                self.notify(format!("{error}; frames due until it works again are lost and counted"));
             }
             // At a timed pace, waiting for answers would delay the next frames.
             let ReplayOptions { pace, lockstep, .. } = self.shared_state.checks.options;
@@ -232,7 +232,7 @@ impl LiveBackend {
                 self.lockstep.silent_cells.extend(late.iter().map(|cell| format!("{cell} on {name}")));
                 let (plural, verb) = if late.len() == 1 { ("", "does") } else { ("s", "do") };
                 self.notify(format!(
-                    "cell{plural} {} on {name} {verb} not answer within {} s: the replay goes on without",
+                    "cell{plural} {} on {name} {verb} not answer within {} s: the replay continues",
                     names(&late, ""),
                     ANSWER_TIMEOUT.as_secs()
                 ));

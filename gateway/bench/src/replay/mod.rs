@@ -193,10 +193,10 @@ fn survey_capture(
     }
     survey.finish();
     if unreadable > 0 {
-        note(format!("lines that could not be read and are left out: {unreadable}"));
+        note(format!("lines skipped because they could not be read: {unreadable}"));
     }
     if survey.dropped > 0 {
-        note(format!("{} frames are missing: they were lost while it was recorded", survey.dropped));
+        note(format!("{} frames are missing: they were lost during recording", survey.dropped));
     }
     if let Some(what) = &reader.extras().unfinished {
         note(what.to_string());
@@ -207,8 +207,8 @@ fn survey_capture(
     if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
         note(format!(
-            "times run backwards, first at frame {frame} by {back:.3} s: what is older than what was sent \
-             before it is sent at once"
+            "times run backwards, first at frame {frame} by {back:.3} s: a frame older than one already \
+             sent is sent at once"
         ));
     }
     if survey.frames == 0 {
@@ -231,7 +231,7 @@ fn warn_of_duplicates(checks: &CellChecks, heard: &[BTreeSet<CellId>], progress:
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
             progress.note(&format!(
-                "cells that are on {name} will receive their own frames of the capture: {}; --only inputs leaves these out",
+                "cells on {name} will receive copies of their own frames from the capture: {}; --only inputs leaves these frames out",
                 names(&both, "")
             ));
         }

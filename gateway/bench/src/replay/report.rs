@@ -159,7 +159,7 @@ impl Summary {
             }
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
                 wrong.push(format!(
-                    "cells came too late for joints {}: --lockstep waits for them",
+                    "cells skipped joints {} because they were too late: --lockstep waits for the cells",
                     count_noun(expect.joints_skipped, "time", "times")
                 ));
             }
@@ -189,7 +189,7 @@ impl Summary {
         match (self.verdict(true), &self.expect) {
             (Some(why), _) => (false, format!("look at: {why}")),
             (None, None) => {
-                (false, format!("all sent{until}: {sent}; no reply was compared, which --expect does"))
+                (false, format!("all sent{until}: {sent}; no reply was compared; use --expect for that"))
             }
             (None, Some(expect)) if expect.tally.equal == 0 => {
                 (false, format!("look at: no reply was compared, {sent}"))
@@ -297,7 +297,7 @@ mod tests {
         let sent = Summary { expect: None, ..well() }.first_line();
         assert_eq!(
             sent,
-            (false, "all sent: 100 frames sent; no reply was compared, which --expect does".to_owned())
+            (false, "all sent: 100 frames sent; no reply was compared; use --expect for that".to_owned())
         );
     }
 

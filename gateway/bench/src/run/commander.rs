@@ -93,27 +93,25 @@ pub(super) enum CommandError {
     NoBus,
     #[error("the skin has no such cell")]
     NoCell,
-    #[error("this run has started no process of it")]
+    #[error("this run did not start its process")]
     NoProcess,
     #[error("its process is {}", match .0 { Phase::Running => "running", Phase::Stopped => "stopped", Phase::Ended => "ended: restart starts it again" })]
     Phase(Phase),
     #[error("the skin has no wire between them")]
     NoWire,
-    #[error("cells of this bus answer with their own torques, so their links carry nothing")]
+    #[error("cells on this bus answer with torques, not sums, so their links carry nothing")]
     NoLinks,
-    #[error("it is not {0} by a command")]
+    #[error("no command has brought it {0}")]
     Already(&'static str),
     #[error("it was brought up, but does not work yet")]
     ComesUp,
-    #[error("another program serves it: end that one")]
+    #[error("another program serves it: stop that program")]
     NotServed,
     #[error("it is not a virtual interface: only vcan, vxcan and embedded buses can be taken down here")]
     NotVirtual,
     #[error("there is no such interface")]
     NoInterface,
-    #[error(
-        "{source}; a run that may not do it needs CAP_NET_ADMIN, or `sudo ip link set {name} {state}` does it"
-    )]
+    #[error("{source}; give the run CAP_NET_ADMIN, or run `sudo ip link set {name} {state}`")]
     Interface { name: String, state: &'static str, source: io::Error },
     #[error(transparent)]
     Launch(#[from] LaunchError),
@@ -142,8 +140,8 @@ mod tests {
     fn a_refusal_says_why_in_one_line() {
         let source = io::Error::from_raw_os_error(1);
         let refused = CommandError::Interface { name: "vcan0".to_owned(), state: "down", source };
-        let why = "Operation not permitted (os error 1); a run that may not do it needs CAP_NET_ADMIN, or `sudo ip \
-                   link set vcan0 down` does it";
+        let why = "Operation not permitted (os error 1); give the run CAP_NET_ADMIN, or run `sudo ip \
+                   link set vcan0 down`";
         assert_eq!(refused.to_string(), why);
     }
 

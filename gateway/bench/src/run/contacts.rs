@@ -36,7 +36,7 @@ impl Bench<'_> {
         if !unclear.is_empty() && !self.options.quiet {
             eprint_line(&format!(
                 "the contact of these cells is unknown, so their torques are not compared: {unclear}; they received \
-                 stimuli before this run (`skinbus frame configure --cell N --write mode 1` clears one)"
+                 stimuli before this run (`skinbus frame configure --cell N --write mode 1` clears a cell)"
             ));
         }
         Ok(())

@@ -52,7 +52,7 @@ pub(super) struct Network {
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
     "the tree of {bus} is {deepest} wires deep: {slots} slots of slot_us = {slot_us} do not fit into the {period_us} us \
-     from joints to joints; slot_us = {} would, or more roots, so that no cell is deeper than {}",
+     between two joints messages: set slot_us = {}, or add roots so that no cell is deeper than {}",
     .period_us.checked_div(*.slots).unwrap_or(0),
     .period_us.checked_div(*.slot_us).unwrap_or(0).saturating_sub(1),
     slots = .slots
@@ -257,7 +257,7 @@ impl Network {
             let cells: Vec<_> = newly_unreachable.into_iter().map(|(cell, _)| cell).collect();
             let is = if cells.len() == 1 { "is" } else { "are" };
             look.notes.push(format!(
-                "{} on {} {is} unreachable: no route to a root, in no sum for {:.1} s",
+                "{} on {} {is} unreachable: no route to a root, and in no sum for {:.1} s",
                 check::cell_list(&cells),
                 self.name,
                 oldest.seconds()
@@ -421,7 +421,7 @@ mod tests {
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(
             look(&mut network, &link_down),
-            ["cells 2, 3 on vcan0 are unreachable: no route to a root, in no sum for 0.4 s"]
+            ["cells 2, 3 on vcan0 are unreachable: no route to a root, and in no sum for 0.4 s"]
         );
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(network.unreachable().collect::<Vec<_>>(), [2, 3]);

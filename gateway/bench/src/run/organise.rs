@@ -47,7 +47,7 @@ impl Bench<'_> {
             let (name, deepest) = (network.name(), network.max_slot_depth());
             let tree_ready = network.tree_ready.unwrap_or_default().seconds();
             eprint_line(&format!(
-                "the cells of {name} are a tree of depth {deepest} after {tree_ready:.2} s"
+                "the cells of {name} formed a tree of depth {deepest} after {tree_ready:.2} s"
             ));
         }
         Ok(())

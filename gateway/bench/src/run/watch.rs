@@ -303,7 +303,7 @@ impl Bench<'_> {
             for cell in cells.iter().filter_map(|&cell| options.skin.cells.get(cell)) {
                 let done = self.processes.apply(cell.bus, cell.node.get(), *action)?;
                 let bus = self.name(cell.bus);
-                let failed = if done { "" } else { " (no process of ours)" };
+                let failed = if done { "" } else { " (this run did not start it)" };
                 progress.note(&format!("scenario: {action:?} cell {} on {bus}{failed}", cell.node));
             }
         }
@@ -377,11 +377,12 @@ impl Bench<'_> {
                 // Without any bus there is no torque, so the run ends, unless a bus is to come back.
                 BusEvent::Lost(why) if self.has_no_bus() => return Err(RunError::Lost(why)),
                 BusEvent::Lost(why) => {
-                    progress
-                        .note(&format!("{why}; the others go on, and it is opened again when it is back"));
+                    progress.note(&format!(
+                        "{why}; the other buses continue, and this one is reopened when it is back"
+                    ));
                 }
                 BusEvent::Refused(why) => {
-                    progress.note(&format!("{} cannot be opened again yet: {why}", self.name(bus)))
+                    progress.note(&format!("{} cannot be reopened yet: {why}", self.name(bus)))
                 }
             }
         }
@@ -447,9 +448,11 @@ impl Bench<'_> {
             progress.note(&match serve(self.options, &name) {
                 Ok(again) => {
                     *served = again;
-                    format!("the process that served {name} ended ({status}); it is served again")
+                    format!("the process that served {name} ended ({status}); a new process serves it")
                 }
-                Err(error) => format!("the process that served {name} ended ({status}), and {error}"),
+                Err(error) => format!(
+                    "the process that served {name} ended ({status}) and could not be restarted: {error}"
+                ),
             });
         }
     }

@@ -103,12 +103,12 @@ pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String
     let above = if with_reasons { "" } else { ", given above" };
     let more = match errors.len().saturating_sub(MAX_REASONS) {
         0 => String::new(),
-        more => format!("; and {more} more reasons, which --summary FILE keeps"),
+        more => format!("; {more} more reasons are in --summary FILE"),
     };
     let all = match errors.iter().map(CellError::count).sum() {
         0_usize => return None,
-        1 => format!("1 cell ended by an error of its own{above}"),
-        count => format!("{count} cells ended by errors of their own{above}"),
+        1 => format!("1 cell ended with an error{above}"),
+        count => format!("{count} cells ended with errors{above}"),
     };
     Some(format!("{all}: {each}{more}"))
 }
@@ -208,7 +208,7 @@ mod tests {
             let (code, words) = match rated.outcome {
                 Outcome::Halted => (3, "the robot was halted at 1.000 s"),
                 Outcome::NoController => (4, "no hello"),
-                Outcome::CellError => (5, "3 cells ended by errors of their own: 1-3 on vcan0 (no memory)"),
+                Outcome::CellError => (5, "3 cells ended with errors: 1-3 on vcan0 (no memory)"),
                 Outcome::Done | Outcome::Interrupted => (0, ""),
                 Outcome::Failed => panic!("{flags:?}"),
             };
@@ -233,21 +233,15 @@ mod tests {
     fn errors_of_cells_are_one_line_however_many_there_are() {
         assert_eq!(cells_in_error(&[], true), None);
         let one = [error("a", &[7])];
-        assert_eq!(
-            cells_in_error(&one, true).unwrap(),
-            "1 cell ended by an error of its own: 7 on vcan0 (a)"
-        );
+        assert_eq!(cells_in_error(&one, true).unwrap(), "1 cell ended with an error: 7 on vcan0 (a)");
         assert_eq!(
             cells_in_error(&one, false).unwrap(),
-            "1 cell ended by an error of its own, given above: 7 on vcan0"
+            "1 cell ended with an error, given above: 7 on vcan0"
         );
         let many: Vec<_> = (1..=252).map(|node| error(&format!("reason {node}"), &[node])).collect();
         let line = cells_in_error(&many, true).unwrap();
-        assert!(
-            line.starts_with("252 cells ended by errors of their own: 1 on vcan0 (reason 1); "),
-            "{line}"
-        );
-        assert!(line.ends_with("; and 248 more reasons, which --summary FILE keeps"), "{line}");
+        assert!(line.starts_with("252 cells ended with errors: 1 on vcan0 (reason 1); "), "{line}");
+        assert!(line.ends_with("; 248 more reasons are in --summary FILE"), "{line}");
         assert!(line.len() < 300, "{line}");
     }
 }

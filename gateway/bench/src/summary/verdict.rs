@@ -158,7 +158,7 @@ fn absent_cells(look_at: &mut Vec<String>, summary: &Summary) {
     }
     for bus in summary.buses.iter().filter(|bus| !bus.silent_cells.is_empty()) {
         look_at.push(format!(
-            "{}: dead, or never heard; check that each runs and is wired",
+            "{}: stopped sending, or never sent; check that each runs and is wired",
             cell_names(&bus.silent_cells, &bus.name)
         ));
     }
@@ -191,19 +191,19 @@ fn unexplained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     if replies.unknown > 0 {
         look_at.push(format!(
-            "{} missing without a reason (unknown) on {name}: cells[].missing of --summary FILE has which cells",
+            "{} missing for no known reason (unknown) on {name}: cells[].missing of --summary FILE lists the cells",
             count_noun(replies.unknown, "reply", "replies")
         ));
     }
     if up.unknown > 0 {
         look_at.push(format!(
-            "{} sent by cells and not received, without a reason (unknown), on {name}: check its wiring and load",
+            "{} sent by cells and not received, for no known reason (unknown), on {name}: check its wiring and load",
             count_noun(up.unknown, "packet", "packets")
         ));
     }
     if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.missing > 0) {
         look_at.push(format!(
-            "{} of {} due in sums missing on {name}: no route to a root, lost sums, or a busy machine",
+            "{} of {} due in sums were missing on {name}: no route to a root, lost sums, or a busy machine",
             parts.missing,
             count_noun(parts.due, "cell", "cells")
         ));
@@ -254,7 +254,7 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
             .push(format!("{} saturated, and not compared", count_noun(accuracy.saturated, "word", "words")));
     }
     for cells in cells_that(summary, |cell| !cell.stuck.is_empty()) {
-        look_at.push(format!("{cells}: stuck, sent the same words while it should have sent others"));
+        look_at.push(format!("{cells}: stuck, sent constant words while the expected words changed"));
     }
     for bus in &summary.buses {
         let parts = bus.sums.map(|sums| sums.contributions);
@@ -262,7 +262,7 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
         let RepliesSummary { unexpected, .. } = bus.replies;
         if unexpected + in_sums > 0 {
             look_at.push(format!(
-                "{} that nothing touched, or that were halted, on {}: not compared",
+                "{} that were not touched, or were halted, on {}: not compared",
                 count_noun(unexpected + in_sums, "torque of cells", "torques of cells"),
                 bus.name
             ));
@@ -273,7 +273,7 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
 /// Adds findings on restarts of cells, and on halts that have ended.
 fn add_restart_findings(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_that(summary, |cell| cell.restarts > 0) {
-        look_at.push(format!("{cells}: restarted; what was due then is in doubt"));
+        look_at.push(format!("{cells}: restarted; it is unknown whether replies due at that time were sent"));
     }
     for bus in &summary.buses {
         let of_cells = summary.cells.iter().filter(|cell| cell.bus == bus.name).map(|cell| cell.restarts);
@@ -291,7 +291,7 @@ fn add_restart_findings(look_at: &mut Vec<String>, summary: &Summary) {
     if ended > 0 {
         let why = summary.halts.first().map_or("", |halt| &halt.reason);
         look_at
-            .push(format!("the robot was halted {} and resumed, at first because {why}", times_text(ended)));
+            .push(format!("the robot was halted {} and resumed; the first reason: {why}", times_text(ended)));
     }
 }
 
@@ -301,7 +301,7 @@ fn add_recording_findings(look_at: &mut Vec<String>, summary: &Summary) {
     // If the run failed, its error already names the file that could not be written.
     if recording.lost + messages > 0 && summary.failure.is_none() {
         look_at.push(format!(
-            "the recording is incomplete, without {} and {}: this machine was busy, or its disk is slow",
+            "the recording is incomplete, it lacks {} and {}: this machine was busy, or its disk is slow",
             count_noun(recording.lost, "frame", "frames"),
             count_noun(messages, "other message", "other messages")
         ));
@@ -351,7 +351,7 @@ fn add_control_findings(look_at: &mut Vec<String>, summary: &Summary) {
     }
     if control.unsent > 0 {
         let frames = count_noun(control.unsent, "frame", "frames");
-        look_at.push(format!("{frames} of the gateway not sent: a bus refused them"));
+        look_at.push(format!("{frames} of the gateway were not sent: a bus refused them"));
     }
     if control.records_lost > 0 {
         let records = count_noun(control.records_lost, "record of a tick", "records of ticks");
@@ -367,7 +367,7 @@ fn add_tick_findings(look_at: &mut Vec<String>, summary: &Summary) {
         let fifo = if control.fifo { "" } else { " (SCHED_FIFO was refused)" };
         let joints = match control.broadcasts_skipped {
             0 => String::new(),
-            joints => format!(", {joints} of them with joints"),
+            joints => format!(", {joints} of them with a joints message"),
         };
         look_at.push(format!(
             "{} of {} of the control loop skipped{joints}: this machine was busy{fifo}",
@@ -392,7 +392,7 @@ fn late_replies(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
     if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.late > 0) {
         look_at.push(format!(
-            "{} of {} due in sums late on {}: this machine was busy, or the tree is deep",
+            "{} of {} due in sums were late on {}: this machine was busy, or the tree is deep",
             parts.late,
             count_noun(parts.due, "cell", "cells"),
             bus.name
@@ -433,12 +433,13 @@ fn irregular_frames(look_at: &mut Vec<String>, bus: &BusSummary) {
 fn add_unchecked_findings(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_that(summary, |cell| cell.contact_unknown > 0 && !cell.is_measuring()) {
         look_at.push(format!(
-            "{cells}: contact not known, torques not compared; stimuli from before this run, or a baseline"
+            "{cells}: contact unknown, so torques were not compared; the cause is stimuli from before this run, or a baseline"
         ));
     }
     for cells in cells_that(summary, CellSummary::is_measuring) {
-        look_at
-            .push(format!("{cells}: in mode \"measure\", not pressed by the scenario, torques not compared"));
+        look_at.push(format!(
+            "{cells}: in mode \"measure\" and not pressed by the scenario, so torques were not compared"
+        ));
     }
     // If the run failed early, its error is already in the list.
     if summary.failure.is_some() {

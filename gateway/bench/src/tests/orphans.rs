@@ -57,8 +57,7 @@ fn what_a_killed_run_left_is_repaired_and_nobody_may_read_more_of_it_than_before
     fs::write(folder.path().join("run-recovered.mcap"), "somebody's").unwrap();
     let (claimed, said) = claims(folder.path(), "run.mcap");
     assert!(claimed.is_ok() && said.len() == 1, "{said:?}");
-    let repaired =
-        "run.mcap.part was left by a run that was killed; repaired, it is run-recovered-1.mcap: 1 messages";
+    let repaired = "run.mcap.part was left by a run that was killed; it was repaired as run-recovered-1.mcap: 1 messages";
     assert!(said[0].starts_with(repaired), "{said:?}");
     let about = fs::metadata(folder.path().join("run-recovered-1.mcap")).unwrap();
     assert_eq!(about.mode() & 0o777, 0o600);
@@ -78,7 +77,7 @@ fn an_original_that_is_damaged_before_its_end_is_kept() {
         File::options().write(true).open(&part).unwrap().write_all(&bytes).unwrap();
         let (claimed, said) = claims(folder.path(), "next.mcap");
         assert!(claimed.is_ok() && said.len() == 1, "{said:?}");
-        let repaired = format!("repaired, it is run-recovered{number}.mcap: 0 messages");
+        let repaired = format!("it was repaired as run-recovered{number}.mcap: 0 messages");
         let kept = format!(" damaged bytes are lost; the damaged original is run.mcap.damaged{number}");
         assert!(said[0].contains(&repaired) && said[0].ends_with(&kept), "{said:?}");
         assert!(!part.exists());
@@ -162,13 +161,13 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
         why.split(';').next().unwrap().to_owned()
     };
     for name in ["again", "copy", "download", "empty", "text"] {
-        assert_eq!(reason(name), "no run of this program created it here");
+        assert_eq!(reason(name), "it was not created here by a run of this program");
     }
     for name in ["folder", "pipe", "socket"] {
         assert_eq!(reason(name), "it is not a regular file");
     }
     assert_eq!(["link", "lost"].map(reason), ["it is a symlink", "it is a symlink"]);
-    assert_eq!(reason("two"), "it has 2 names (hard links)");
+    assert_eq!(reason("two"), "it has 2 hard links");
     assert_eq!(reason("locked"), "another program is writing it");
     assert_eq!(said.len(), 12);
     assert!(fs::symlink_metadata(path("pipe.mcap.part")).unwrap().file_type().is_fifo());

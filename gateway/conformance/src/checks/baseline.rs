@@ -156,7 +156,7 @@ fn check_first_tare(session: &mut Session<'_>) -> Result<(), StopReason> {
     if let Some((sum, zero, _)) = request_baseline(session)? {
         let is_so = zero.tared && near(zero.zero.to_bits().into(), 307, 1) && near(sum, 0, 1);
         session.check("BASE-2", is_so, || {
-            format!("after {JOINTS_BEFORE_TARE} joints with 0.3 N, page 3 must have a zero of 307 steps, tared, and page 0 must add up to 0, but page 3 is {}, and page 0 adds up to {sum}", text(zero))
+            format!("after {JOINTS_BEFORE_TARE} joints messages at 0.3 N, page 3 must show a tared zero of 307 steps, and the contact words of page 0 must sum to 0, but page 3 is {}, and the sum is {sum}", text(zero))
         });
     }
     let raw = reading(307 + TOUCH_SUM, TEMPERATURE_25_C);
@@ -188,7 +188,7 @@ fn check_first_tare(session: &mut Session<'_>) -> Result<(), StopReason> {
     });
     if let Some((sum, zero, _)) = request_baseline(session)? {
         session.check("BASE-2", !zero.tared && sum == 700, || {
-            format!("0.68 N from the start must not be tared, and page 0 must add up to 700, but page 3 is {}, and page 0 adds up to {sum}", text(zero))
+            format!("0.68 N from the start must not be tared, and the contact words of page 0 must sum to 700, but page 3 is {}, and the sum is {sum}", text(zero))
         });
     }
     Ok(())
@@ -204,7 +204,7 @@ fn check_hold(session: &mut Session<'_>) -> Result<(), StopReason> {
         send_reading(session, TOUCH_SUM, TEMPERATURE_25_C, joints)?;
         if let Some((sum, zero, _)) = request_baseline(session)? {
             session.check("BASE-3", near(sum, TOUCH_SUM, 1) && near(zero.zero.to_bits().into(), 0, 1), || {
-                format!("after {joints} joints under 1 N the zero must be 0, and page 0 must add up to {TOUCH_SUM}, but page 3 is {}, and page 0 adds up to {sum}", text(zero))
+                format!("after {joints} joints messages at 1 N the zero must be 0, and the contact words of page 0 must sum to {TOUCH_SUM}, but page 3 is {}, and the sum is {sum}", text(zero))
             });
         }
     }
@@ -225,7 +225,7 @@ fn check_follow(session: &mut Session<'_>) -> Result<(), StopReason> {
         let is_so = (min..=max).contains(&steps) || skips != session.skips;
         session.check("BASE-4", is_so, || {
             format!(
-                "after {JOINTS_MESSAGES} joints with a reading of 80 steps, at a rate of {} uN/s, the zero must be {min} to {max} steps, but is {steps}",
+                "after {JOINTS_MESSAGES} joints messages with a reading of 80 steps, at a rate of {} uN/s, the zero must be {min} to {max} steps, but is {steps}",
                 rate.cast_unsigned()
             )
         });
@@ -243,7 +243,7 @@ fn check_temperature(session: &mut Session<'_>) -> Result<(), StopReason> {
         if let Some((sum, zero, _)) = request_baseline(session)? {
             session.check("BASE-5", near(sum, TOUCH_SUM - expected, 2), || {
                 format!(
-                    "{degrees} °C more with a slope of 0.02 N/°C: page 3 is {}, and page 0 adds up to {sum}, but must add up to {}",
+                    "after a change by {degrees} °C with a slope of 0.02 N/°C page 3 is {}, and the contact words of page 0 sum to {sum}, but must sum to {}",
                     text(zero),
                     TOUCH_SUM - expected
                 )
@@ -269,7 +269,7 @@ fn check_tares(session: &mut Session<'_>) -> Result<(), StopReason> {
             let is_so = near(zero.zero.to_bits().into(), expected, 2) && is_counted;
             session.check("BASE-6", is_so, || {
                 format!(
-                    "{what} page 3 must have a zero of {expected} steps and count refused tares, but is {}",
+                    "{what}, page 3 must have a zero of {expected} steps and the number of refused tares, but is {}",
                     text(zero)
                 )
             });
@@ -291,7 +291,7 @@ fn check_tares(session: &mut Session<'_>) -> Result<(), StopReason> {
     tare(session, 0, Reply::Value([0; WORDS]), "to forget the zero")?;
     let reply = session.read(TARE_PARAMETER)?;
     session.check("BASE-6", reply == Reply::Value([0; WORDS]), || {
-        format!("without a zero parameter 12 must be read as 0, but is read as {reply}")
+        format!("without a zero, parameter 12 must read as 0, but reads as {reply}")
     });
     Ok(())
 }
@@ -305,7 +305,7 @@ fn check_pages(session: &mut Session<'_>) -> Result<(), StopReason> {
         let came = pages.find_map(|(_, page)| zero_of(page));
         session.check("BASE-7", came.is_some_and(|page| page.touched == touched), || {
             let came = came.map_or_else(|| "none".to_owned(), text);
-            format!("a touch or its end must send page 3 with the new state of the touch, but {came} came")
+            format!("the start or end of a touch must send page 3 with the new touch state, but {came} came")
         });
     }
     session.wait_for_quiet(Span::from_millis(60))?;
@@ -317,9 +317,7 @@ fn check_pages(session: &mut Session<'_>) -> Result<(), StopReason> {
     let count = pages.filter(|(_, page)| zero_of(page).is_some()).count();
     session.mark_expected();
     session.check("BASE-7", count >= beats / 4 && count <= beats / 4 + 1, || {
-        format!(
-            "page 3 must come with every fourth heartbeat, but came {count} times with {beats} heartbeats"
-        )
+        format!("page 3 must come with every fourth heartbeat, but came {count} times in {beats} heartbeats")
     });
     Ok(())
 }

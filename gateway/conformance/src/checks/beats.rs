@@ -233,7 +233,9 @@ fn check_order(session: &mut Session<'_>) {
     let first =
         answers.filter(|(place, it)| it.beat().is_some_and(|(_, epoch)| before(*place, epoch))).count();
     session.check("TIME-3", first <= 1, || {
-        format!("a regular heartbeat must follow the torque of its epoch, but {first} came before it")
+        format!(
+            "a regular heartbeat must follow the torque of its epoch, but {first} heartbeats came before it"
+        )
     });
 }
 
@@ -248,7 +250,7 @@ fn check_clock(session: &mut Session<'_>, first: HeartbeatGrid, last: HeartbeatG
     session.begin_expected_exchange();
     session.check("TIME-1", off <= allowed, || {
         format!(
-            "by {beats} heartbeats in {} ms, the cell's clock is off by {} us, but only {allowed} us are allowed",
+            "over {beats} heartbeats in {} ms, the cell's clock is off by {} us, but at most {allowed} us are allowed",
             span / 1_000,
             off
         )

@@ -159,7 +159,7 @@ fn check_not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), 
     let is_set = shown.has(State::DUPLICATE);
     session.check("CONF-1", is_set, || {
         format!(
-            "DUPLICATE must be set in the identity after a 4nn of another cell, but the state is {:04X}",
+            "DUPLICATE must be set in the identity after a network packet (4nn) of another cell, but the state is {:04X}",
             shown.0
         )
     });
@@ -169,7 +169,7 @@ fn check_not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), 
     let state = beats(session).last().map(|(_, state)| *state).unwrap_or_default();
     session.check("CLAIM-7", state.has(State::DUPLICATE), || {
         format!(
-            "DUPLICATE must be set in the heartbeat after a 4nn of another cell, but the state is {:04X}",
+            "DUPLICATE must be set in the heartbeat after a network packet (4nn) of another cell, but the state is {:04X}",
             state.0
         )
     });

@@ -117,7 +117,7 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         let taken = |of: &protocol::message::ReceivedCounts| of.joints.wrapping_add(of.joints_late);
         let counted = taken(&after).wrapping_sub(taken(&before));
         session.check("CMD-1", counted == 5, || {
-            format!("a halted cell must count 5 joints, but counted {counted}")
+            format!("a halted cell must count 5 joints messages, but counted {counted}")
         });
         session.check("CMD-1", after.torques == before.torques, || {
             "a halted cell must not count torques, but its count changed".to_owned()
@@ -134,7 +134,7 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
             .unwrap_or(0);
         session.check("CMD-2", off <= 8, || {
             format!(
-                "the first torque after a resume must be that of the new joints, but is {}",
+                "the first torque after a resume must match the new joint positions, but is {}",
                 arm::format_words(&step.words())
             )
         });
@@ -211,14 +211,14 @@ fn check_report(session: &mut Session<'_>) -> Result<(), StopReason> {
         [SensorPage::Skin(skin), page].iter().for_each(|page| latched.set(page));
         let latched = latched.pages();
         session.check("SENSE-1", sent.len() == latched.len(), || {
-            format!("{} sensors pages came to a report", sent.len())
+            format!("a report must be answered with each latched sensors page, but {} pages came", sent.len())
         });
         session.check("SENSE-2", sent == latched, || {
             let text = |pages: &[SensorPage]| {
                 pages.iter().map(|page| arm::format_page(*page)).collect::<Vec<_>>().join("; ")
             };
             format!(
-                "a report must have the latched values, but has {}, and {} is latched",
+                "a report must contain the latched values, but contains {}, while {} is latched",
                 text(&sent),
                 text(&latched)
             )

@@ -25,12 +25,12 @@ enum RejectCounter {
 impl RejectCounter {
     const fn text(self) -> &'static str {
         match self {
-            Self::Length => "only as length",
-            Self::Crc => "only as CRC",
-            Self::MaybeForeign => "only as foreign",
-            Self::Meaning => "only as meaning",
-            Self::Incomplete => "only as incomplete",
-            Self::None => "nowhere",
+            Self::Length => "only in the counter length",
+            Self::Crc => "only in the counter crc",
+            Self::MaybeForeign => "only in the counter foreign",
+            Self::Meaning => "only in the counter meaning",
+            Self::Incomplete => "only in the counter incomplete",
+            Self::None => "in no counter",
         }
     }
 }
@@ -159,7 +159,7 @@ fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, RejectCounter)> {
                 let short = bytes.get(..*length).unwrap_or_default();
                 let frame = Frame::classic(id, short).into_iter().collect();
                 cases.push((
-                    format!("{length} bytes under the identifier of {name}"),
+                    format!("{length} bytes with the identifier of {name}"),
                     frame,
                     RejectCounter::Length,
                 ));
@@ -169,7 +169,7 @@ fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, RejectCounter)> {
     }
     for byte in [0, 0xFF] {
         let wrong = if format == Format::Fd { RejectCounter::Crc } else { RejectCounter::Incomplete };
-        cases.push((format!("a halt of 16 bytes {byte:02X}"), frames(format, 0, &[byte; 16]), wrong));
+        cases.push((format!("a halt with 16 bytes of {byte:02X}"), frames(format, 0, &[byte; 16]), wrong));
     }
     add_bad_pages(session, &mut cases);
     cases
@@ -222,11 +222,15 @@ fn add_foreign_frames(
 ) {
     // On a classic bus, only the first segment.
     let whole = frames(format, id | EXTENDED, bytes).into_iter().take(1).collect();
-    cases.push((format!("{name} under an identifier of 29 bits"), whole, RejectCounter::MaybeForeign));
+    cases.push((format!("{name} with a 29-bit identifier"), whole, RejectCounter::MaybeForeign));
     // The upper 11 of 29 bits; the frames of a wire have the uppermost bit set.
     if id < 0x400 {
         let upper = frames(format, id << 18 | EXTENDED, bytes).into_iter().take(1).collect();
-        cases.push((format!("{name} in the upper bits of 29"), upper, RejectCounter::MaybeForeign));
+        cases.push((
+            format!("{name} with its identifier in the upper 11 of 29 bits"),
+            upper,
+            RejectCounter::MaybeForeign,
+        ));
     }
     let remote = Frame::remote(id, 8).into_iter().collect();
     cases.push((format!("a remote frame of {name}"), remote, RejectCounter::MaybeForeign));
@@ -245,7 +249,7 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
     for page in [5, 9, 127, 128, 255] {
         let claim = [1, 0, 0, 0, 0, (State::CLAIMING.0 | 1 << 12).cast_signed()];
         add(
-            format!("its own 4nn of page {page}"),
+            format!("a network packet (4nn) with its node id and page {page}"),
             packet(Id::new(Kind::Network, own), claim, 0, page),
             RejectCounter::Meaning,
         );
@@ -253,7 +257,7 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
     for count in [2, 3, 0x7F, 0x82, 0xFF] {
         for to in [own, Node::Everyone] {
             let stimulus = packet(Id::new(Kind::Stimulus, to), [999, 0, 0, 0, 0, 0], 0, count);
-            add(format!("a stimulus of count {count:02X} to {to}"), stimulus, RejectCounter::Meaning);
+            add(format!("a stimulus with count byte {count:02X} to {to}"), stimulus, RejectCounter::Meaning);
         }
     }
     for command in [5, 6, 0x55, 0xFF] {
@@ -273,7 +277,7 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
             let bytes: Vec<_> = packet.encode().iter().copied().take(length).collect();
             add(format!("a {} packet of node {node}", kind.name()), packet, RejectCounter::None);
             others.push((
-                format!("{length} bytes under the identifier of a {} packet of node {node}", kind.name()),
+                format!("{length} bytes with the identifier of a {} packet of node {node}", kind.name()),
                 frames(session.format, id.to_bits().into(), &bytes),
                 RejectCounter::None,
             ));
@@ -285,7 +289,7 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
     for count in [0, 7, 14, 200] {
         let words = Words::new(Length::Six, [3; MAX_JOINTS]);
         let packet = Packet { id: joints, words, epoch: Epoch(251), count };
-        add(format!("joints of count {count}"), packet, RejectCounter::Meaning);
+        add(format!("joints with count {count}"), packet, RejectCounter::Meaning);
     }
     cases.extend(others);
 }

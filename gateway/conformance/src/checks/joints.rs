@@ -34,7 +34,7 @@ fn check_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
         epoch = epoch.wrapping_add(step);
         let came = session.step_at(epoch, &POSITIONS)?.torque;
         session.check("JOINTS-1", came.is_some(), || {
-            format!("joints {epoch}, {} epochs after the last ones, must be answered with a torque, but none came", step.cast_signed())
+            format!("joints of epoch {epoch}, {} epochs after the last ones, must be answered with a torque, but none came", step.cast_signed())
         });
         if let (Some(came), Some(before)) = (came, torque) {
             let words = |words: &Words| arm::format_words(words.as_slice());
@@ -54,7 +54,7 @@ fn check_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
     let late = session.skips;
     session.check("JOINTS-5", skipped <= late, || {
         format!(
-            "{skipped} joints were counted as skipped, but only {late} were answered late enough for that"
+            "{skipped} joints messages were counted as skipped, but only {late} were delayed enough for that"
         )
     });
     Ok(())
@@ -71,7 +71,7 @@ fn check_repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
             let joints = session.joints(first, &positions);
             let exchange = session.exchange_all(&[joints])?;
             session.check("JOINTS-1", exchange.is_silent(), || {
-                format!("repeated joints {first} must not be answered, but were")
+                format!("repeated joints of epoch {first} must not be answered, but were")
             });
         }
         // A pending stimulus must not be latched by repeated joints.
@@ -90,7 +90,7 @@ fn check_repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
         let after = session.counters()?.heard;
         let counted = after.joints_repeated.wrapping_sub(before.joints_repeated);
         session.check("JOINTS-1", counted == 3, || {
-            format!("3 repeated joints must be counted as repeated, but {counted} were")
+            format!("3 repeated joints messages must be counted as repeated, but {counted} were")
         });
     }
     Ok(())
@@ -117,19 +117,21 @@ fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
             )
         });
         session.check("JOINTS-2", exchange.is_silent(), || {
-            format!("joints with count {count} must not be answered, because the chain has 6, but were")
+            format!(
+                "joints with count {count} must not be answered, because the chain has 6 joints, but were"
+            )
         });
         let after = session.counters()?;
         let is_so =
             after.refused.meaning == before.refused.meaning.wrapping_add(1) && after.heard == before.heard;
         let id = if (1..=6).contains(&count) { "JOINTS-2" } else { "COUNT-1" };
         session.check(id, is_so, || {
-            format!("joints with count {count} must be counted only as meaning, but the counters are {after}; before: {before}")
+            format!("joints with count {count} must be counted only in the counter meaning, but the counters are {after}; before: {before}")
         });
         // The epoch of the dropped joints does not become the last one.
         let step = session.step_at(epoch, &POSITIONS)?;
         session.check("JOINTS-2", step.torque.is_some(), || {
-            format!("joints {epoch} with the right count must be answered after those with a wrong one, but were not")
+            format!("joints of epoch {epoch} with the right count must be answered after joints with a wrong count, but were not")
         });
         before = session.counters()?;
     }
@@ -145,7 +147,7 @@ fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.check(id, (repeated, meaning) == (is_repeated.into(), (!is_repeated).into()), || {
             format!(
                 "joints of the last epoch with count {count} were counted {repeated} times as repeated and {meaning} \
-                 times as meaning; count 5 must be counted once as repeated, and count 0 once as meaning"
+                 times in the counter meaning; count 5 must be counted once as repeated, and count 0 once in meaning"
             )
         });
         before = after;
@@ -158,7 +160,7 @@ fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let is_so = after.refused.meaning == before.refused.meaning.wrapping_add(1)
             && after.refused.length == before.refused.length;
         session.check("JOINTS-2", is_so, || {
-            format!("joints of 7 in 20 bytes must be counted as meaning, but the counters are {after}; before: {before}")
+            format!("joints with count 7 in 20 bytes must be counted in the counter meaning, but the counters are {after}; before: {before}")
         });
     }
     Ok(())
@@ -262,7 +264,7 @@ fn send_burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -
         taken <= u16::from(BURST_JOINTS) && usize::from(torques) == answers.len() && joints >= torques;
     session.check("JOINTS-4", is_so, || {
         format!(
-            "the counters must match the {BURST_JOINTS} joints sent and the torques that came, but {joints} were counted as joints, {skipped} as skipped and {torques} as torques, and {} were answered",
+            "the counters must match the {BURST_JOINTS} joints messages sent and the torques that came, but {joints} messages were counted as joints, {skipped} as skipped and {torques} as torques, and {} torques came",
             answers.len()
         )
     });
@@ -298,7 +300,7 @@ fn find_old_answer(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<St
     });
     let Some([(before, first), (_, epoch)]) = late else { return None };
     Some(format!(
-        "with a period of 1 us, joints {epoch} must be skipped as too old, but were answered; they had come before the answer to joints {first} at {} us",
+        "with a period of 1 us, joints of epoch {epoch} must be skipped as too old, but were answered; they came before the answer to epoch {first} at {} us",
         before.0
     ))
 }

@@ -50,7 +50,7 @@ fn check_stimuli_kept(
     session.step_at(later, &POSITIONS)?;
     let skin = session.read_latched_skin()?;
     session.check(id, skin == Some(arm::press_with_sum(PENDING_SUM)), || {
-        format!("{what} must keep a pending stimulus, but at its epoch {} is latched", arm::format_skin(skin))
+        format!("{what} must keep a pending stimulus, but {} is latched at its epoch", arm::format_skin(skin))
     });
     Ok(())
 }
@@ -78,7 +78,7 @@ fn check_commit(session: &mut Session<'_>) -> Result<(), StopReason> {
         for (number, expected) in [(thresholds, events), (sensing, padded_words([1, i16::MAX]))] {
             let reply = session.read(number)?;
             session.check("CONF-7", reply == Reply::Value(expected), || {
-                format!("a commit must not change parameter {number}, but it is read as {reply}")
+                format!("a commit must not change parameter {number}, but it reads as {reply}")
             });
         }
         session.write_first_words(sensing, [0])?;
@@ -127,7 +127,7 @@ fn check_mode_write(session: &mut Session<'_>) -> Result<(), StopReason> {
             session.set_test_mode(to, on != 0)?;
             let is_on = session.exchange_all(&[])?.state().has(protocol::message::State::TEST_MODE);
             session.check("CONF-11", is_on == (on != 0), || {
-                format!("a write of {on} to parameter 5, sent to {to}, must switch TEST_MODE, but did not")
+                format!("a write of {on} to parameter 5, sent to {to}, must change TEST_MODE, but did not")
             });
         }
         let joints = session.joints(session.known.last_epoch, &POSITIONS);

@@ -41,7 +41,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         };
         session.check("JOINTS-6", wrong.is_none(), || {
             format!(
-                "answers to joints must agree with ACTIVE outside test mode: {}",
+                "outside test mode, answers to joints must agree with ACTIVE: {}",
                 wrong.unwrap_or_default()
             )
         });

@@ -78,11 +78,11 @@ fn check_test_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.skin = on.then(Default::default);
         let reply = session.read(5)?;
         session.check("CONF-9", reply == Reply::Value(padded_words([on.into()])), || {
-            format!("only 1 must switch test mode on, but after a write of {written} parameter 5 is read as {reply}")
+            format!("only a write of 1 may switch test mode on, but after a write of {written} parameter 5 reads as {reply}")
         });
         let state = session.exchange_all(&[])?.state();
         session.check("CONF-9", state.has(State::TEST_MODE) == on, || {
-            format!("only 1 must set TEST_MODE, but after a write of {written} to parameter 5 the state is {:04X}", state.0)
+            format!("only a write of 1 may set TEST_MODE, but after a write of {written} to parameter 5 the state is {:04X}", state.0)
         });
     }
     Ok(())
@@ -104,7 +104,7 @@ fn check_reply_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     expect_reply(session, "CONF-3", REPLY_PARAMETER, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
     let reply = session.read(REPLY_PARAMETER)?;
     session.check("CONF-9", reply == Reply::Value([0; WORDS]), || {
-        format!("parameter 6 must be read as 0 after a write of 0, but is read as {reply}")
+        format!("parameter 6 must read as 0 after a write of 0, but reads as {reply}")
     });
     Ok(())
 }
@@ -115,7 +115,9 @@ fn check_sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
             expect_reply(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
             let reply = session.read(number)?;
             session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
-                format!("parameter {number} of an option that the cell lacks must be read as 0, but is read as {reply}")
+                format!(
+                    "parameter {number} of an option that the cell lacks must read as 0, but reads as {reply}"
+                )
             });
             expect_refusal(session, "OPT-1", number, padded_words([1, 50]))?;
         }
@@ -150,7 +152,7 @@ fn check_sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
         expect_reply(session, "SENSE-3", EVENTS_PARAMETER, [a, b, c, d, e, 77], Reply::Value(good))?;
         let reply = session.read(EVENTS_PARAMETER)?;
         session.check("CONF-9", reply == Reply::Value(good), || {
-            format!("parameter 8 must be read as it was written, but is read as {reply}")
+            format!("parameter 8 must read as it was written, but reads as {reply}")
         });
     }
     Ok(())
@@ -203,10 +205,7 @@ fn check_impossible_row(session: &mut Session<'_>) -> Result<(), StopReason> {
     };
     let reply = session.read(number)?;
     session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
-        format!(
-            "row {} of a cell that can have {most} rows must be read as 0, but is read as {reply}",
-            most + 1
-        )
+        format!("row {} of a cell with at most {most} rows must read as 0, but reads as {reply}", most + 1)
     });
     expect_reply(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
     expect_refusal(session, "OPT-1", number, padded_words([1, 2, 3, 4]))

@@ -58,7 +58,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     check_computes_with(session, &other, &one, "CONF-7")?;
     let reply = session.read(Parameter::Commit.number())?;
     session.check("CONF-1", reply == Reply::Value([0; WORDS]), || {
-        format!("the commit parameter must be read as 0, but is read as {reply}")
+        format!("the commit parameter must read as 0, but reads as {reply}")
     });
     check_unused_words(session)?;
     check_tags(session)
@@ -71,7 +71,7 @@ fn check_reads(session: &mut Session<'_>, expected: &Parameters, id: &'static st
         let words = expected.words(parameter);
         session.check(id, reply == Reply::Value(words), || {
             format!(
-                "parameter {} is read as {reply}, but must be read as {}",
+                "parameter {} reads as {reply}, but must read as {}",
                 parameter.number(),
                 Reply::Value(words)
             )

@@ -35,7 +35,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.stage(&staged)?;
     let reply = session.read(Parameter::Timing.number())?;
     session.check("CONF-5", reply == Reply::Value(staged.words(Parameter::Timing)), || {
-        format!("refused commits must not change the period in use, but it is read as {reply}")
+        format!("refused commits must not change the period in use, but it reads as {reply}")
     });
     session.exchange_all(&[])?;
     let after = session.counters()?;
@@ -195,7 +195,7 @@ fn check_refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16
     session.check("CONF-6", reply == Reply::Refused(reason), || {
         let words = |parameter| Reply::Value(parameters.words(parameter));
         format!(
-            "a commit with a wrong hash must be refused with reason {reason}, but the answer was {reply}; staged are \
+            "a commit with a wrong hash must be refused with reason {reason}, but the answer was {reply}; the staged values are \
              mount {}, pose {}, contact {}, timing {}",
             words(Parameter::Mount),
             words(Parameter::Pose),

@@ -234,7 +234,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
         let reply = session.read(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
             format!(
-                "after a restart parameter {} must be read as it was committed, but is read as {reply}",
+                "after a restart parameter {} must read as it was committed, but reads as {reply}",
                 parameter.number()
             )
         });

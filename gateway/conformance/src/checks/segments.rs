@@ -185,7 +185,7 @@ fn run_series(session: &mut Session<'_>, series: &SegmentSeries) -> Result<(), S
             after.length == before.length && after.meaning == before.meaning && after.crc == before.crc;
         session.check("COUNT-3", (answers, counted) == expected && others, || {
             format!(
-                "{}: {answers} packets were answered and {counted} counted as incomplete, but must be {} and {}",
+                "{}: {answers} packets were answered and {counted} counted as incomplete, but {} and {} were expected",
                 series.what, series.packets, series.incomplete
             )
         });
@@ -244,7 +244,7 @@ fn check_frame_between(
         exchange.answers.len() == 1 && is_counted && after.refused.incomplete == before.refused.incomplete;
     session.check("COUNT-3", is_so, || {
         format!(
-            "{what} between two segments must not disturb the read: one answer must come, and {} came; the counters are {after}; before: {before}",
+            "{what} between two segments must not disturb the read: one answer must come, but {} came; the counters are {after}; before: {before}",
             exchange.answers.len()
         )
     });
@@ -283,7 +283,7 @@ fn check_joints_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
             let is_so = came == arrives && counted == u16::from(!arrives) && step.torque.is_some();
             session.check("COUNT-3", is_so, || {
                 format!(
-                    "segments of joints must wait 15 ms for each other, but those {} us apart were {}answered, and {counted} counted as incomplete",
+                    "a cell must wait 15 ms for the next segment of joints, but segments {} us apart were {}answered, and {counted} were counted as incomplete",
                     apart.0,
                     if came { "" } else { "not " }
                 )

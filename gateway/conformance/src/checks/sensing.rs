@@ -77,7 +77,7 @@ fn check_switch(
     let pages = pages(session.answers());
     session.check("SENSE-4", pages == expected, || {
         format!(
-            "after {what} sensors pages {} came, but must be {}",
+            "after {what}, sensors pages {} came, but {} were expected",
             format_pages(&pages),
             format_pages(expected)
         )
@@ -107,7 +107,7 @@ fn check_order(session: &mut Session<'_>) -> Result<(), StopReason> {
         let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
         session.check("TIME-3", kinds == ["torque", "sensors"], || {
             let kinds = kinds.join(", ");
-            format!("a touch or its end in event mode must give a torque and then a sensors page, but {kinds} came")
+            format!("in event mode, the start and the end of a touch must each give a torque and then a sensors page, but {kinds} came")
         });
     }
     Ok(())
@@ -165,7 +165,7 @@ fn check_events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<
                 let moved = acceleration
                     .map_or_else(String::new, |it| arm::format_page(SensorPage::Acceleration(it)));
                 format!(
-                    "{} {moved} is latched at step {} (before: {turned}): pages {} came, but must be {}",
+                    "{} {moved} is latched at step {} (before: {turned}): pages {} came, but {} were expected",
                     arm::format_skin(Some(skin)),
                     step + 1,
                     format_pages(&numbers),
@@ -280,7 +280,7 @@ fn check_pages_after_beats(session: &mut Session<'_>) -> Result<(), StopReason> 
     session.check("SENSE-10", is_so, || {
         let all: Vec<_> = beats.iter().map(|pages| format_pages(pages)).collect();
         let count = beats.len();
-        format!("pages after each of {count} heartbeats in event mode: {}; expected are page 0, and the others after each fourth", all.join(", "))
+        format!("in event mode page 0 must follow each heartbeat, and every page each fourth one, but these came after {count} heartbeats: {}", all.join(", "))
     });
     // Other heartbeats are not followed by pages.
     session.wait_for_quiet(Span::from_millis(60))?;
@@ -302,7 +302,9 @@ fn check_halted(session: &mut Session<'_>) -> Result<(), StopReason> {
         let pages = pages(&step.exchange.answers);
         session.check("SENSE-11", pages == [0], || {
             let pages = format_pages(&pages);
-            format!("a halted cell in event mode must send page 0 at a touch or its end, but sent {pages}")
+            format!(
+                "a halted cell in event mode must send page 0 when a touch starts or ends, but sent {pages}"
+            )
         });
     }
     session.send_messages(&[Message::Resume])?;
@@ -368,7 +370,7 @@ fn check_page_times(session: &mut Session<'_>, period: u64, with_joints: bool) -
             session.check(id, is_so, || {
                 let times = format_ms(times.iter().copied());
                 format!(
-                    "every {period} ms{}: page 0 came {times} ms after the switch, but must come after {} ms and then \
+                    "with a period of {period} ms{}: page 0 came {times} ms after the switch, but must come after {} ms and then \
                      every {period} ms",
                     if with_joints { ", joints every 16 ms" } else { "" },
                     first / 1_000

@@ -69,7 +69,7 @@ fn check_latched(
     let is_there = step.torque.is_some_and(|words| !words.is_zero());
     session.check(id, is_there == (sum > 0), || {
         format!(
-            "at joints {epoch} {} N must be latched, but the torque is {}",
+            "the joints of epoch {epoch} must latch {} N, but the torque is {}",
             f64::from(sum) / 1024.0,
             arm::format_words(&step.words())
         )

@@ -44,7 +44,7 @@ fn check_staged_reads(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read(number)?;
     session.check("CONF-1", reply == Reply::Value(pose), || {
         format!(
-            "without a configuration parameter {number} must be read as the staged {}, but is read as {reply}",
+            "without a configuration, parameter {number} must read as the staged {}, but reads as {reply}",
             Reply::Value(pose)
         )
     });
@@ -68,7 +68,7 @@ fn check_joints(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.epoch = Some(epoch);
         let exchange = session.exchange_all(&[joints])?;
         session.check("JOINTS-5", exchange.is_silent(), || {
-            format!("a cell without a configuration must not answer joints, but answered those of a chain of {count}")
+            format!("a cell without a configuration must not answer joints, but answered those of a chain of {count} joints")
         });
         session.exchange_all(&[joints])?;
     }
@@ -80,12 +80,12 @@ fn check_joints(session: &mut Session<'_>) -> Result<(), StopReason> {
     let counted = after.heard.joints.wrapping_sub(before.heard.joints);
     session.check("JOINTS-2", counted == u16::from(most), || {
         format!(
-            "a cell without a configuration must count joints of {most} chain lengths, but counted {counted}"
+            "a cell without a configuration must count joints of chain lengths 1 to {most}, but counted {counted}"
         )
     });
     let repeated = after.heard.joints_repeated.wrapping_sub(before.heard.joints_repeated);
     session.check("JOINTS-3", repeated == u16::from(most), || {
-        format!("{most} joints were sent twice to a cell without a configuration, but {repeated} were counted as repeated")
+        format!("{most} joints messages were sent twice to a cell without a configuration, but {repeated} were counted as repeated")
     });
     let wrong = [
         (7, Length::Six),
@@ -107,7 +107,7 @@ fn check_joints(session: &mut Session<'_>) -> Result<(), StopReason> {
     let expected = can.count();
     session.check("COUNT-1", usize::from(counted) == expected, || {
         format!(
-            "{expected} joints whose count does not match their length must be counted as meaning, but {counted} were"
+            "{expected} joints messages whose count does not match their length must be counted in the counter meaning, but {counted} were"
         )
     });
     session.exchange_all(&[Message::Resume])?;

@@ -146,7 +146,7 @@ impl Session<'_> {
             exchange.answers.iter().filter(|heard| heard.torque().is_some()).copied().collect();
         let count = torques.len();
         self.check("JOINTS-6", count <= 1, || {
-            format!("joints {epoch} must be answered with at most one torque, but {count} came")
+            format!("joints of epoch {epoch} must be answered with at most one torque, but {count} came")
         });
         for other in exchange.answers.iter().filter(|heard| heard.torque().is_none()) {
             if let Some(id) = self.known.violated_requirement(&other.message) {
@@ -175,7 +175,7 @@ impl Session<'_> {
                     _ if halted => "halted: no torque was due, but one came",
                     _ => "not in contact: nothing was due, but a torque came",
                 };
-                format!("joints {epoch}, {what}")
+                format!("joints of epoch {epoch}, {what}")
             });
         }
         if let Some((at, of, words)) = first {
@@ -184,7 +184,7 @@ impl Session<'_> {
                 self.note_time("torque", exchange.at, at);
             }
             self.check("JOINTS-6", of.0 == epoch, || {
-                format!("the torque that answers joints {epoch} must have their epoch, but has {of}")
+                format!("the torque that answers epoch {epoch} must have that epoch, but has {of}")
             });
             if due == Some(ExpectedAnswer::Zeros) {
                 self.check("JOINTS-6", words.is_zero(), || {
@@ -237,7 +237,7 @@ impl Session<'_> {
             let stays = *first && !expected && self.life.saturated;
             self.check(if stays { "STATE-2" } else { "TORQUE-2" }, *first == expected, || {
                 let (set, words) = (if *first { "" } else { "not " }, arm::format_words(words.as_slice()));
-                format!("SATURATED must be set only after a torque at a limit of its range, but is {set}set after {words}")
+                format!("SATURATED must be set exactly after torques at a limit of their range, but is {set}set after {words}")
             });
             let again = expected && rest.contains(&true);
             self.check("STATE-2", !again, || {

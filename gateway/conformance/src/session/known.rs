@@ -109,7 +109,7 @@ impl Session<'_> {
             let expected = u16::from(parameters.joint);
             self.check("STATE-3", state.joint() == expected, || {
                 format!(
-                    "joint {} is in state {:04X}, but joint {expected} was expected",
+                    "the joint of the cell is {} in state {:04X}, but {expected} was expected",
                     state.joint(),
                     state.0
                 )

@@ -137,7 +137,7 @@ impl Session<'_> {
             if let Some((last, packets)) = self.life.sent {
                 let expected = last.wrapping_add(packets);
                 self.check("BEAT-4", sent == expected, || {
-                    format!("sent must be {expected} in a heartbeat, by the packets that came, but is {sent}")
+                    format!("the counter sent in a heartbeat must be {expected}, going by the packets that came, but is {sent}")
                 });
             }
             self.life.sent = Some((sent, 0));

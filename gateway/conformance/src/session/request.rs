@@ -313,7 +313,7 @@ impl Session<'_> {
             let sum =
                 [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
             self.check("BEAT-4", beat.rejected == sum, || {
-                format!("refused is {} in a heartbeat, but must be {sum}, the sum of page 2", beat.rejected)
+                format!("the counter refused in a heartbeat is {}, but must be {sum}, the sum of the counters of network page 2", beat.rejected)
             });
         }
         let (heard, refused) = whole.unwrap_or_default();

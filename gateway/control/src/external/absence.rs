@@ -23,8 +23,8 @@ pub enum ControllerAbsence {
     },
     /// A program sent a hello, but no answer in time.
     #[error(
-        "the external controller on {} sent a hello and answered no tick in time ({missing} without an answer, {late} \
-         answered late, {nonsense} datagrams of nonsense): it must answer each state before the next tick, as in \
+        "the external controller on {} sent a hello but answered no tick in time ({missing} without an answer, {late} \
+         answered late, {nonsense} invalid datagrams): it must answer each state before the next tick, as in \
          docs/how-to/external-controller.md", .socket.display()
     )]
     NoAnswer {
@@ -39,8 +39,8 @@ pub enum ControllerAbsence {
     },
     /// The program answered at first, and then ended or fell silent.
     #[error(
-        "the external controller on {} answered {answers} ticks and none of the last {ticks}, when the run ended: it \
-         must answer until then; see its own messages", .socket.display()
+        "the external controller on {} answered {answers} ticks, but none of the last {ticks} before the run ended: it \
+         must answer until the end; see its own messages", .socket.display()
     )]
     Gone {
         /// Path of the gateway's socket.
@@ -63,8 +63,8 @@ pub struct OtherDatagrams {
 
 impl Display for OtherDatagrams {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let named = |count| format!("{count} datagrams came that are no hello of this version");
-        let unnamed = |count| format!("{count} came from a socket without an address, which must be bound");
+        let named = |count| format!("{count} datagrams came that are not a hello of this version");
+        let unnamed = |count| format!("{count} datagrams came from a socket without an address: bind it");
         match (self.named, self.unnamed) {
             (0, 0) => Ok(()),
             (count, 0) => write!(f, " ({})", named(count)),

@@ -277,7 +277,7 @@ fn a_socket_is_replaced_when_dead_refused_when_live_and_removed_at_the_end() {
     let (folder, path, gateway) = gateway();
     let error = listen(&path).unwrap_err().to_string();
     assert!(
-        error.ends_with("another program listens on this socket; end it, or name another path"),
+        error.ends_with("another program listens on this socket; stop it, or choose another path"),
         "{error}"
     );
     drop(gateway);
@@ -287,7 +287,10 @@ fn a_socket_is_replaced_when_dead_refused_when_live_and_removed_at_the_end() {
     drop(listen(&path).unwrap());
     std::fs::write(&path, "notes").unwrap();
     let error = listen(&path).unwrap_err().to_string();
-    assert!(error.ends_with("exists and is no socket; it is left alone"), "{error}");
+    assert!(
+        error.ends_with("exists and is not a socket, so it was left unchanged; choose another path"),
+        "{error}"
+    );
     assert_eq!(std::fs::read_to_string(&path).unwrap(), "notes");
     let nowhere = folder.path().join("none/controller.sock");
     assert!(listen(&nowhere).unwrap_err().to_string().ends_with("cannot listen on this socket"));
@@ -360,7 +363,7 @@ fn a_controller_that_never_says_hello_is_absent_whatever_else_comes() {
     program.send(&of_another_version).unwrap();
     program.send(&velocity(0, 0.5)).unwrap();
     gateway.step(&input(1));
-    absent(&gateway, &path, None, " (2 datagrams came that are no hello of this version): start it");
+    absent(&gateway, &path, None, " (2 datagrams came that are not a hello of this version): start it");
     UnixDatagram::unbound().unwrap().send_to(HELLO, &path).unwrap();
     gateway.step(&input(2));
     absent(&gateway, &path, Some(25), ", 1 came from a socket without an address");
@@ -377,7 +380,7 @@ fn a_controller_that_says_hello_and_never_answers_in_time_is_absent() {
     program.send(&velocity(0, 0.5)).unwrap();
     program.send(b"SKBC").unwrap();
     gateway.step(&input(2));
-    let counts = "(2 without an answer, 1 answered late, 1 datagrams of nonsense)";
+    let counts = "(2 without an answer, 1 answered late, 1 invalid datagrams)";
     absent(&gateway, &path, None, counts);
     absent(&gateway, &path, Some(25), counts);
 }
@@ -391,7 +394,7 @@ fn a_controller_that_answered_is_absent_only_if_it_is_silent_at_the_end() {
     one.send(&velocity(0, 0.5)).unwrap();
     gateway.step(&input(1));
     assert_eq!(gateway.absence(None), None);
-    absent(&gateway, &path, Some(40), " answered 1 ticks and none of the last 40");
+    absent(&gateway, &path, Some(40), " answered 1 ticks, but none of the last 40");
     // A second program takes over; the first one's answers still count.
     let other = program(&folder, "other");
     other.send(HELLO).unwrap();

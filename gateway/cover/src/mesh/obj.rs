@@ -71,5 +71,7 @@ fn corner(word: &str, vertices: &[Point3<f64>]) -> Result<Point3<f64>, String> {
     let count = i64::try_from(vertices.len()).unwrap_or(i64::MAX);
     let index = if index < 0 { index.checked_add(count) } else { index.checked_sub(1) };
     let vertex = index.and_then(|index| vertices.get(usize::try_from(index).ok()?));
-    vertex.copied().ok_or_else(|| format!("vertex {number} is not there; {count} come before the face"))
+    vertex
+        .copied()
+        .ok_or_else(|| format!("vertex {number} does not exist; {count} vertices come before the face"))
 }

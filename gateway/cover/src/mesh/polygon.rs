@@ -60,7 +60,7 @@ impl Triangulation {
         if off > AREA_TOLERANCE * expected.abs() {
             let share = got / expected;
             let why = format!(
-                "a polygon with {corners} corners crosses itself, as triangles it has {share:.4} times its area"
+                "a polygon with {corners} corners crosses itself, and its triangles have {share:.4} times its area"
             );
             self.record_fault(off * scale, &why);
             return;
@@ -70,7 +70,7 @@ impl Triangulation {
         if bent > MAX_BENT_AREA_RATIO * expected {
             let share = bent / expected;
             let why = format!(
-                "a polygon with {corners} corners is bent, as triangles it has {share:.4} times its area"
+                "a polygon with {corners} corners is not flat, and its triangles have {share:.4} times its area"
             );
             self.record_fault((bent - expected) * scale, &why);
         }
@@ -123,7 +123,7 @@ impl Triangulation {
         let whole: f64 = self.triangles.iter().map(surface::area).sum();
         match self.worst {
             Some((_, why)) if self.off.is_nan() || self.off > MAX_FAULTY_AREA_SHARE * whole => {
-                Err(format!("{why}: make triangles of it where it was drawn"))
+                Err(format!("{why}: triangulate it in the program in which it was drawn"))
             }
             _ => Ok(self.triangles),
         }
@@ -290,15 +290,18 @@ mod tests {
         assert!((total(&triangles) - (4.0 - 0.16 - 0.04)).abs() < 1e-12, "{}", total(&triangles));
         // The hole is outside the polygon.
         let outside = filled(&square(1.0, [0.0; 2]), &[square(0.5, [3.0, 0.0])]).unwrap_err();
-        assert!(outside.starts_with("a polygon with 8 corners crosses itself, as triangles"), "{outside}");
+        assert!(
+            outside.starts_with("a polygon with 8 corners crosses itself, and its triangles"),
+            "{outside}"
+        );
     }
 
     #[test]
     fn polygons_that_cross_themselves_are_refused_unless_next_to_nothing() {
         let even = filled(&[[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]], &[]).unwrap_err();
-        assert!(even.starts_with("a polygon with 4 corners crosses itself: make"), "{even}");
+        assert!(even.starts_with("a polygon with 4 corners crosses itself: triangulate"), "{even}");
         let uneven = filled(&[[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 1.0]], &[]).unwrap_err();
-        assert!(uneven.contains("corners crosses itself, as triangles it has"), "{uneven}");
+        assert!(uneven.contains("corners crosses itself, and its triangles have"), "{uneven}");
         let star: Vec<_> =
             (0..5).map(|at| f64::from(at) * TAU * 0.4).map(|it| [it.cos(), it.sin()]).collect();
         assert!(filled(&star, &[]).unwrap_err().contains("5 corners crosses itself"));

@@ -34,7 +34,10 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
         Some(BinaryContents { announced, body }) => {
             let (count, rest) = (body.len() / TRIANGLE_BYTES, body.len() % TRIANGLE_BYTES);
             let rest = if rest == 0 { String::new() } else { format!(" and {rest} bytes") };
-            Err(damaged(name, &format!("its header announces {announced} triangles, it has {count}{rest}")))
+            Err(damaged(
+                name,
+                &format!("its header announces {announced} triangles, but it has {count}{rest}"),
+            ))
         }
         None => Err(damaged(
             name,
@@ -109,7 +112,7 @@ fn parse_ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
                         .push(facet.map_err(|_| wrong(&format!("a facet has {count} vertices, not 3")))?);
                 }
                 "facet" | "outer" | "loop" | "outerloop" | "endloop" => (),
-                _ => return Err(wrong(&format!("{word:?} is no keyword of an ASCII STL"))),
+                _ => return Err(wrong(&format!("{word:?} is not a keyword of an ASCII STL"))),
             }
         }
     }
@@ -160,7 +163,7 @@ mod tests {
             for announced in [0, 11, 13, 24, u32::MAX] {
                 let message = refused(&titled(binary(announced)));
                 let words = format!(
-                    "mesh a.stl: its header announces {announced} triangles, it has 12: it is cut off"
+                    "mesh a.stl: its header announces {announced} triangles, but it has 12: it is cut off"
                 );
                 assert!(message.starts_with(&words), "{message}");
             }
@@ -168,7 +171,7 @@ mod tests {
                 let message = refused(&titled(whole.clone())[..length]);
                 let body = length - HEADER_BYTES;
                 assert!(
-                    message.contains(&format!("announces 12 triangles, it has {}", body / 50)),
+                    message.contains(&format!("announces 12 triangles, but it has {}", body / 50)),
                     "{message}"
                 );
                 assert_eq!(

@@ -262,8 +262,8 @@ fn a_face_of_an_obj_has_its_own_area() {
     }
     let refused =
         |line: &str| message(Mesh::parse("a.obj", format!("{text}{line}\n").as_bytes(), UpAxis::Ignore));
-    assert!(refused("f 1 2 6").contains("line 7: vertex 6 is not there; 5 come before the face"));
-    assert!(refused("f 0 1 2").contains("vertex 0 is not there"));
+    assert!(refused("f 1 2 6").contains("line 7: vertex 6 does not exist; 5 vertices come before the face"));
+    assert!(refused("f 0 1 2").contains("vertex 0 does not exist"));
     assert!(refused("f 1 2 x").contains("\"x\" is not a corner of a face"));
     assert!(refused("v 1 2").contains("a vertex has 2 numbers, not 3"));
     assert!(refused("v 1 2 three").contains("\"three\" is not a number"));

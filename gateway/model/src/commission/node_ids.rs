@@ -22,7 +22,7 @@ pub enum NodeIdsError {
         cells: usize,
     },
     /// The text does not describe the skin that was read.
-    #[error("the description's text is not that of the skin that was read: {0}")]
+    #[error("the text of the skin file does not match the skin that was read: {0}")]
     Text(String),
 }
 

@@ -69,7 +69,7 @@ pub enum FailureReason {
     #[error("is not on the bus: switch it on, or check its wiring")]
     Missing,
     /// The heartbeats of the cell stopped.
-    #[error("has gone from the bus")]
+    #[error("has disappeared from the bus")]
     Gone,
     /// Two cells, with these node ids, have the same serial number.
     #[error("is on the bus twice, with node ids {0} and {1}: give one of them another serial number")]
@@ -83,7 +83,7 @@ pub enum FailureReason {
         other: u32,
     },
     /// The cell uses another version of the protocol.
-    #[error("speaks protocol version {got}, but this program speaks {VERSION}: bring both to one version")]
+    #[error("uses protocol version {got}, but this program uses {VERSION}: install matching versions")]
     Version {
         /// The version that the cell reports.
         got: u16,
@@ -105,7 +105,7 @@ pub enum FailureReason {
         code: i16,
     },
     /// The cell lacks an ability that the skin needs.
-    #[error("does not support {0}: install newer firmware, or leave it out of the skin")]
+    #[error("does not support {0}: install newer firmware, or change the skin")]
     Cannot(MissingAbility),
     /// The answer of the cell differs from the written value.
     #[error(
@@ -130,7 +130,9 @@ pub enum FailureReason {
         got: u16,
     },
     /// The commissioning ended before this cell was done.
-    #[error("was not reached before the end; its configuration is complete, either the old or the new one")]
+    #[error(
+        "was not finished before commissioning ended; it has either its complete old or its complete new configuration"
+    )]
     Stopped,
 }
 

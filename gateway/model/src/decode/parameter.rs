@@ -32,7 +32,7 @@ pub enum ParameterTextError {
     )]
     ReadOnly,
     /// The number of values differs from the number of fields of the parameter.
-    #[error("{name} is written with {} ({fields}), not with {got}", value_count_text(*.target))]
+    #[error("{name} needs {} ({fields}), not {got}", value_count_text(*.target))]
     Count {
         /// The parameter.
         name: &'static str,
@@ -255,10 +255,10 @@ mod tests {
         assert_eq!(says("128", &[]), says("poes", &[]).replace("poes", "128"));
         assert_eq!(
             says("contact", &["1"]),
-            "contact is written with 5 values (alpha_c alpha_p_n contact_threshold_n proximity_threshold \
-             force_threshold_n), not with 1"
+            "contact needs 5 values (alpha_c alpha_p_n contact_threshold_n proximity_threshold \
+             force_threshold_n), not 1"
         );
-        assert_eq!(says("mode", &[]), "mode is written with one value (mode), not with 0");
+        assert_eq!(says("mode", &[]), "mode needs one value (mode), not 0");
         assert_eq!(says("mode", &["2"]), "mode = 2: 0 measures, 1 obeys stimuli");
         assert_eq!(says("mount", &["2", "15"]), "joints = 15: joints are 1 to 14");
         assert_eq!(says("timing", &["65536"]), "period_us = 65536: a period is 1 to 65535 us");
@@ -305,14 +305,11 @@ mod tests {
         assert_eq!(says("reply", &["sums"]), "reply = sums: torque is, and sum SLOT_US DEEPEST CARRY");
         assert_eq!(
             says("reply", &["sum", "1500"]),
-            "reply is written with 4 values (reply slot_us deepest carry), not with 2"
+            "reply needs 4 values (reply slot_us deepest carry), not 2"
         );
         assert_eq!(says("reply", &["sum", "0", "6", "1"]), "slot_us = 0: it is 1 to 65535");
         assert_eq!(says("reply", &["sum", "9", "254", "1"]), "deepest = 254: a depth is 0, a root's, to 253");
-        assert_eq!(
-            says("sensing", &["event", "16"]),
-            "sensing is written with one value (sensing), not with 2"
-        );
+        assert_eq!(says("sensing", &["event", "16"]), "sensing needs one value (sensing), not 2");
         assert_eq!(
             says("events", &["-1", "0", "0", "0", "0"]),
             "contact_n = -1: it must be in [0, 31.9990234375]"

@@ -110,7 +110,7 @@ impl FromStr for IdMask {
     fn from_str(word: &str) -> Result<Self, String> {
         let allowed = || {
             format!(
-                "{word:?}: an identifier of up to 3 hexadecimal digits (11 bits) or of 8 (29 bits), or ID:MASK, is needed"
+                "{word:?} is not an identifier: allowed are up to 3 hexadecimal digits (11 bits), 8 digits (29 bits), and ID:MASK"
             )
         };
         let number = |digits: &str| {
@@ -317,7 +317,7 @@ mod tests {
         {
             let said = wrong.parse::<IdMask>().unwrap_err();
             assert!(
-                said.contains("3 hexadecimal digits (11 bits) or of 8 (29 bits), or ID:MASK"),
+                said.contains("3 hexadecimal digits (11 bits), 8 digits (29 bits), and ID:MASK"),
                 "{wrong}: {said}"
             );
         }

@@ -292,7 +292,7 @@ fn with_an_identifier_that_carries_packets_it_is_damaged() {
     }
     settler.finish();
     let last = std::iter::from_fn(|| settler.pop()).last().unwrap().1;
-    assert_eq!(last.to_string(), "incomplete torque 12: no other segment");
+    assert_eq!(last.to_string(), "incomplete torque 12: the other segments are missing");
 }
 
 #[test]
@@ -316,7 +316,9 @@ fn segments_are_reassembled_by_bus_and_identifier() {
     for (comment, text) in &all {
         segments += u32::from(text.starts_with("segment "));
         let expected: &[&str] = match comment.split(' ').next().unwrap() {
-            "waiting" | "incomplete" => &["segment ", "foreign no packet: no other segment", "incomplete "],
+            "waiting" | "incomplete" => {
+                &["segment ", "foreign no packet: the other segments are missing", "incomplete "]
+            }
             "whole" => {
                 // All segments of a packet but the last are pending; 7 and 8 words take three.
                 let values = comment.rsplit('=').next().unwrap().split(',').count();

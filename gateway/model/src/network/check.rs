@@ -99,7 +99,7 @@ pub enum Difference {
     #[error("two cells have node id {0}: stop one of the two")]
     Duplicate(CellId),
     /// A cell has another version of the protocol.
-    #[error("cell {cell} speaks {}", other_version_message(*version))]
+    #[error("cell {cell} uses {}", other_version_message(*version))]
     Version {
         /// The cell.
         cell: CellId,
@@ -123,9 +123,7 @@ pub enum Difference {
     #[error("a wire leads from {0} to {1} and is not described: describe it, or unplug it")]
     ExtraWire(WireEnd, WireEnd),
     /// A port is connected to another end than described.
-    #[error(
-        "{end} leads to {leads} and should lead to {described}: plug it there, or change the description"
-    )]
+    #[error("{end} is wired to {leads} instead of {described}: move the plug, or change the description")]
     SwappedWire {
         /// The port.
         end: WireEnd,
@@ -135,10 +133,10 @@ pub enum Difference {
         described: WireEnd,
     },
     /// A cell without a node id is connected to this port.
-    #[error("a cell without a node id is at {0}: it gets one from the network, unless all are used")]
+    #[error("a cell without a node id is wired to {0}: the network assigns one, unless all are in use")]
     Unnumbered(WireEnd),
     /// Cells whose parents form a circle, in order.
-    #[error("{} are each other's parents, a circle that would count cells twice: restart them", cell_list(.0))]
+    #[error("{} form a circle of parents, so sums would count cells twice: restart them", cell_list(.0))]
     Circle(Vec<CellId>),
     /// Cells without a route to a root.
     #[error(
@@ -152,11 +150,11 @@ pub enum Difference {
 fn other_cell_message(cell: CellId, serial: u32, described: u32, belongs: Option<CellId>) -> String {
     match belongs {
         Some(belongs) => format!(
-            "node id {cell} is used by the cell with serial number {serial}, which is described as cell {belongs}; \
-             {described} is described there: exchange the cells, or their serial numbers in the description"
+            "node id {cell} is used by serial number {serial}, which is cell {belongs} in the description; \
+             cell {cell} has serial number {described} there: swap the cells, or their serial numbers in the description"
         ),
         None => format!(
-            "cell {cell} has serial number {serial} and is described with {described}: write {serial} into the \
+            "cell {cell} has serial number {serial}, but {described} in the description: write {serial} into the \
              description, or put the other cell back"
         ),
     }
@@ -165,9 +163,12 @@ fn other_cell_message(cell: CellId, serial: u32, described: u32, belongs: Option
 fn other_version_message(version: Option<u16>) -> String {
     match version {
         Some(version) => format!(
-            "version {version} of the protocol, and this gateway version {VERSION}: give both the same firmware"
+            "version {version} of the protocol, but this gateway uses version {VERSION}: install matching versions"
         ),
-        None => "another version of the protocol than its neighbours: give them the same firmware".to_owned(),
+        None => {
+            "another version of the protocol than its neighbours: install the same firmware on all of them"
+                .to_owned()
+        }
     }
 }
 

@@ -34,7 +34,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
     let robot = &skin.robot;
     let joints = |key, values: &[f64]| {
         if values.len() != robot.joints.len() {
-            let why = format!("one for each of the robot's {} joints is needed", robot.joints.len());
+            let why = format!("one value for each of the robot's {} joints is needed", robot.joints.len());
             return Err(at.key(key).fault(format_args!("{} values", values.len()), why));
         }
         Ok(core::array::from_fn(|joint| values.get(joint).copied().unwrap_or(0.0)))
@@ -105,7 +105,7 @@ fn check_speeds(
         let (speed, unit) = (TAU * amplitude.abs() / period_s, joint.kind.unit());
         if speed.is_nan() || speed > max {
             let why = format!(
-                "in {period_s} s this takes {speed:.3} {unit}/s, but the limit of joint {} is {max}",
+                "with a period of {period_s} s this needs {speed:.3} {unit}/s, but the limit of joint {} is {max}",
                 index + 1
             );
             return Err(at.element(index).fault(amplitude, why));

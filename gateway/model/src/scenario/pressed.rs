@@ -96,12 +96,12 @@ fn point_profile(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<
     if let Some(for_s) =
         raw.for_s.filter(|seconds| !(*seconds >= 0.0 && span_from_seconds(*seconds) == length))
     {
-        let why = format!("the points of the profile end at {} s: leave for_s out", length.seconds());
+        let why = format!("the points of the profile end at {} s: omit for_s", length.seconds());
         return Err(at.key("for_s").fault(for_s, why));
     }
     #[expect(clippy::float_cmp, reason = "two numbers of the same file")]
     if let Some(force_n) = raw.force_n.filter(|force_n| *force_n != peak_n) {
-        let why = format!("the largest force of the profile's points is {peak_n} N: leave force_n out");
+        let why = format!("the largest force of the profile's points is {peak_n} N: omit force_n");
         return Err(at.key("force_n").fault(force_n, why));
     }
     Ok((ForceProfile::Points(points), length, peak_n))
@@ -231,11 +231,11 @@ mod tests {
             ),
             (
                 "profile = [[1.0, 3.0]]\nfor_s = 2.0",
-                "5:9: touch[0].for_s = 2: the points of the profile end at 1 s: leave for_s out",
+                "5:9: touch[0].for_s = 2: the points of the profile end at 1 s: omit for_s",
             ),
             (
                 "force_n = 2.0\nprofile = [[1.0, 3.0]]",
-                "4:11: touch[0].force_n = 2: the largest force of the profile's points is 3 N: leave force_n out",
+                "4:11: touch[0].force_n = 2: the largest force of the profile's points is 3 N: omit force_n",
             ),
             ("", "1:1: touch[0].force_n: needed with profile = \"step\""),
             ("force_n = 3.0\nprofile = \"poke\"", "\"ramp\" or points [[t_s, force_n], ...]"),

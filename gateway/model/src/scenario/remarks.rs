@@ -44,6 +44,6 @@ fn weak_touch(touch: &Touch, skin: &Skin) -> Option<String> {
                 format!("force_n = {}", touch.force_n)
             }
         };
-        format!("the touch at {at_s} s: {peak} is below the thresholds of its cells: they send no torque")
+        format!("the touch at {at_s} s: {peak} is below the thresholds of its cells, so they send no torque")
     })
 }

@@ -182,7 +182,7 @@ fn what_has_no_effect_is_remarked() {
     assert!(remarks(&touch("0.0\nproximity = 0.5"), &skin).is_empty(), "it presses nobody");
     assert_eq!(
         remarks(&touch("0.01"), &skin),
-        ["the touch at 0.5 s: force_n = 0.01 is below the thresholds of its cells: they send no torque"]
+        ["the touch at 0.5 s: force_n = 0.01 is below the thresholds of its cells, so they send no torque"]
     );
     let external = SKIN.replace("\"kinesthetic\"", "\"external\"\nsocket = \"arm.sock\"");
     let external =
@@ -218,7 +218,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     assert_eq!(says("period_s = 4.0\n", ""), "s.toml:5: motion.period_s: needed with kind = \"sine\"");
     assert_eq!(
         says("-1.57, 0.0]", "-1.57]"),
-        "s.toml:7: motion.start_rad = 5 values: one for each of the robot's 6 joints is needed"
+        "s.toml:7: motion.start_rad = 5 values: one value for each of the robot's 6 joints is needed"
     );
     assert_eq!(
         says("start_rad = [0.0", "start_rad = [6.0"),
@@ -226,7 +226,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("[0.5, 0.1", "[1.5, 0.1"),
-        "s.toml:8: motion.amplitude_rad[0] = 1.5: in 4 s this takes 2.356 rad/s, but the limit of joint 1 is 2"
+        "s.toml:8: motion.amplitude_rad[0] = 1.5: with a period of 4 s this needs 2.356 rad/s, but the limit of joint 1 is 2"
     );
     assert_eq!(
         says("at_s = 5.7", "at_s = 0.0"),

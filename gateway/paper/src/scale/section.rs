@@ -19,8 +19,8 @@ pub fn section(measured: &ScaleMeasurements) -> Section {
     let most = sizes.last();
     Section::new("scale", "A bench over its cells")
         .text(format!(
-            "Whole benches on embedded buses, as few as have node ids for the cells, the cells of a bus in one process: first \
-             with {} % of the cells touched, at half the rate where fewer than {} % of the replies come in time, and once more \
+            "Whole benches on as few embedded buses as have enough node ids, with one process for all cells of a bus: first \
+             with {} % of the cells touched, at half the rate if fewer than {} % of the replies come in time, and if necessary once more \
              at half of that; then with none touched, at the same rate.",
             ACTIVE_SHARE * 100.0,
             MIN_IN_TIME_SHARE * 100.0
@@ -132,7 +132,7 @@ fn largest_bench_findings(size: &SizeFigures) -> Vec<Finding> {
     let of = |what: &str| format!("{what}, {cells} cells");
     let BenchFigures { start_s, memory_mb, .. } = active;
     let at = format!("replies in time at {} Hz, 5 % active", number(*hz));
-    let bar = format!("at least {} %, none unknown", MIN_IN_TIME_SHARE * 100.0);
+    let bar = format!("at least {} %, none missing for no known reason", MIN_IN_TIME_SHARE * 100.0);
     vec![
         Finding::new_unrated(of("from the start to the first joints"), (*start_s, "s")).at_most(MAX_START_S),
         Finding::new_unrated(of(&at), (active.share() * 100.0, "%")).with_requirement(bar, *holds),
@@ -152,11 +152,15 @@ fn largest_bench_findings(size: &SizeFigures) -> Vec<Finding> {
 fn tick_findings(sizes: &[SizeFigures], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Finding> {
     let (Some(fewest), Some(largest)) = (sizes.first(), sizes.last()) else { return Vec::new() };
     let (cells, buses, fewest_cells) = (largest.cells, largest.buses, fewest.cells);
-    let beside = |what: &str| format!("distributed tick of {cells} cells by that of {fewest_cells}{what}");
+    let beside =
+        |what: &str| format!("distributed tick of {cells} cells, relative to that of {fewest_cells}{what}");
     vec![
         Finding::new_unrated(beside(", without threads, all active"), most / few).at_most(MAX_TICK_RATIO),
-        Finding::new_unrated(beside(&format!(" on {buses} buses too, the same way")), most / few_on_as_many)
-            .at_most(MAX_TICK_RATIO_SAME_BUSES),
+        Finding::new_unrated(
+            beside(&format!(" also on {buses} buses, measured the same way")),
+            most / few_on_as_many,
+        )
+        .at_most(MAX_TICK_RATIO_SAME_BUSES),
         Finding::new_unrated(
             beside(", medians of benches, 5 % active"),
             largest.active.tick_us / fewest.active.tick_us,

@@ -71,11 +71,7 @@ fn other_faults_have_their_line_and_what_to_do() {
             "<!-- x -->\n<?xml version=\"1.0\"?><robot",
             "t.urdf:3: an XML declaration that is not at the beginning of the file: delete it",
         ),
-        (
-            "</joint>",
-            "</link>",
-            "t.urdf:4: </link> stands where <joint> is to be closed: correct one of both",
-        ),
+        ("</joint>", "</link>", "t.urdf:4: </link> does not close the open <joint>: correct one of the two"),
         ("type=", "name=", "t.urdf:4: an element has the attribute name twice: delete one"),
         (
             "<robot",
@@ -118,7 +114,10 @@ fn a_file_of_another_kind_is_named() {
     other("x", "");
     let srdf =
         "<robot name=\"r\">\n<group name=\"arm\"><chain base_link=\"a\" tip_link=\"b\"/></group></robot>";
-    assert_eq!(refused(srdf), "t.urdf:1: an SRDF file, of MoveIt, which has no links: name the robot's URDF");
+    assert_eq!(
+        refused(srdf),
+        "t.urdf:1: this is an SRDF file (MoveIt), which has no links: name the robot's URDF"
+    );
 }
 
 #[test]
@@ -153,7 +152,7 @@ fn utf_16_is_refused_as_by_ros_with_a_command_that_repairs_it() {
         assert_eq!(
             text("t.urdf", &wide).unwrap_err().to_string(),
             format!(
-                "t.urdf: it is UTF-16, which ROS does not read either: save it as UTF-8, as with `iconv -f {name} -t utf-8 FILE > NEW`"
+                "t.urdf: it is UTF-16, which ROS does not read either: save it as UTF-8, for example with `iconv -f {name} -t utf-8 FILE > NEW`"
             )
         );
     }
@@ -173,7 +172,10 @@ fn xacro_that_is_used_is_named() {
         ("<xacro:if value=\"1\"/>", "element <xacro:if>"),
     ] {
         let message = refused(inner);
-        assert!(message.starts_with(&format!("t.urdf:4: {what} is left: this is a xacro file")), "{message}");
+        assert!(
+            message.starts_with(&format!("t.urdf:4: {what} is not expanded: this is a xacro file")),
+            "{message}"
+        );
         assert!(message.contains("`xacrodoc t.urdf -o NEW.urdf` (pip install xacrodoc)"), "{message}");
     }
 }

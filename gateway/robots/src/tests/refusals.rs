@@ -33,7 +33,7 @@ fn files_that_are_no_urdf() {
     assert_eq!(parse("\u{feff} \n"), empty);
     assert_eq!(
         parse("robot"),
-        "t.urdf:1: not XML: a URDF begins with <?xml or <robot, and this does not; name the robot's URDF"
+        "t.urdf:1: not XML: a URDF begins with <?xml or <robot; name the robot's URDF"
     );
     assert_eq!(
         parse("<sdf/>"),
@@ -46,7 +46,7 @@ fn files_that_are_no_urdf() {
 
 #[test]
 fn xacro_is_refused_where_it_was_not_run() {
-    let why = "is left: this is a xacro file, a template of a URDF. Make one with `xacrodoc t.urdf -o NEW.urdf` (pip install xacrodoc), and name that";
+    let why = "is not expanded: this is a xacro file, a template of a URDF. Generate the URDF with `xacrodoc t.urdf -o NEW.urdf` (pip install xacrodoc), and name that file";
     let bound =
         "<robot xmlns:xacro=\"http://www.ros.org/wiki/xacro\">\n<xacro:arm/><link name=\"a\"/></robot>";
     assert_eq!(parse(bound), format!("t.urdf:2: element <xacro:arm> {why}"));
@@ -127,7 +127,7 @@ fn links_that_are_no_tree() {
         tree(&[joint("j", "a", "c"), joint("k", "b", "c")]),
         "t.urdf:5: link \"c\" is the child of the joints \"j\" and \"k\"; one is allowed: remove the other"
     );
-    let cycle = "is above itself; links must be a tree: remove a joint of the cycle";
+    let cycle = "is its own ancestor; links must form a tree: remove a joint of the cycle";
     assert_eq!(tree(&[joint("j", "b", "c"), joint("k", "c", "b")]), format!("t.urdf: link \"b\" {cycle}"));
     let whole = [joint("j", "b", "c"), joint("k", "c", "a"), joint("l", "a", "b")];
     assert_eq!(tree(&whole), format!("t.urdf: link \"a\" {cycle}"));
@@ -142,13 +142,13 @@ fn joints_that_a_chain_cannot_have() {
         assert_eq!(
             chain(&joined(kind, ""), "b"),
             format!(
-                "t.urdf:5: joint \"j\" is {kind}; a chain has revolute, continuous, prismatic and fixed joints: choose a root below it, or a tip above it"
+                "t.urdf:5: joint \"j\" is {kind}; a chain may only have revolute, continuous, prismatic and fixed joints: choose a root below it, or a tip above it"
             )
         );
     }
     assert_eq!(
         chain(&joined("revolute", &format!("{LIMIT}<mimic joint=\"k\"/>")), "b"),
-        "t.urdf:5: joint \"j\" mimics \"k\"; the joints of a chain move by themselves: choose a tip above it, or make it fixed"
+        "t.urdf:5: joint \"j\" mimics \"k\"; the joints of a chain must move independently: choose a tip above it, or make it fixed"
     );
     for limit in ["", "<limit velocity=\"1\"/>"] {
         assert_eq!(
@@ -182,7 +182,7 @@ fn chains_that_are_not_there() {
     let xml = robot(&joints);
     assert_eq!(
         chain(&xml, "l15"),
-        "t.urdf: 15 joints move between \"l0\" and \"l15\"; 14 are possible: choose a root or a tip nearer to the other"
+        "t.urdf: 15 joints move between \"l0\" and \"l15\"; at most 14 are possible: choose a root or a tip nearer to the other"
     );
     assert_eq!(good(&xml, "l14").joints.len(), 14);
     assert_eq!(
@@ -192,7 +192,7 @@ fn chains_that_are_not_there() {
     let urdf = Urdf::parse("t.urdf", &xml).unwrap();
     assert_eq!(
         urdf.chain(Some("l4"), "l2").unwrap_err().to_string(),
-        "t.urdf: link \"l2\" is not below \"l4\"; the path to it is l0 > l1 > l2: choose a root on it"
+        "t.urdf: link \"l2\" is not below \"l4\"; the path to it is l0 > l1 > l2: choose a root on that path"
     );
     assert!(urdf.pose("x", &|_| 0.0).is_err() && urdf.visuals("x").is_err() && urdf.collisions("x").is_err());
 }
@@ -219,7 +219,7 @@ fn chains_that_are_too_long() {
     };
     assert_eq!(
         chain(&reaching(0.8), "l4"),
-        "t.urdf: link \"l4\" can come 2.100 m from a frame of the rows below it, if all joints turn freely; less than 1.999 m is possible: choose a tip or a root nearer to the other"
+        "t.urdf: link \"l4\" can be up to 2.100 m from a frame of the rows below it, if all joints turn freely; less than 1.999 m is possible: choose a tip or a root nearer to the other"
     );
     assert_eq!(good(&reaching(0.8), "l3").rows.len(), 3);
     assert_eq!(good(&reaching(0.74), "l4").rows.len(), 3);

@@ -172,7 +172,7 @@ fn rows_do_not_fold_back_beside_the_robot() {
         assert!(chain.residual < 1e-14, "{}", chain.residual);
     }
     let long = Urdf::parse("t.urdf", &robot(&tilted_shoulder(1.7))).unwrap().chain(None, "l8").unwrap_err();
-    assert!(long.to_string().contains("can come 2."), "{long}");
+    assert!(long.to_string().contains("can be up to 2."), "{long}");
 }
 
 /// The path from joint to joint, with a fixed row for each, is an upper bound.
@@ -278,7 +278,7 @@ fn links_are_where_the_file_has_them() {
     let why = |link: &str| chain.link(link).unwrap_err().to_string();
     assert_eq!(
         why("foot"),
-        r#"t.urdf: link "foot" is before the chain's first joint "j2" and moves with none; a cell needs a link behind it"#
+        r#"t.urdf: link "foot" is before the chain's first joint "j2", so no joint moves it: put the cell on a link behind that joint"#
     );
     assert_eq!(why("l0"), why("foot").replace("foot", "l0"));
     assert_eq!(

@@ -18,7 +18,7 @@ pub fn text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError>
     refuse_foreign(file, bytes)?;
     if let Some(name) = utf16_encoding_name(bytes) {
         let what = format!(
-            "it is UTF-16, which ROS does not read either: save it as UTF-8, as with `iconv -f {name} -t utf-8 FILE > NEW`"
+            "it is UTF-16, which ROS does not read either: save it as UTF-8, for example with `iconv -f {name} -t utf-8 FILE > NEW`"
         );
         return Err(error(file, XmlFault { line: None, what }));
     }
@@ -74,7 +74,7 @@ fn description(reason: &Error) -> String {
             plain("an XML declaration that is not at the beginning of the file: delete it")
         }
         Error::UnexpectedCloseTag(expected, found, _) => {
-            format!("</{found}> stands where <{expected}> is to be closed: correct one of both")
+            format!("</{found}> does not close the open <{expected}>: correct one of the two")
         }
         Error::UnclosedRootNode | Error::UnexpectedEndOfStream | Error::NoRootNode => {
             plain("it ends before its outermost element does: it is cut off; copy or download it again")

@@ -58,7 +58,7 @@ fn append_seconds(line: &mut Vec<u8>, nanos: Option<u64>) {
 /// Formats the result for all buses as a table.
 pub(super) fn format_report(name: &str, what: &str, missing: u64, report: &ShadowReport) -> String {
     let head = format!("{what}, {} frames", report.frames);
-    let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
+    let beside = if missing > 0 { format!("{missing} frames are missing from it") } else { String::new() };
     let mut rows = KeyValueTable::new(name, head, beside).names_in_one_line();
     for bus in &report.buses {
         bus_rows(&mut rows, bus, report);
@@ -84,7 +84,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
         start_up_rows(rows, bus, start_up);
     }
     if bit_error_rate > 0.0 {
-        let each = format!("of each bit {bit_error_rate:e}");
+        let each = format!("bit error rate {bit_error_rate:e}");
         rows.add_row("damaged, and sent again", format!("{} attempts", bus.counts.damaged), each);
     }
     add_bench_traffic_row(rows, bus);
@@ -122,7 +122,7 @@ fn add_fit_rows(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
             );
         }
         Some(Answering { epochs, epochs_halted, mean: Some(mean), .. }) => {
-            let beside = format!("{epochs} joints, and {epochs_halted} while halted are left out");
+            let beside = format!("{epochs} joints; {epochs_halted} more while halted are left out");
             rows.add_row("  cells that answered", format!("{mean:.1} on average"), beside);
         }
         Some(Answering { epochs_halted: halted @ 1.., mean: None, .. }) => {
@@ -201,8 +201,8 @@ fn add_answer_rows(rows: &mut KeyValueTable, replies: &Replies) {
     rows.add_row("answers after joints, µs", delays(after_joints_us), "50 % / 99 % / max");
     let beside = [
         Some("after the next joints".to_owned()),
-        (*late_when_ready > 0).then(|| format!("{late_when_ready} were ready too late for any bus")),
-        (*late_before > 0).then(|| format!("{late_before} more were late in the recording already")),
+        (*late_when_ready > 0).then(|| format!("{late_when_ready} not caused by the bus")),
+        (*late_before > 0).then(|| format!("{late_before} others were already late in the recording")),
     ];
     rows.add_row("  late", format!("{late} of {count}"), comma_separated(beside.into_iter().flatten()));
 }

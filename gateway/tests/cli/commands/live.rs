@@ -185,7 +185,7 @@ fn a_cell_that_cannot_compute_its_part_is_named_and_not_written() {
         .iter()
         .fold(longer, |text, three| text.replace(&format!("{three}]"), &format!("{three}, 1.0]")));
     let wide = plain.replace("format = \"fd\"", "format = \"fd\"\ntorque_format = \"Q7.8\"");
-    for (skin_text, expected) in [(wide, "torques in Q7.8"), (longer, "7 joints (it can have 6)")] {
+    for (skin_text, expected) in [(wide, "torques in Q7.8"), (longer, "7 joints (it supports 6)")] {
         std::fs::write(&skin, &skin_text).unwrap();
         let mut command = bench.gateway(&format!("commission {}", skin.display()));
         let Output { status, stdout, stderr } = bench.beside(Format::Fd, || command.output().unwrap());
@@ -218,7 +218,10 @@ fn a_foreign_classic_frame_is_shown_though_nothing_comes_after_it() {
     // The frame may be the first segment of a packet until the reassembly timeout.
     let mut line = String::new();
     BufReader::new(dump.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
-    assert!(line.ends_with("20C#0707070707070707\tforeign no packet: no other segment\n"), "{line}");
+    assert!(
+        line.ends_with("20C#0707070707070707\tforeign no packet: the other segments are missing\n"),
+        "{line}"
+    );
     kill_process(Pid::from_child(&dump), Signal::INT).unwrap();
     assert_eq!(dump.wait().unwrap().code(), Some(0));
 }
@@ -298,7 +301,7 @@ fn a_bus_that_comes_later_is_waited_for() {
     assert_eq!(dump("").wait().unwrap().code(), Some(2));
     for missing in ["missing.log", "folder/run"] {
         let Output { status, stderr, .. } = gateway(&format!("dump {missing} --wait")).output().unwrap();
-        let expected = format!("skinbus: --wait is for buses, and there is no file {missing}\n");
+        let expected = format!("skinbus: --wait is only for buses, and there is no file {missing}\n");
         assert_eq!((status.code(), text(&stderr)), (Some(2), expected.as_str()));
     }
     let mut waits = dump("--wait -n 1");
@@ -326,7 +329,7 @@ fn the_bus_of_a_cell_is_where_a_frame_is_sent() {
     let both: serde_json::Value = serde_json::from_str(&node).unwrap();
     assert!(both.to_string().contains("vcan1"), "{both}");
     for (arguments, expected) in [
-        ("--cell vcan1:5 --bus vcan0", "--cell vcan1:5 is not on --bus vcan0: name one of the two"),
+        ("--cell vcan1:5 --bus vcan0", "--cell vcan1:5 is not on --bus vcan0: correct --cell or --bus"),
         (&format!("--cell 1 --skin {skin}"), "--cell 1 is on several buses: choose one of vcan0:1, vcan1:1"),
         (&format!("--cell 99 --skin {skin}"), "--cell 99: the skin has no such cell on vcan0, vcan1"),
         (&format!("--cell vcan7:1 --skin {skin}"), "bus vcan7 is not in "),
@@ -342,8 +345,14 @@ fn the_bus_of_a_cell_is_where_a_frame_is_sent() {
 fn what_the_options_of_a_dump_leave_out_is_said() {
     let bench = Bench::new();
     for (arguments, expected) in [
-        ("vcan0 --bus vcan1", "skinbus: vcan1 is not shown: name it beside vcan0\n"),
-        ("vcan0 --cell vcan1:3", "skinbus: vcan1 is not shown: name it beside vcan0\n"),
+        (
+            "vcan0 --bus vcan1",
+            "skinbus: bus vcan1 is not among the dumped buses: name it in addition to vcan0\n",
+        ),
+        (
+            "vcan0 --cell vcan1:3",
+            "skinbus: bus vcan1 is not among the dumped buses: name it in addition to vcan0\n",
+        ),
         (
             "vcan0 --bus vcan0 --cell vcan1:3",
             "skinbus: vcan1:3 is not on a selected bus (vcan0): leave out one of the two filters\n",

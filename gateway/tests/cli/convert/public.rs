@@ -128,7 +128,7 @@ fn times_that_are_none_get_a_remark_and_no_verdict() {
         assert!(code == Some(0) && said.contains(remark), "{said}");
         assert!(!out.contains('%') && !out.contains("fit"), "{out}");
         let (_, out, said) = run(&folder, &format!("dump --stats {name}"));
-        assert!(said.contains(remark) && !out.contains("a second"), "{said}{out}");
+        assert!(said.contains(remark) && !out.contains("per second"), "{said}{out}");
         let (_, out, _) = run(&folder, &format!("dump --stats --json {name}"));
         let stats: serde_json::Value = serde_json::from_str(&out).unwrap();
         let bus = &stats["buses"][0];
@@ -148,9 +148,9 @@ fn a_rate_stands_beside_its_span() {
     let (_, out, _) = run(&folder, "dump --stats run.log");
     let row = out.lines().find(|line| line.contains("1000000.0")).unwrap();
     assert!(row.contains("0.000001000"), "{row}");
-    assert!(out.contains("0.4 a second in 8.000 s"), "{out}");
+    assert!(out.contains("0.4 per second over 8.000 s"), "{out}");
     let can1 = out.lines().find(|line| line.contains("│ can1 ")).unwrap();
-    assert!(!can1.contains("a second"), "one frame has no rate: {can1}");
+    assert!(!can1.contains("per second"), "one frame has no rate: {can1}");
 }
 
 #[test]
@@ -201,7 +201,9 @@ fn files_of_one_capture_are_read_in_the_order_of_their_frames() {
     assert!(code == Some(0) && said.ends_with("one.mcap: 10 frames, 0 notes\n"), "{said}");
     assert_eq!(lines(&folder, "one.mcap"), lines(&folder, "split_0.mcap split_1.mcap"));
     assert!(
-        folder.refuses("convert one.mcap again.mcap", 2).ends_with("is an MCAP recording already: copy it")
+        folder
+            .refuses("convert one.mcap again.mcap", 2)
+            .ends_with("is already an MCAP recording: copy it instead")
     );
     let said = folder.refuses("convert split_0.mcap split_0.mcap x.log", 2);
     assert_eq!(said, "skinbus: split_0.mcap is named twice: name it once");
@@ -224,11 +226,14 @@ fn logs_that_overlap_are_read_one_after_the_other_and_that_is_said() {
     let (code, out, said) = run(&folder, "convert c.log b.log a.log -");
     assert_eq!((code, out.as_str()), (Some(0), format!("{a}{b}\n(7.000000) can0 007#\n").as_str()));
     assert!(said.contains("b.log begins before a.log ends: they are read one after the other"), "{said}");
-    assert!(said.contains("times run backwards 1 times, first at frame 3; the order is kept"), "{said}");
+    assert!(
+        said.contains("the time runs backwards 1 times, first at frame 3; the order of the frames is kept"),
+        "{said}"
+    );
     let (_, _, said) = run(&folder, "convert a.log c.log -");
     assert_eq!(said, "a.log to c.log (2 parts) -> -: 3 frames, 0 notes\n");
     let (_, _, said) = run(&folder, "dump b.log c.log a.log");
-    assert!(said.contains("times run backwards 1 times"), "{said}");
+    assert!(said.contains("the time runs backwards 1 times"), "{said}");
 }
 
 #[test]
@@ -246,7 +251,7 @@ fn texts_of_other_programs_are_named_with_what_to_do() {
     ] {
         let folder = folder(&[file]);
         let name = file.strip_prefix("kinds/").unwrap();
-        let begin = format!("skinbus: {name} is {what}, and no candump log or MCAP recording: ");
+        let begin = format!("skinbus: {name} is {what}, not a candump log or MCAP recording: ");
         for command in
             ["dump NAME", "convert NAME -", "convert NAME out.log", "fit NAME", "view NAME", "skin dbc NAME"]
         {
@@ -273,7 +278,7 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
         let said = folder.refuses(command, 1);
         assert!(
             said.starts_with(
-                "skinbus: words.txt: there is no frame in 1000 lines; the output of candump is expected"
+                "skinbus: words.txt: there is no frame in 1000 lines; expected the output of candump"
             ),
             "{command}: {said}"
         );
@@ -282,7 +287,7 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
     assert!(
         folder
             .refuses("skin dbc late.log", 2)
-            .ends_with("late.log is a capture (candump log), and a skin is needed: name the skin's own file")
+            .ends_with("late.log is a capture (candump log), but a skin is needed: name the skin's own file")
     );
     let mut view = folder.gateway("view late.log --skin skin.toml").stderr(Stdio::piped()).spawn().unwrap();
     let said = BufReader::new(view.stderr.take().unwrap()).lines().next().unwrap().unwrap();
@@ -327,7 +332,9 @@ fn what_came_through_a_pipe_outlives_a_killed_convert() {
         assert!(!folder.path(to).exists());
         let said = folder.refuses("convert - run.mcap", 2);
         assert!(
-            said.contains("run.mcap.part was left by a program that was killed: `skinbus recover"),
+            said.contains(
+                "run.mcap.part was left by a program that was killed: recover it with `skinbus recover"
+            ),
             "{said}"
         );
         let (code, said, _) = run(&folder, "recover run.mcap.part -o run.mcap");

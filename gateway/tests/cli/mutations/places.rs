@@ -328,7 +328,7 @@ fn check_output(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Ran
     let has_end = file.ends_with(mcap::MAGIC);
     let said = |line: &str, code: Option<i32>, stderr: &str| {
         // The output may end without an end of the recording.
-        let tells = has_end || stderr.contains("it has no end: after ");
+        let tells = has_end || stderr.contains("its end is missing: ");
         assert!(code != Some(0) || tells, "{what}: gateway {line}: {stderr}");
         let refuses = code == Some(1) && !stderr.is_empty();
         assert!(code == Some(0) || refuses, "{what}: gateway {line}: {code:?}: {stderr}");

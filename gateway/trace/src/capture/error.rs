@@ -24,7 +24,7 @@ pub enum CaptureError {
     #[error(transparent)]
     Parts(#[from] PartsError),
     /// The file begins with the magic bytes of another format.
-    #[error("{name} is {what}, and no candump log or MCAP recording: {hint}")]
+    #[error("{name} is {what}, not a candump log or MCAP recording: {hint}")]
     OtherFormat {
         /// The name of the capture.
         name: String,
@@ -35,7 +35,7 @@ pub enum CaptureError {
     },
     /// The file is damaged after some entries that could be read.
     #[error(
-        "{name} is damaged: {what}; {entries} frames and notes before that were read; `skinbus recover` copies the \
+        "{name} is damaged: {what}; {entries} frames and notes before the damage were read; `skinbus recover` copies the \
          intact part to a new file"
     )]
     Damaged {

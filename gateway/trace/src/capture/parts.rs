@@ -33,7 +33,7 @@ pub enum PartsError {
         other: PathBuf,
     },
     /// The list contains both a log and a recording.
-    #[error("{} is a candump log, and {} an MCAP recording: convert it to a log first with `skinbus convert`", .log.display(), .mcap.display())]
+    #[error("{} is a candump log, and {} an MCAP recording: convert the recording to a log first with `skinbus convert`", .log.display(), .mcap.display())]
     Formats {
         /// The log.
         log: PathBuf,
@@ -51,7 +51,7 @@ pub enum PartsError {
     StandardInput,
     /// Two parts belong to different recordings.
     #[error(
-        "{} and {} belong to different recordings, begun at {} and {} ns: name the parts of one",
+        "{} and {} belong to different recordings, begun at {} and {} ns: name the parts of one recording",
         .one.path.display(), .other.path.display(), .one.began, .other.began
     )]
     Different {
@@ -73,7 +73,7 @@ pub enum PartsError {
     },
     /// One part is missing between two others.
     #[error(
-        "part {} of the recording is missing between {} and {}: name all parts from the first to the last, or one alone",
+        "part {} of the recording is missing between {} and {}: name all parts from the first to the last, or only one part",
         .one.number + 1, .one.path.display(), .next.path.display()
     )]
     Missing {

@@ -77,14 +77,16 @@ impl TimeChecks {
     /// Returns the remark on times that run backwards.
     pub(super) fn backwards_remark(&self) -> Option<String> {
         let (times, first) = self.backwards?;
-        Some(format!("times run backwards {times} times, first at frame {first}; the order is kept"))
+        Some(format!(
+            "the time runs backwards {times} times, first at frame {first}; the order of the frames is kept"
+        ))
     }
 
     /// Returns the other remarks, one per line.
     pub(super) fn remarks(&self) -> impl Iterator<Item = String> {
         let overlap = self.overlap.as_ref().map(|(file, before)| {
             format!(
-                "{file} begins before {before} ends: they are read one after the other, and not in the order of their times"
+                "{file} begins before {before} ends: they are read one after the other, not in the order of their times"
             )
         });
         let constant = self.buses.iter().filter(|bus| !bus.has_several && bus.frames >= MIN_CONSTANT_FRAMES);
@@ -130,7 +132,8 @@ mod tests {
 
     #[test]
     fn times_that_run_backwards_are_counted_by_bus() {
-        let backwards = ["times run backwards 1 times, first at frame 3; the order is kept"];
+        let backwards =
+            ["the time runs backwards 1 times, first at frame 3; the order of the frames is kept"];
         assert_eq!(remarks(&[("a", 5), ("b", 1), ("a", 4), ("b", 2)]), backwards);
     }
 }

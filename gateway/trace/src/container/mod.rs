@@ -65,7 +65,7 @@ pub enum FormatError {
         field: &'static str,
     },
     /// A record or chunk is too long to be read.
-    #[error("a {what} of {bytes} bytes is too long: at most {limit} are read")]
+    #[error("a {what} of {bytes} bytes is too long: the limit is {limit} bytes")]
     TooLong {
         /// The kind of record.
         what: &'static str,
@@ -75,7 +75,9 @@ pub enum FormatError {
         limit: u64,
     },
     /// A checksum is wrong.
-    #[error("the checksum of {what} is {saved:08x} in the file, and {found:08x} by its bytes")]
+    #[error(
+        "the checksum of {what} is {saved:08x} in the file, but {found:08x} when computed from its bytes"
+    )]
     Checksum {
         /// The part of the file that the checksum covers.
         what: &'static str,
@@ -85,13 +87,13 @@ pub enum FormatError {
         found: u32,
     },
     /// The compression of a chunk is not supported.
-    #[error("a chunk is compressed by {0:?}: zstd, lz4 and none are read")]
+    #[error("a chunk is compressed with {0:?}: only zstd, lz4 and none are supported")]
     Compression(String),
     /// A chunk cannot be decompressed.
     #[error("a chunk cannot be unpacked: {0}")]
     Unpack(String),
     /// A chunk decompresses to another length than its header states.
-    #[error("a chunk unpacks to {found} bytes, not to the {claimed} that it claims")]
+    #[error("a chunk unpacks to {found} bytes, but its header states {claimed}")]
     Unpacked {
         /// The length in the header.
         claimed: u64,
@@ -107,7 +109,7 @@ pub enum FormatError {
         leftover: u64,
     },
     /// The names of topics and types take too much memory.
-    #[error("the names of its topics and types are too long: at most {limit} bytes are read")]
+    #[error("the names of its topics and types are too long: the limit is {limit} bytes")]
     Names {
         /// The limit in bytes.
         limit: usize,
@@ -127,16 +129,16 @@ pub enum FormatError {
         source: MessageError,
     },
     /// The operation code is not defined by the format.
-    #[error("no record has the operation code {0:02x}")]
+    #[error("a record has the unknown operation code {0:02x}")]
     Unknown(u8),
     /// The operation code does not fit the place of the record in the file, or its contents.
     #[error(
-        "a record has the operation code {0:02x}, but its position or contents are those of another kind of record"
+        "a record has the operation code {0:02x}, but the position or contents of another kind of record"
     )]
     Code(u8),
     /// The length field of a record contradicts the length of its contents.
     #[error(
-        "a record of operation code {code:02x} has {own} bytes by its content, and {bytes} by its length"
+        "a record of operation code {code:02x} contains {own} bytes, but its length field states {bytes}"
     )]
     Length {
         /// The operation code.
@@ -147,12 +149,10 @@ pub enum FormatError {
         own: u64,
     },
     /// The length field of a message spans other records that follow the message.
-    #[error("a message of {0} bytes contains the records behind it")]
+    #[error("a message with a length of {0} bytes reaches over the records after it")]
     Swallowed(u64),
     /// A record reaches beyond the end of the file, but other records follow its beginning.
-    #[error(
-        "a record of {bytes} bytes reaches beyond the file's end, but other records follow its beginning"
-    )]
+    #[error("a record of {bytes} bytes reaches beyond the end of the file, although other records follow it")]
     Beyond {
         /// The length in the record's header.
         bytes: u64,
@@ -161,7 +161,7 @@ pub enum FormatError {
     #[error("it ends with the magic bytes of an MCAP file, but the footer before them is missing")]
     Footer,
     /// Bytes follow the end of the recording.
-    #[error("the file continues after its end")]
+    #[error("the file contains more bytes after the end of the recording")]
     TrailingData,
     /// The file holds another number of messages than its statistics record states.
     #[error("it has {found} messages, but its statistics say {stated}")]

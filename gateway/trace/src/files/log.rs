@@ -144,12 +144,12 @@ impl LogFile {
         let Ok(about) = file.metadata() else { return Ok(()) };
         let (bytes, written) = (about.len(), self.bytes);
         let why = if still_names_file(&self.path, device_and_inode(&about)) == Some(false) {
-            "another program renamed, removed or replaced it while it was written; what comes goes on to the file \
+            "another program renamed, removed or replaced it while it was written; further data goes to the file \
              that was opened"
                 .to_owned()
         } else if bytes != written {
             format!(
-                "another program changed it while it was written: it has {bytes} bytes, and {written} were written"
+                "another program changed it while it was written: it has {bytes} bytes, but {written} were written"
             )
         } else {
             return Ok(());

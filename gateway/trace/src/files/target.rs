@@ -283,7 +283,10 @@ pub fn sync_folder(path: &Path) {
 #[must_use]
 pub fn with_hint(error: io::Error) -> io::Error {
     if matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) {
-        return io::Error::new(error.kind(), format!("{error}; make room, or name a file on another disk"));
+        return io::Error::new(
+            error.kind(),
+            format!("{error}; free some space, or name a file on another disk"),
+        );
     }
     let place = matches!(
         error.kind(),

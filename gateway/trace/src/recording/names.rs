@@ -165,7 +165,7 @@ impl PartFile {
 
 /// Returns the error message for a recording whose name another program took while it was written.
 pub(super) fn name_conflict_message(goal: &Path) -> String {
-    format!("{}: another program made a file of this name meanwhile", goal.display())
+    format!("{}: another program has created a file of this name in the meantime", goal.display())
 }
 
 /// Returns the error message for a recording whose name is already in use.
@@ -233,7 +233,7 @@ pub enum PartFileError {
     #[error("it cannot be read: {0}")]
     Unreadable(#[source] io::Error),
     /// It belongs to another user.
-    #[error("it belongs to user {owner}, and this is user {me}")]
+    #[error("it belongs to user {owner}, but this program runs as user {me}")]
     Owner {
         /// The user id of the owner.
         owner: u32,
@@ -241,13 +241,13 @@ pub enum PartFileError {
         me: u32,
     },
     /// It has several hard links.
-    #[error("it has {0} names (hard links)")]
+    #[error("it has {0} hard links")]
     Linked(u64),
     /// Another process holds the lock.
     #[error("another program is writing it")]
     Locked,
     /// The file does not hold its own identity, so it may be a copy or a file of another program.
-    #[error("no run of this program created it here")]
+    #[error("it was not created here by a run of this program")]
     ForeignIdentity,
 }
 

@@ -99,8 +99,8 @@ fn publish<T>(CompleteFile { file, part, about }: CompleteFile<T>, force: bool) 
             let (goal, there) = (part.goal.display(), part.path.display());
             if !part.has_temporary_name() {
                 let error = format!(
-                    "{there}: another program renamed, removed or replaced it while it was written; it is whole \
-                     wherever it is now, and what is in it counts as lost"
+                    "{there}: another program renamed, removed or replaced it while it was written; the recording is \
+                     complete, wherever it is now, but its contents count as lost"
                 );
                 return PublishedFile { path: None, about, error: Some(error) };
             }
@@ -109,7 +109,7 @@ fn publish<T>(CompleteFile { file, part, about }: CompleteFile<T>, force: bool) 
             } else {
                 format!("{goal}: {error}")
             };
-            let error = Some(format!("{error}; {there} is the whole recording: rename it"));
+            let error = Some(format!("{error}; {there} is the complete recording: rename it"));
             PublishedFile { path: Some(part.path), about, error }
         }
     }
@@ -127,8 +127,11 @@ mod tests {
         std::fs::write(&goal, "another program's").unwrap();
         let published = publish(CompleteFile { file, part, about: () }, false);
         let error = published.error.unwrap();
-        assert!(error.contains("run.mcap: another program made a file of this name meanwhile; "), "{error}");
-        assert!(error.ends_with("run.mcap.part is the whole recording: rename it"), "{error}");
+        assert!(
+            error.contains("run.mcap: another program has created a file of this name in the meantime; "),
+            "{error}"
+        );
+        assert!(error.ends_with("run.mcap.part is the complete recording: rename it"), "{error}");
         assert_eq!(published.path, Some(folder.path().join("run.mcap.part")));
     }
 }

@@ -81,24 +81,24 @@ impl fmt::Display for RecoveryResult {
             write!(f, ", the last at {}.{:06}", seconds.0, seconds.1)?;
         }
         match self.unfinished_bytes {
-            0 => write!(f, "; nothing unfinished at the end")?,
+            0 => write!(f, "; no unfinished record at the end")?,
             bytes => write!(f, "; {bytes} bytes of an unfinished record are lost")?,
         }
         match self.damaged {
             (0, _) => {}
-            (_, 0) => write!(f, "; a length in it was wrong, and nothing is lost for that")?,
+            (_, 0) => write!(f, "; a wrong length in it caused no loss")?,
             (1, bytes) => write!(f, "; {bytes} damaged bytes are lost")?,
             (places, bytes) => write!(f, "; {bytes} damaged bytes in {places} places are lost")?,
         }
         if self.orphaned_messages > 0 {
             write!(
                 f,
-                "; {} messages of topics that are described nowhere else are lost",
+                "; {} messages are lost with the descriptions of their topics",
                 self.orphaned_messages
             )?;
         }
         if self.is_checksum_wrong && self.is_undamaged() {
-            write!(f, "; a checksum of the whole was wrong, and none of a part")?;
+            write!(f, "; a checksum of the whole file was wrong, but none of a chunk")?;
         }
         Ok(())
     }
@@ -121,10 +121,10 @@ pub enum RecoverError {
     #[error("it ends after {0} bytes, before its first message, so nothing can be recovered")]
     Empty(u64),
     /// The input cannot be read.
-    #[error("reading: {0}")]
+    #[error("reading failed: {0}")]
     Read(io::Error),
     /// The new file cannot be written.
-    #[error("writing: {0}")]
+    #[error("writing failed: {0}")]
     Write(io::Error),
 }
 
@@ -234,5 +234,5 @@ impl<W: Write> RecordCopier<W> {
 
 /// Returns the error for an input that was changed between the survey and the copy.
 fn changed_input_error(damage: FormatError) -> RecoverError {
-    RecoverError::Read(io::Error::other(format!("it was changed meanwhile: {damage}")))
+    RecoverError::Read(io::Error::other(format!("it was changed during the recovery: {damage}")))
 }

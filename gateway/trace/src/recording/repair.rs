@@ -79,7 +79,7 @@ pub(super) fn unrepaired(PartFile { path, goal, .. }: &PartFile, error: &Recover
         format!("{path}: {error}")
     };
     let more = if is(is_disk_full) { " -o FILE`, a file on another disk" } else { "`" };
-    format!("{why}; what was recorded is in {path}: repair it with `skinbus recover {path}{more}")
+    format!("{why}; the recorded data is in {path}: repair it with `skinbus recover {path}{more}")
 }
 
 /// Recovers a file into a new one, unless the file is sound or holds no messages. Returns the result, and the length of
@@ -155,9 +155,7 @@ pub fn repair_orphans(path: &Path, mut say: impl FnMut(&str)) {
             Ok(held) => held,
             Err(why) => {
                 let hint = why.may_be_recording().then(|| {
-                    format!(
-                        "; if it is a recording that broke off, `skinbus recover {name} -o NAME` copies it"
-                    )
+                    format!("; if it is an unfinished recording, `skinbus recover {name} -o NAME` copies it")
                 });
                 say(&format!("{name} is left alone: {why}{}", hint.unwrap_or_default()));
                 continue;
@@ -168,7 +166,7 @@ pub fn repair_orphans(path: &Path, mut say: impl FnMut(&str)) {
             Ok(RepairResult { recovered, new: Some((path, _)), original }) => {
                 let kept = original.map(|path| format!("; the damaged original is {}", path.display()));
                 let kept = kept.unwrap_or_default();
-                say(&format!("{name} {leftover}; repaired, it is {}: {recovered}{kept}", path.display()));
+                say(&format!("{name} {leftover}; it was repaired as {}: {recovered}{kept}", path.display()));
             }
             Ok(RepairResult { new: None, .. }) => {
                 say(&format!("{name} {leftover}; it held no messages and was removed"));
@@ -190,7 +188,10 @@ mod tests {
         let full = line(io::ErrorKind::StorageFull);
         assert!(full.ends_with("run.mcap.part -o FILE`, a file on another disk"), "{full}");
         let taken = line(io::ErrorKind::AlreadyExists);
-        assert!(taken.contains("run.mcap: another program made a file of this name meanwhile; "), "{taken}");
+        assert!(
+            taken.contains("run.mcap: another program has created a file of this name in the meantime; "),
+            "{taken}"
+        );
         assert!(taken.ends_with("run.mcap.part`") && !taken.contains("--overwrite"), "{taken}");
     }
 }

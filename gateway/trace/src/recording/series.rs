@@ -334,7 +334,7 @@ impl<T> SplitRecording<T> {
             Ok(open) => {
                 if failed_before.is_some() {
                     let goal = open.part.goal.display();
-                    self.said.push(RecordingEvent::Other(format!("recording goes on in {goal}")));
+                    self.said.push(RecordingEvent::Other(format!("recording continues in {goal}")));
                 }
                 (self.failed, self.open) = (None, Some(open));
                 true

@@ -198,7 +198,7 @@ pub enum CdrError {
         at: usize,
     },
     /// The value of a field is not allowed.
-    #[error("{what} of a message is {got}: allowed is {allowed}")]
+    #[error("{what} of a message is {got}; allowed: {allowed}")]
     Value {
         /// The name of the field.
         what: &'static str,
@@ -212,7 +212,7 @@ pub enum CdrError {
     Identifier(#[from] IdentifierError),
     /// A time is out of range.
     #[error(
-        "the time of a message is {sec} s and {nanosec} ns: allowed are 0 s or more, and less than 1000000000 ns"
+        "the time of a message is {sec} s and {nanosec} ns: use at least 0 s and less than 1000000000 ns"
     )]
     Time {
         /// Seconds since 1970.

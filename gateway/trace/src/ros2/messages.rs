@@ -195,13 +195,12 @@ mod tests {
         let id = "id of a message: FF000000 does not fit an identifier of 11 bits: at most 7FF";
         assert_eq!(with(23, 0xFF), id);
         assert!(with(21, 8).ends_with("800 does not fit an identifier of 11 bits: at most 7FF"));
-        assert!(with(28, 1).starts_with("flags of a message is 1: allowed is 0 to 15 in an FD frame"));
-        assert!(with(30, 14).starts_with("raw_dlc of a message is 14: allowed is 0; 9 to 15"));
-        let time =
-            "the time of a message is -1 s and 0 ns: allowed are 0 s or more, and less than 1000000000 ns";
+        assert!(with(28, 1).starts_with("flags of a message is 1; allowed: 0 to 15 in an FD frame"));
+        assert!(with(30, 14).starts_with("raw_dlc of a message is 14; allowed: 0; 9 to 15"));
+        let time = "the time of a message is -1 s and 0 ns: use at least 0 s and less than 1000000000 ns";
         assert_eq!(back_from_1969(&buffer), time);
-        assert!(with(29, 1).starts_with("length of a message is 1: allowed is that of the data"));
-        assert!(with(31, 3).starts_with("direction of a message is 3: allowed is 0, 1 or 2"));
+        assert!(with(29, 1).starts_with("length of a message is 1; allowed: that of the data"));
+        assert!(with(31, 3).starts_with("direction of a message is 3; allowed: 0, 1 or 2"));
     }
 
     fn back_from_1969(message: &[u8]) -> String {

@@ -203,7 +203,10 @@ fn times_that_run_backwards_are_counted_and_keep_their_order() {
     let log = "(3.000000) can0 001#\n(2.000000) can0 002#\n(2.500000) can0 003#\n(1.000000) can0 004#\n";
     let (mcap, done) = converted(log.as_bytes(), CaptureFormat::Mcap);
     assert_eq!(done.frames, 4);
-    assert_eq!(backwards(log), ["times run backwards 2 times, first at frame 2; the order is kept"]);
+    assert_eq!(
+        backwards(log),
+        ["the time runs backwards 2 times, first at frame 2; the order of the frames is kept"]
+    );
     assert_eq!(converted(&mcap, CaptureFormat::Candump).0, log.as_bytes());
 }
 
@@ -212,7 +215,10 @@ fn times_of_each_bus_are_compared_with_its_own() {
     let apart = "(3.000000) can0 001#\n(1.000000) can1 002#\n(4.000000) can0 003#\n(2.000000) can1 004#\n";
     assert_eq!(backwards(apart), [""; 0]);
     let earlier = apart.replace("(2.", "(0.");
-    assert_eq!(backwards(&earlier), ["times run backwards 1 times, first at frame 4; the order is kept"]);
+    assert_eq!(
+        backwards(&earlier),
+        ["the time runs backwards 1 times, first at frame 4; the order of the frames is kept"]
+    );
 }
 
 /// Returns a recording of several chunks, and the times and data of its frames.
@@ -255,7 +261,7 @@ fn a_recording_that_is_truncated_is_read_as_far_as_it_goes() {
         assert!(found.len() >= most, "cut at {length}");
         most = found.len();
         let why = end.unwrap_or_else(|error| panic!("cut at {length}: {error}"));
-        assert!(why.unwrap().contains("it has no end"), "cut at {length}");
+        assert!(why.unwrap().contains("its end is missing"), "cut at {length}");
     }
     assert_eq!((most, frames(&mcap).1.unwrap()), (all.len(), None));
 }

@@ -44,7 +44,7 @@ pub fn address(directory: &Path, bus: &str) -> Result<SocketAddrUnix, DirectoryE
 #[non_exhaustive]
 pub enum DirectoryError {
     /// The directory belongs to another user, who could replace its sockets.
-    #[error("{} belongs to user {owner}, and this is user {us}: set SKINBUS_DIR to a directory of your own", path.display())]
+    #[error("{} belongs to user {owner}, but this program runs as user {us}: set SKINBUS_DIR to a directory of your own", path.display())]
     Owner {
         /// The directory.
         path: PathBuf,
@@ -54,7 +54,7 @@ pub enum DirectoryError {
         us: u32,
     },
     /// Other users have access to the directory.
-    #[error("{} has mode {mode:04o}, and the bus is private: `chmod 700` it, or set SKINBUS_DIR to another directory", path.display())]
+    #[error("{} has mode {mode:04o}, but the bus must be private: `chmod 700` it, or set SKINBUS_DIR to another directory", path.display())]
     Mode {
         /// The directory.
         path: PathBuf,

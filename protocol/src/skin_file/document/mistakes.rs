@@ -43,7 +43,7 @@ fn describe_allowed(path: &str, message: &str) -> Option<String> {
         "i64" | "u64" | "u32" | "u8" if got.starts_with("integer ") => "the number is too large".to_owned(),
         "i64" | "u64" | "u32" | "u8" => match parse_cell_name(got) {
             Some(CellName { bus: Some(bus), node }) => {
-                format!("a whole number is needed: write {node}, and bus = \"{bus}\" as a key of its own")
+                format!("a whole number is needed: write {node}, and bus = \"{bus}\" as a separate key")
             }
             Some(_) | None => "a whole number is needed".to_owned(),
         },

@@ -31,11 +31,11 @@ pub(super) fn cells(
         let cell = cell(&at, raw, robot, buses, base)?;
         if let Some(first) = taken.insert((cell.bus, cell.node), index) {
             let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
-            let why = format!("cell[{first}] has this node on {bus:?} already");
+            let why = format!("cell[{first}] already has this node id on {bus:?}");
             return Err(at.key("node").fault(raw.node, why));
         }
         if let Some(first) = serials.insert(cell.serial, index) {
-            let why = format!("cell[{first}] has this serial number already");
+            let why = format!("cell[{first}] already has this serial number");
             return Err(at.key("serial").fault(cell.serial, why));
         }
         cells.push(cell);
@@ -76,7 +76,7 @@ fn check_wire_ends(cells: &[Cell]) -> Checked<()> {
         *so_far += 1;
         if *so_far > all.get(&(cell.bus, neighbor, node)).copied().unwrap_or(0) {
             let why = format!(
-                "this wire has no other end: name node {node} in a further one of the neighbors of node {neighbor}, \
+                "the other end of this wire is missing: name node {node} once more in the neighbors of node {neighbor}, \
                  or put 0 here"
             );
             return Err(KeyPath::top_level_key("cell")
@@ -110,7 +110,7 @@ fn cell(
     if reach >= MAX_REACH {
         let [x, y, z] = raw.position;
         let why = format!(
-            "node {node} can come {reach:.3} m from a frame of its rows, {:.3} m more than the {MAX_REACH} m that Q1.14 holds",
+            "node {node} can be {reach:.3} m away from a frame of its rows, {:.3} m more than the {MAX_REACH} m that Q1.14 can hold",
             reach - MAX_REACH
         );
         return Err(at.key("position").fault(format_args!("[{x}, {y}, {z}]"), why));
@@ -191,7 +191,7 @@ fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) 
             0 => Err(at.key("row").fault(row, "no joint moves what this row carries")),
             joint if given.is_none_or(|given| given == joint) => Ok((joint, row)),
             joint => {
-                let why = format!("this row is moved by joint {joint}: leave the joint out, or correct it");
+                let why = format!("this row is moved by joint {joint}: correct the joint, or leave it out");
                 Err(at.key("row").fault(row, why))
             }
         },

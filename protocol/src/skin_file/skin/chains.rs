@@ -55,7 +55,7 @@ fn serial_robot(
 ) -> Checked<Robot> {
     let count = rows.len();
     if count == 0 || count > MAX_JOINTS {
-        let why = format!("a robot has 1 to {MAX_JOINTS} revolute joints here");
+        let why = format!("1 to {MAX_JOINTS} revolute joints are allowed in this key");
         return Err(at.key("joints").fault(format_args!("{count} joints"), why));
     }
     for (index, row) in rows.iter().enumerate() {
@@ -208,7 +208,7 @@ fn chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> 
             && [min, max].iter().any(|q| (table.d + q).abs() > MAX_PRISMATIC_POSITION_M)
         {
             let why = format!(
-                "d and its position together stay within -{MAX_PRISMATIC_POSITION_M} to {MAX_PRISMATIC_POSITION_M} m"
+                "d plus the position must stay within -{MAX_PRISMATIC_POSITION_M} to {MAX_PRISMATIC_POSITION_M} m"
             );
             return Err(at.fault(format_args!("{name:?} from {min} to {max} with d = {}", table.d), why));
         }
@@ -217,7 +217,7 @@ fn chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> 
     }
     let moving = chain.joints.len();
     if moving == 0 || moving > MAX_JOINTS {
-        let why = format!("a chain has 1 to {MAX_JOINTS} joints: rows with the name of one");
+        let why = format!("a chain has 1 to {MAX_JOINTS} joints, which are rows with the name of a joint");
         return Err(at.key("rows").fault(format_args!("{moving} joints"), why));
     }
     Ok(chain)
@@ -227,7 +227,7 @@ pub(super) fn check_joint_count(at: &KeyPath, got: usize, joints: usize) -> Chec
     if got == joints {
         return Ok(());
     }
-    let why = format!("one for each of the robot's {joints} joints is needed");
+    let why = format!("one value for each of the robot's {joints} joints is needed");
     Err(at.fault(format_args!("{got} values"), why))
 }
 
@@ -236,7 +236,8 @@ pub(super) fn normalized<const N: usize>(at: &KeyPath, what: &str, parts: [f64; 
     let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
     if length.is_nan() || (length - 1.0).abs() > UNIT_LENGTH_TOLERANCE {
         let got = parts.map(|part| part.to_string()).join(", ");
-        let why = format!("this {what} has length {length:.6}; it must be 1 within {UNIT_LENGTH_TOLERANCE}");
+        let why =
+            format!("this {what} has length {length:.6}; it must be 1 to within {UNIT_LENGTH_TOLERANCE}");
         return Err(at.fault(format_args!("[{got}]"), why));
     }
     Ok(parts.map(|part| part / length))

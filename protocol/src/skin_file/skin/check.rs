@@ -80,11 +80,11 @@ fn check_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checke
         let node = skin.cells.get(first).map_or(0, |cell| cell.node.get());
         let others = match skin.cells.iter().filter(|cell| is_truncated(cell)).count() - 1 {
             0 => String::new(),
-            1 => " (nor does another cell)".to_owned(),
-            count => format!(" (nor do {count} other cells)"),
+            1 => " (nor to another cell)".to_owned(),
+            count => format!(" (nor to {count} other cells)"),
         };
         let why = format!(
-            "no wire leads from here to a root of its bus{others}, which sums need: name neighbors on both ends, or \
+            "no wires lead from a root of its bus to this cell{others}, but sums need them: name neighbors at both ends, or \
              set root = true"
         );
         return Err(KeyPath::top_level_key("cell").element(first).key("node").fault(node, why));
@@ -100,7 +100,7 @@ fn check_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checke
         "no slots fit: send joints less often, or use more roots or buses".to_owned()
     };
     let why = format!(
-        "the tree needs {slots} slots within the {period_us} us between two broadcasts of joints: {hint}"
+        "the tree needs {slots} slots within the {period_us} us between two joint broadcasts: {hint}"
     );
     Err(at.key("slot_us").fault(slot_us, why))
 }

@@ -30,7 +30,10 @@ pub(super) fn check_names(skin: &raw::RawSkin) -> Checked<()> {
 fn check_name(at: &KeyPath, name: &str) -> Checked<()> {
     let count = name.chars().count();
     if count > MAX_CHARACTERS {
-        return Err(at.fault(format!("{count} characters"), format!("a name has at most {MAX_CHARACTERS}")));
+        return Err(at.fault(
+            format!("{count} characters"),
+            format!("a name has at most {MAX_CHARACTERS} characters"),
+        ));
     }
     if let Some(character) = name.chars().find(|&character| is_unprintable(character)) {
         let value = format!("\"{}\"", printable(name));

@@ -19,7 +19,7 @@ pub fn continuous_sensing(hz: f64) -> Result<Sensing, String> {
     if (period - nearest).abs() > 1e-3 * period {
         let (above, below) = (1_000.0 / period.floor(), 1_000.0 / period.ceil());
         return Err(format!(
-            "its period must be a whole number of ms; the nearest are {below:.4} and {above:.4} Hz"
+            "its period must be a whole number of ms; the nearest rates are {below:.4} and {above:.4} Hz"
         ));
     }
     Ok(Sensing::Continuous { period_ms: nearest as u16 })
@@ -97,7 +97,7 @@ mod tests {
         for hz in [0.0, -1.0, f64::NAN, f64::INFINITY, 1_100.0, 0.015] {
             assert_eq!(period(hz), Err("0.0153 to 1000 Hz are possible".to_owned()), "{hz}");
         }
-        let why = "its period must be a whole number of ms; the nearest are 58.8235 and 62.5000 Hz";
+        let why = "its period must be a whole number of ms; the nearest rates are 58.8235 and 62.5000 Hz";
         assert_eq!(period(60.0), Err(why.to_owned()));
     }
 

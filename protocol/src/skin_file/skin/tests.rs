@@ -100,7 +100,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     assert_eq!(says("version = 1", "version = 2"), "skin.toml:1: version = 2: this program reads version 1");
     assert_eq!(
         says("node = 2", "node = 1"),
-        "skin.toml:40: cell[1].node = 1: cell[0] has this node on \"vcan0\" already"
+        "skin.toml:40: cell[1].node = 1: cell[0] already has this node id on \"vcan0\""
     );
     assert_eq!(
         says("node = 2", "node = 255"),
@@ -113,12 +113,12 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     assert_eq!(
         says("[0.7071068, 0.0, 0.0, 0.7071068]", "[0.5, 0.0, 0.0, 0.5]"),
         "skin.toml:43: cell[1].orientation = [0.5, 0, 0, 0.5]: \
-         this quaternion has length 0.707107; it must be 1 within 0.001"
+         this quaternion has length 0.707107; it must be 1 to within 0.001"
     );
     assert_eq!(
         says("[0.1, 0.0, 0.06]", "[1.6, 0.0, 0.0]"),
         "skin.toml:34: cell[0].position = [1.6, 0, 0]: \
-         node 1 can come 2.100 m from a frame of its rows, 0.101 m more than the 1.999 m that Q1.14 holds"
+         node 1 can be 2.100 m away from a frame of its rows, 0.101 m more than the 1.999 m that Q1.14 can hold"
     );
     assert_eq!(
         says("[controller]", "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n[controller]"),
@@ -142,7 +142,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("inertia = [1.0, 1.0]", "inertia = [1.0]"),
-        "skin.toml:26: controller.inertia = 1 values: one for each of the robot's 2 joints is needed"
+        "skin.toml:26: controller.inertia = 1 values: one value for each of the robot's 2 joints is needed"
     );
     assert_eq!(says("a = 0.5", "a = 2.5"), "skin.toml:8: robot.joints[1].a = 2.5: the range is [-2, 2)");
     assert_eq!(
@@ -237,18 +237,18 @@ fn a_robot_of_joints_and_chains_names_what_is_wrong_with_them() {
 fn a_wire_has_two_ends() {
     assert_eq!(
         says("neighbors = [2, 0, 0, 0]", "neighbors = [2, 2, 0, 0]"),
-        "skin.toml:36: cell[0].neighbors[1] = 2: this wire has no other end: \
-         name node 1 in a further one of the neighbors of node 2, or put 0 here"
+        "skin.toml:36: cell[0].neighbors[1] = 2: the other end of this wire is missing: \
+         name node 1 once more in the neighbors of node 2, or put 0 here"
     );
     assert_eq!(
         says("neighbors = [0, 0, 0, 1]", "neighbors = [0, 0, 0, 0]"),
-        "skin.toml:36: cell[0].neighbors[0] = 2: this wire has no other end: \
-         name node 1 in a further one of the neighbors of node 2, or put 0 here"
+        "skin.toml:36: cell[0].neighbors[0] = 2: the other end of this wire is missing: \
+         name node 1 once more in the neighbors of node 2, or put 0 here"
     );
     assert_eq!(
         says("neighbors = [2, 0, 0, 0]", "neighbors = [0, 0, 0, 0]"),
-        "skin.toml:45: cell[1].neighbors[3] = 1: this wire has no other end: \
-         name node 2 in a further one of the neighbors of node 1, or put 0 here"
+        "skin.toml:45: cell[1].neighbors[3] = 1: the other end of this wire is missing: \
+         name node 2 once more in the neighbors of node 1, or put 0 here"
     );
 }
 
@@ -268,8 +268,8 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
     );
     assert_eq!(
         fault("reply = \"sum\"\nslot_us = 4001", &CHAIN),
-        "skin.toml:22: bus[0].slot_us = 4001: the tree needs 4 slots within the 16000 us between two \
-         broadcasts of joints: at most 4000 us fit"
+        "skin.toml:22: bus[0].slot_us = 4001: the tree needs 4 slots within the 16000 us between two joint \
+         broadcasts: at most 4000 us fit"
     );
     let mut cells = CHAIN;
     cells[0].1 = false;
@@ -278,13 +278,13 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
         "skin.toml:21: bus[0].reply = \"sum\": sums need a path to the gateway, but no cell of this bus has \
          root = true: set it for one"
     );
-    let link_down = |cells: &[_]| fault(without, cells).split_once(": no wire").unwrap().1.to_owned();
+    let link_down = |cells: &[_]| fault(without, cells).split_once(": no wires").unwrap().1.to_owned();
     cells = CHAIN;
     (cells[1].0, cells[2].0) = ([1, 0, 0, 0], [0, 4, 0, 0]);
     assert_eq!(
         fault(without, &cells),
-        "skin.toml:50: cell[2].node = 3: no wire leads from here to a root of its bus (nor does another cell), \
-         which sums need: name neighbors on both ends, or set root = true"
+        "skin.toml:50: cell[2].node = 3: no wires lead from a root of its bus to this cell (nor to another cell), \
+         but sums need them: name neighbors at both ends, or set root = true"
     );
     assert_eq!(
         parse("reply = \"torque\"", &cells).unwrap().wires(0).depths()[..4],
@@ -292,11 +292,12 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
     );
     assert!(
         link_down(&[([0; 4], true), ([0; 4], false)])
-            .starts_with(" leads from here to a root of its bus, which")
+            .starts_with(" lead from a root of its bus to this cell, but")
     );
     let three = [([0; 4], true), ([0; 4], false), ([0; 4], false), ([0; 4], false)];
     assert!(
-        link_down(&three).starts_with(" leads from here to a root of its bus (nor do 2 other cells), which")
+        link_down(&three)
+            .starts_with(" lead from a root of its bus to this cell (nor to 2 other cells), but")
     );
 }
 
@@ -342,7 +343,7 @@ fn a_broken_file_says_where_in_one_line() {
         ("joint = 2\n", "", "skin.toml:30: cell[0].joint: which joint moves the cell? the joints are 1 to 2"),
         ("joint = 2", "joint = \"two\"", "skin.toml:33: cell[0].joint = \"two\": a whole number is needed"),
         ("joint = 2", "joint = 18446744073709551616", "= 18446744073709551616: the number is too large"),
-        ("joint = 2", "joint = \"vcan0:2\"", ": write 2, and bus = \"vcan0\" as a key of its own"),
+        ("joint = 2", "joint = \"vcan0:2\"", ": write 2, and bus = \"vcan0\" as a separate key"),
         ("version = 1", "version = 1\nevents = 5", ": it is a table: write [events], and its keys below"),
         ("joint = 2", "joint = 2.5", "skin.toml:33: cell[0].joint = 2.5: a whole number is needed"),
         ("control_hz = 500.0", "control_hz = \"500\"", "timing.control_hz = \"500\": a number is needed"),
@@ -395,7 +396,7 @@ fn sensing_is_off_unless_said_and_its_keys_are_checked() {
     );
     assert_eq!(
         fault("sensing = \"continuous\"\nsensing_hz = 60.0"),
-        "skin.toml:24: bus[0].sensing_hz = 60: its period must be a whole number of ms; the nearest are \
+        "skin.toml:24: bus[0].sensing_hz = 60: its period must be a whole number of ms; the nearest rates are \
          58.8235 and 62.5000 Hz"
     );
 }
@@ -480,7 +481,7 @@ normal = [0.0, 0.6, 0.8]
     );
     assert_eq!(
         fault("0.8]", "1.0]"),
-        "skin.toml:7: cell[0].normal = [0, 0.6, 1]: this vector has length 1.166190; it must be 1 within 0.001"
+        "skin.toml:7: cell[0].normal = [0, 0.6, 1]: this vector has length 1.166190; it must be 1 to within 0.001"
     );
     assert_eq!(
         fault("[[cell]]", "[[bus]]\n[[bus]]\nname = \"vcan1\"\n[[cell]]"),

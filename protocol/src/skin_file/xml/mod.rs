@@ -186,9 +186,8 @@ impl<'a> XmlSurvey<'a> {
             (self.bindings, "xmlns attributes", MAX_BINDINGS),
         ] {
             if count > most {
-                let what = format!(
-                    "it has {count} {what}, and at most {most} are read: delete those that nothing needs"
-                );
+                let what =
+                    format!("it has {count} {what}, and at most {most} are read: delete the unused ones");
                 return Err(XmlFault { line: None, what });
             }
         }

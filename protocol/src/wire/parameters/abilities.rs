@@ -45,8 +45,8 @@ pub enum MissingAbility {
 impl fmt::Display for MissingAbility {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
-            Self::Joints { needed, most } => write!(f, "{needed} joints (it can have {most})"),
-            Self::Rows { needed, most } => write!(f, "{needed} rows (it can have {most})"),
+            Self::Joints { needed, most } => write!(f, "{needed} joints (it supports {most})"),
+            Self::Rows { needed, most } => write!(f, "{needed} rows (it supports {most})"),
             Self::Kind(kind) => write!(f, "{} rows", kind.name()),
             Self::Format(format) => write!(f, "torques in {}", format.name()),
         }
@@ -144,10 +144,10 @@ mod tests {
             abilities.first_missing(&parameters).map(|ability| ability.to_string())
         };
         let seven = Parameters { joint: 7, joints: 7, ..plain };
-        assert_eq!(lacks(none, seven).unwrap(), "7 joints (it can have 6)");
+        assert_eq!(lacks(none, seven).unwrap(), "7 joints (it supports 6)");
         let mut helped = Parameters { row: 7, table_rows: 7, ..plain };
         helped.rows[2].kind = RowKind::Fixed;
-        assert_eq!(lacks(none, helped).unwrap(), "7 rows (it can have 6)");
+        assert_eq!(lacks(none, helped).unwrap(), "7 rows (it supports 6)");
         assert_eq!(lacks(Abilities(7 << 4), helped).unwrap(), "fixed rows");
         let mut sliding = plain;
         sliding.rows[0] = Row { kind: RowKind::Prismatic, ..Row::default() };

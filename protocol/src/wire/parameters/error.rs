@@ -12,7 +12,7 @@ pub enum ParameterError {
     #[error("parameter {0} cannot be written")]
     NotWritable(u8),
     /// The number of joints is out of range.
-    #[error("{got} joints; 1 to {MAX_JOINTS} are possible")]
+    #[error("{got} joints are not possible; use 1 to {MAX_JOINTS}")]
     Joints {
         /// The requested number of joints.
         got: i16,
@@ -26,7 +26,7 @@ pub enum ParameterError {
         joints: i16,
     },
     /// The normal does not have unit length.
-    #[error("the outward normal has length^2 {got} / 2^28; within 1/64 of 2^28 is allowed")]
+    #[error("the squared length of the outward normal is {got} / 2^28; it must be within 1/64 of 1")]
     Normal {
         /// Square of the length, in steps of 2^-28.
         got: i64,
@@ -43,7 +43,7 @@ pub enum ParameterError {
     #[error("a joint broadcast every 0 us is not possible")]
     Period,
     /// The number of rows is out of range, or does not match the joints.
-    #[error("{got} rows; a row for each of the {joints} joints is needed, and {MAX_ROWS} are possible")]
+    #[error("{got} rows are not possible; use one for each of the {joints} joints, and at most {MAX_ROWS}")]
     Rows {
         /// The requested number of rows.
         got: i16,
@@ -59,7 +59,7 @@ pub enum ParameterError {
         rows: i16,
     },
     /// The kind of a row is undefined.
-    #[error("row {row} has kind {got}; 0 revolute, 1 prismatic and 2 fixed are possible")]
+    #[error("row {row} has kind {got}; use 0 (revolute), 1 (prismatic) or 2 (fixed)")]
     Kind {
         /// The number of the row, from 1.
         row: u8,
@@ -67,7 +67,7 @@ pub enum ParameterError {
         got: i16,
     },
     /// The torque format is undefined.
-    #[error("torque format {got} does not exist: 0 Q3.12, 1 Q5.10, 2 Q7.8 do")]
+    #[error("torque format {got} does not exist: use 0 (Q3.12), 1 (Q5.10) or 2 (Q7.8)")]
     Format {
         /// The requested format.
         got: i16,

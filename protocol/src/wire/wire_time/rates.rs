@@ -19,7 +19,7 @@ pub struct BitRates {
 #[non_exhaustive]
 pub enum BitRatesError {
     /// The text is not a bit rate.
-    #[error("not a bit rate: write bit/s, as 1000000, 500k or 1M")]
+    #[error("not a bit rate: write it in bit/s, such as 1000000, 500k or 1M")]
     Text,
     /// The nominal bit rate is out of range.
     #[error(
@@ -209,7 +209,7 @@ mod tests {
             error("1M/500k"),
             "data bit rate 500000 bit/s: CAN FD allows 1000000 (the nominal one) to 8000000 (8M)"
         );
-        assert_eq!(error("fast"), "not a bit rate: write bit/s, as 1000000, 500k or 1M");
+        assert_eq!(error("fast"), "not a bit rate: write it in bit/s, such as 1000000, 500k or 1M");
         assert!(BitRates::new(10_000, 8_000_000).is_ok());
     }
 }

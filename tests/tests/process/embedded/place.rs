@@ -85,7 +85,7 @@ fn a_directory_that_others_can_enter_is_refused_by_both_sides() {
     std::fs::create_dir(&directory).unwrap();
     std::fs::set_permissions(&directory, std::fs::Permissions::from_mode(0o755)).unwrap();
     let expected = format!(
-        "{} has mode 0755, and the bus is private: `chmod 700` it, or set SKINBUS_DIR to another directory",
+        "{} has mode 0755, but the bus must be private: `chmod 700` it, or set SKINBUS_DIR to another directory",
         directory.display()
     );
     assert_eq!(ServerThread::start_in(&directory, BUS).unwrap_err().to_string(), expected);
@@ -105,7 +105,7 @@ fn a_link_a_file_in_the_way_and_a_path_that_is_too_long_are_refused() {
 
     std::fs::write(real.join("vcan0.bus"), "").unwrap();
     let error = ServerThread::start_in(&real, BUS).unwrap_err().to_string();
-    assert!(error.ends_with("vcan0.bus is in the way and is no socket: move it away"), "{error}");
+    assert!(error.ends_with("vcan0.bus exists and is not a socket: move it away"), "{error}");
 
     let error = ServerThread::start_in(&parent.path().join("x".repeat(100)), BUS).unwrap_err().to_string();
     assert!(error.contains("is too long for a socket"), "{error}");

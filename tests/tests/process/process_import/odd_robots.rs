@@ -11,7 +11,7 @@ fn a_link_without_its_mesh_is_left_out() {
     let place = arm();
     place.write("arm.urdf", &ARM.replace("upper=\"1.5\"", "upper=\"180\""));
     let said = run(&place, &format!("{COVER} --leave-out plate -o skin.toml")).succeeded().stderr;
-    assert!(said.contains("joint elbow: limits of 0.5 to 180 rad, more than four turns each way"), "{said}");
+    assert!(said.contains("joint elbow: limits of 0.5 to 180 rad are more than four turns"), "{said}");
     assert!(place.read("skin.toml").contains(" --leave-out plate "));
 }
 

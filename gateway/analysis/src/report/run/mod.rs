@@ -49,8 +49,8 @@ pub enum ReportError {
     Capture(#[from] CaptureError),
     /// The capture has frames only, and the options do not name its skin.
     #[error(
-        "{name} is a log, and frames alone are not enough: name their skin with --skin; a recording, `skinbus run SKIN \
-         --record run.mcap`, has it"
+        "{name} is a log, which has only frames: name their skin with --skin, or record with `skinbus run SKIN \
+         --record run.mcap`, which keeps the skin"
     )]
     Log {
         /// Name of the capture.
@@ -74,8 +74,8 @@ pub enum ReportError {
     },
     /// The recording is from another program, or is empty.
     #[error(
-        "{name} holds no run: {what}; `skinbus run SKIN --record run.mcap` makes what a report needs{}",
-        if *.has_skin { "" } else { ", and frames alone need their --skin" }
+        "{name} contains no run: {what}; record one with `skinbus run SKIN --record run.mcap`{}",
+        if *.has_skin { "" } else { ", or name the skin of a capture with --skin" }
     )]
     Foreign {
         /// Name of the recording.
@@ -86,7 +86,7 @@ pub enum ReportError {
         has_skin: bool,
     },
     /// The recording ends before the first data of a run.
-    #[error("{name} holds no run that can be shown: {what}")]
+    #[error("{name} contains no run that can be shown: {what}")]
     Unfinished {
         /// Name of the recording.
         name: String,
@@ -187,7 +187,7 @@ fn open(paths: &[PathBuf], options: &ReportOptions) -> Result<(Reader, Option<u6
             && !items.has_frame()?
             && let Some((kind, hint)) = items.text_kind()
         {
-            let what = format!("is {kind}, and no candump log or MCAP recording: {hint}");
+            let what = format!("is {kind}, not a candump log or MCAP recording: {hint}");
             return Err(ReportError::Frames { name, what });
         }
         return Err(if empty {
@@ -459,11 +459,11 @@ impl RunData {
         Some(match (&self.other_bus, items.text_kind()) {
             (Some(other), _) => {
                 format!(
-                    "has no frame of the skin's buses ({}): its frames are of {other}; name the skin that has them",
+                    "has no frame of the skin's buses ({}): its frames are from {other}; name the skin that has this bus",
                     buses.join(", ")
                 )
             }
-            (None, Some((what, hint))) => format!("is {what}, and no candump log or MCAP recording: {hint}"),
+            (None, Some((what, hint))) => format!("is {what}, not a candump log or MCAP recording: {hint}"),
             (None, None) => "has no frame in it: a log is what `candump -L` writes".to_owned(),
         })
     }
@@ -483,7 +483,7 @@ impl RunData {
         let here = self.motion.seconds();
         let planned = self.fact("configuration", "duration_s").and_then(|text| text.parse::<f64>().ok());
         let lacks = planned.filter(|planned| *planned > here).map_or_else(String::new, |planned| {
-            format!(" of the {planned} s that the run was to last: {:.2} s are missing", planned - here)
+            format!(" of the planned {planned} s: {:.2} s are missing", planned - here)
         });
         format!("{why}. It covers {here:.2} s{lacks}")
     }

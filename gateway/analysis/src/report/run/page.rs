@@ -68,7 +68,7 @@ fn intro_of_run(run: &RunData) -> String {
 fn intro_of_frames(run: &RunData, frames_only: &FramesOnly) -> String {
     let remarks: String = run.remarks.iter().map(|remark| format!(" {remark}.")).collect();
     format!(
-        "Frames of {} on {} during {}, from the {} {}. Times count from the first joints. Not in {}: {}.{remarks}",
+        "Frames of {} on {} during {}, from the {} {}. Times count from the first joints message. Not in {}: {}.{remarks}",
         skin_size_text(run),
         count_text(run.skin.buses.len(), "bus", "buses"),
         format_seconds(run.motion.seconds()),
@@ -149,7 +149,7 @@ impl PageDraft<'_> {
             let [of_active, of_each, of_none] = PAPER_CENTRAL_US;
             let law = of_active * active + of_each * skin.cells.len() as f64 + of_none;
             let what = format!(
-                "central computation in a tick, median (paper: its law at these {} cells, {} of them active on average)",
+                "central computation per tick, median (paper: value of its formula for {} cells, {} of them active on average)",
                 skin.cells.len(),
                 number((active * 10.0).round() / 10.0)
             );
@@ -178,7 +178,7 @@ impl PageDraft<'_> {
         let accounts = self.run.bus_figures.iter().map(BusFigures::reply_counts);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
-            let what = format!("replies not received before the next joints, of {due} due");
+            let what = format!("replies not received before the next joints message, of {due} due");
             let period = 1.0 / skin.timing.broadcast_hz();
             let bar = format!("none after {}", quantity(period, "s"));
             let late = due - in_time;

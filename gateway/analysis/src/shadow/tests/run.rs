@@ -266,7 +266,7 @@ fn beside_the_run_stands_the_worst_case_of_the_skin_at_the_same_rates() {
     );
     let heard = run.shadow(options());
     assert_eq!(heard.worst_case, None);
-    assert!(heard.this_run.unwrap().to_string().contains("at most 120 of 253 cells seen answered"));
+    assert!(heard.this_run.unwrap().to_string().contains("at most 120 of 253 observed cells answered"));
 }
 
 #[test]

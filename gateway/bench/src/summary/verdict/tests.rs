@@ -120,14 +120,16 @@ const CASES: &[Case] = &[
     ("no external controller sent a hello", |it| {
         it.no_controller = Some("no external controller sent a hello".to_owned());
     }),
-    ("2 cells ended by errors of their own: 7, 8 on vcan0 (no memory)", |it| {
+    ("2 cells ended with errors: 7, 8 on vcan0 (no memory)", |it| {
         let cells = vec![ErrorCells { bus: "vcan0".to_owned(), nodes: vec![7, 8] }];
         it.cell_errors.push(CellError { reason: "no memory".to_owned(), cells });
     }),
     ("vcan0 was lost 2 times for 1.2 s in all, also at the end: ", |it| {
         it.buses[0].outages = OutagesSummary { times: 2, lost_s: 1.2, at_end: true, ticks: 600 };
     }),
-    ("cells 1-3, 9 on vcan0: dead, or never heard", |it| it.buses[0].silent_cells = vec![1, 2, 3, 9]),
+    ("cells 1-3, 9 on vcan0: stopped sending, or never sent", |it| {
+        it.buses[0].silent_cells = vec![1, 2, 3, 9]
+    }),
     ("host cells: gone once for 0.5 s in all, not reached at the end, 1 frame lost; ", |it| {
         let name = "cells".to_owned();
         it.buses[0].hosts.push(HostSummary {
@@ -138,14 +140,14 @@ const CASES: &[Case] = &[
             ..HostSummary::default()
         });
     }),
-    ("12 replies missing without a reason (unknown) on vcan0: ", |it| {
+    ("12 replies missing for no known reason (unknown) on vcan0: ", |it| {
         it.buses[0].replies.in_time -= 12;
         it.buses[0].replies.unknown = 12;
     }),
-    ("1 packet sent by cells and not received, without a reason (unknown), on vcan0", |it| {
+    ("1 packet sent by cells and not received, for no known reason (unknown), on vcan0", |it| {
         it.buses[0].uplink.unknown = 1;
     }),
-    ("5 of 900 cells due in sums missing on vcan0: ", |it| {
+    ("5 of 900 cells due in sums were missing on vcan0: ", |it| {
         let contributions = Contributions { due: 900, in_time: 895, missing: 5, ..Contributions::default() };
         it.buses[0].sums = Some(SumsSummary { contributions, ..SumsSummary::default() });
     }),
@@ -158,12 +160,12 @@ const CASES: &[Case] = &[
     ("mean error of sums 2.9e-2 Nm", |it| it.accuracy.sums = [0.029].into_iter().collect()),
     ("3 torques saturated: ", |it| count(it, "saturated", 3)),
     ("cell 6 on vcan0: stuck", |it| _ = it.cells[5].stuck.insert("torque", 40)),
-    ("4 torques of cells that nothing touched", |it| it.buses[0].replies.unexpected = 4),
+    ("4 torques of cells that were not touched", |it| it.buses[0].replies.unexpected = 4),
     ("cells 7, 9 on vcan0: restarted", |it| [6, 8].into_iter().for_each(|at| it.cells[at].restarts = 1)),
-    ("the robot was halted once and resumed, at first because a halt frame", |it| {
+    ("the robot was halted once and resumed; the first reason: a halt frame", |it| {
         it.halts.insert(0, halt(0.5, Some(0.6)));
     }),
-    ("the recording is incomplete, without 2 frames and 1 other message: ", |it| {
+    ("the recording is incomplete, it lacks 2 frames and 1 other message: ", |it| {
         let messages_lost = [("ticks", 1)].into();
         it.recording =
             Some(RecordingAccount { lost: 2, lost_queue: 2, messages_lost, ..RecordingAccount::default() });
@@ -176,19 +178,19 @@ const CASES: &[Case] = &[
         it.buses[0].uplink.dropped = 4;
         it.buses[0].dropped_by_bus = 4;
     }),
-    ("cell 10 on vcan0: contact not known", |it| it.cells[9].contact_unknown = 1),
+    ("cell 10 on vcan0: contact unknown", |it| it.cells[9].contact_unknown = 1),
     ("cell 11 on vcan0: in mode \"measure\"", |it| it.cells[10].mode = Some("measure")),
     ("2 bad cycles, most of them because the torque is not valid", |it| {
         _ = it.control.bad_cycles.insert("the torque is not valid".to_owned(), 2);
     }),
-    ("3 frames of the gateway not sent: ", |it| it.control.unsent = 3),
+    ("3 frames of the gateway were not sent: ", |it| it.control.unsent = 3),
     ("9 late and 2 skipped by cells that received the joints too late of 17772 replies on vcan0: ", |it| {
         let replies = &mut it.buses[0].replies;
         replies.in_time -= 11;
         (replies.late, replies.too_late, replies.skipped) = (8, 1, 2);
     }),
     (
-        "8 of 1008 ticks of the control loop skipped, 1 of them with joints: this machine was busy (SCHED_FIFO was refused)",
+        "8 of 1008 ticks of the control loop skipped, 1 of them with a joints message: this machine was busy (SCHED_FIFO was refused)",
         |it| {
             (it.control.ticks, it.control.ticks_skipped, it.control.broadcasts_skipped) = (1_000, 8, 1);
         },
@@ -248,7 +250,7 @@ fn the_error_of_a_file_says_what_to_do_with_it_and_no_other_hint_does() {
             RecordingAccount { lost_write, errors, files: vec![file], ..RecordingAccount::default() };
         Summary { recording: Some(recording), ..well() }.lost_frames().unwrap()
     };
-    let taken = "r.mcap: taken; r.mcap.part is the whole recording: rename it";
+    let taken = "r.mcap: taken; r.mcap.part is the complete recording: rename it";
     assert_eq!(failure(0, &[taken]), format!("the recording has an error: {taken}"));
     let both = failure(2, &["r.mcap: no room", taken]);
     assert_eq!(
@@ -309,10 +311,13 @@ fn torques_in_sums_are_checked_too() {
         let parts = &mut it.buses[0].sums.as_mut().unwrap().contributions;
         (parts.in_time, parts.late) = (890, 10);
     });
-    assert!(late.len() == 1 && late[0].starts_with("10 of 900 cells due in sums late on vcan0"), "{late:?}");
+    assert!(
+        late.len() == 1 && late[0].starts_with("10 of 900 cells due in sums were late on vcan0"),
+        "{late:?}"
+    );
     let unasked = change(|it| it.buses[0].sums.as_mut().unwrap().contributions.unasked = 2);
     assert!(
-        unasked.len() == 1 && unasked[0].starts_with("2 torques of cells that nothing touched"),
+        unasked.len() == 1 && unasked[0].starts_with("2 torques of cells that were not touched"),
         "{unasked:?}"
     );
     let never = change(|it| it.buses[0].network.as_mut().unwrap().tree_ready_s = None);

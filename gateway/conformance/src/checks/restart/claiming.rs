@@ -115,7 +115,9 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
     let counters = session.counters()?;
     let is_so = counters.heard.joints == 2 && counters.heard.torques == 0;
     session.check("CLAIM-2", is_so, || {
-        format!("a claiming cell must count 2 joints and no torques, but the counters are {counters}")
+        format!(
+            "a claiming cell must count 2 joints messages and no torques, but the counters are {counters}"
+        )
     });
     let refused = protocol::message::RejectedCounts { stimuli: u16::from(!presses), ..Default::default() };
     session.check("CLAIM-2", counters.refused == refused, || {

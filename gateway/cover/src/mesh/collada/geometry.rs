@@ -82,7 +82,10 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             let points = self.points(indices, corners)?;
             let (all, rest) = points.as_chunks();
             if !rest.is_empty() {
-                return Err(self.error(&format!("triangles have {} corners, no multiple of 3", points.len())));
+                return Err(self.error(&format!(
+                    "triangles have {} corners, which is not a multiple of 3",
+                    points.len()
+                )));
             }
             triangles.extend_from_slice(all);
         }
@@ -103,7 +106,9 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         let announced = sizes.iter().fold(0_usize, |sum, size| sum.saturating_add(*size));
         if announced != points.len() {
             let got = points.len();
-            return Err(self.error(&format!("a polylist has {got} corners, but its vcount {announced}")));
+            return Err(
+                self.error(&format!("a polylist has {got} corners, but its vcount announces {announced}"))
+            );
         }
         self.check_count(element, "polygons", sizes.len())?;
         let mut rest = points.as_slice();
@@ -143,7 +148,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     fn check_count(&self, element: Node<'_, '_>, what: &str, got: usize) -> Result<(), MeshError> {
         match element.attribute("count").map(|count| count.trim().parse::<usize>()) {
             Some(Ok(count)) if count != got => {
-                Err(self.error(&format!("{got} {what} are there, but {count} are announced")))
+                Err(self.error(&format!("the file has {got} {what}, but announces {count}")))
             }
             _ => Ok(()),
         }
@@ -156,14 +161,15 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         let groups = indices.chunks_exact(*stride);
         if !groups.remainder().is_empty() {
             let got = indices.len();
-            return Err(self
-                .error(&format!("{got} indices of {kind} are no multiple of {stride}, those of a corner")));
+            return Err(self.error(&format!(
+                "{got} indices of {kind} are not a multiple of {stride}, the number per corner"
+            )));
         }
         let point = |group: &[usize]| {
             let index = group.get(*offset).copied().unwrap_or(usize::MAX);
             points.get(index).copied().ok_or_else(|| {
                 self.error(&format!(
-                    "vertex {index} of {kind} is not there; the geometry has {}",
+                    "vertex {index} of {kind} does not exist; the geometry has {} vertices",
                     points.len()
                 ))
             })
@@ -177,7 +183,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         let source = input.attribute("source").unwrap_or_default();
         let own = self.own.find(kind, source)?;
         let found = own.map_or_else(|| self.all.find(kind, source), |own| Ok(Some(own)))?;
-        found.ok_or_else(|| self.error(&format!("{kind} {source:?} is not there")))
+        found.ok_or_else(|| self.error(&format!("{kind} {source:?} does not exist")))
     }
 
     /// Reads the inputs of a primitive, which state what the indices of its corners refer to.
@@ -189,7 +195,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             let offset = text.trim().parse().ok().filter(|offset| *offset < MAX_INDICES_PER_CORNER);
             let offset = offset.ok_or_else(|| {
                 self.error(&format!(
-                    "an input has the offset {text:?}, not one of 0 to {}",
+                    "an input has the offset {text:?}; allowed is 0 to {}",
                     MAX_INDICES_PER_CORNER - 1
                 ))
             })?;
@@ -223,7 +229,9 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         let values = values.get(number("offset").unwrap_or(0)..).unwrap_or_default();
         let stride = number("stride").unwrap_or(3);
         if stride < 3 {
-            return Err(self.error(&format!("a source of positions has {stride} numbers each, not 3")));
+            return Err(
+                self.error(&format!("a source of positions has {stride} numbers per position, not 3"))
+            );
         }
         let groups = values.chunks(stride);
         let points = groups.filter_map(|group| group.first_chunk().map(|&[x, y, z]| Point3::new(x, y, z)));

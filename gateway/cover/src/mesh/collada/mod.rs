@@ -159,7 +159,7 @@ impl<'a, 'i> SceneReader<'a, 'i> {
     /// Returns the element of this kind to which the `url` of an element refers. It must be in the same file.
     fn referred(&self, node: Node<'_, '_>, kind: &str) -> Result<Node<'a, 'i>, MeshError> {
         let url = node.attribute("url").unwrap_or_default();
-        let missing = || self.error(&format!("{kind} {url:?} is not there"));
+        let missing = || self.error(&format!("{kind} {url:?} does not exist"));
         self.names.find(kind, url)?.ok_or_else(missing)
     }
 

@@ -71,7 +71,7 @@ fn a_name_of_several_elements_is_refused_where_it_is_used() {
     let elsewhere =
         geometry("c", 0.0, TRIANGLES).replace("source=\"#pos\"/></vertices>", "source=\"#far\"/></vertices>");
     let missing = parse(&file(&elsewhere, &placed(&["c"]), "")).unwrap_err();
-    assert!(missing.contains("source \"#far\" is not there"), "{missing}");
+    assert!(missing.contains("source \"#far\" does not exist"), "{missing}");
     let far = geometry("d", 9.0, "").replace("<source id=\"pos\"", "<source id=\"far\"");
     assert_eq!(places(&parse(&file(&(elsewhere + &far), &placed(&["c"]), "")).unwrap()), [9.0]);
 }
@@ -83,7 +83,7 @@ fn nodes_and_scenes_are_found_by_kind_and_missed_in_words() {
     let mesh = parse(&file(&shape, r##"<node><instance_node url="#a"/></node>"##, library)).unwrap();
     assert_eq!(places(&mesh), [2.0]);
     for (nodes, words) in [
-        (r##"<node><instance_node url="#b"/></node>"##, "node \"#b\" is not there"),
+        (r##"<node><instance_node url="#b"/></node>"##, "node \"#b\" does not exist"),
         (r#"<node><instance_node url="b.dae#a"/></node>"#, "its node \"b.dae#a\" is not in this file"),
         (r##"<node><instance_controller url="#c"/></node>"##, "controller \"#c\" deforms a mesh"),
     ] {
@@ -91,7 +91,7 @@ fn nodes_and_scenes_are_found_by_kind_and_missed_in_words() {
         assert!(error.contains(words), "{error}");
     }
     let lost = file(&shape, &placed(&["a"]), "").replace("scene url=\"#a\"", "scene url=\"#z\"");
-    assert!(parse(&lost).unwrap_err().contains("visual_scene \"#z\" is not there"));
+    assert!(parse(&lost).unwrap_err().contains("visual_scene \"#z\" does not exist"));
 }
 
 #[test]
@@ -115,7 +115,7 @@ fn polygons_of_each_kind_have_their_own_area() {
     for (primitives, words) in [
         (
             format!("<polylist>{input}<vcount>5</vcount><p>0 1 2</p></polylist>"),
-            "has 3 corners, but its vcount 5",
+            "has 3 corners, but its vcount announces 5",
         ),
         (
             format!("<polylist>{input}<vcount>3</vcount><p>0 1 2 3</p></polylist>"),
@@ -123,11 +123,11 @@ fn polygons_of_each_kind_have_their_own_area() {
         ),
         (
             format!("<triangles>{input}<p>0 1 2 3</p></triangles>"),
-            "triangles have 4 corners, no multiple of 3",
+            "triangles have 4 corners, which is not a multiple of 3",
         ),
         (
             format!("<triangles count=\"2\">{input}<p>0 1 2</p></triangles>"),
-            "1 triangles are there, but 2 are announced",
+            "the file has 1 triangles, but announces 2",
         ),
         (
             format!("<polygons count=\"1\">{input}<p>0 2 1 4</p></polygons>"),
@@ -138,7 +138,7 @@ fn polygons_of_each_kind_have_their_own_area() {
         assert!(error.contains(words), "{error}");
     }
     let short = file(&geometry("a", 0.0, TRIANGLES), &placed(&["a"]), "").replace("  0 0 3<", "<");
-    assert!(parse(&short).unwrap_err().contains("9 numbers of a source are there, but 12 are announced"));
+    assert!(parse(&short).unwrap_err().contains("the file has 9 numbers of a source, but announces 12"));
 }
 
 #[test]

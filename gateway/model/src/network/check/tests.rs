@@ -355,9 +355,9 @@ fn exchanged_cells_and_cells_without_a_node_id_are_named() {
     assert_eq!(
         lines,
         [
-            "node id 2 is used by the cell with serial number 501, which is described as cell 1; 502 is described \
-             there: exchange the cells, or their serial numbers in the description",
-            "a cell without a node id is at port 2 of cell 2: it gets one from the network, unless all are used",
+            "node id 2 is used by serial number 501, which is cell 1 in the description; cell 2 has serial number 502 \
+             there: swap the cells, or their serial numbers in the description",
+            "a cell without a node id is wired to port 2 of cell 2: the network assigns one, unless all are in use",
         ]
     );
 }

@@ -132,7 +132,7 @@ impl McapState {
 
     /// Records that the file ends without a footer, after `read` bytes.
     pub(super) fn record_truncation(&mut self, read: u64) {
-        let why = || format!("it has no end: after {read} bytes it was cut off, or never finished");
+        let why = || format!("its end is missing: it was cut off after {read} bytes, or never finished");
         self.extras.unfinished.get_or_insert_with(why);
     }
 

@@ -19,7 +19,7 @@ pub enum EditError {
     #[error("its cells are not [[cell]] tables")]
     NoCells,
     /// The numbers of cells in the text and in the skin differ.
-    #[error("{found} cells, not {expected}")]
+    #[error("it has {found} cells, not {expected}")]
     Count {
         /// Number of cells in the text.
         found: usize,

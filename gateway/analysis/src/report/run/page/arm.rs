@@ -45,8 +45,8 @@ impl PageDraft<'_> {
         if !loaded.is_empty() {
             let when = if self.run.frames_only.is_some() { "before each broadcast" } else { "at each tick" };
             section = section.text(format!("The upper curve is the sum of the torques received {when}. The lower curve is the \
-             difference, once per epoch, of all cells' answers to the same joints and the central computation for them; an epoch without an \
-             answer in time is a gap. Dotted: one step of the torque words."));
+             difference, once per epoch, between the sum of all cells' answers and the central computation for the same joints; an epoch without an \
+             answer in time is a gap. Dotted lines: one step of the torque words."));
             let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.count() > 0);
             let lacks = self.missing_sentence(
                 "stimuli or sensors from which central torques, and the difference to them, follow",
@@ -56,7 +56,7 @@ impl PageDraft<'_> {
         if !free.is_empty() {
             let names: Vec<_> = free.iter().map(|joint| self.joint_name(*joint)).collect();
             section = section.text(format!(
-                "Torques below the resolution (half a step of the words), distributed and central: {}.",
+                "Joints whose torques, distributed and central, are all below the resolution (half a step of the words): {}.",
                 names.join(", ")
             ));
         }

@@ -56,7 +56,7 @@ impl PageDraft<'_> {
         };
         let y = Axis::new(unit, "");
         let lost = bus_figures.reply_counts().late + bus_figures.reply_counts().missing;
-        let slowest = format!("{name}: from joints to the last reply for them, epoch by epoch");
+        let slowest = format!("{name}: time from the joints message to its last reply, by epoch");
         let [due, late] = [
             [("due", &bus_figures.lines.due), ("in time", &bus_figures.lines.in_time)],
             [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
@@ -160,7 +160,7 @@ impl PageDraft<'_> {
         } else {
             "All cells".to_owned()
         };
-        let title = format!("{title}: by replies late or missing, then losses, then the slowest reply");
+        let title = format!("{title}, sorted by late or missing replies, then losses, then slowest reply");
         Some(Table::new(title, head, rows))
     }
 
@@ -205,7 +205,7 @@ impl PageDraft<'_> {
         let figure = |bus_figures: &BusFigures| {
             let BusFigures { name, load, load_of_all, rates, .. } = bus_figures;
             let (rates, width) = (rates.rates, quantity(load.width(), "s"));
-            let title = format!("{name}: load of a real bus at {rates}, over {width} each");
+            let title = format!("{name}: load of a real bus at {rates}, averaged over {width}");
             self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
                 .draw("load of a real bus", Shape::Steps, self.load_percent(load))
                 .draw("including bench-only frames", Shape::Dashed, stairs(&self.load_percent(load_of_all)))
@@ -247,7 +247,7 @@ impl PageDraft<'_> {
             let name = &bus_figures.name;
             let uplink = bus_figures.table.uplink();
             row(format!("{name}: frames recorded"), bus_figures.frames, true);
-            row(format!("{name}: frames lost by the recorder, by its own notes"), bus_figures.dropped, true);
+            row(format!("{name}: frames that the recorder reported as lost"), bus_figures.dropped, true);
             row(format!("{name}: packets that cells sent, by their own count"), uplink.sent, true);
             row(format!("{name}: packets lost, of those that cells sent"), uplink.lost, true);
             row(format!("{name}: packets refused, of those that cells sent"), uplink.rejected, false);

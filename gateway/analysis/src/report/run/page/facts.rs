@@ -26,7 +26,7 @@ pub(super) fn facts(run: &RunData, command: &str) -> Vec<(String, String)> {
         format!("woke a thread {idle} late (median), 99 % within {p99}, at most {max}")
     });
     let clock = format!(
-        "{}, of {}; wall clock in steps of {} ns",
+        "{} (available: {}); wall clock in steps of {} ns",
         machine("clocksource"),
         machine("clocksources"),
         machine("realtime_resolution_ns")

@@ -87,7 +87,7 @@ impl PageDraft<'_> {
         let legend = Legend::for_values("force", "N", rows.iter().map(|(_, max, _)| *max));
         let title = match rest.first() {
             None => {
-                format!("Force over time on the {touched} touched cells of {}", self.run.skin.cells.len())
+                format!("Force over time on the {touched} touched cells (of {})", self.run.skin.cells.len())
             }
             Some((_, max, _)) => format!(
                 "Force over time on the {MAX_STRIP_ROWS} cells with the largest forces; {} more were touched, with at most {}",
