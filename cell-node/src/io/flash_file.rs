@@ -174,7 +174,7 @@ mod tests {
         first.store(&FlashContent::default()).unwrap();
         first.store(&FlashContent::default()).unwrap();
         let name = fs::read_to_string("/proc/self/comm").unwrap();
-        let who = format!("process {} ({}) uses it", std::process::id(), name.trim_end());
+        let who = format!("process {} ({}) is using it", std::process::id(), name.trim_end());
         for error in
             [second.load().map(drop).unwrap_err(), second.store(&FlashContent::default()).unwrap_err()]
         {

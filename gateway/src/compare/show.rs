@@ -197,7 +197,7 @@ impl ComparisonText<'_> {
         let cell = first.cell.map_or_else(String::new, |cell| format!(" of cell {cell}"));
         let joint = first.joint.map_or_else(String::new, |joint| format!(", joint {joint}"));
         let mut text = format!(
-            "the first difference: {what}{cell} on {}{joint}, epoch {epoch} (joint broadcast {number})\n",
+            "first difference: {what}{cell} on {}{joint}, epoch {epoch} (broadcast {number})\n",
             printable(bus)
         );
         for (letter, which) in [("A", CaptureSide::A), ("B", CaptureSide::B)] {

@@ -39,7 +39,7 @@ pub(super) fn text(name: &str, what: &str, report: &StatsReport, extras: Option<
 
 /// A rate with the time span that it covers.
 fn per_s(rate: Option<f64>, span_s: f64) -> String {
-    or_else_text(rate.map(|rate| format!("{rate:.1} per second over {} s", seconds_text(span_s))), "")
+    or_else_text(rate.map(|rate| format!("{rate:.1} per s over {} s", seconds_text(span_s))), "")
 }
 
 /// Formats seconds with enough digits to differ from zero.

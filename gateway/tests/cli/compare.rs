@@ -280,7 +280,7 @@ fn a_report_for_servers_has_a_case_for_each_aspect_and_replaces_no_file_unasked(
         "{xml}"
     );
     assert!(xml.contains("name=\"torques\"><failure message=\""), "{xml}");
-    assert!(xml.contains("the first difference: torque of cell "), "{xml}");
+    assert!(xml.contains("first difference: torque of cell "), "{xml}");
     let said = refusal(folder, "compare fd.mcap fd.log --junit out.xml", 2);
     assert!(said.starts_with("--junit out.xml: it exists"), "{said}");
     assert_eq!(gateway(folder, "compare fd.mcap fd.log --junit out.xml --overwrite").0, Some(0));

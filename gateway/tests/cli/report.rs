@@ -55,7 +55,7 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
     let begun = refuses(&folder, "begun.mcap", 1);
     assert!(
         begun.starts_with(
-            "begun.mcap contains no run that can be shown: skin.toml is not attached to it (it has no end"
+            "begun.mcap contains no run that can be shown: skin.toml is not attached to it (its end is missing"
         ),
         "{begun}"
     );

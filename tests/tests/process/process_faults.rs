@@ -198,7 +198,7 @@ fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason
             let note = format!("the process of cells 1 to 4 on vcan1 ended (exit status: 1: {why})\n");
             assert!(ended.stderr.contains(&note), "{ended:#?}");
         }
-        assert!(ended.stdout.contains("ended by errors of their own"), "{}", ended.stdout);
+        assert!(ended.stdout.contains("4 cells ended with errors"), "{}", ended.stdout);
     }
 }
 

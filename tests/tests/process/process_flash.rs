@@ -176,7 +176,7 @@ fn two_programs_do_not_use_one_cells_file_at_a_time() {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     let who = running.cell(1).as_raw_nonzero();
     assert!(ended.stderr.contains(&format!("flash of cell 1 ({flash}/vcan0-1.flash)")), "{ended:#?}");
-    assert!(ended.stderr.contains(&format!("process {who} (cell-node) uses it")), "{ended:#?}");
+    assert!(ended.stderr.contains(&format!("process {who} (cell-node) is using it")), "{ended:#?}");
     // A cell started alone reports it too; a cell without a file starts.
     let words = |node| {
         format!("--bus vcan0 --bus-kind embedded --node {node} --skin skin.toml --flash {flash} --fresh")

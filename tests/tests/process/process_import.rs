@@ -413,7 +413,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         ),
         (
             "cell,force_n,q\n2,1,0 -6.3\n",
-            "skinbus: rows.csv, row 1: cell 2: position -6.3 rad: elbow takes -6.2832 to 6.2832 rad",
+            "skinbus: rows.csv, row 1: cell 2: position -6.3 rad: elbow allows -6.2832 to 6.2832 rad",
         ),
     ] {
         place.write("rows.csv", text);

@@ -283,7 +283,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
     side.until("a tree", Side::is_tree_ready);
     let without = cells(&place, "--node 1", "");
     let said = without.end();
-    assert!(said.refusal(1).contains("cell 1 is on vcan0 already"), "{said:?}");
+    assert!(said.refusal(1).contains("cell 1 is already on vcan0"), "{said:?}");
 
     let before = heard(&mut side);
     first.signal(Signal::TERM);

@@ -186,7 +186,7 @@ fn files_that_cannot_be_written_are_noticed_before_the_run() {
     }
     let both = "run skin.toml --bus-kind embedded --candump file --summary file";
     let said = refusal(&place, "skinbus", both, 2);
-    assert_eq!(said, "skinbus: --summary and --candump name the same file: name two");
+    assert_eq!(said, "skinbus: --summary and --candump name the same file: name two different files");
 }
 
 #[test]

@@ -104,8 +104,8 @@ fn invalid_input_is_refused_in_one_line() {
     let zip = place.path("some.zip");
     fs::write(&zip, b"PK\x03\x04..............").unwrap();
     for (words, code, said) in [
-        ("empty.log", 1, "skinbus: empty.log: there is no frame in it"),
-        ("none.log", 1, "skinbus: none.log: there is no frame in it"),
+        ("empty.log", 1, "skinbus: empty.log contains no frame"),
+        ("none.log", 1, "skinbus: none.log contains no frame"),
         ("nothing.log", 2, "skinbus: nothing.log: No such file"),
         ("some.zip", 2, "skinbus: some.zip is a zip"),
         ("-", 2, "skinbus: a replay reads its capture twice, which standard input does not allow"),

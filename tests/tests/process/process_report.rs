@@ -249,10 +249,10 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
     fs::write(place.path("cut.mcap"), &bytes[..bytes.len() / 2]).unwrap();
     let ended = place.start("skinbus", "report cut.mcap").end().succeeded();
     assert_eq!(ended.stderr.matches('\n').count(), 1, "{ended:?}");
-    for words in ["skinbus: cut.mcap: it has no end", "of the planned 2 s", "s are missing"] {
+    for words in ["skinbus: cut.mcap: its end is missing", "of the planned 2 s", "s are missing"] {
         assert!(ended.stderr.contains(words), "{words}: {ended:?}");
     }
-    assert!(place.read("cut.html").contains("The run is incomplete: it has no end"));
+    assert!(place.read("cut.html").contains("The run is incomplete: its end is missing"));
     // As much as a recovery finds.
     place.start("skinbus", "recover cut.mcap -o recovered.mcap").end().succeeded();
     let recovered = Recorded::read(&place.path("recovered.mcap"));

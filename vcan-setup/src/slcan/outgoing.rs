@@ -80,6 +80,8 @@ pub struct BusToLineQueue {
     is_up: bool,
     stage: OpeningStage,
     since_open: u64,
+    /// True if a frame was written since the adapter was opened.
+    has_written_frame: bool,
     /// The counts of the frames.
     pub account: ToLineCounts,
 }
@@ -123,6 +125,13 @@ impl BusToLineQueue {
     #[must_use]
     pub const fn stage(&self) -> OpeningStage {
         self.stage
+    }
+
+    /// Returns true if a frame was written since the adapter was opened. Without one, all that the adapter can have
+    /// refused are the commands that opened it.
+    #[must_use]
+    pub const fn has_written_frame(&self) -> bool {
+        self.has_written_frame
     }
 
     /// Records that the adapter refused `lines` lines. As many sent frames are counted as refused instead of sent.
@@ -193,10 +202,11 @@ impl BusToLineQueue {
                 QueuedTextKind::Frame => {
                     self.account.sent += 1;
                     self.since_open += 1;
+                    self.has_written_frame = true;
                 }
                 QueuedTextKind::Command(stage) => {
                     if stage == OpeningStage::Open {
-                        self.since_open = 0;
+                        (self.since_open, self.has_written_frame) = (0, false);
                     }
                     self.stage = stage;
                 }

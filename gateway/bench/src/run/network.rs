@@ -358,7 +358,7 @@ mod tests {
         let deeper = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2)), Some((Some(3), 3))];
         let look = network.check_running(at(4), &view(&deeper, new));
         let [note] = look.notes.as_slice() else { panic!("{look:?}") };
-        assert!(note.contains("slot_us = 4000 would") && note.contains("deeper than 2"), "{note}");
+        assert!(note.contains("set slot_us = 4000") && note.contains("deeper than 2"), "{note}");
     }
 
     #[test]

@@ -63,8 +63,9 @@ pub struct OtherDatagrams {
 
 impl Display for OtherDatagrams {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let named = |count| format!("{count} datagrams came that are not a hello of this version");
-        let unnamed = |count| format!("{count} datagrams came from a socket without an address: bind it");
+        let datagrams = |count| format!("{count} datagram{}", if count == 1 { "" } else { "s" });
+        let named = |count| format!("{} without a hello of this version", datagrams(count));
+        let unnamed = |count| format!("{} from a socket without an address: bind it", datagrams(count));
         match (self.named, self.unnamed) {
             (0, 0) => Ok(()),
             (count, 0) => write!(f, " ({})", named(count)),

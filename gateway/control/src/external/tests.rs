@@ -363,10 +363,10 @@ fn a_controller_that_never_says_hello_is_absent_whatever_else_comes() {
     program.send(&of_another_version).unwrap();
     program.send(&velocity(0, 0.5)).unwrap();
     gateway.step(&input(1));
-    absent(&gateway, &path, None, " (2 datagrams came that are not a hello of this version): start it");
+    absent(&gateway, &path, None, " (2 datagrams without a hello of this version): start it");
     UnixDatagram::unbound().unwrap().send_to(HELLO, &path).unwrap();
     gateway.step(&input(2));
-    absent(&gateway, &path, Some(25), ", 1 came from a socket without an address");
+    absent(&gateway, &path, Some(25), ", 1 datagram from a socket without an address");
 }
 
 #[test]

@@ -214,7 +214,9 @@ impl BusTable {
                 );
             } else if let NetworkPage::Rejected(_) = page {
                 cell.said.counters = true;
-            } else if let (NetworkPage::Tree(tree), true, false) = (page, cell.root, self.follows_root_wires)
+            } else if let NetworkPage::Tree(tree) = page
+                && cell.root
+                && self.root_totals.as_ref().is_some_and(|totals| !totals.follows_wires)
             {
                 let root = cell.node;
                 self.set_root_feeds_gateway(root, tree.parent == Some(0));

@@ -146,8 +146,6 @@ pub struct BusTable {
     difference: Option<[f64; MAX_JOINTS]>,
     delays: Delays,
     notices: VecDeque<Notice>,
-    /// True if the wires to the roots, and not their tree pages, tell which root sends its sums to the gateway.
-    follows_root_wires: bool,
 }
 
 /// The torque format and the chain length of a bus.
@@ -200,7 +198,6 @@ impl BusTable {
             difference: None,
             delays: Delays::default(),
             notices: VecDeque::new(),
-            follows_root_wires: false,
         }
     }
 
@@ -214,7 +211,7 @@ impl BusTable {
     /// sums to the gateway; until then none does. Without this, all roots do until a tree page of theirs names another
     /// parent.
     pub fn follow_root_wires(&mut self) {
-        self.follows_root_wires = true;
+        self.root_totals.iter_mut().for_each(|totals| totals.follows_wires = true);
         self.cells
             .iter_mut()
             .filter_map(|cell| cell.sums.as_mut())

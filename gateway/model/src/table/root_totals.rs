@@ -181,6 +181,8 @@ pub(super) struct RootTotals {
     pub(super) counts: SumCounts,
     pub(super) contributions: Contributions,
     pub(super) error: SumError,
+    /// True if the wires to the roots, and not their tree pages, tell which root sends its sums to the gateway.
+    pub(super) follows_wires: bool,
 }
 
 /// The classification of a root's sum.

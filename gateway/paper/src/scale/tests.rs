@@ -115,7 +115,7 @@ fn bars_are_rated_by_what_was_measured() {
     assert_eq!(rated(&measured, "private memory").1, FindingVerdict::Better);
     measured.beside = [1.0, 4.0, 4.5];
     assert_eq!(rated(&measured, "without threads").1, FindingVerdict::Worse);
-    assert_eq!(rated(&measured, "buses too").1, FindingVerdict::Better);
+    assert_eq!(rated(&measured, "measured the same way").1, FindingVerdict::Better);
     measured.sizes[1].active.memory_mb[0] = 201.0;
     assert_eq!(rated(&measured, "private memory").1, FindingVerdict::Worse);
 }

@@ -242,7 +242,10 @@ fn cells_on_a_foreign_bus_reports_that_frames_came_and_none_of_a_cell() {
     let Output { status, stderr, .. } = child.wait_with_output().unwrap();
     let said = text(&stderr);
     assert_eq!(status.code(), Some(1), "{said}");
-    assert!(said.contains(" frames are not from cells; `skinbus dump` shows them): start them"), "{said}");
+    assert!(
+        said.contains(" frames are not from cells; `skinbus dump` shows them): start the cells"),
+        "{said}"
+    );
 }
 
 #[test]

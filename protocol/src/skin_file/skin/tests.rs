@@ -180,7 +180,7 @@ fn names_that_mislead_are_refused_and_escaped_in_recordings() {
     let long = format!("name = \"{}\"", "e".repeat(201));
     assert_eq!(
         says("name = \"elbow\"", &long),
-        "skin.toml:5: robot.name = 201 characters: a name has at most 200"
+        "skin.toml:5: robot.name = 201 characters: a name has at most 200 characters"
     );
     Skin::parse_recorded("skin.toml", &GOOD.replacen("name = \"elbow\"", &long, 1)).unwrap();
     for name in ["Grüße 機器人", "a b", "\u{1f916}"] {
