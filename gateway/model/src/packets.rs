@@ -12,7 +12,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id};
 use protocol::message::{Message, MessageError};
-use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembler, Reassembly, data_id};
+use protocol::packet::{Length, Lengths, Packet, PacketError, PacketRef, Reassembler, Reassembly, data_id};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
@@ -145,14 +145,17 @@ impl PacketReader {
         frame: &Frame,
     ) -> (Result<Packet, NoPacket>, PendingSegments) {
         let Ok(id) = data_id(frame) else { return (Err(NoPacket::NotData), PendingSegments::default()) };
-        let packet = match self.format.unwrap_or_else(|| frame.format()) {
-            Format::Fd => Packet::from_fd(frame).and_then(|packet| self.check_length(packet)),
+        let error = match self.format.unwrap_or_else(|| frame.format()) {
+            Format::Fd => match PacketRef::from_fd(frame).and_then(|packet| self.check_length(packet)) {
+                Ok(packet) => return (Ok(packet.to_packet()), PendingSegments::default()),
+                Err(error) => error,
+            },
             Format::Classic if frame.format() == Format::Fd => {
-                Err(PacketError::Length { expected: 8, got: frame.data().len() })
+                PacketError::Length { expected: 8, got: frame.data().len() }
             }
             Format::Classic => return self.reassemble(at, id, frame),
         };
-        (packet.map_err(|error| NoPacket::Damaged(id, error)), PendingSegments::default())
+        (Err(NoPacket::Damaged(id, error)), PendingSegments::default())
     }
 
     /// Does the second half of [`read`](Self::read): decodes a packet.
@@ -168,12 +171,12 @@ impl PacketReader {
     }
 
     /// Checks that the length of a packet fits the described chain.
-    fn check_length(&self, packet: Packet) -> Result<Packet, PacketError> {
+    fn check_length<'b>(&self, packet: PacketRef<'b>) -> Result<PacketRef<'b>, PacketError> {
         match self.length {
             ChainLength::Described(length)
-                if packet.words.length() != length && Lengths::for_id(packet.id) == Lengths::ALL =>
+                if packet.length() != length && Lengths::for_id(packet.id()) == Lengths::ALL =>
             {
-                Err(PacketError::Length { expected: length.bytes(), got: packet.words.length().bytes() })
+                Err(PacketError::Length { expected: length.bytes(), got: packet.length().bytes() })
             }
             ChainLength::Described(_) | ChainLength::FromJoints(_) => Ok(packet),
         }
@@ -194,8 +197,8 @@ impl PacketReader {
         };
         let segments = self.segments.entry(id);
         let before = segments.waiting();
-        let packet = match segments.push(at, id, lengths, frame.data()) {
-            Ok(Reassembly::Complete(packet)) => Ok(packet),
+        let packet = match segments.push_borrowed(at, id, lengths, frame.data()) {
+            Ok(Reassembly::Complete(packet)) => Ok(packet.to_packet()),
             Ok(Reassembly::Waiting) => Err(NoPacket::Segment(id)),
             Ok(Reassembly::Incomplete) => Err(NoPacket::AfterLost(id)),
             Ok(Reassembly::Ambiguous) => Err(NoPacket::Damaged(id, PacketError::Ambiguous)),

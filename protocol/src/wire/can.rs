@@ -222,6 +222,20 @@ impl Frame {
         Ok(Self { id, format, flags, raw_dlc: 0, len, data })
     }
 
+    /// Makes this a data frame with `len` bytes, which must not be more than the format can carry. Returns the bytes,
+    /// which the caller writes.
+    #[inline]
+    pub(crate) fn rewrite(&mut self, id: u32, format: Format, flags: u8, len: usize) -> &mut [u8] {
+        let before = usize::from(self.len);
+        if before > len {
+            self.data.get_mut(len..before).unwrap_or_default().fill(0);
+        }
+        (self.id, self.format, self.flags, self.raw_dlc) = (id, format, flags, 0);
+        let data = self.data.get_mut(..len).unwrap_or_default();
+        self.len = u8::try_from(data.len()).unwrap_or_default();
+        data
+    }
+
     /// Creates a remote frame that requests `len` bytes.
     ///
     /// # Errors

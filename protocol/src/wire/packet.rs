@@ -23,9 +23,11 @@
 //! the identifier as two bytes, little endian, and all bytes before the CRC. It includes the identifier so
 //! that a packet with another cell's identifier is refused.
 
+mod borrowed;
 mod length;
 mod reassembly;
 
+pub use borrowed::PacketRef;
 pub use length::{Length, Lengths, Words};
 pub use reassembly::{Reassembler, Reassembly};
 
@@ -177,21 +179,6 @@ impl PacketError {
 }
 
 impl Packet {
-    /// Encodes the packet into a buffer. Returns the buffer and the number of bytes in use.
-    fn encode_all(&self) -> ([u8; MAX_BYTES], usize) {
-        let mut bytes = [0; MAX_BYTES];
-        let length = self.words.length();
-        let (words, tail) = bytes.as_chunks_mut::<2>().0.split_at_mut(length.words());
-        for (bytes, word) in words.iter_mut().zip(self.words.as_slice()) {
-            *bytes = word.to_le_bytes();
-        }
-        if let [end, crc, ..] = tail {
-            *end = [self.epoch.0, self.count];
-            *crc = checksum(self.id, words, *end).to_le_bytes();
-        }
-        (bytes, length.bytes())
-    }
-
     /// Returns the bytes to which the fields of [`crate::schema`] refer: the first six words, epoch and count as in a
     /// packet of six words, then the other words.
     #[must_use]
@@ -205,8 +192,10 @@ impl Packet {
     /// Encodes the packet to bytes.
     #[must_use]
     pub fn encode(&self) -> Bytes {
-        let (bytes, sent) = self.encode_all();
-        bytes.into_iter().take(sent).collect()
+        let mut bytes = Bytes::new();
+        let _ = bytes.resize(self.words.length().bytes(), 0);
+        self.write_all(&mut bytes);
+        bytes
     }
 
     /// Decodes the bytes of a packet that was received with identifier `id`. Never panics.
@@ -214,40 +203,75 @@ impl Packet {
     /// # Errors
     /// Returns an error if packets of this kind cannot have that length, or the CRC is wrong.
     pub fn decode(id: Id, bytes: &[u8]) -> Result<Self, PacketError> {
-        let lengths = Lengths::for_id(id);
-        let wrong = PacketError::Length { expected: lengths.first().bytes(), got: bytes.len() };
-        let length =
-            Length::from_byte_count(bytes.len()).filter(|&length| lengths.contains(length)).ok_or(wrong)?;
-        let (chunks, _) = bytes.as_chunks::<2>();
-        let [words @ .., end, crc] = chunks else {
-            return Err(wrong);
-        };
-        let (expected, got) = (checksum(id, words, *end), u16::from_le_bytes(*crc));
-        if expected != got {
-            return Err(PacketError::Crc { expected, got });
-        }
-        let mut all = [0; MAX_WORDS];
-        for (word, bytes) in all.iter_mut().zip(words) {
-            *word = i16::from_le_bytes(*bytes);
-        }
-        Ok(Self { id, words: Words::new(length, all), epoch: Epoch(end[0]), count: end[1] })
+        PacketRef::decode(id, bytes).map(|packet| packet.to_packet())
     }
 
-    /// Returns the frames that carry this packet: one FD frame with bit rate switch, or classic frames of 8
-    /// bytes, the last of which may be shorter.
-    pub fn frames(&self, format: Format) -> impl Iterator<Item = Frame> + use<> {
-        let id = u32::from(self.id.to_bits());
-        let (bytes, sent) = self.encode_all();
-        let step = match format {
-            Format::Fd => MAX_BYTES,
-            Format::Classic => SEGMENT_BYTES,
-        };
-        (0..sent).step_by(step).filter_map(move |from| {
-            let bytes = bytes.get(from..sent.min(from + step))?;
-            match format {
-                Format::Fd => Frame::fd(id, can::BIT_RATE_SWITCH, bytes).ok(),
-                Format::Classic => Frame::classic(id, bytes).ok(),
+    /// Encodes the packet to `bytes`, which has its size.
+    #[inline(always)]
+    fn write_all(&self, bytes: &mut [u8]) {
+        self.write_pairs(bytes.as_chunks_mut::<2>().0, 0);
+        if let Some((rest, crc)) = bytes.split_last_chunk_mut::<2>() {
+            *crc = checksum(self.id, rest).to_le_bytes();
+        }
+    }
+
+    /// Writes the words from the one with index `first`, and epoch and count if there is room after them.
+    #[inline(always)]
+    fn write_pairs(&self, pairs: &mut [[u8; 2]], first: usize) {
+        let words = self.words.as_slice().get(first..).unwrap_or_default();
+        for (pair, word) in pairs.iter_mut().zip(words) {
+            // Else this is a call of memcpy, which takes a Cortex-M0 longer than the loop.
+            core::hint::black_box(());
+            *pair = word.to_le_bytes();
+        }
+        if let Some(pair) = pairs.get_mut(words.len()) {
+            *pair = [self.epoch.0, self.count];
+        }
+    }
+
+    /// Returns the number of frames that carry this packet: 1 FD frame, or 2 to 4 classic frames.
+    #[must_use]
+    pub const fn frame_count(&self, format: Format) -> usize {
+        match format {
+            Format::Fd => 1,
+            Format::Classic => self.words.length().segments(),
+        }
+    }
+
+    /// Makes `frame` the frame with this number of those that carry the packet, from 0 to
+    /// [`frame_count`](Self::frame_count) - 1: an FD frame with bit rate switch, or a classic frame of 8 bytes, the
+    /// last of which may be shorter.
+    pub fn write_frame(&self, number: usize, format: Format, frame: &mut Frame) {
+        let (id, size) = (self.id.to_bits().into(), self.words.length().bytes());
+        match format {
+            Format::Fd => {
+                let flags = can::BIT_RATE_SWITCH | can::FD_FORMAT;
+                self.write_all(frame.rewrite(id, format, flags, size));
             }
+            Format::Classic => {
+                let first = number * SEGMENT_BYTES;
+                let data = frame.rewrite(id, format, 0, size.saturating_sub(first).min(SEGMENT_BYTES));
+                self.write_pairs(data.as_chunks_mut::<2>().0, first / 2);
+                if let (true, Some(crc)) = (first + data.len() == size, data.last_chunk_mut::<2>()) {
+                    *crc = self.checksum().to_le_bytes();
+                }
+            }
+        }
+    }
+
+    /// Returns the CRC, for a packet whose bytes are in several frames.
+    fn checksum(&self) -> u16 {
+        let mut bytes = [0; MAX_BYTES - 2];
+        self.write_pairs(bytes.as_chunks_mut::<2>().0, 0);
+        checksum(self.id, bytes.get(..self.words.length().bytes() - 2).unwrap_or_default())
+    }
+
+    /// Returns the frames that carry this packet, as [`write_frame`](Self::write_frame) writes them.
+    pub fn frames(&self, format: Format) -> impl Iterator<Item = Frame> + use<> {
+        let (packet, mut frame) = (*self, Frame::EMPTY);
+        (0..self.frame_count(format)).map(move |number| {
+            packet.write_frame(number, format, &mut frame);
+            frame
         })
     }
 
@@ -256,11 +280,7 @@ impl Packet {
     /// # Errors
     /// Returns an error if the frame is not an FD data frame with an 11-bit identifier, or does not contain a packet.
     pub fn from_fd(frame: &Frame) -> Result<Self, PacketError> {
-        let id = data_id(frame)?;
-        if frame.format() != Format::Fd {
-            return Err(PacketError::Length { expected: PACKET_BYTES, got: frame.data().len() });
-        }
-        Self::decode(id, frame.data())
+        PacketRef::from_fd(frame).map(|packet| packet.to_packet())
     }
 }
 
@@ -275,11 +295,12 @@ pub fn data_id(frame: &Frame) -> Result<Id, PacketError> {
     u16::try_from(frame.id()).map(Id::from_bits).map_err(|_| PacketError::Foreign)
 }
 
-fn checksum(id: Id, words: &[[u8; 2]], end: [u8; 2]) -> u16 {
+/// Returns the CRC of a packet, of its bytes before the CRC.
+#[inline(always)]
+fn checksum(id: Id, bytes: &[u8]) -> u16 {
     let mut digest = CRC.digest();
     digest.update(&id.to_bits().to_le_bytes());
-    digest.update(words.as_flattened());
-    digest.update(&end);
+    digest.update(bytes);
     digest.finalize()
 }
 

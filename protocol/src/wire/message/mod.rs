@@ -23,13 +23,11 @@ pub use network::{
 pub use sensors::{BaselinePage, SensorPage, SensorReadings, SkinSensors};
 pub use state::State;
 
-use core::ops::RangeInclusive;
-
 use thiserror::Error;
 
 use crate::fixed::{Q1_14, Q5_10};
 use crate::id::{CellId, Command, Id, Kind, Node};
-use crate::packet::{self, Epoch, Length, Packet, WORDS, Words};
+use crate::packet::{self, Epoch, Length, Packet, PacketRef, WORDS, Words};
 use crate::parameters::MAX_JOINTS;
 
 /// The version of this protocol, sent in every heartbeat.
@@ -260,10 +258,7 @@ impl Message {
                 Command::Resume => Self::Resume,
                 Command::Report => Self::Report,
                 Command::Joints => {
-                    let allowed = allowed_joints(words.length());
-                    if !allowed.0.contains(&count) {
-                        return Err(MessageError::Count { kind, got: count, allowed: allowed.1 });
-                    }
+                    check_joint_count(words.length(), count)?;
                     let positions = words.padded().map(Q1_14::from_bits);
                     Self::Joints { epoch, joints: Joints { positions, in_use: count } }
                 }
@@ -458,14 +453,32 @@ impl Joints {
     }
 }
 
-/// Returns the possible numbers of joints in a packet of this length, and their range as text for errors.
-const fn allowed_joints(length: Length) -> (RangeInclusive<u8>, &'static str) {
-    match length {
+/// Writes the positions of a joints packet to the first elements of `positions`, and leaves those beyond its words
+/// unchanged. Returns the number of joints in use. It is for cells: they need no [`Message`].
+///
+/// # Errors
+/// Returns an error if a packet of this length cannot have so many joints.
+#[inline]
+pub fn read_joints(packet: &PacketRef<'_>, positions: &mut [Q1_14; MAX_JOINTS]) -> Result<u8, MessageError> {
+    check_joint_count(packet.length(), packet.count())?;
+    for (position, word) in positions.iter_mut().zip(packet.words()) {
+        // Else this is a call of memcpy, which takes a Cortex-M0 longer than the loop.
+        core::hint::black_box(());
+        *position = Q1_14::from_bits(word);
+    }
+    Ok(packet.count())
+}
+
+/// Checks the number of joints in use in a packet of this length.
+fn check_joint_count(length: Length, count: u8) -> Result<(), MessageError> {
+    let (counts, allowed) = match length {
         Length::Six => (1..=6, "1 to 6"),
         Length::Eight => (7..=8, "7 or 8"),
         Length::Ten => (9..=10, "9 or 10"),
         Length::Fourteen => (11..=14, "11 to 14"),
-    }
+    };
+    let kind = Kind::Command;
+    if counts.contains(&count) { Ok(()) } else { Err(MessageError::Count { kind, got: count, allowed }) }
 }
 
 fn addressee(kind: Kind, node: u8) -> Result<Node, MessageError> {

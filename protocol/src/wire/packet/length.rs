@@ -129,7 +129,7 @@ impl Lengths {
 
     /// Returns the longest length.
     pub(super) fn longest(self) -> Length {
-        self.iter().last().unwrap_or_default()
+        Length::ALL.into_iter().rfind(|&length| self.contains(length)).unwrap_or_default()
     }
 }
 
@@ -158,6 +158,16 @@ impl Words {
         it
     }
 
+    /// Creates words of this length, with zeros from the end of `words` on.
+    #[must_use]
+    pub(super) fn from_words(length: Length, words: impl Iterator<Item = i16>) -> Self {
+        let mut it = Self::zeros(length);
+        for (place, word) in it.words.iter_mut().zip(words.take(length.words())) {
+            *place = word;
+        }
+        it
+    }
+
     /// Returns the length.
     #[must_use]
     pub const fn length(&self) -> Length {
@@ -168,6 +178,12 @@ impl Words {
     #[must_use]
     pub fn as_slice(&self) -> &[i16] {
         self.words.get(..self.length.words()).unwrap_or_default()
+    }
+
+    /// Returns the words as a mutable slice.
+    #[must_use]
+    pub fn as_mut_slice(&mut self) -> &mut [i16] {
+        self.words.get_mut(..self.length.words()).unwrap_or_default()
     }
 
     /// Returns the words, padded with zeros.

@@ -1,18 +1,18 @@
 //! Reassembly of packets from classic frames.
 
-use heapless::Deque;
+use core::ops::Range;
 
-use super::{Length, Lengths, MAX_BYTES, Packet, PacketError, SEGMENT_BYTES};
+use super::{Length, Lengths, MAX_BYTES, Packet, PacketError, PacketRef, SEGMENT_BYTES};
 use crate::id::{Command, Id, Kind};
 use crate::time::{Micros, Span};
 
 /// The result of adding a classic frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Reassembly {
+pub enum Reassembly<P = Packet> {
     /// The packet still lacks segments.
     Waiting,
     /// The packet is complete and its CRC is correct.
-    Complete(Packet),
+    Complete(P),
     /// A packet was lost: its segments do not fit together, or arrived too far apart. The oldest segment is dropped,
     /// and the one after it counts as the first. Returned once for each lost packet of which several segments arrived.
     Incomplete,
@@ -28,19 +28,22 @@ pub enum Reassembly {
 /// ones.
 #[derive(Clone, Debug, Default)]
 pub struct Reassembler {
-    waiting: Deque<PendingSegment, { Length::MAX_SEGMENTS }>,
+    /// The data of the pending segments without gaps, so that a packet can be read where it lies.
+    bytes: [u8; MAX_BYTES],
+    /// The pending segments in the order of their arrival. Only the first `waiting` are in use.
+    segments: [PendingSegment; Length::MAX_SEGMENTS],
+    waiting: u8,
     /// Number of segments at the front of the buffer that may belong to a packet already reported as incomplete. That
     /// packet is not reported again.
-    reported: usize,
+    reported: u8,
     /// True if a packet was lost before the last complete one and has not been reported yet.
     unreported_loss: bool,
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct PendingSegment {
-    data: [u8; SEGMENT_BYTES],
-    len: usize,
-    since: Micros,
+    arrived: Micros,
+    byte_count: u8,
 }
 
 impl Reassembler {
@@ -53,7 +56,13 @@ impl Reassembler {
     const MAX_GAP: Span = Span::from_millis(100);
 
     /// An empty buffer.
-    pub const NONE: Self = Self { waiting: Deque::new(), reported: 0, unreported_loss: false };
+    pub const NONE: Self = Self {
+        bytes: [0; MAX_BYTES],
+        segments: [PendingSegment { arrived: Micros(0), byte_count: 0 }; Length::MAX_SEGMENTS],
+        waiting: 0,
+        reported: 0,
+        unreported_loss: false,
+    };
 
     /// Returns the maximum time from the arrival of the first segment of a packet to that of the last.
     #[must_use]
@@ -64,14 +73,14 @@ impl Reassembler {
 
     /// Returns true if the buffer holds a segment of an incomplete packet.
     #[must_use]
-    pub fn is_waiting(&self) -> bool {
-        !self.waiting.is_empty()
+    pub const fn is_waiting(&self) -> bool {
+        self.waiting > 0
     }
 
     /// Returns the number of segments in the buffer.
     #[must_use]
     pub fn waiting(&self) -> usize {
-        self.waiting.len()
+        self.waiting.into()
     }
 
     /// Adds the next classic frame with this identifier. Its packets can have one of `lengths`, restricted to the
@@ -87,57 +96,111 @@ impl Reassembler {
         lengths: Lengths,
         data: &[u8],
     ) -> Result<Reassembly, PacketError> {
+        Ok(match self.push_borrowed(at, id, lengths, data)? {
+            Reassembly::Complete(packet) => Reassembly::Complete(packet.to_packet()),
+            Reassembly::Waiting => Reassembly::Waiting,
+            Reassembly::Incomplete => Reassembly::Incomplete,
+            Reassembly::Ambiguous => Reassembly::Ambiguous,
+        })
+    }
+
+    /// Like [`push`](Self::push), with a complete packet where it lies in the buffer.
+    ///
+    /// # Errors
+    /// Returns an error as [`push`](Self::push) does.
+    pub fn push_borrowed(
+        &mut self,
+        at: Micros,
+        id: Id,
+        lengths: Lengths,
+        data: &[u8],
+    ) -> Result<Reassembly<PacketRef<'_>>, PacketError> {
         let lengths = lengths.restricted_to(id);
-        if !lengths.iter().any(|length| [SEGMENT_BYTES, length.last_segment()].contains(&data.len())) {
+        if data.len() != SEGMENT_BYTES && !lengths.iter().any(|length| data.len() == length.last_segment()) {
             return Err(PacketError::Length { expected: SEGMENT_BYTES, got: data.len() });
         }
-        let mut newest = PendingSegment { data: [0; SEGMENT_BYTES], len: data.len(), since: at };
-        for (byte, &data) in newest.data.iter_mut().zip(data) {
-            *byte = data;
+        if self.waiting() == Length::MAX_SEGMENTS {
+            self.drop_segments(1);
         }
-        if self.waiting.is_full() {
-            self.waiting.pop_front();
-        }
-        let _ = self.waiting.push_back(newest);
+        self.append(at, data);
 
         let within = Self::max_gap(id);
         let mut found = None;
         let mut belong_together = false;
         for length in lengths.iter() {
-            let Some((packet, since)) = self.packet_ending_with(id, length) else { continue };
+            let Some((place, since)) = self.segments_of_last(length) else { continue };
+            if PacketRef::decode(id, self.bytes.get(place.clone()).unwrap_or_default()).is_err() {
+                continue;
+            }
             if at.elapsed_since(since) > within {
                 belong_together = true;
-            } else if found.replace((packet, length.segments())).is_some() {
-                *self = Self::NONE;
+            } else if found.replace((place, length)).is_some() {
+                self.clear();
                 return Ok(Reassembly::Ambiguous);
             }
         }
-        if let Some((packet, segments)) = found {
-            let lost = self.waiting.len().saturating_sub(segments) > self.reported || self.unreported_loss;
-            *self = Self { unreported_loss: lost, ..Self::NONE };
-            return Ok(Reassembly::Complete(packet));
-        }
-        Ok(self.drop_oldest(at, within, lengths.longest().segments(), belong_together))
+        let Some((place, length)) = found else {
+            return Ok(self.drop_oldest(at, within, lengths.longest().segments(), belong_together));
+        };
+        let older = self.waiting().saturating_sub(length.segments());
+        let lost = older > usize::from(self.reported) || self.unreported_loss;
+        self.clear();
+        self.unreported_loss = lost;
+        let packet = self.bytes.get(place).and_then(|bytes| PacketRef::split(id, length, bytes));
+        Ok(packet.map_or(Reassembly::Incomplete, |(packet, _)| Reassembly::Complete(packet)))
     }
 
-    /// Returns the packet of this length that ends with the newest segment, and the arrival time of its first segment.
-    /// Returns `None` if the CRC is wrong or segments are missing.
-    fn packet_ending_with(&self, id: Id, length: Length) -> Option<(Packet, Micros)> {
-        let skipped = self.waiting.len().checked_sub(length.segments())?;
-        let mut bytes = [0; MAX_BYTES];
-        let mut rest = bytes.get_mut(..length.bytes())?;
-        let mut since = None;
-        for segment in self.waiting.iter().skip(skipped) {
-            since.get_or_insert(segment.since);
-            let (place, after) = rest.split_at_mut_checked(segment.len)?;
-            place.copy_from_slice(segment.data.get(..segment.len)?);
-            rest = after;
+    /// Removes all segments, and forgets losses that have not been reported. Their bytes stay, for a packet that is
+    /// read where it lies.
+    const fn clear(&mut self) {
+        (self.waiting, self.reported, self.unreported_loss) = (0, 0, false);
+    }
+
+    /// Returns the pending segments.
+    fn pending(&self) -> &[PendingSegment] {
+        self.segments.get(..self.waiting()).unwrap_or_default()
+    }
+
+    /// Returns the number of bytes of the first `count` segments.
+    fn byte_count(&self, count: usize) -> usize {
+        self.pending().iter().take(count).map(|segment| usize::from(segment.byte_count)).sum()
+    }
+
+    /// Appends a segment, for which there must be room.
+    fn append(&mut self, at: Micros, data: &[u8]) {
+        let first = self.byte_count(self.waiting());
+        if let (Some(segment), Some(place), Ok(byte_count)) = (
+            self.segments.get_mut(usize::from(self.waiting)),
+            self.bytes.get_mut(first..first + data.len()),
+            u8::try_from(data.len()),
+        ) {
+            if let (Some(place), Some(data)) = (place.first_chunk_mut(), data.first_chunk::<SEGMENT_BYTES>())
+            {
+                // Not a call of memcpy, which takes a Cortex-M0 longer.
+                *place = *data;
+            } else {
+                place.copy_from_slice(data);
+            }
+            *segment = PendingSegment { arrived: at, byte_count };
+            self.waiting += 1;
         }
-        if !rest.is_empty() {
-            return None;
-        }
-        let packet = Packet::decode(id, bytes.get(..length.bytes())?).ok()?;
-        Some((packet, since?))
+    }
+
+    /// Drops the oldest `count` segments.
+    fn drop_segments(&mut self, count: usize) {
+        let bytes = self.byte_count(count);
+        self.bytes.copy_within(bytes.., 0);
+        self.segments.copy_within(count.min(Length::MAX_SEGMENTS).., 0);
+        self.waiting = self.waiting.saturating_sub(u8::try_from(count).unwrap_or(u8::MAX));
+    }
+
+    /// Returns the place of the bytes of the newest segments that together have this length, and the arrival time of
+    /// the first of them. Returns `None` if segments are missing or have other sizes.
+    fn segments_of_last(&self, length: Length) -> Option<(Range<usize>, Micros)> {
+        let skipped = self.waiting().checked_sub(length.segments())?;
+        let (first, end) = (self.byte_count(skipped), self.byte_count(self.waiting()));
+        let since = self.pending().get(skipped)?.arrived;
+        (end - first == length.bytes()).then_some((first..end, since))
     }
 
     /// Handles a segment that completes no packet. Drops the segments that are too old. If there are none, drops the
@@ -148,21 +211,23 @@ impl Reassembler {
         within: Span,
         segments: usize,
         belong_together: bool,
-    ) -> Reassembly {
-        let is_late = |waiting: &PendingSegment| now.elapsed_since(waiting.since) > within;
-        let late = self.waiting.iter().filter(|waiting| is_late(waiting)).count();
-        let dropped = if late > 0 { late } else { (self.waiting.len() + 1).saturating_sub(segments) };
-        for _ in 0..dropped {
-            self.waiting.pop_front();
-        }
-        let is_new = dropped > self.reported;
-        self.reported = match (is_new, late > 0 && !belong_together) {
-            _ if dropped == 0 => self.reported,
+    ) -> Reassembly<PacketRef<'static>> {
+        let is_late = |segment: &&PendingSegment| now.elapsed_since(segment.arrived) > within;
+        let late = self.pending().iter().filter(is_late).count();
+        let dropped = if late > 0 { late } else { (self.waiting() + 1).saturating_sub(segments) };
+        let reported = usize::from(self.reported);
+        let is_new = dropped > reported;
+        let reported = match (is_new, late > 0 && !belong_together) {
+            _ if dropped == 0 => reported,
             (true, false) => segments - 1,
             (true, true) => 0,
-            (false, _) => self.reported - dropped,
+            (false, _) => reported - dropped,
         };
-        let owed = core::mem::take(&mut self.unreported_loss);
-        if is_new || owed { Reassembly::Incomplete } else { Reassembly::Waiting }
+        if dropped > 0 {
+            self.drop_segments(dropped);
+        }
+        self.reported = u8::try_from(reported).unwrap_or(u8::MAX);
+        let unreported = core::mem::take(&mut self.unreported_loss);
+        if is_new || unreported { Reassembly::Incomplete } else { Reassembly::Waiting }
     }
 }
