@@ -159,17 +159,21 @@ impl Baseline {
     /// Returns the sensor readings with the zero subtracted from the contact force.
     #[must_use]
     pub fn subtract_zero(&self, raw: &SkinSensors) -> SkinSensors {
-        let Rule::On(rule) = self.rule else { return *raw };
+        SkinSensors { contact: self.net_contact(raw), ..*raw }
+    }
+
+    /// Returns the contact words with the zero subtracted.
+    pub(crate) fn net_contact(&self, raw: &SkinSensors) -> [Q5_10; 3] {
+        let Rule::On(rule) = &self.rule else { return raw.contact };
         if !self.is_tared {
-            let is_none = is_within_limit(contact_force(raw), &rule);
-            return if is_none { SkinSensors { contact: [Q5_10::ZERO; 3], ..*raw } } else { *raw };
+            let is_none = is_within_limit(contact_force(raw), rule);
+            return if is_none { [Q5_10::ZERO; 3] } else { raw.contact };
         }
         let zero = self.coarse_zero();
         // One third, rounded down; the last word gets the remainder.
         let third = (zero * 21_845) >> 16;
         let [first, second, last] = raw.contact;
-        let contact = [subtract(first, third), subtract(second, third), subtract(last, zero - 2 * third)];
-        SkinSensors { contact, ..*raw }
+        [subtract(first, third), subtract(second, third), subtract(last, zero - 2 * third)]
     }
 
     /// Takes the present readings as the zero, as a tare command requests.

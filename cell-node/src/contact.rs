@@ -100,9 +100,9 @@ impl<'a> Torque<'a> {
         words
     }
 
-    /// Like [`Torque::rounded_words`], but writes to an array. Words beyond the length of J do not change.
+    /// Like [`Torque::rounded_words`], but writes to a slice. Words beyond the length of J do not change.
     #[inline]
-    pub fn write_words(&self, rounding: &TorqueRounding, words: &mut [i16; MAX_JOINTS]) {
+    pub fn write_words(&self, rounding: &TorqueRounding, words: &mut [i16]) {
         if self.force.0 > rounding.max_unsaturated_force {
             return self.write_saturating_words(rounding.format, words);
         }
@@ -116,7 +116,7 @@ impl<'a> Torque<'a> {
     /// Writes the words with saturation, for forces at which a torque may be out of range.
     #[cold]
     #[inline(never)]
-    fn write_saturating_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
+    fn write_saturating_words(&self, format: TorqueFormat, words: &mut [i16]) {
         self.write_each(words, |row| {
             let steps = self.steps(row, format.fraction_bits());
             i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX })
@@ -126,8 +126,8 @@ impl<'a> Torque<'a> {
     /// Writes the word of each element of J, last joint first. `black_box` prevents loop unrolling, for which a
     /// Cortex-M0 has too few registers.
     #[inline(always)]
-    fn write_each(&self, words: &mut [i16; MAX_JOINTS], word_of: impl Fn(Q1_14) -> i16) {
-        for index in (0..self.jacobian.len().min(MAX_JOINTS)).rev() {
+    fn write_each(&self, words: &mut [i16], word_of: impl Fn(Q1_14) -> i16) {
+        for index in (0..self.jacobian.len().min(words.len())).rev() {
             core::hint::black_box(());
             if let (Some(word), Some(row)) = (words.get_mut(index), self.jacobian.get(index)) {
                 *word = word_of(*row);

@@ -117,7 +117,8 @@ impl Node {
         let heartbeat = Heartbeat {
             serial: self.identity.serial,
             configuration: self.configuration.hash(),
-            sent: 0, // filled in when it goes out
+            // The packets before this one.
+            sent: self.sent.wrapping_add(self.outbox.len().into()),
             rejected,
             state: self.state(),
         };

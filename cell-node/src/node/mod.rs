@@ -12,6 +12,7 @@
 
 mod claim;
 mod configuration;
+mod outbox;
 mod parameters;
 mod receiver;
 mod rest;
@@ -20,12 +21,14 @@ mod stimuli;
 mod summing;
 mod zero;
 
-use heapless::Deque;
 use protocol::can::{Format, Frame};
-use protocol::fixed::Q7_8;
+use protocol::fixed::{Q1_14, Q7_8};
 use protocol::id::{Command, Id, Kind, Node as Address};
-use protocol::message::{Joints, Message, NetworkPage, ReceivedCounts, SensorPage, State, StimulusStart};
+use protocol::message::{
+    Message, NetworkPage, ReceivedCounts, SensorPage, State, StimulusStart, read_joints,
+};
 use protocol::packet::{self, Epoch, Length, Lengths, Packet};
+use protocol::parameters::MAX_JOINTS;
 use protocol::port::{PORTS, PortMessage};
 use protocol::time::{Micros, Span};
 
@@ -37,6 +40,7 @@ use crate::kernel::Kernel;
 use crate::sum::SumWords;
 use claim::AddressClaim;
 use configuration::{ActiveParameters, Configuration};
+use outbox::Outbox;
 use parameters::{PendingStore, VolatileParameters};
 use receiver::Receiver;
 use rest::RestState;
@@ -50,8 +54,11 @@ pub use stimuli::MAX_PENDING;
 
 /// Maximum number of identifiers that a cell receives: those of its node id, and the sums of the cells at its ports.
 pub const MAX_RECEIVED_IDS: usize = OWN_IDS + PORTS;
-/// Capacity for outgoing packets. The caller collects them after every call.
-const OUTBOX_CAPACITY: usize = 16;
+
+/// The identifier of joints, which a cell receives most.
+const JOINTS: Id = Id::command(Command::Joints);
+/// The reassembly buffer of joints, of those of [`Identity::received_ids`].
+const JOINTS_SLOT: usize = 1;
 
 /// A cell: the state machine without input and output.
 #[derive(Debug)]
@@ -74,7 +81,11 @@ pub struct Node {
     active: bool,
     rest: RestState,
     storing: Option<PendingStore>,
-    outbox: Deque<Message, OUTBOX_CAPACITY>,
+    outbox: Outbox,
+    /// Positions of the joints to answer, and J for them. They are here and not on the stack, so that they are written
+    /// only once.
+    positions: [Q1_14; MAX_JOINTS],
+    jacobian: [Q1_14; MAX_JOINTS],
     sent: u16,
 }
 
@@ -111,7 +122,9 @@ impl Node {
             active: false,
             rest: RestState::default(),
             storing: None,
-            outbox: Deque::new(),
+            outbox: Outbox::new(),
+            positions: [Q1_14::ZERO; MAX_JOINTS],
+            jacobian: [Q1_14::ZERO; MAX_JOINTS],
             sent: 0,
         }
     }
@@ -165,15 +178,11 @@ impl Node {
         self.claim.other_owner
     }
 
-    /// Returns the next packet to send.
-    pub fn poll_transmit(&mut self) -> Option<Packet> {
-        let mut message = self.outbox.pop_front()?;
-        // The counter covers the packets before this one, so it is filled in when the heartbeat is sent.
-        if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = &mut message {
-            heartbeat.sent = self.sent;
-        }
+    /// Returns the next packet to send, where it lies.
+    pub fn poll_transmit(&mut self) -> Option<&Packet> {
+        let packet = self.outbox.pop()?;
         increment(&mut self.sent);
-        Some(message.encode())
+        Some(packet)
     }
 
     /// Corrects the counter of sent packets for a packet that the caller collected but could not send. Packets that
@@ -244,31 +253,46 @@ impl Node {
             increment(&mut self.receiver.refused.foreign);
             return;
         };
-        let Some(slot) = self.received_id_slots().position(|heard| heard == Some(id)) else { return };
         let lengths = Lengths::for_chain(self.length());
-        let Some(packet) = self.receiver.receive(now - age, id, slot, lengths, frame) else { return };
+        if id == JOINTS {
+            return self.handle_joints_frame(now, age, lengths, frame);
+        }
+        let Some(slot) = self.received_id_slots().position(|heard| heard == Some(id)) else { return };
+        let packet = self.receiver.receive(now - age, id, slot, lengths, frame);
+        let Some(packet) = packet.map(|packet| packet.to_packet()) else { return };
         match Message::decode(&packet) {
             Ok(message) => self.handle_message(now, age, message),
             Err(_) => increment(&mut self.receiver.refused.meaning),
         }
     }
 
+    /// Handles a frame of joints. The packet is read where it lies: the answer waits for it.
+    fn handle_joints_frame(&mut self, now: Micros, age: Span, lengths: Lengths, frame: &Frame) {
+        if self.identity.cell.is_none() {
+            return;
+        }
+        let packet = self.receiver.receive(now - age, JOINTS, JOINTS_SLOT, lengths, frame);
+        let Some(packet) = packet else { return };
+        let epoch = packet.epoch();
+        let Ok(count) = read_joints(&packet, &mut self.positions) else {
+            return increment(&mut self.receiver.refused.meaning);
+        };
+        let accepted = self.received.joints;
+        self.handle_joints(now, age, epoch, count);
+        // Stimuli latched at joints that were too old are sent with the next ones.
+        if self.received.joints != accepted {
+            self.send_changed_pages(now);
+            self.report_zero();
+        }
+        self.send_pages_before_next_joints(now);
+        self.send_before_next_joints(now);
+    }
+
     fn handle_message(&mut self, now: Micros, age: Span, message: Message) {
-        if !matches!(message, Message::Joints { .. } | Message::Sync | Message::Report) {
+        if !matches!(message, Message::Sync | Message::Report) {
             self.rest.end_rest();
         }
         match message {
-            Message::Joints { epoch, joints } => {
-                let taken = self.received.joints;
-                self.handle_joints(now, age, epoch, &joints);
-                // Stimuli latched at joints that were too old are sent with the next ones.
-                if self.received.joints != taken {
-                    self.send_changed_pages(now);
-                    self.report_zero();
-                }
-                self.send_pages_before_next_joints(now);
-                self.send_before_next_joints(now);
-            }
             Message::Halt => {
                 self.flags = self.flags.with(State::HALTED, true);
                 self.active = false;
@@ -308,13 +332,17 @@ impl Node {
                     self.handle_sums(now);
                 }
             }
-            // These are never received, see `Identity::hears`.
-            Message::Torque { .. } | Message::Sensors { .. } | Message::Configured { .. } => {}
+            // Joints are handled before they become a message; the others are never received.
+            Message::Joints { .. }
+            | Message::Torque { .. }
+            | Message::Sensors { .. }
+            | Message::Configured { .. } => {}
         }
     }
 
-    /// Computes the torques for new joint positions by the paper's Eq. 8 and Algorithm 1, and replies with them.
-    fn handle_joints(&mut self, now: Micros, age: Span, epoch: Epoch, joints: &Joints) {
+    /// Computes the torques for the new joint positions by the paper's Eq. 8 and Algorithm 1, and replies with them.
+    /// `count` is the number of joints in use.
+    fn handle_joints(&mut self, now: Micros, age: Span, epoch: Epoch, count: u8) {
         if self.epoch == Some(epoch) {
             increment(&mut self.received.joints_repeated);
             return;
@@ -322,7 +350,7 @@ impl Node {
         // All frames before these joints have been received.
         self.check_missing(now);
         let in_use = self.configuration.in_use();
-        if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
+        if in_use.is_some_and(|in_use| in_use.parameters.joints != count) {
             increment(&mut self.receiver.refused.meaning);
             return;
         }
@@ -341,44 +369,49 @@ impl Node {
         increment(&mut self.received.joints);
         let answers = self.claim.is_settled() && !self.flags.has(State::HALTED);
         let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip_epoch() };
-        let skin = self.baseline.subtract_zero(&self.stimuli.sensed.skin);
-        let force = Force::fuse(skin.contact, skin.proximity, &in_use.parameters.contact);
-        let jacobian;
-        let torque = if force.is_active() {
-            jacobian = in_use.kernel.jacobian(&joints.positions);
-            let moved = jacobian.get(..in_use.parameters.joint.into()).unwrap_or_default();
-            Some(Torque::new(moved, force))
-        } else {
-            None
-        };
+        let sensed = &self.stimuli.sensed.skin;
+        let contact = self.baseline.net_contact(sensed);
+        let force = Force::fuse(contact, sensed.proximity, &in_use.parameters.contact);
+        if force.is_active() {
+            in_use.kernel.write_jacobian(&self.positions, &mut self.jacobian);
+        }
         if self.summing.sum.is_enabled() {
-            self.active = torque.is_some();
+            self.active = force.is_active();
+            let moved = self.jacobian.get(..in_use.parameters.joint.into()).unwrap_or_default();
+            let torque = force.is_active().then(|| Torque::new(moved, force));
             self.summing.begin_epoch(now, age, (epoch, in_use.period()), torque);
             return self.handle_sums(now);
         }
-        self.answer_joints(epoch, torque);
+        self.answer_joints(epoch, force);
     }
 
-    /// Replies with the cell's own torque. A single reply of zero marks the end of a contact.
-    fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque<'_>>) {
+    /// Replies with the cell's own torque, for the J that has been computed. A single reply of zero marks the end of a
+    /// contact.
+    fn answer_joints(&mut self, epoch: Epoch, force: Force) {
         let (Some(from), Some(in_use)) = (self.identity.cell, self.configuration.in_use()) else { return };
-        let torque = match torque {
-            Some(torque) => {
-                self.active = true;
-                torque.rounded_words(in_use.kernel.rounding())
-            }
-            None if core::mem::take(&mut self.active) => Default::default(),
-            // A pending stimulus, or a zero that follows the sensor, may change the contact state at any
-            // joints.
-            None if self.stimuli.has_pending() || self.baseline.is_on() => return,
+        if force.is_active() {
+            self.active = true;
+        } else if core::mem::take(&mut self.active) {
+            // The zero that ends the contact.
+        } else if self.stimuli.has_pending() || self.baseline.is_on() {
+            // A pending stimulus, or a zero that follows the sensor, may change the contact state at any joints.
+            return;
+        } else if self.summing.network.has_wires() {
             // A cell of a network stays awake for its neighbours.
-            None if self.summing.network.has_wires() => return,
-            None => return self.rest.count_quiet(),
-        };
-        let torque = packet::Words::new(in_use.length(), torque);
-        self.mark_saturated(torque.is_saturated());
+            return;
+        } else {
+            return self.rest.count_quiet();
+        }
+        let Some(packet) = self.outbox.push() else { return };
+        (packet.id, packet.epoch, packet.count) = (Id::new(Kind::Torque, Address::Cell(from)), epoch, 1);
+        packet.words = packet::Words::zeros(in_use.length());
+        if force.is_active() {
+            let moved = self.jacobian.get(..in_use.parameters.joint.into()).unwrap_or_default();
+            Torque::new(moved, force).write_words(in_use.kernel.rounding(), packet.words.as_mut_slice());
+        }
+        let is_saturated = packet.words.is_saturated();
+        self.mark_saturated(is_saturated);
         increment(&mut self.received.torques);
-        self.push(Message::Torque { from, epoch, torque });
     }
 
     /// Sends hellos and a heartbeat now if they are due before the next joints, so that the cell need not wake up
@@ -420,8 +453,11 @@ impl Node {
     /// Queues a message. There is always room, because one frame causes at most four packets and the caller collects
     /// them after each frame.
     fn push(&mut self, message: Message) {
-        let fits = self.outbox.push_back(message).is_ok();
-        debug_assert!(fits, "a shell takes what is to be sent after each call");
+        let slot = self.outbox.push();
+        debug_assert!(slot.is_some(), "a shell takes what is to be sent after each call");
+        if let Some(packet) = slot {
+            *packet = message.encode();
+        }
     }
 }
 

@@ -3,7 +3,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
 use protocol::message::RejectedCounts;
-use protocol::packet::{Lengths, Packet, PacketError, Reassembler, Reassembly};
+use protocol::packet::{Lengths, PacketError, PacketRef, Reassembler, Reassembly};
 use protocol::time::Micros;
 
 use super::{MAX_RECEIVED_IDS, increment};
@@ -25,28 +25,30 @@ impl Receiver {
     }
 
     /// Returns the packet that a frame contains or completes, if any. Joints, torques and sums have one of `lengths`.
-    pub(super) fn receive(
-        &mut self,
+    pub(super) fn receive<'f>(
+        &'f mut self,
         arrived: Micros,
         id: Id,
         slot: usize,
         lengths: Lengths,
-        frame: &Frame,
-    ) -> Option<Packet> {
+        frame: &'f Frame,
+    ) -> Option<PacketRef<'f>> {
         let packet = match self.format {
-            Format::Fd => Packet::from_fd(frame),
+            Format::Fd => PacketRef::from_fd(frame),
             Format::Classic if frame.format() != Format::Classic => {
                 Err(PacketError::Length { expected: 8, got: frame.data().len() })
             }
-            Format::Classic => match self.segments.get_mut(slot)?.push(arrived, id, lengths, frame.data()) {
-                Ok(Reassembly::Waiting) => return None,
-                Ok(Reassembly::Incomplete | Reassembly::Ambiguous) => {
-                    increment(&mut self.refused.incomplete);
-                    return None;
+            Format::Classic => {
+                match self.segments.get_mut(slot)?.push_borrowed(arrived, id, lengths, frame.data()) {
+                    Ok(Reassembly::Waiting) => return None,
+                    Ok(Reassembly::Incomplete | Reassembly::Ambiguous) => {
+                        increment(&mut self.refused.incomplete);
+                        return None;
+                    }
+                    Ok(Reassembly::Complete(packet)) => Ok(packet),
+                    Err(error) => Err(error),
                 }
-                Ok(Reassembly::Complete(packet)) => Ok(packet),
-                Err(error) => Err(error),
-            },
+            }
         };
         match packet {
             Ok(packet) => return Some(packet),

@@ -174,6 +174,9 @@ impl Node {
         // Pages are sent only once the cell owns its node id. The comparison with the last sent values
         // ensures that no change is lost.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
+        if self.sensing.mode == self.switches.sensing && self.sensing.mode != Mode::Event {
+            return;
+        }
         let pages = self.sensing.update(now, &self.switches, cell, &self.net_readings());
         self.push_sensors(pages);
     }
@@ -206,6 +209,9 @@ impl Node {
 
     /// Sends pages with the present contact state.
     pub(super) fn push_sensors(&mut self, pages: DuePages) {
+        if pages == DuePages::NONE {
+            return;
+        }
         let Some(from) = self.identity.cell else { return };
         for (_, page) in
             self.net_readings().pages().into_iter().enumerate().filter(|(index, _)| pages.contain(*index))

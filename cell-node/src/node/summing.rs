@@ -350,7 +350,7 @@ impl Node {
 
     /// Checks for missing sums of children in this epoch, once per epoch.
     pub(super) fn check_missing(&mut self, now: Micros) {
-        if self.summing.check_missing(now) {
+        if self.summing.sum.is_enabled() && self.summing.check_missing(now) {
             self.apply_network_changes(now);
         }
     }

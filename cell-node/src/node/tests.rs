@@ -1,10 +1,10 @@
 use super::parameters::pad_with_zeros;
 use super::*;
-use protocol::fixed::{Q1_14, Q3_12, Q5_10};
+use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::CellId;
-use protocol::message::{Answer, Heartbeat, RejectedCounts, Request, SkinSensors};
+use protocol::message::{Answer, Heartbeat, Joints, RejectedCounts, Request, SkinSensors};
 use protocol::packet::{Reassembler, WORDS, Words};
-use protocol::parameters::{Contact, MAX_JOINTS, Parameter, Parameters, Pose, Row};
+use protocol::parameters::{Contact, Parameter, Parameters, Pose, Row};
 
 /// Returns the parameters of a wheel: one joint about z, and a cell on the rim that faces the direction of
 /// motion.
@@ -56,7 +56,9 @@ fn claiming(identity: Identity) -> (Node, Message) {
 }
 
 fn drain(node: &mut Node) -> Vec<Message> {
-    core::iter::from_fn(|| node.poll_transmit()).map(|packet| Message::decode(&packet).unwrap()).collect()
+    core::iter::from_fn(|| node.poll_transmit().copied())
+        .map(|packet| Message::decode(&packet).unwrap())
+        .collect()
 }
 
 const NOW: Micros = Micros(300_000);

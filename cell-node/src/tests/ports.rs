@@ -48,7 +48,9 @@ fn tell(node: &mut Node, now: Micros, message: &Message) -> Vec<Message> {
     for frame in message.encode().frames(Format::Fd) {
         node.handle_frame(now, Span(0), &frame);
     }
-    core::iter::from_fn(|| node.poll_transmit()).map(|packet| Message::decode(&packet).unwrap()).collect()
+    core::iter::from_fn(|| node.poll_transmit().copied())
+        .map(|packet| Message::decode(&packet).unwrap())
+        .collect()
 }
 
 fn sum_with(words: [i16; WORDS]) -> Message {
@@ -126,7 +128,7 @@ fn join_gateway(node: &mut Node, now: Micros) {
 fn the_place_in_the_tree_is_reported_at_most_every_50_ms() {
     let mut node = start(1 << UPLINK | 0b1);
     let pages = |node: &mut Node| {
-        core::iter::from_fn(|| node.poll_transmit())
+        core::iter::from_fn(|| node.poll_transmit().copied())
             .filter_map(|packet| {
                 let message = Message::decode(&packet).unwrap();
                 let Message::Network { page: NetworkPage::Tree(tree), .. } = message else { return None };

@@ -53,7 +53,7 @@ impl Cell {
 
     /// Returns the sensor pages that the cell has sent.
     fn sends(&mut self) -> Vec<SensorPage> {
-        let packets = core::iter::from_fn(|| self.node.poll_transmit());
+        let packets = core::iter::from_fn(|| self.node.poll_transmit().copied());
         let page = |packet| {
             if let Message::Sensors { page, .. } = Message::decode(&packet).unwrap() {
                 Some(page)
@@ -259,7 +259,7 @@ fn a_heartbeat_with_an_event_does_not_send_it_twice() {
         cell.node.handle_frame(cell.now, Span(0), &frame);
     }
     let said: Vec<_> =
-        core::iter::from_fn(|| cell.node.poll_transmit()).map(|packet| packet.id.kind).collect();
+        core::iter::from_fn(|| cell.node.poll_transmit().copied()).map(|packet| packet.id.kind).collect();
     let expected = [Kind::Torque, Kind::Sensors, Kind::Network];
     assert_eq!(said, expected, "the torque first");
 }
