@@ -145,6 +145,6 @@ impl CellSlot {
             self.flash = kept.parameters.map_or(FlashState::Empty, FlashState::Valid);
             node.handle_stored(true);
         }
-        core::iter::from_fn(|| node.poll_transmit()).collect()
+        core::iter::from_fn(|| node.poll_transmit().copied()).collect()
     }
 }

@@ -342,7 +342,7 @@ impl Wiring {
             messages.push(message);
         }
         let mut packets = Vec::new();
-        while let Some(packet) = node.poll_transmit() {
+        while let Some(packet) = node.poll_transmit().copied() {
             packets.push(packet);
         }
         let timeout = node.poll_timeout().max(self.agenda.now + Span(1));

@@ -227,7 +227,7 @@ impl Workshop {
             }
             node.handle_stored(!piece.worn);
         }
-        let packets: Vec<_> = core::iter::from_fn(|| node.poll_transmit()).collect();
+        let packets: Vec<_> = core::iter::from_fn(|| node.poll_transmit().copied()).collect();
         if node.other_owner().is_some() {
             piece.node = None;
         }

@@ -96,8 +96,8 @@ fn drain(node: &mut Node, from: &mut Unstructured<'_>) -> Result<()> {
         let Some(packet) = node.poll_transmit() else { return Ok(()) };
         packets += 1;
         assert!(packets < MANY, "{packet:?}");
-        let message = Message::decode(&packet).unwrap();
-        assert_eq!(message.encode(), packet);
+        let message = Message::decode(packet).unwrap();
+        assert_eq!(message.encode(), *packet);
         assert!(!matches!(
             message,
             Message::Joints { .. } | Message::Stimulus { .. } | Message::Configure { .. }

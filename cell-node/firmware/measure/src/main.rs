@@ -14,7 +14,9 @@ use cell_node::contact::{MAX_JACOBIAN_STEPS, TorqueRounding};
 use cell_node::kernel::oracle::Projection;
 use cell_node::kernel::{Kernel, Wrench};
 use cell_node::node::Node;
+use counted::Frames;
 use machine::Machine;
+use protocol::can::Format;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::message::Joints;
 use protocol::parameters::MAX_JOINTS;
@@ -81,7 +83,8 @@ fn count(machine: &mut Machine) {
             _ => continue,
         }
         kernels(case);
-        reply(case, false);
+        reply(case, Format::Fd, false);
+        reply(case, Format::Classic, false);
         machine.text(case.chain().name);
         machine.words([i16::from(case.joint)].into_iter());
         machine.line();
@@ -91,7 +94,7 @@ fn count(machine: &mut Machine) {
 /// Prints the number of bytes of stack that one reply uses, and the size of a node, which can be kept in a static.
 fn stack(machine: &mut Machine) {
     let case = CASES.iter().rfind(|case| case.is_counted());
-    machine.number(case.map_or(0, |case| reply(case, true)));
+    machine.number(case.map_or(0, |case| reply(case, Format::Fd, true)));
     machine.number(u32::try_from(size_of::<Node>()).unwrap_or(u32::MAX));
     machine.line();
 }
@@ -111,19 +114,25 @@ fn kernels(case: &cases::Case) {
 /// Runs one reply of a cell on this chain. Returns the number of bytes of stack used, if `measures_stack` is
 /// true.
 #[inline(never)]
-fn reply(case: &cases::Case, measures_stack: bool) -> u32 {
-    let mut node = counted::node();
+fn reply(case: &cases::Case, format: Format, measures_stack: bool) -> u32 {
+    let mut node = counted::node(format);
     counted::configure(&mut node, &case.parameters());
     let joints = Joints { positions: case.joints(), in_use: case.chain().joints() };
-    let Some(frame) = counted::pressed(&mut node, joints) else { return 0 };
-    let mut answer = frame;
+    let (mut frames, mut answer) = (Frames::NONE, Frames::NONE);
+    if counted::press(&mut node, joints, format, &mut frames).is_none() {
+        return 0;
+    }
+    let reply = match format {
+        Format::Fd => counted::reply,
+        Format::Classic => counted::reply_classic,
+    };
     if !measures_stack {
-        counted::reply(&mut node, &frame, &mut answer);
+        reply(&mut node, &frames, &mut answer);
         return 0;
     }
     // The node is in this function's frame, above the painted stack.
     let top = machine::painted_stack();
-    counted::reply(&mut node, &frame, &mut answer);
+    reply(&mut node, &frames, &mut answer);
     machine::used_stack(top)
 }
 
