@@ -64,7 +64,7 @@ fn print_sine_errors(name: &str, function: impl Fn(Q1_14) -> Q1_14, oracle: impl
 fn print_operation_counts<K: Kernel<CountingWord>>(name: &str, joint: u8) {
     let case = Case::all().into_iter().find(|case| case.joint == joint).unwrap();
     let kernel = K::new(&case.parameters());
-    let (_, done) = Operations::count(|| kernel.jacobian(&case.words()));
+    let (_, done) = Operations::count_operations(|| kernel.jacobian(&case.words()));
     let work = [done.multiplications, done.additions, done.sines, done.cosines];
     let rest = [done.negations, done.angle_additions, done.roundings];
     println!(

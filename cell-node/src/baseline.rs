@@ -17,28 +17,28 @@ use protocol::parameters::{Baseline as Rule, BaselineSettings, TareCommand};
 use protocol::touch::{TouchState, contact_force};
 
 /// Number of consecutive joints messages with a steady reading before the first tare.
-pub const STEADY_JOINTS: u8 = 32;
+pub const STEADY_MESSAGES_BEFORE_TARE: u8 = 32;
 /// Fraction bits that the zero has in addition to those of a contact word.
-const EXTRA_FRACTION_BITS: u32 = 12;
+const ZERO_EXTRA_FRACTION_BITS: u32 = 12;
 /// Shift of the running mean of readings, which extends over about 2^`MEAN` joints messages.
 const MEAN_SHIFT: u32 = 3;
 /// Shift of the zero's approach to the reading. With each joints message the zero moves by 2^-`NEARER` of the
 /// difference, limited by the rate.
-const APPROACH_SHIFT: u32 = 4;
+const ZERO_APPROACH_SHIFT: u32 = 4;
 /// Maximum temperature difference that is compensated: 64 °C, in steps of 2^-6 °C.
 const MAX_TEMPERATURE_CHANGE: i32 = 64 << 6;
 /// Temperature change after which the coefficient is corrected: 2 °C, in steps of 2^-6 °C.
-const LEARNING_SPAN: i32 = 2 << 6;
+const LEARNING_TEMPERATURE_CHANGE: i32 = 2 << 6;
 /// Maximum temperature change for a correction of the coefficient. After a faster change, the zero has not followed the
 /// reading yet.
-const MAX_LEARNING_SPAN: i32 = LEARNING_SPAN + (LEARNING_SPAN >> 2);
+const MAX_LEARNING_TEMPERATURE_CHANGE: i32 = LEARNING_TEMPERATURE_CHANGE + (LEARNING_TEMPERATURE_CHANGE >> 2);
 /// Maximum number of joints messages for a correction of the coefficient. Over a longer time, the zero may have drifted
 /// for another reason.
-const MAX_LEARNING_JOINTS: u16 = 1 << 14;
+const MAX_LEARNING_MESSAGES: u16 = 1 << 14;
 
 /// The reason for which a tare is refused.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum TareRefused {
+pub enum TareRefusal {
     /// The baseline is off.
     Off,
     /// The cell is touched, or has not received any joints.
@@ -71,7 +71,7 @@ pub struct Baseline {
     refused: u16,
     /// Number of tares and changes of the settings, modulo 2^8. A change of this number is reported.
     changes: u8,
-    anchor: Option<Anchor>,
+    anchor: Option<TemperatureChangeStart>,
     pace: StepLimit,
 }
 
@@ -84,7 +84,7 @@ struct StepLimit {
 
 /// The start of a temperature change over which the coefficient is learned.
 #[derive(Clone, Copy, Debug)]
-struct Anchor {
+struct TemperatureChangeStart {
     temperature: Q9_6,
     base: i32,
     joints: u16,
@@ -92,9 +92,9 @@ struct Anchor {
 
 impl Baseline {
     /// Sets the baseline mode and forgets the zero.
-    pub fn set(&mut self, rule: Rule) {
+    pub fn set_rule(&mut self, rule: Rule) {
         self.rule = rule;
-        self.forget();
+        self.reset_zero();
         self.pace = StepLimit::default();
     }
 
@@ -112,7 +112,7 @@ impl Baseline {
 
     /// Resets everything to the state after a start, except for the baseline mode and the count of refused tares.
     #[inline(never)]
-    pub fn forget(&mut self) {
+    pub fn reset_zero(&mut self) {
         let Self { rule, refused, changes, pace, .. } = *self;
         let n_per_c = if let Rule::On(zeroing) = rule { zeroing.n_per_c } else { Q1_14::ZERO };
         let changes = changes.wrapping_add(1);
@@ -128,25 +128,25 @@ impl Baseline {
             self.pace = StepLimit { period_us, step: step_per_period(rule.rate_un_per_s, period_us) };
         }
         let [temperature, _] = raw.temperature;
-        let (sum, reading) = (contact_force(raw), contact_force(raw) << EXTRA_FRACTION_BITS);
+        let (sum, reading) = (contact_force(raw), contact_force(raw) << ZERO_EXTRA_FRACTION_BITS);
         let mean = self.mean.unwrap_or(reading);
-        self.is_steady = (reading - mean).abs() < rule.threshold.to_zero_steps() >> 2;
+        self.is_steady = (reading - mean).abs() < rule.threshold.to_baseline_steps() >> 2;
         let mean = mean + ((reading - mean) >> MEAN_SHIFT);
         self.mean = Some(mean);
         if !self.is_tared {
-            let is_within = mean.abs() <= rule.limit.to_zero_steps();
+            let is_within = mean.abs() <= rule.limit.to_baseline_steps();
             self.steady = if self.is_steady && is_within { self.steady + 1 } else { 0 };
-            if self.steady < STEADY_JOINTS {
+            if self.steady < STEADY_MESSAGES_BEFORE_TARE {
                 let net = if is_within_limit(sum, &rule) { 0 } else { sum };
                 self.touch = self.touch.next(net, rule.threshold.to_bits(), rule.hysteresis);
                 return;
             }
             self.set_zero(mean, temperature);
         }
-        let shift = self.shift(temperature);
-        let limit = rule.limit.to_zero_steps();
+        let shift = self.zero_shift_at(temperature);
+        let limit = rule.limit.to_baseline_steps();
         self.zero = (self.base + shift).clamp(-limit, limit);
-        let net = sum - self.coarse_zero();
+        let net = sum - self.zero_in_word_steps();
         self.touch = self.touch.next(net, rule.threshold.to_bits(), rule.hysteresis);
         if self.touch == TouchState::Touched {
             self.anchor = None;
@@ -169,18 +169,22 @@ impl Baseline {
             let is_none = is_within_limit(contact_force(raw), rule);
             return if is_none { [Q5_10::ZERO; 3] } else { raw.contact };
         }
-        let zero = self.coarse_zero();
+        let zero = self.zero_in_word_steps();
         // One third, rounded down; the last word gets the remainder.
         let third = (zero * 21_845) >> 16;
         let [first, second, last] = raw.contact;
-        [subtract(first, third), subtract(second, third), subtract(last, zero - 2 * third)]
+        [
+            subtract_saturating(first, third),
+            subtract_saturating(second, third),
+            subtract_saturating(last, zero - 2 * third),
+        ]
     }
 
     /// Takes the present readings as the zero, as a tare command requests.
     ///
     /// # Errors
     /// Returns the reason if the tare is refused. The zero does not change then; the refusal is counted.
-    pub fn tare(&mut self, raw: &SkinSensors, how: TareCommand) -> Result<(), TareRefused> {
+    pub fn tare(&mut self, raw: &SkinSensors, how: TareCommand) -> Result<(), TareRefusal> {
         let done = self.try_tare(raw, how);
         if done.is_err() {
             self.refused = self.refused.wrapping_add(1);
@@ -188,16 +192,16 @@ impl Baseline {
         done
     }
 
-    fn try_tare(&mut self, raw: &SkinSensors, how: TareCommand) -> Result<(), TareRefused> {
+    fn try_tare(&mut self, raw: &SkinSensors, how: TareCommand) -> Result<(), TareRefusal> {
         if how == TareCommand::Forget {
-            self.forget();
+            self.reset_zero();
             return Ok(());
         }
-        let Rule::On(rule) = self.rule else { return Err(TareRefused::Off) };
+        let Rule::On(rule) = self.rule else { return Err(TareRefusal::Off) };
         let is_free = how == TareCommand::Forced || self.is_steady && self.touch != TouchState::Touched;
-        let mean = self.mean.filter(|_| is_free).ok_or(TareRefused::Touched)?;
-        if mean.abs() > rule.limit.to_zero_steps() {
-            return Err(TareRefused::Limit);
+        let mean = self.mean.filter(|_| is_free).ok_or(TareRefusal::Touched)?;
+        if mean.abs() > rule.limit.to_baseline_steps() {
+            return Err(TareRefusal::Limit);
         }
         let [temperature, _] = raw.temperature;
         self.set_zero(mean, temperature);
@@ -208,7 +212,7 @@ impl Baseline {
     #[must_use]
     pub fn page(&self) -> Option<BaselinePage> {
         let page = BaselinePage {
-            zero: Q5_10::from_bits(saturate_word(self.coarse_zero())),
+            zero: Q5_10::from_bits(saturate_to_word(self.zero_in_word_steps())),
             n_per_c: self.n_per_c,
             temperature: self.reference,
             tared: self.is_tared,
@@ -237,7 +241,7 @@ impl Baseline {
     }
 
     /// Returns the shift of the zero at a temperature, relative to the reference temperature.
-    fn shift(&self, temperature: Q9_6) -> i32 {
+    fn zero_shift_at(&self, temperature: Q9_6) -> i32 {
         let degrees = i32::from(temperature.to_bits()) - i32::from(self.reference.to_bits());
         let degrees = degrees.clamp(-MAX_TEMPERATURE_CHANGE, MAX_TEMPERATURE_CHANGE);
         // 14 + 6 fraction bits.
@@ -245,14 +249,14 @@ impl Baseline {
     }
 
     /// Returns the zero in steps of a contact word.
-    const fn coarse_zero(&self) -> i32 {
-        (self.zero + (1 << (EXTRA_FRACTION_BITS - 1))) >> EXTRA_FRACTION_BITS
+    const fn zero_in_word_steps(&self) -> i32 {
+        (self.zero + (1 << (ZERO_EXTRA_FRACTION_BITS - 1))) >> ZERO_EXTRA_FRACTION_BITS
     }
 
     /// Moves the zero towards the reading of an untouched sensor, by at most the rate and within `limit`.
     fn move_zero_towards(&mut self, reading: i32, shift: i32, limit: i32) {
         let step = self.pace.step;
-        let target = self.zero + ((reading - self.zero) >> APPROACH_SHIFT).clamp(-step, step);
+        let target = self.zero + ((reading - self.zero) >> ZERO_APPROACH_SHIFT).clamp(-step, step);
         self.zero = target.clamp(-limit, limit);
         self.is_limited = self.zero != target;
         self.base = self.zero - shift;
@@ -260,25 +264,28 @@ impl Baseline {
 
     /// Corrects the coefficient (N/°C) by the drift of the zero since the start of a temperature change.
     fn learn_coefficient(&mut self, temperature: Q9_6) {
-        let fresh = Anchor { temperature, base: self.base, joints: 0 };
+        let fresh = TemperatureChangeStart { temperature, base: self.base, joints: 0 };
         let anchor = self.anchor.get_or_insert(fresh);
         anchor.joints = anchor.joints.saturating_add(1);
         let degrees = i32::from(temperature.to_bits()) - i32::from(anchor.temperature.to_bits());
-        if degrees.abs() < LEARNING_SPAN {
+        if degrees.abs() < LEARNING_TEMPERATURE_CHANGE {
             return;
         }
-        if degrees.abs() <= MAX_LEARNING_SPAN && anchor.joints <= MAX_LEARNING_JOINTS && !self.is_limited {
+        if degrees.abs() <= MAX_LEARNING_TEMPERATURE_CHANGE
+            && anchor.joints <= MAX_LEARNING_MESSAGES
+            && !self.is_limited
+        {
             // Per 2 °C, with 14 fraction bits. From the second time on only half is applied, to limit the
             // effect of a single error.
             let lacks = (self.base - anchor.base)
-                >> (EXTRA_FRACTION_BITS + 10 - 14 + 1 + u32::from(self.is_n_per_c_known));
+                >> (ZERO_EXTRA_FRACTION_BITS + 10 - 14 + 1 + u32::from(self.is_n_per_c_known));
             self.is_n_per_c_known = true;
             let lacks = if degrees < 0 { -lacks } else { lacks };
             let n_per_c = i32::from(self.n_per_c.to_bits()) + lacks;
-            self.n_per_c = Q1_14::from_bits(saturate_word(n_per_c));
+            self.n_per_c = Q1_14::from_bits(saturate_to_word(n_per_c));
         }
         (self.base, self.reference) = (self.zero, temperature);
-        self.anchor = Some(Anchor { temperature, base: self.zero, joints: 0 });
+        self.anchor = Some(TemperatureChangeStart { temperature, base: self.zero, joints: 0 });
     }
 }
 
@@ -286,13 +293,13 @@ impl Baseline {
 pub type BaselineStatus = (bool, bool, bool, u16, u8);
 
 /// Conversion of a number to the fraction bits of the zero.
-trait ToZeroSteps {
-    fn to_zero_steps(self) -> i32;
+trait ToBaselineSteps {
+    fn to_baseline_steps(self) -> i32;
 }
 
-impl ToZeroSteps for Q5_10 {
-    fn to_zero_steps(self) -> i32 {
-        i32::from(self.to_bits()) << EXTRA_FRACTION_BITS
+impl ToBaselineSteps for Q5_10 {
+    fn to_baseline_steps(self) -> i32 {
+        i32::from(self.to_bits()) << ZERO_EXTRA_FRACTION_BITS
     }
 }
 
@@ -309,12 +316,12 @@ fn step_per_period(rate_un_per_s: u16, period_us: u16) -> i32 {
 }
 
 /// Converts a value to a word. Values out of range saturate.
-fn saturate_word(value: i32) -> i16 {
+fn saturate_to_word(value: i32) -> i16 {
     i16::try_from(value).unwrap_or(if value < 0 { i16::MIN } else { i16::MAX })
 }
 
-fn subtract(reading: Q5_10, zero: i32) -> Q5_10 {
-    Q5_10::from_bits(saturate_word(i32::from(reading.to_bits()) - zero))
+fn subtract_saturating(reading: Q5_10, zero: i32) -> Q5_10 {
+    Q5_10::from_bits(saturate_to_word(i32::from(reading.to_bits()) - zero))
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! The path from a cell's sensor words to joint torques: the paper's Algorithm 1 and `tau = J F_z`.
 //!
-//! The code uses integers only. It is exact except for three roundings: [`Force`] (16 fraction bits), [`Torque::words`]
+//! The code uses integers only. It is exact except for three roundings: [`Force`] (16 fraction bits), [`Torque::torque_words`]
 //! (the torque format), and the rounding of a sum of [`Torque::exact_torques`]. It never panics, and its work is bounded.
 
 use protocol::fixed::{Accumulator, Q1_14, Q5_10, TorqueFormat};
@@ -24,15 +24,16 @@ impl Force {
     /// threshold.
     #[must_use]
     pub fn fuse(contact: [Q5_10; 3], proximity: Q1_14, rule: &Contact) -> Self {
-        let touch =
-            contact.into_iter().fold(Accumulator::<10>::ZERO, |sum, word| sum.saturating_add(word.widen()));
-        let touch = if touch < rule.contact_threshold.widen() { Accumulator::ZERO } else { touch };
+        let touch = contact
+            .into_iter()
+            .fold(Accumulator::<10>::ZERO, |sum, word| sum.saturating_add(word.to_accumulator()));
+        let touch = if touch < rule.contact_threshold.to_accumulator() { Accumulator::ZERO } else { touch };
         let near = if proximity < rule.proximity_threshold { Q1_14::ZERO } else { proximity };
 
         // At most 2^18 * 2^15 * 2^2 + 2^30 steps.
-        let weighed = Accumulator::<22>::from_steps(touch.steps() * rule.alpha_c.widen().steps());
+        let weighed = Accumulator::<22>::from_steps(touch.steps() * rule.alpha_c.to_accumulator().steps());
         let fused = weighed.with_fraction_bits::<24>().saturating_add(rule.alpha_p.mul_wide::<14, 24>(near));
-        if fused < rule.force_threshold.widen().with_fraction_bits() {
+        if fused < rule.force_threshold.to_accumulator().with_fraction_bits() {
             return Self::ZERO;
         }
         Self::from_steps((fused.steps() + (1 << 7)) >> 8)
@@ -78,7 +79,7 @@ impl<'a> Torque<'a> {
         let mut exact = [Accumulator::ZERO; MAX_JOINTS];
         for (exact, row) in exact.iter_mut().zip(self.jacobian) {
             // At most 2^15 * 2^31 steps.
-            *exact = Accumulator::from_steps(row.widen().steps() * i64::from(self.force.0));
+            *exact = Accumulator::from_steps(row.to_accumulator().steps() * i64::from(self.force.0));
         }
         exact
     }
@@ -86,11 +87,11 @@ impl<'a> Torque<'a> {
     /// Returns the torques as words for the bus, rounded once, ties up. Torques outside the range become the largest or
     /// smallest word, which mean *saturated*. The error of all others is at most half a step, for Q3.12 1.3e-4 Nm.
     #[must_use]
-    pub fn words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
+    pub fn torque_words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
         self.rounded_words(&TorqueRounding::new(format, MAX_JACOBIAN_STEPS))
     }
 
-    /// Like [`Torque::words`], with a rounding computed once per configuration. J must not exceed the bound for which
+    /// Like [`Torque::torque_words`], with a rounding computed once per configuration. J must not exceed the bound for which
     /// the rounding was created.
     #[must_use]
     #[inline]
@@ -107,9 +108,9 @@ impl<'a> Torque<'a> {
             return self.write_saturating_words(rounding.format, words);
         }
         match rounding.format {
-            TorqueFormat::Q3_12 => self.write_each(words, |row| low_word(self.steps(row, 12))),
-            TorqueFormat::Q5_10 => self.write_each(words, |row| low_word(self.steps(row, 10))),
-            TorqueFormat::Q7_8 => self.write_each(words, |row| low_word(self.steps(row, 8))),
+            TorqueFormat::Q3_12 => self.write_each_word(words, |row| low_16_bits(self.torque_steps(row, 12))),
+            TorqueFormat::Q5_10 => self.write_each_word(words, |row| low_16_bits(self.torque_steps(row, 10))),
+            TorqueFormat::Q7_8 => self.write_each_word(words, |row| low_16_bits(self.torque_steps(row, 8))),
         }
     }
 
@@ -117,8 +118,8 @@ impl<'a> Torque<'a> {
     #[cold]
     #[inline(never)]
     fn write_saturating_words(&self, format: TorqueFormat, words: &mut [i16]) {
-        self.write_each(words, |row| {
-            let steps = self.steps(row, format.fraction_bits());
+        self.write_each_word(words, |row| {
+            let steps = self.torque_steps(row, format.fraction_bits());
             i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX })
         });
     }
@@ -126,7 +127,7 @@ impl<'a> Torque<'a> {
     /// Writes the word of each element of J, last joint first. `black_box` prevents loop unrolling, for which a
     /// Cortex-M0 has too few registers.
     #[inline(always)]
-    fn write_each(&self, words: &mut [i16], word_of: impl Fn(Q1_14) -> i16) {
+    fn write_each_word(&self, words: &mut [i16], word_of: impl Fn(Q1_14) -> i16) {
         for index in (0..self.jacobian.len().min(words.len())).rev() {
             core::hint::black_box(());
             if let (Some(word), Some(row)) = (words.get_mut(index), self.jacobian.get(index)) {
@@ -137,7 +138,7 @@ impl<'a> Torque<'a> {
 
     /// Returns the torque for one element of J, rounded to steps of 2^-`fraction`.
     #[inline(always)]
-    fn steps(&self, row: Q1_14, fraction: u32) -> i32 {
+    fn torque_steps(&self, row: Q1_14, fraction: u32) -> i32 {
         // A 16 by 32 bit product in 32 bits: (J high + (J low >> 16)) 2^16 is less than 2^16 below J F, which
         // does not change the rounded result.
         let (high, low) = (self.force.0 >> 16, self.force.0 & 0xFFFF);
@@ -175,7 +176,7 @@ impl TorqueRounding {
 
 /// Converts steps to a word, without a check of the range.
 #[inline]
-fn low_word(steps: i32) -> i16 {
+fn low_16_bits(steps: i32) -> i16 {
     debug_assert!(i16::try_from(steps).is_ok(), "{steps} is no word");
     let [low, high, ..] = steps.to_le_bytes();
     i16::from_le_bytes([low, high])
@@ -251,13 +252,13 @@ mod tests {
         jacobian[0] = arm;
         jacobian[1] = arm.saturating_neg();
         let torque = Torque::new(&jacobian, Force::from_steps(10 << 16));
-        assert_eq!(torque.words(TorqueFormat::Q3_12)[..3], [i16::MAX, i16::MIN, 0]);
-        let wider = torque.words(TorqueFormat::Q5_10);
+        assert_eq!(torque.torque_words(TorqueFormat::Q3_12)[..3], [i16::MAX, i16::MIN, 0]);
+        let wider = torque.torque_words(TorqueFormat::Q5_10);
         assert_eq!(wider[..3], [Q5_10::nearest(10.0 * arm.to_f64()).to_bits(), -wider[0], 0]);
         assert_eq!(torque.exact_torques()[1].to_f64(), -10.0 * arm.to_f64());
 
         let less = Torque::new(&jacobian, Force::from_steps(9 << 16));
-        assert_eq!(less.words(TorqueFormat::Q3_12)[0], Q3_12::nearest(9.0 * arm.to_f64()).to_bits());
+        assert_eq!(less.torque_words(TorqueFormat::Q3_12)[0], Q3_12::nearest(9.0 * arm.to_f64()).to_bits());
     }
 
     #[test]
@@ -320,7 +321,7 @@ mod tests {
             for force in [sensed, Force::from_steps(steps)] {
                 prop_assert!(force.steps() >= 0);
                 let torque = Torque::new(&jacobian, force);
-                for ((row, exact), word) in jacobian.iter().zip(torque.exact_torques()).zip(torque.words(TorqueFormat::Q3_12)) {
+                for ((row, exact), word) in jacobian.iter().zip(torque.exact_torques()).zip(torque.torque_words(TorqueFormat::Q3_12)) {
                     let real = row.to_f64() * force.to_f64();
                     prop_assert_eq!(exact.to_f64(), real);
                     let held = real.clamp(Q3_12::MIN.to_f64(), Q3_12::MAX.to_f64());
@@ -328,7 +329,7 @@ mod tests {
                 }
                 for format in TorqueFormat::ALL {
                     let rounded = torque.exact_torques().map(|exact| format.round(exact));
-                    prop_assert_eq!(torque.words(format), rounded);
+                    prop_assert_eq!(torque.torque_words(format), rounded);
                     let bound = jacobian.iter().map(|row| row.to_bits().unsigned_abs()).max().unwrap_or(0);
                     let mut words = [0; MAX_JOINTS];
                     torque.write_words(&TorqueRounding::new(format, bound), &mut words);

@@ -94,7 +94,7 @@ pub fn encode_into(bytes: &mut FlashImage, serial: u32, kept: &FlashContent) {
     let head: [&[u8]; 4] = [MAGIC, &[VERSION, number], &serial, &[kept.parameters.is_some().into()]];
     bytes.extend(head.into_iter().flatten().copied());
     match &kept.parameters {
-        Some(parameters) => parameters.image_parts().for_each(|part| bytes.extend(part)),
+        Some(parameters) => parameters.encode_image_parts().for_each(|part| bytes.extend(part)),
         None => bytes.extend([0; IMAGE_BYTES]),
     }
     bytes.extend(crc16(bytes).to_le_bytes());

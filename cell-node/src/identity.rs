@@ -3,7 +3,7 @@
 use protocol::id::{CellId, Id};
 
 /// Number of identifiers that every cell receives because of its node id.
-pub const OWN_IDS: usize = 10;
+pub const CELL_RECEIVED_ID_COUNT: usize = 10;
 
 /// The identity of a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -15,10 +15,10 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Returns the identifiers that this cell receives in every network state ([`Id::received_by_cell`]). A cell without a node
+    /// Returns the identifiers that this cell receives in every network state ([`Id::ids_received_by_cell`]). A cell without a node
     /// id receives no identifiers, only messages at its ports.
     #[must_use]
-    pub fn received_ids(&self) -> [Option<Id>; OWN_IDS] {
-        self.cell.map_or([None; OWN_IDS], |cell| Id::received_by_cell(cell).map(Some))
+    pub fn received_ids(&self) -> [Option<Id>; CELL_RECEIVED_ID_COUNT] {
+        self.cell.map_or([None; CELL_RECEIVED_ID_COUNT], |cell| Id::ids_received_by_cell(cell).map(Some))
     }
 }

@@ -32,7 +32,7 @@ pub use sockets::Sockets;
 /// Retry interval for opening a bus that does not exist yet.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 /// Retry interval while a network interface is down.
-const DOWN_RETRY_INTERVAL: Duration = Duration::from_millis(100);
+const INTERFACE_DOWN_RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Maximum age of unsent frames. Older frames are dropped: epochs count modulo 256, so a receiver could take their
 /// torques for newer ones.
@@ -120,7 +120,13 @@ impl HostedCells {
 
     /// Adds a cell that starts with the contents of its flash and has wires with these link ids. A simulated cell has
     /// no sensors, so it uses stimuli.
-    pub fn start(&mut self, identity: Identity, flash: &FlashState, file: FlashFile, link_ids: PortLinkIds) {
+    pub fn add_cell(
+        &mut self,
+        identity: Identity,
+        flash: &FlashState,
+        file: FlashFile,
+        link_ids: PortLinkIds,
+    ) {
         let mut wired = 0;
         for (port, link_id) in
             link_ids.iter().enumerate().filter_map(|(port, link_id)| Some((port, (*link_id)?)))
@@ -140,7 +146,7 @@ impl HostedCells {
     ///
     /// # Errors
     /// Returns an error if the bus does not exist, is not accessible, or does not support the options.
-    pub fn open(&mut self, line: &BusPort) -> Result<Sockets, StopReason> {
+    pub fn open_sockets(&mut self, line: &BusPort) -> Result<Sockets, StopReason> {
         self.update_subscriptions();
         let options = BusOptions {
             filters: self.filters.at_once.clone(),
@@ -155,10 +161,10 @@ impl HostedCells {
     ///
     /// # Errors
     /// Returns an error if the bus cannot be used, and waiting would not help.
-    pub fn open_again(&mut self, line: &BusPort) -> Result<Sockets, StopReason> {
+    pub fn reopen_sockets(&mut self, line: &BusPort) -> Result<Sockets, StopReason> {
         loop {
             std::thread::sleep(RETRY_INTERVAL);
-            match self.open(line) {
+            match self.open_sockets(line) {
                 Err(StopReason::Bus(error)) if error.may_open_later() => {}
                 opened => return opened,
             }
@@ -172,10 +178,12 @@ impl HostedCells {
             return None;
         }
         let (cells, rest) = (self.cells.iter().enumerate(), self.cells.len() <= MAX_RESTING_CELLS);
-        self.subscriptions.replace(cells.flat_map(|(place, HostedCell { node, link_ids, .. })| {
-            let may_defer = rest || link_ids.iter().any(Option::is_some);
-            node.received_ids().map(move |id| (place, id, may_defer && node.may_defer(id)))
-        }));
+        self.subscriptions.replace_subscriptions(cells.flat_map(
+            |(place, HostedCell { node, link_ids, .. })| {
+                let may_defer = rest || link_ids.iter().any(Option::is_some);
+                node.received_ids().map(move |id| (place, id, may_defer && node.may_receive_deferred(id)))
+            },
+        ));
         let hearing = self.subscriptions.filters();
         (hearing != self.filters).then(|| core::mem::replace(&mut self.filters, hearing))
     }
@@ -195,7 +203,7 @@ impl HostedCells {
                 Ok(()) => {}
                 // Frames received before the error have already been processed.
                 Err(StopReason::Bus(error)) => {
-                    self.recover(error, &mut sockets, line)?;
+                    self.recover_bus(error, &mut sockets, line)?;
                     now = self.clock.now();
                     continue;
                 }
@@ -207,20 +215,25 @@ impl HostedCells {
                 // A frame that a resting cell only counts is processed as if it had woken the process. With
                 // sums, its epoch is as old as its joints.
                 let (now, age) = if waited && !line.wires { (now - age, Span(0)) } else { (now, age) };
-                self.deliver(received, age, sockets.name(), now)?;
+                self.deliver_frame(received, age, sockets.name(), now)?;
             }
         }
     }
 
     /// Waits for a bus that does not work, or opens it again. Pending frames are sent afterwards. Frames that are too
     /// old are lost, as on a microcontroller without a bus.
-    fn recover(&mut self, error: BusError, sockets: &mut Sockets, line: &BusPort) -> Result<(), StopReason> {
+    fn recover_bus(
+        &mut self,
+        error: BusError,
+        sockets: &mut Sockets,
+        line: &BusPort,
+    ) -> Result<(), StopReason> {
         let since = *self.unsent_since.get_or_insert_with(Instant::now);
         if line.reconnect && error.is_closed() {
-            *sockets = self.open_again(line)?;
+            *sockets = self.reopen_sockets(line)?;
         } else if matches!(error, BusError::Down(_)) {
             self.drop_outbox();
-            std::thread::sleep(DOWN_RETRY_INTERVAL);
+            std::thread::sleep(INTERFACE_DOWN_RETRY_INTERVAL);
         } else if !error.is_temporary() {
             return Err(error.into());
         }
@@ -232,9 +245,9 @@ impl HostedCells {
 
     /// Drops the pending frames and subtracts their packets from the counters of sent packets.
     fn drop_outbox(&mut self) {
-        for place in self.outbox.drop_all() {
+        for place in self.outbox.drop_all_frames() {
             if let Some(hosted_cell) = self.cells.get_mut(place) {
-                hosted_cell.node.handle_unsent();
+                hosted_cell.node.handle_unsent_packet();
             }
         }
     }
@@ -246,7 +259,7 @@ impl HostedCells {
         // Frames that arrived before a timer became due are processed first, once.
         if let Some(due) = due
             && !core::mem::replace(&mut self.received_first, true)
-            && sockets.receive_pending(self.clock.wall_nanos(due))?
+            && sockets.receive_pending(self.clock.wall_clock_nanos(due))?
         {
             return Ok(());
         }
@@ -255,11 +268,12 @@ impl HostedCells {
         for (place, hosted_cell) in self.cells.iter_mut().enumerate() {
             if hosted_cell.node.poll_timeout() <= now {
                 hosted_cell.node.handle_timeout(now);
-                self.subscriptions_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
+                self.subscriptions_changed |=
+                    hosted_cell.collect_outgoing(place, self.format, &mut self.outbox);
             }
             next = next.min(hosted_cell.node.poll_timeout());
         }
-        self.clock.remeasure(now);
+        self.clock.measure_offset_if_due(now);
         // Set the filters before the answers to the following frames can arrive.
         if let Some(before) = self.update_subscriptions()
             && let Err(error) = sockets.set_filters(&self.filters, &before)
@@ -274,11 +288,11 @@ impl HostedCells {
         self.outbox.mark_sent(count);
         sent.map_err(|error| error.cause)?;
         self.unsent_since = None;
-        Ok(sockets.wait(Duration::from_micros(next.elapsed_since(now).0))?)
+        Ok(sockets.wait_for_frames(Duration::from_micros(next.elapsed_since(now).0))?)
     }
 
     /// Passes a frame to the cells that receive it, and collects the packets that they answer with.
-    fn deliver(
+    fn deliver_frame(
         &mut self,
         received: &ReceivedFrame,
         age: Span,
@@ -292,11 +306,12 @@ impl HostedCells {
                     (self.cells.get_mut(place), link_id.decode_frame(frame))
             {
                 hosted_cell.node.handle_port(now, age, port, message);
-                self.subscriptions_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
+                self.subscriptions_changed |=
+                    hosted_cell.collect_outgoing(place, self.format, &mut self.outbox);
             }
             return Ok(());
         }
-        let Ok(id) = packet::data_id(frame) else {
+        let Ok(id) = packet::data_frame_id(frame) else {
             // Each cell counts frames that it cannot use.
             self.cells.iter_mut().for_each(|hosted_cell| hosted_cell.node.handle_frame(now, age, frame));
             return Ok(());
@@ -313,7 +328,7 @@ impl HostedCells {
                 let (bus, cell) = (bus.to_owned(), hosted_cell.node.identity().cell.map_or(0, CellId::get));
                 return Err(StopReason::NodeIdTaken { bus, cell, serial });
             }
-            self.subscriptions_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
+            self.subscriptions_changed |= hosted_cell.collect_outgoing(place, self.format, &mut self.outbox);
         }
         Ok(())
     }
@@ -322,7 +337,7 @@ impl HostedCells {
 impl HostedCell {
     /// Writes the cell's pending parameters to flash and moves its pending packets to the outbox. Returns true if the
     /// cell now receives other identifiers.
-    fn collect(&mut self, place: usize, format: Format, outbox: &mut Outbox) -> bool {
+    fn collect_outgoing(&mut self, place: usize, format: Format, outbox: &mut Outbox) -> bool {
         if let Some(kept) = self.node.poll_store() {
             self.node.handle_stored(self.file.store(&kept).is_ok());
         }

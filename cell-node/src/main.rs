@@ -11,7 +11,7 @@ use clap::Parser;
 use protocol::bus::{BusKind, KindChoice};
 use protocol::id::CellId;
 use protocol::last_words::{CellRange, ExitReason};
-use protocol::skin::{Skin, SkinReply, Wires};
+use protocol::skin::{BusWires, Skin, SkinReply};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
 /// A tactile skin cell: receives joint positions, answers with its joint torques.
@@ -65,14 +65,14 @@ fn parse_range(text: &str) -> Result<(u8, u8), String> {
 
 impl Arguments {
     /// Returns the first and the last node id that the process runs; `None` if the network assigns it.
-    fn nodes(&self) -> Option<(u8, u8)> {
+    fn node_range(&self) -> Option<(u8, u8)> {
         self.node.map(|node| (node, node)).or(self.nodes)
     }
 
     /// Reports the reason for the end of this process: as a line of [`LastWords`] if another program started
     /// it.
-    fn report_exit(&self, why: impl core::fmt::Display) {
-        match self.nodes().filter(|_| self.with_parent.is_some()) {
+    fn report_exit_reason(&self, why: impl core::fmt::Display) {
+        match self.node_range().filter(|_| self.with_parent.is_some()) {
             Some((first, last)) => {
                 eprint_line(ExitReason {
                     cells: CellRange(first, last),
@@ -102,24 +102,24 @@ fn main() -> ExitCode {
     };
     // Hundreds of cells wake up at once; each waits for its turn.
     protocol::bus::set_batch_scheduling();
-    match prepare(&arguments) {
+    match prepare_cells(&arguments) {
         Ok((mut cells, sockets, line)) => {
             let Err(stopped) = cells.run(sockets, &line);
             // The program that started hundreds of cells reports once that their bus is gone.
             let is_gone = matches!(&stopped, StopReason::Bus(error) if error.is_closed());
             if arguments.with_parent.is_none() || !is_gone {
-                arguments.report_exit(stopped);
+                arguments.report_exit_reason(stopped);
             }
             ExitCode::from(1)
         }
         Err(error) => {
-            arguments.report_exit(format_args!("{error:#}"));
+            arguments.report_exit_reason(format_args!("{error:#}"));
             ExitCode::from(2)
         }
     }
 }
 
-fn prepare(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
+fn prepare_cells(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
     if let Some(parent) = arguments.with_parent {
         // A stopped process would not receive SIGTERM before it is continued.
         set_parent_process_death_signal(Some(Signal::KILL))?;
@@ -130,7 +130,7 @@ fn prepare(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
         bail!("--flash {}: there is no such directory; make it first", flash.display());
     }
     let skin = Skin::read_for_bus(&arguments.skin, &arguments.bus)?;
-    let bus_index = skin.bus_named(&arguments.bus).with_context(|| {
+    let bus_index = skin.bus_index(&arguments.bus).with_context(|| {
         let names = skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
         format!("bus {} is not in {}, which has {names}", arguments.bus, arguments.skin.display())
     })?;
@@ -139,7 +139,7 @@ fn prepare(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
         SkinReply::Torque => None,
         SkinReply::Sum { .. } => Some(skin.wires(bus_index)),
     };
-    let (first, last) = arguments.nodes().context("--node or --nodes is needed")?;
+    let (first, last) = arguments.node_range().context("--node or --nodes is needed")?;
     let mut cells = HostedCells::new(bus.format);
     for number in first..=last {
         start_cell(&mut cells, arguments, &skin, bus_index, wires.as_ref(), CellId::new(number.into())?)?;
@@ -150,13 +150,13 @@ fn prepare(arguments: &Arguments) -> Result<(HostedCells, Sockets, BusPort)> {
         wires: wires.is_some(),
         reconnect: arguments.reconnect,
     };
-    let sockets = match cells.open(&line) {
+    let sockets = match cells.open_sockets(&line) {
         Err(StopReason::Bus(error)) if line.reconnect && error.may_open_later() => {
             // The program that started hundreds of cells reports it.
             if arguments.with_parent.is_none() {
                 eprint_line(format_args!("{error}; waiting for it"));
             }
-            cells.open_again(&line)?
+            cells.reopen_sockets(&line)?
         }
         opened => opened?,
     };
@@ -169,7 +169,7 @@ fn start_cell(
     arguments: &Arguments,
     skin: &Skin,
     bus_index: usize,
-    wires: Option<&Wires>,
+    wires: Option<&BusWires>,
     cell: CellId,
 ) -> Result<()> {
     let described =
@@ -198,6 +198,6 @@ fn start_cell(
         }
     };
     let link_ids = wires.map_or_else(PortLinkIds::default, |wires| wires.link_ids_of(cell));
-    cells.start(identity, &flash, file, link_ids);
+    cells.add_cell(identity, &flash, file, link_ids);
     Ok(())
 }

@@ -28,40 +28,40 @@ pub use paper::{paper_cosine, paper_sine};
 /// The number one, with the 16 fraction bits of the polynomials.
 const ONE_Q16: i32 = 1 << 16;
 /// A quarter turn as a word.
-pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
+pub(crate) const QUARTER_TURN: Q1_14 = Q1_14::from_bits(1 << 14);
 
 /// Coefficients of z, z^3, z^5 and z^7 in the polynomial of seventh order for the sine of z quarter turns.
 ///
 /// The coefficients were found by search. Among all integers whose sum is one (so that the sine of a quarter turn is
 /// one), they have the smallest mean error when every intermediate result is truncated.
-const SEVENTH_ORDER: [i32; 4] = [ONE_Q16 + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
+const SEVENTH_ORDER_COEFFICIENTS: [i32; 4] = [ONE_Q16 + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
 
 /// Returns the sine of an angle in quarter turns, in [-1, 1].
 ///
 /// Seventh order; the mean error over all angles is below 1.6e-5, and the maximum below 6.2e-5.
 #[must_use]
 pub fn sine(angle: Q1_14) -> Q1_14 {
-    odd_polynomial(angle, SEVENTH_ORDER)
+    evaluate_odd_polynomial(angle, SEVENTH_ORDER_COEFFICIENTS)
 }
 
 /// Returns the cosine of an angle in quarter turns: the [`sine`] a quarter turn later (Eq. 19).
 #[must_use]
 pub fn cosine(angle: Q1_14) -> Q1_14 {
-    sine(angle.wrapping_add(QUARTER))
+    sine(angle.wrapping_add(QUARTER_TURN))
 }
 
 /// Returns [`sine`] and [`cosine`] of one angle in steps of 2^-14. The results are identical to those of the two
 /// functions, but take less time.
 #[inline]
 pub(crate) fn sine_cosine(angle: Q1_14) -> [i32; 2] {
-    evaluate(angle, SEVENTH_ORDER)
+    evaluate_sine_cosine(angle, SEVENTH_ORDER_COEFFICIENTS)
 }
 
 /// Returns sine and cosine, computed with an odd polynomial whose coefficients add up to one. The angle is folded to
 /// |z| within one quarter turn. |sin z| is the polynomial of |z|, and |cos z| is the polynomial of 1 - |z|.
 /// Intermediate results can be negative only because coefficients are.
 #[inline]
-fn evaluate<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2] {
+fn evaluate_sine_cosine<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2] {
     let quarter = 1 << 14;
     let z = i32::from(angle.to_bits());
     let negative = z >> 31;
@@ -69,14 +69,18 @@ fn evaluate<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i3
     let beyond = left >> 31;
     let left_over = (left ^ beyond) - beyond;
     let folded = quarter - left_over;
-    let squares = [product(folded, folded) >> 13, product(left_over, left_over) >> 13];
+    let squares =
+        [product_fitting_i32(folded, folded) >> 13, product_fitting_i32(left_over, left_over) >> 13];
     let horner = |[s, c]: [i32; 2], [coefficient, _]: [i32; 2]| {
-        [coefficient + (product(squares[0], s) >> 15), coefficient + (product(squares[1], c) >> 15)]
+        [
+            coefficient + (product_fitting_i32(squares[0], s) >> 15),
+            coefficient + (product_fitting_i32(squares[1], c) >> 15),
+        ]
     };
     let factors = coefficients.map(|it| [it, it]).into_iter().rev().reduce(horner).unwrap_or([0; 2]);
     // Rounded, ties away from zero, because the sign is applied later.
-    let sine = ((product(folded, factors[0]) >> 15) + 1) >> 1;
-    let cosine = ((product(left_over, factors[1]) >> 15) + 1) >> 1;
+    let sine = ((product_fitting_i32(folded, factors[0]) >> 15) + 1) >> 1;
+    let cosine = ((product_fitting_i32(left_over, factors[1]) >> 15) + 1) >> 1;
     [(sine ^ negative) - negative, (cosine ^ beyond) - beyond]
 }
 
@@ -88,12 +92,12 @@ fn fold_angle(angle: Q1_14) -> i32 {
 }
 
 /// Evaluates an odd polynomial at the folded angle. Its coefficients must add up to one.
-fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> Q1_14 {
+fn evaluate_odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> Q1_14 {
     let z = fold_angle(angle);
-    let square = product(z, z) >> 13; // 15 fraction bits, at most 2^15
-    let horner = |sum: i32, coefficient: i32| coefficient + (product(square, sum) >> 15);
+    let square = product_fitting_i32(z, z) >> 13; // 15 fraction bits, at most 2^15
+    let horner = |sum: i32, coefficient: i32| coefficient + (product_fitting_i32(square, sum) >> 15);
     let factor = coefficients.into_iter().rev().reduce(horner).unwrap_or(0);
-    let sine = product(z, factor); // 30 fraction bits, at most 2^30
+    let sine = product_fitting_i32(z, factor); // 30 fraction bits, at most 2^30
     let rounded = (sine + (1 << 15) + (sine >> 31)) >> 16; // ties away from zero, which is odd
     let [low, high, ..] = rounded.to_le_bytes(); // a sine is within 1
     Q1_14::from_bits(i16::from_le_bytes([low, high]))
@@ -101,20 +105,24 @@ fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) 
 
 /// Returns a product that is known to fit 32 bits. A release build does not check this, because on a small processor
 /// the check would take longer than the product.
-fn product(lhs: i32, rhs: i32) -> i32 {
+fn product_fitting_i32(lhs: i32, rhs: i32) -> i32 {
     debug_assert!(lhs.checked_mul(rhs).is_some(), "{lhs} x {rhs} is wider than 32 bits");
     lhs.wrapping_mul(rhs)
 }
 
 /// Number of fraction bits of [`fine_sine_cosine`].
-pub(crate) const FINE_FRACTION_BITS: u32 = 28;
+pub(crate) const PRECISE_SINE_FRACTION_BITS: u32 = 28;
 
 /// Returns sine and cosine with 28 fraction bits, for constants that are computed once. They are exact at the quarter
 /// turns; elsewhere the error is at most 1e-8.
-pub(crate) fn fine_sine_cosine(angle: Q1_14) -> [i64; 2] {
-    [angle, angle.wrapping_add(QUARTER)].map(|angle| {
+pub(crate) fn precise_sine_cosine(angle: Q1_14) -> [i64; 2] {
+    [angle, angle.wrapping_add(QUARTER_TURN)].map(|angle| {
         let z = i64::from(fold_angle(angle));
-        let factor = TAYLOR.into_iter().rev().reduce(|sum, c| c + ((z * z * sum) >> 28)).unwrap_or(0);
+        let factor = SINE_TAYLOR_COEFFICIENTS
+            .into_iter()
+            .rev()
+            .reduce(|sum, c| c + ((z * z * sum) >> 28))
+            .unwrap_or(0);
         let product = z * factor; // 14 + 32 fraction bits
         (product + (1 << 17)) >> 18
     })
@@ -123,7 +131,7 @@ pub(crate) fn fine_sine_cosine(angle: Q1_14) -> [i64; 2] {
 /// Coefficients of the power series for the sine of a quarter turn, with 32 fraction bits: (pi/2)^n / n!, n = 1, 3, 5
 /// ... 15.
 #[expect(clippy::cast_possible_truncation, reason = "all below 2^33")]
-const TAYLOR: [i64; 8] = {
+const SINE_TAYLOR_COEFFICIENTS: [i64; 8] = {
     let mut series = [0; 8];
     let (mut term, mut n) = (FRAC_PI_2, 1.0);
     let mut rest: &mut [i64] = &mut series;
@@ -218,15 +226,15 @@ mod tests {
 
     #[test]
     fn the_fine_ones_are_exact_at_quarter_turns_and_fine_between() {
-        let one = 1 << FINE_FRACTION_BITS;
+        let one = 1 << PRECISE_SINE_FRACTION_BITS;
         for (angle, target) in
             [(0, [0, one]), (1 << 14, [one, 0]), (-1 << 14, [-one, 0]), (i16::MIN, [0, -one])]
         {
-            assert_eq!(fine_sine_cosine(Q1_14::from_bits(angle)), target, "at {angle}");
+            assert_eq!(precise_sine_cosine(Q1_14::from_bits(angle)), target, "at {angle}");
         }
-        let real = |fine: i64| Accumulator::<FINE_FRACTION_BITS>::from_steps(fine).to_f64();
+        let real = |fine: i64| Accumulator::<PRECISE_SINE_FRACTION_BITS>::from_steps(fine).to_f64();
         for (index, oracle) in [f64::sin, f64::cos].into_iter().enumerate() {
-            let (_, max) = errors(|z| real(fine_sine_cosine(z)[index]), oracle);
+            let (_, max) = errors(|z| real(precise_sine_cosine(z)[index]), oracle);
             assert!(max <= 1e-8, "{max:e}");
         }
     }

@@ -18,9 +18,9 @@ use protocol::port::PORTS;
 use protocol::time::{Micros, Span};
 
 /// Number of consecutive epochs in which a missing sum is NACKed, because the child's reply to a NACK may be lost too.
-const NACK_EPOCHS: u8 = 4;
+const MAX_NACK_EPOCHS: u8 = 4;
 /// Number of fraction bits that rounding to Q7.8 removes from an exact sum.
-const DROPPED_BITS: u32 = 30 - 8;
+const DROPPED_FRACTION_BITS: u32 = 30 - 8;
 
 /// A sum as it is sent on the bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -37,14 +37,14 @@ impl SumWords {
 
     /// Returns true if the sum ends the lease of its sender.
     #[must_use]
-    pub const fn is_end(&self) -> bool {
+    pub const fn is_lease_end(&self) -> bool {
         self.count == 0
     }
 }
 
 /// The sums of one child, as its parent receives them.
 #[derive(Clone, Copy, Debug, Default)]
-struct Child {
+struct ChildSums {
     /// Epoch of the last sum that arrived; `None` if the lease does not run.
     last: Option<Epoch>,
     /// True if a sum of any epoch has arrived in the present epoch.
@@ -59,7 +59,7 @@ struct Child {
 
 /// The sum of a cell's own torque and the sums of its children, and the times to send it.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Sum {
+pub struct SubtreeSum {
     slots: Option<SumSchedule>,
     /// The present epoch.
     pub(crate) epoch: Option<Epoch>,
@@ -71,7 +71,7 @@ pub struct Sum {
     ends: bool,
     /// The rounding error that is carried into the next sum, in steps of 2^-30 Nm.
     carry: [i64; MAX_JOINTS],
-    children: [Child; PORTS],
+    children: [ChildSums; PORTS],
     /// True if the sum is held back until a message of the parent arrives.
     pub(crate) held: bool,
     /// The time at which the sum is to be sent.
@@ -109,9 +109,9 @@ pub struct EpochStart {
     pub children: u8,
 }
 
-impl Sum {
+impl SubtreeSum {
     /// Sets the schedule of sums, which applies from the next joints on. With `None` the cell sends no sums.
-    pub fn set_slots(&mut self, slots: Option<SumSchedule>) {
+    pub fn set_schedule(&mut self, slots: Option<SumSchedule>) {
         if slots.is_none() {
             *self = Self { sent: self.sent, taken: self.taken, dropped: self.dropped, ..Self::default() };
         }
@@ -124,7 +124,7 @@ impl Sum {
     }
 
     /// Starts an epoch. `own` is the exact torque of this cell; `None` if it is not in contact.
-    pub fn begin(&mut self, begin: &EpochStart, own: Option<&[Accumulator<30>; MAX_JOINTS]>) {
+    pub fn begin_epoch(&mut self, begin: &EpochStart, own: Option<&[Accumulator<30>; MAX_JOINTS]>) {
         let Some(slots) = self.slots else { return };
         let before = self.epoch.replace(begin.epoch);
         let follows = before.is_some_and(|before| before.next() == begin.epoch);
@@ -132,27 +132,27 @@ impl Sum {
             let is_child = begin.children >> port & 1 == 1;
             let last = child.last.filter(|_| is_child);
             let waiting = child.waiting.filter(|(epoch, _)| *epoch == begin.epoch);
-            *child = Child { last, received_any: false, taken: None, waiting, missing: child.missing };
+            *child = ChildSums { last, received_any: false, taken: None, waiting, missing: child.missing };
         }
         self.begin = *begin;
         self.held = false;
         if own.is_none() {
             self.carry = [0; MAX_JOINTS];
         }
-        self.own = own.map(|exact| self.round(exact, slots.carry));
+        self.own = own.map(|exact| self.round_torques(exact, slots.carry));
         // Send an end, so that the parent does not keep the last sum forever.
         self.ends =
-            follows && self.last_sent.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
+            follows && self.last_sent.is_some_and(|(of, words)| Some(of) == before && !words.is_lease_end());
         self.due = None;
-        self.schedule(begin.at);
+        self.schedule_sum(begin.at);
         (self.is_checked, self.check) = (false, None);
         if self.children.iter().any(|child| child.missing > 0) {
-            self.schedule_check();
+            self.schedule_missing_check();
         }
     }
 
     /// Schedules the check for missing sums at a time before the next joints at which lost sums can still be requested.
-    pub(crate) fn schedule_check(&mut self) {
+    pub(crate) fn schedule_missing_check(&mut self) {
         if !self.is_checked && self.epoch.is_some() {
             self.check = Some(self.begin.at + self.settling_time());
         }
@@ -164,35 +164,35 @@ impl Sum {
     }
 
     /// Rounds exact torques to Q7.8. If `carries` is true, the rounding errors are added to the next torques.
-    fn round(&mut self, exact: &[Accumulator<30>; MAX_JOINTS], carries: bool) -> [i32; MAX_JOINTS] {
+    fn round_torques(&mut self, exact: &[Accumulator<30>; MAX_JOINTS], carries: bool) -> [i32; MAX_JOINTS] {
         let mut words = [0; MAX_JOINTS];
         for ((word, carry), exact) in words.iter_mut().zip(&mut self.carry).zip(exact) {
             let target = exact.steps() + if carries { *carry } else { 0 };
-            let rounded = (target + (1 << (DROPPED_BITS - 1))) >> DROPPED_BITS;
-            *carry = target - (rounded << DROPPED_BITS);
+            let rounded = (target + (1 << (DROPPED_FRACTION_BITS - 1))) >> DROPPED_FRACTION_BITS;
+            *carry = target - (rounded << DROPPED_FRACTION_BITS);
             *word = i32::try_from(rounded).unwrap_or(if rounded < 0 { i32::MIN } else { i32::MAX });
         }
         words
     }
 
     /// Handles the state message of a child, which announces its sums from this epoch on.
-    pub fn handle_state(&mut self, now: Micros, port: usize, epoch: Epoch) {
+    pub fn handle_state_message(&mut self, now: Micros, port: usize, epoch: Epoch) {
         let Some(child) = self.children.get_mut(port) else { return };
         child.last = Some(epoch.previous());
         if let Some((_, words)) = child.waiting.take_if(|(of, _)| *of == epoch) {
             self.dropped = self.dropped.wrapping_sub(1);
-            self.receive(now, port, epoch, words);
+            self.receive_sum(now, port, epoch, words);
         }
     }
 
     /// Handles a sum of a child. Among several sums of one epoch, the one with the largest count is kept.
-    pub fn receive(&mut self, now: Micros, port: usize, epoch: Epoch, words: SumWords) {
+    pub fn receive_sum(&mut self, now: Micros, port: usize, epoch: Epoch, words: SumWords) {
         let present = self.epoch == Some(epoch);
         let Some(child) = self.children.get_mut(port) else { return };
         child.received_any = true;
         child.missing = 0;
         let follows = child.last.is_some_and(|last| epoch == last || epoch == last.next());
-        child.last = Some(epoch).filter(|_| follows && !words.is_end());
+        child.last = Some(epoch).filter(|_| follows && !words.is_lease_end());
         if !follows || !present {
             self.dropped = self.dropped.wrapping_add(1);
             child.waiting = (!follows).then_some((epoch, words));
@@ -203,15 +203,15 @@ impl Sum {
         }
         child.taken = Some(words);
         self.taken = self.taken.wrapping_add(1);
-        self.schedule(now);
+        self.schedule_sum(now);
     }
 
     /// Schedules the sum: at once if the sums of all children have arrived, otherwise in this cell's slot. If a child
     /// that sent in the previous epoch is late, the sum waits as long as it is still useful to the parent. Later
     /// changes are sent in the next slot.
-    fn schedule(&mut self, now: Micros) {
+    fn schedule_sum(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
-        if self.count() == 0 && !self.ends {
+        if self.summed_cell_count() == 0 && !self.ends {
             return;
         }
         let width = u64::from(slots.slot_us);
@@ -222,13 +222,14 @@ impl Sum {
             self.due = Some(self.due.map_or(at, |due| due.min(at)));
             return;
         }
-        let is_in =
-            |(port, child): (usize, &Child)| self.begin.children >> port & 1 == 0 || child.taken.is_some();
-        let is_late = |child: &Child| child.last.is_some() && child.taken.is_none();
+        let is_in = |(port, child): (usize, &ChildSums)| {
+            self.begin.children >> port & 1 == 0 || child.taken.is_some()
+        };
+        let is_late = |child: &ChildSums| child.last.is_some() && child.taken.is_none();
         let at = if self.children.iter().enumerate().all(is_in) {
             0
         } else if self.children.iter().any(is_late) {
-            self.late_send_time().0.max(slot)
+            self.late_send_delay().0.max(slot)
         } else {
             slot
         };
@@ -242,7 +243,7 @@ impl Sum {
 
     /// Returns the time after the joints at which the sum is sent even if a child is late. It is half a slot earlier
     /// for each wire to the root, so that the sum still reaches the waiting cells above.
-    fn late_send_time(&self) -> Span {
+    fn late_send_delay(&self) -> Span {
         let width = self.slots.map_or(0, |slots| u64::from(slots.slot_us));
         Span(self.settling_time().0.saturating_sub(u64::from(self.depth()) * width / 2))
     }
@@ -254,7 +255,7 @@ impl Sum {
 
     /// Returns the time at which the sum of the next epoch is sent even if a child is late.
     pub(crate) fn next_late_send_time(&self) -> Micros {
-        self.begin.at + self.begin.period + self.late_send_time()
+        self.begin.at + self.begin.period + self.late_send_delay()
     }
 
     /// Ends the lease of the child at a port, which is not a child any more.
@@ -286,12 +287,12 @@ impl Sum {
         if !self.begin.may_send || self.begin.depth.is_none() {
             return None;
         }
-        let words = self.words()?;
+        let words = self.sum_words()?;
         if self.last_sent == Some((epoch, words)) {
             return None;
         }
         let follows =
-            |(of, before): (Epoch, SumWords)| of == epoch || (of.next() == epoch && !before.is_end());
+            |(of, before): (Epoch, SumWords)| of == epoch || (of.next() == epoch && !before.is_lease_end());
         let goes_on = self.last_sent.is_some_and(follows) && !core::mem::take(&mut self.restate);
         self.last_sent = Some((epoch, words));
         self.sent = self.sent.wrapping_add(1);
@@ -299,14 +300,14 @@ impl Sum {
     }
 
     /// Returns the number of cells whose torques have arrived in this epoch.
-    fn count(&self) -> u32 {
+    fn summed_cell_count(&self) -> u32 {
         let children = self.children.iter().filter_map(|child| child.taken);
         u32::from(self.own.is_some()) + children.map(|words| u32::from(words.count)).sum::<u32>()
     }
 
     /// Returns the sum of all contributions of this epoch; `None` if no sum needs to be sent.
-    fn words(&self) -> Option<SumWords> {
-        let count = self.count();
+    fn sum_words(&self) -> Option<SumWords> {
+        let count = self.summed_cell_count();
         if count == 0 {
             return self.ends.then_some(SumWords::LEASE_END);
         }
@@ -330,9 +331,9 @@ impl Sum {
     }
 
     /// Returns true if a sum was sent in this epoch or the previous one, and more will follow.
-    pub(crate) fn is_busy(&self) -> bool {
+    pub(crate) fn is_sending_sums(&self) -> bool {
         let recent = |of: Epoch| self.epoch.is_some_and(|epoch| of == epoch || of.next() == epoch);
-        self.last_sent.is_some_and(|(of, words)| recent(of) && !words.is_end())
+        self.last_sent.is_some_and(|(of, words)| recent(of) && !words.is_lease_end())
     }
 
     /// Handles joints that the cell does not answer: all leases end, and the children must repeat their state messages.
@@ -346,7 +347,7 @@ impl Sum {
 
     /// Records that a frame was handled `age` after it was on the bus. If that exceeds a quarter of a period, this
     /// machine is slow, and missing sums are not checked in this epoch.
-    pub(crate) const fn note_delay(&mut self, age: Span) {
+    pub(crate) const fn note_frame_delay(&mut self, age: Span) {
         if age.0 * 4 > self.begin.period.0 && self.begin.period.0 > 0 {
             self.is_checked = true;
             self.check = None;
@@ -354,18 +355,18 @@ impl Sum {
     }
 
     /// Returns true if all sums of this epoch have been sent.
-    pub(crate) fn is_settled(&self, now: Micros) -> bool {
+    pub(crate) fn are_all_sums_sent(&self, now: Micros) -> bool {
         self.epoch.is_none() || now >= self.begin.at + self.settling_time()
     }
 
     /// Returns the lateness of the check for missing sums; `None` if the check is not due.
-    pub(crate) fn poll_check(&mut self, now: Micros) -> Option<Span> {
+    pub(crate) fn poll_check_lateness(&mut self, now: Micros) -> Option<Span> {
         self.check.take_if(|check| *check <= now).map(|check| now.elapsed_since(check))
     }
 
     /// Returns the children whose sums of this epoch are missing, once per epoch: bit p is set for the child at port p.
     /// The lease of such a child ends.
-    pub(crate) fn check_missing(&mut self) -> Option<(Epoch, u8)> {
+    pub(crate) fn take_missing_children(&mut self) -> Option<(Epoch, u8)> {
         if core::mem::replace(&mut self.is_checked, true) {
             return None;
         }
@@ -375,7 +376,7 @@ impl Sum {
             let unsaid = child.waiting.is_some_and(|(of, _)| Some(of) == self.epoch);
             if unsaid || (child.last.is_some() && !child.received_any) {
                 child.last = None;
-                child.missing = NACK_EPOCHS;
+                child.missing = MAX_NACK_EPOCHS;
             }
             if child.missing > 0 {
                 child.missing -= 1;

@@ -11,12 +11,12 @@ use criterion::{Criterion, Throughput};
 use protocol::candump::write_record;
 use trace::capture::{CaptureEntry, Reader};
 
-const LINES: u64 = 20_000;
+const LOG_LINES: u64 = 20_000;
 
 /// A log as `candump -L` writes it.
 fn candump_log() -> &'static [u8] {
     let mut log = String::new();
-    for line in 0..LINES {
+    for line in 0..LOG_LINES {
         let micros = 1_700_000_000_000_000 + line * 63;
         let (sec, micro, id) = (micros / 1_000_000, micros % 1_000_000, 0x200 + line % 253);
         let word = line.wrapping_mul(0x9E37_79B9_7F4A_7C15);
@@ -69,14 +69,14 @@ fn main() {
         .measurement_time(Duration::from_millis(1_500))
         .configure_from_args();
     let log = candump_log();
-    assert_eq!([read_with_skinbus(log), read_with_socketcan(log)], [LINES; 2]);
+    assert_eq!([read_with_skinbus(log), read_with_socketcan(log)], [LOG_LINES; 2]);
     assert_eq!(
         read_and_write(log),
         log.iter().filter(|&&byte| byte != b'\n').count(),
         "what is written is what was read"
     );
     let mut group = criterion.benchmark_group("candump");
-    group.throughput(Throughput::Elements(LINES));
+    group.throughput(Throughput::Elements(LOG_LINES));
     group.bench_function("this reader", |bencher| bencher.iter(|| read_with_skinbus(black_box(log))));
     group.bench_function("socketcan", |bencher| bencher.iter(|| read_with_socketcan(black_box(log))));
     group.bench_function("read and written", |bencher| bencher.iter(|| read_and_write(black_box(log))));

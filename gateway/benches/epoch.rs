@@ -73,7 +73,7 @@ impl ReplyBus {
 }
 
 /// The replies of an epoch.
-fn replies(epoch: Epoch) -> Vec<Frame> {
+fn reply_frames(epoch: Epoch) -> Vec<Frame> {
     let reply = |from: CellId| {
         let torque = [0.1, -0.2, 0.3, 0.05, 0.01, 0.0].map(Q3_12::nearest);
         Message::Torque { from, epoch, torque: torque.map(Q3_12::to_bits).into() }.encode().frames(Format::Fd)
@@ -92,7 +92,7 @@ impl Listener {
         let text = generate(&SkinRequest { cells: CELLS, ..SkinRequest::default() }).expect("a UR5 has room");
         let skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
         let mut table = BusTable::new(&skin, 0);
-        table.set_comparing(false);
+        table.set_torque_comparison(false);
         Self { table, number: 0 }
     }
 
@@ -114,7 +114,7 @@ impl Listener {
 }
 
 /// Compiles the C program with the compiler that links Rust programs.
-fn compile() -> PathBuf {
+fn compile_c_program() -> PathBuf {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/recv.c");
     let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("recv");
     let compiler = std::env::var("CC").unwrap_or_else(|_| "cc".to_owned());
@@ -142,7 +142,7 @@ fn time_c_program(program: &Path, epochs: u64) -> Duration {
 }
 
 fn main() {
-    let program = compile();
+    let program = compile_c_program();
     let place = tempfile::tempdir().expect("a temporary directory");
     let mut wire = ReplyBus::new(place.path().join("skinbus"));
     let mut listener = Listener::new();
@@ -154,7 +154,7 @@ fn main() {
 
     let mut group = criterion.benchmark_group("epoch of 253 frames");
     group.throughput(Throughput::Elements(CELLS as u64));
-    let frames = replies(Epoch(0));
+    let frames = reply_frames(Epoch(0));
     group.bench_function("frames", |bencher| {
         bencher.iter_custom(|epochs| {
             let mut sum = 0;
@@ -172,7 +172,7 @@ fn main() {
             let mut took = Duration::ZERO;
             for _ in 0..epochs {
                 let epoch = listener.open_epoch();
-                wire.send_replies(&replies(epoch));
+                wire.send_replies(&reply_frames(epoch));
                 took += wire.receive_epoch(|_, frame| listener.receive(frame));
                 assert_eq!(listener.table.snapshot().sums.contributing, 253, "every reply counts");
             }

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use bench::bus::realtime;
 use control::controller::KinestheticController;
 use control::cycle::turn::{BusPort, SharedRunState, TickDriver, TimedRecord};
-use control::cycle::{Cycle, Tick};
+use control::cycle::{ControlCycle, Tick};
 use control::robot::SimulatedArm;
 use criterion::{BenchmarkId, Criterion};
 use model::generate::{SkinRequest, generate};
@@ -19,7 +19,7 @@ use model::scenario::{ModeChange, Scenario, TorqueSource};
 use model::table::{BusTotals, Snapshot};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::message::SkinSensors;
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Skin, SkinBus};
@@ -110,7 +110,11 @@ impl Bench {
         let modes = vec![ModeChange { at: Micros(0), mode }];
         let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
         let controller = Box::new(KinestheticController::new(skin).expect("a generated skin has one"));
-        let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, padded(&[0.1; WORDS]))));
+        let cycle = ControlCycle::new(
+            skin,
+            controller,
+            Box::new(SimulatedArm::new(skin, pad_with_defaults(&[0.1; WORDS]))),
+        );
         let (producer, records) = rtrb::RingBuffer::new(64);
         let turn =
             TickDriver::new(cycle, lines, Arc::new(scenario), Arc::new(SharedRunState::default()), producer);
@@ -124,14 +128,14 @@ impl Bench {
             let next = snapshots.input_buffer_mut();
             next.sums.read_back = last;
             next.sums.contributing = u32::try_from(next.sensors.len()).unwrap_or(u32::MAX);
-            next.sums.torque = padded(&[0.01, -0.02, 0.03, 0.01, -0.01, 0.0]);
+            next.sums.torque = pad_with_defaults(&[0.01, -0.02, 0.03, 0.01, -0.01, 0.0]);
             snapshots.publish();
         }
         let mut sent = 0;
         let began = Instant::now();
         for number in self.tick..self.tick + TICKS_PER_EPOCH {
             let tick = Tick { number, time: Micros(number * 2_000) };
-            self.turn.run_tick(tick, 0, realtime::now(), realtime::now, |_, frames| {
+            self.turn.run_tick(tick, 0, realtime::monotonic_ns(), realtime::monotonic_ns, |_, frames| {
                 sent += black_box(frames).len();
                 true
             });

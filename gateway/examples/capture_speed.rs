@@ -33,10 +33,10 @@ fn write_line(log: &mut String, line: u64) {
 }
 
 /// Converts a file. Returns million lines per second, and the peak memory of the process in MB.
-fn convert(gateway: &Path, from: &Path, to: &Path, lines: u64) -> (f64, f64) {
+fn measure_conversion(gateway: &Path, from: &Path, to: &Path, lines: u64) -> (f64, f64) {
     let mut command = Command::new(gateway);
     command.arg("convert").arg(from).arg(to).arg("--overwrite").stderr(Stdio::null());
-    let (seconds, memory) = watched::run(&mut command);
+    let (seconds, memory) = watched::run_measured(&mut command);
     (lines as f64 / seconds / 1e6, memory)
 }
 
@@ -45,7 +45,7 @@ fn main() {
     let lines: u64 = arguments.next().map_or(10_000_000, |lines| lines.parse().expect("LINES is a number"));
     let folder = arguments.next().map_or_else(std::env::temp_dir, PathBuf::from);
 
-    let gateway = watched::gateway();
+    let gateway = watched::gateway_program();
     let place = tempfile::tempdir_in(folder).unwrap();
     let [log, mcap, back] = ["run.log", "run.mcap", "back.log"].map(|name| place.path().join(name));
     let mut out = BufWriter::new(File::create(&log).unwrap());
@@ -58,9 +58,9 @@ fn main() {
     out.flush().unwrap();
     drop(out);
     for _ in 0..3 {
-        let (into, memory) = convert(&gateway, &log, &mcap, lines);
+        let (into, memory) = measure_conversion(&gateway, &log, &mcap, lines);
         println!("log to MCAP, million lines/s   {into:.2}, {memory:.0} MB");
-        let (out, memory) = convert(&gateway, &mcap, &back, lines);
+        let (out, memory) = measure_conversion(&gateway, &mcap, &back, lines);
         println!("MCAP to log, million lines/s   {out:.2}, {memory:.0} MB");
     }
     let size = |path: &Path| std::fs::metadata(path).unwrap().len() as f64 / lines as f64;

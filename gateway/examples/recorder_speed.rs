@@ -18,47 +18,47 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use bench::record::feed::{self, RecorderFeed};
-use bench::record::{Mcap, Outputs, RecordOptions};
+use bench::record::{McapOutput, RecordOptions, RecordingOutputs};
 use model::central::CentralComputation;
 use model::latched::LatchedFrame;
 use protocol::can::Format;
 use protocol::candump::{self, CandumpLine, Direction, Record, Timestamp};
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Joints, Message};
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::packet::{Epoch, Length, WORDS, Words};
 use protocol::skin::Skin;
 use trace::recording::file::FileWriter;
 use trace::recording::layout::Layout;
 use trace::recording::series::{FileHead, SplitLimits};
 
-const SKIN: &str = include_str!("ur5-253.toml");
+const SKIN_TOML: &str = include_str!("ur5-253.toml");
 /// Time for which frames are pushed.
-const PUSH_TIME: Duration = Duration::from_secs(10);
+const FRAME_PUSH_TIME: Duration = Duration::from_secs(10);
 /// Interval between flushes of a run in ns.
-const FLUSH_NANOS: u64 = 40_000_000;
+const FLUSH_INTERVAL_NS: u64 = 40_000_000;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut words = std::env::args_os().skip(1);
     let folder = words.next().map_or_else(|| PathBuf::from("."), PathBuf::from);
-    let skin = Skin::parse("ur5-253.toml", SKIN)?;
+    let skin = Skin::parse("ur5-253.toml", SKIN_TOML)?;
     let frames = match words.next() {
-        Some(log) => log_frames(&std::fs::read_to_string(log)?)?,
-        None => run_frames(&skin, 60),
+        Some(log) => parse_log_frames(&std::fs::read_to_string(log)?)?,
+        None => simulated_run_frames(&skin, 60),
     };
-    println!("{} frames, {:.1} s of bus traffic", frames.len(), seconds(&frames));
+    println!("{} frames, {:.1} s of bus traffic", frames.len(), duration_s(&frames));
     measure_speed(&skin, &folder, &frames)?;
-    measure_size(&frames)
+    measure_recording_size(&frames)
 }
 
 #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
-fn seconds(frames: &[LatchedFrame]) -> f64 {
+fn duration_s(frames: &[LatchedFrame]) -> f64 {
     let ends = frames.first().zip(frames.last());
     ends.map_or(0.0, |(first, last)| last.at_nanos.saturating_sub(first.at_nanos) as f64 * 1e-9)
 }
 
 /// Frames of 253 cells that are pressed by 1.5 N each, while each joint swings to and fro.
-fn run_frames(skin: &Skin, seconds: u32) -> Vec<LatchedFrame> {
+fn simulated_run_frames(skin: &Skin, seconds: u32) -> Vec<LatchedFrame> {
     let central = CentralComputation::new(skin);
     let (hz, began) = (skin.timing.broadcast_hz(), 1_700_000_000_000_000_000_u64);
     let mut frames = Vec::new();
@@ -83,11 +83,14 @@ fn run_frames(skin: &Skin, seconds: u32) -> Vec<LatchedFrame> {
         add_message(
             at,
             true,
-            &Message::Joints { epoch, joints: Joints { positions: padded(&positions), in_use: 6 } },
+            &Message::Joints {
+                epoch,
+                joints: Joints { positions: pad_with_defaults(&positions), in_use: 6 },
+            },
         );
-        let links = central.frames(&positions);
+        let links = central.link_frames(&positions);
         for (place, cell) in skin.cells.iter().enumerate() {
-            let torque = central.torque(place, &links, 1.5).map(|nm| Q3_12::nearest(nm).to_bits());
+            let torque = central.cell_torque(place, &links, 1.5).map(|nm| Q3_12::nearest(nm).to_bits());
             let torque = Words::new(Length::Six, torque);
             // Cells wake one after the other, in an order that varies by ns.
             let after = 150_000
@@ -99,7 +102,7 @@ fn run_frames(skin: &Skin, seconds: u32) -> Vec<LatchedFrame> {
     }
 }
 
-fn log_frames(text: &str) -> Result<Vec<LatchedFrame>, Box<dyn Error>> {
+fn parse_log_frames(text: &str) -> Result<Vec<LatchedFrame>, Box<dyn Error>> {
     let mut frames = Vec::new();
     for line in text.lines() {
         if let CandumpLine::Frame(Record { time, frame, direction, .. }) = candump::parse(line)? {
@@ -122,10 +125,16 @@ fn measure_speed(
 ) -> Result<(), Box<dyn Error>> {
     let path = folder.join("recorder_speed.mcap");
     let split = SplitLimits { bytes: u64::MAX / 2, age: Duration::MAX };
-    let mcap =
-        Mcap { path: path.clone(), split, attachments: Vec::new(), robot: None, command_line: Vec::new() };
+    let mcap = McapOutput {
+        path: path.clone(),
+        split,
+        attachments: Vec::new(),
+        robot: None,
+        command_line: Vec::new(),
+    };
     let options = RecordOptions { mcap: Some(mcap), force: true, ..RecordOptions::default() };
-    let outputs = Outputs::open_outputs(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
+    let outputs =
+        RecordingOutputs::open_outputs(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
     let (mut outlet, bus_feed) = feed::bus_feed(1, true, Arc::default(), Arc::default());
     let feed = RecorderFeed { bus_feeds: vec![bus_feed], ticks: None };
     let recorder = outputs.start(feed, Layout::new(skin), FileHead::default())?;
@@ -133,18 +142,18 @@ fn measure_speed(
     let mut count = 0_u64;
     'pushed: loop {
         for chunk in frames.chunks(1_024) {
-            if began.elapsed() >= PUSH_TIME {
+            if began.elapsed() >= FRAME_PUSH_TIME {
                 break 'pushed;
             }
             // A bus never waits; this loop does, so that it measures the sustainable rate.
-            while outlet.free_slots() < chunk.len() {
+            while outlet.free_frame_slots() < chunk.len() {
                 std::thread::sleep(Duration::from_micros(200));
             }
             chunk.iter().for_each(|&seen| outlet.push_frame(seen));
             count += chunk.len() as u64;
         }
     }
-    let unrecorded = outlet.unrecorded();
+    let unrecorded = outlet.unrecorded_counts();
     let recording = recorder.finish(unrecorded, 0);
     let took = began.elapsed().as_secs_f64();
     let bytes: u64 = recording.files.iter().map(|file| file.bytes).sum();
@@ -162,9 +171,9 @@ fn measure_speed(
 
 /// A writer that counts bytes.
 #[derive(Default)]
-struct Counter(u64);
+struct ByteCounter(u64);
 
-impl Write for Counter {
+impl Write for ByteCounter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.0 += bytes.len() as u64;
         Ok(bytes.len())
@@ -177,15 +186,15 @@ impl Write for Counter {
 
 /// Writes only frames, flushed as in a run.
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn measure_size(frames: &[LatchedFrame]) -> Result<(), Box<dyn Error>> {
-    let mut writer = FileWriter::new(Counter::default())?;
+fn measure_recording_size(frames: &[LatchedFrame]) -> Result<(), Box<dyn Error>> {
+    let mut writer = FileWriter::new(ByteCounter::default())?;
     let mut channel = writer.channel::<Record<'_>>("/can/vcan0", &[("time_digits", "9")])?;
     let (mut flushes, mut next) = (0_u64, 0);
     let began = Instant::now();
     for &LatchedFrame { at_nanos, from_gateway: own, frame } in frames {
         if at_nanos >= next {
             writer.flush()?;
-            next = at_nanos + FLUSH_NANOS;
+            next = at_nanos + FLUSH_INTERVAL_NS;
             flushes += 1;
         }
         let direction = Some(if own { Direction::Sent } else { Direction::Received });

@@ -69,7 +69,7 @@ fn main() {
     let mut arguments = protocol::usage::command_line().into_iter().skip(1);
     let minutes: u64 = arguments.next().map_or(60, |minutes| minutes.parse().expect("MINUTES is a number"));
     let folder = arguments.next().map_or_else(std::env::temp_dir, PathBuf::from);
-    let gateway = watched::gateway();
+    let gateway = watched::gateway_program();
     let place = tempfile::tempdir_in(folder).unwrap();
     let log = place.path().join("run.log");
     let mut out = BufWriter::with_capacity(1 << 20, File::create(&log).unwrap());
@@ -90,7 +90,7 @@ fn main() {
     ] {
         let mut command = Command::new(&gateway);
         command.arg("fit").arg(&log).args(arguments).stdout(Stdio::null());
-        let (seconds, memory) = watched::run(&mut command);
+        let (seconds, memory) = watched::run_measured(&mut command);
         let (rate, times) = (frames as f64 / seconds / 1e6, lasts / seconds);
         println!("{name:25}{rate:.2} million frames/s, {times:.0} times real time, {memory:.0} MB");
     }

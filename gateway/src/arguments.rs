@@ -71,22 +71,22 @@ fn kinds_help() -> String {
 
 impl BusKinds {
     /// Returns the kinds that the option names, for any buses.
-    pub(crate) fn any_kinds(&self) -> Result<KindChoices, Failure> {
-        self.kinds_or(KindChoice::Auto)
+    pub(crate) fn kinds_of_any_buses(&self) -> Result<KindChoices, Failure> {
+        self.kinds_or_default(KindChoice::Auto)
     }
 
     /// Returns the kinds that the option names, for any buses. `otherwise` is the kind of the buses that it does not
     /// name.
-    pub(crate) fn kinds_or(&self, otherwise: KindChoice) -> Result<KindChoices, Failure> {
-        KindChoices::from_options(&self.bus_kind, otherwise).map_err(Failure::usage)
+    pub(crate) fn kinds_or_default(&self, otherwise: KindChoice) -> Result<KindChoices, Failure> {
+        KindChoices::from_options(&self.bus_kind, otherwise).map_err(Failure::usage_error)
     }
 
     /// Returns the kinds of these buses, or an error if the option names another bus.
-    pub(crate) fn kinds_of<'a>(
+    pub(crate) fn kinds_of_buses<'a>(
         &self,
         buses: impl IntoIterator<Item = &'a str>,
     ) -> Result<KindChoices, Failure> {
-        self.any_kinds()?.restrict_to(buses).map_err(Failure::usage)
+        self.kinds_of_any_buses()?.restrict_to(buses).map_err(Failure::usage_error)
     }
 }
 
@@ -96,7 +96,7 @@ pub(crate) fn environment_number(name: &str, allowed: RangeInclusive<u32>) -> Re
     let number = given.to_str().and_then(|text| text.parse().ok()).filter(|number| allowed.contains(number));
     number.map(Some).ok_or_else(|| {
         let (given, [min, max]) = (given.display(), [allowed.start(), allowed.end()]);
-        Failure::usage(format!("the environment variable {name}={given}: {min} to {max} is allowed"))
+        Failure::usage_error(format!("the environment variable {name}={given}: {min} to {max} is allowed"))
     })
 }
 
@@ -120,9 +120,9 @@ pub(crate) fn bus_names(skin: &Skin) -> impl Iterator<Item = &str> {
 
 /// Returns the index of the bus with this name in the skin that `file` describes.
 pub(crate) fn find_bus(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
-    skin.bus_named(name).ok_or_else(|| {
+    skin.bus_index(name).ok_or_else(|| {
         let names = comma_separated(bus_names(skin));
-        Failure::usage(format!("bus {name} is not in {file}, which has {names}"))
+        Failure::usage_error(format!("bus {name} is not in {file}, which has {names}"))
     })
 }
 
@@ -131,8 +131,11 @@ pub(crate) fn find_bus(skin: &Skin, file: &str, name: &str) -> Result<usize, Fai
 pub(crate) fn find_cell(skin: &Skin, name: &CellName, option: &str) -> Result<usize, Failure> {
     let CellName { bus, node } = name;
     let names = || comma_separated(bus_names(skin));
-    if bus.as_ref().is_some_and(|bus| skin.bus_named(bus).is_none()) {
-        return Err(Failure::usage(format!("{option} {name}: the skin has no such bus; it has {}", names())));
+    if bus.as_ref().is_some_and(|bus| skin.bus_index(bus).is_none()) {
+        return Err(Failure::usage_error(format!(
+            "{option} {name}: the skin has no such bus; it has {}",
+            names()
+        )));
     }
     let there: Vec<_> = skin
         .cells
@@ -140,18 +143,18 @@ pub(crate) fn find_cell(skin: &Skin, name: &CellName, option: &str) -> Result<us
         .enumerate()
         .filter_map(|(index, cell)| {
             let bus = skin.buses.get(cell.bus)?;
-            name.fits(&bus.name, cell.node).then_some((index, bus))
+            name.matches_cell(&bus.name, cell.node).then_some((index, bus))
         })
         .collect();
     match there.as_slice() {
         [(index, _)] => Ok(*index),
-        [] => Err(Failure::usage(format!(
+        [] => Err(Failure::usage_error(format!(
             "{option} {node}: the skin has no such cell on {}",
             bus.clone().unwrap_or_else(names)
         ))),
         buses => {
             let choices = comma_separated(buses.iter().map(|(_, bus)| format!("{}:{node}", bus.name)));
-            Err(Failure::usage(format!("{option} {node} is on several buses: choose one of {choices}")))
+            Err(Failure::usage_error(format!("{option} {node} is on several buses: choose one of {choices}")))
         }
     }
 }

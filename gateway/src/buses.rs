@@ -16,7 +16,7 @@ pub(super) fn private_directory(what: &str) -> Result<TempDir, Failure> {
     let folder = Some(std::env::temp_dir()).filter(fits).unwrap_or_else(|| PathBuf::from("/tmp"));
     let mine = Permissions::from_mode(0o700);
     let made = Builder::new().prefix(&format!("skinbus-{what}-")).permissions(mine).tempdir_in(folder);
-    let failed = |error| Failure::run(format!("{error}; set SKINBUS_DIR to a directory of your own"));
+    let failed = |error| Failure::run_error(format!("{error}; set SKINBUS_DIR to a directory of your own"));
     let made = made.map_err(failed)?;
     // If this program is killed, the last bus server removes the directory.
     let marked = File::open(made.path()).and_then(|directory| Ok(write_marker(directory)?));

@@ -6,13 +6,13 @@ mod recorded;
 use std::path::PathBuf;
 use std::thread;
 
-use bench::record::{self, Mcap};
+use bench::record::{self, McapOutput};
 use bench::run::{self, RunOptions};
 use bench::summary::Outcome;
 use calibration::motion::MotionPlan;
 use calibration::neighbors::Spacing;
 use calibration::observe::Observations;
-use calibration::plan::{Bounds, plan};
+use calibration::plan::{PlanBounds, plan_motion};
 use calibration::write::calibrated_text;
 use calibration::{Calibration, Settings, calibrate};
 use clap::Args;
@@ -32,9 +32,9 @@ use trace::capture::{CaptureEntry, Reader};
 use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{BusKinds, bus_names, parse_duration};
-use super::input::no_frame;
-use super::output::{OverwriteOption, check_distinct, print_beside, print_note};
-use super::print::{count_with_noun, json};
+use super::input::no_frame_failure;
+use super::output::{OverwriteOption, check_distinct_files, print_beside_files, print_note};
+use super::print::{count_with_noun, to_pretty_json};
 use super::robot_file::{SkinRobot, urdf_path};
 
 /// Find the poses of cells from their accelerometers
@@ -104,44 +104,44 @@ pub(crate) struct CalibrateCommand {
 
 impl CalibrateCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let text = document::read_text(&self.skin).map_err(Failure::usage)?;
-        let skin = Skin::parse(&self.skin.display().to_string(), &text).map_err(Failure::usage)?;
+        let text = document::read_text(&self.skin).map_err(Failure::usage_error)?;
+        let skin = Skin::parse(&self.skin.display().to_string(), &text).map_err(Failure::usage_error)?;
         let settings = self.settings(&skin)?;
         let written = [
             ("-o", self.output.as_deref()),
             ("--record", self.record.as_deref()),
             ("--page", self.page.as_deref()),
         ];
-        check_distinct(
+        check_distinct_files(
             written,
             [self.skin.as_path()].into_iter().chain(self.recording.iter().map(PathBuf::as_path)),
         )?;
         for (option, path) in written {
-            path.map_or(Ok(()), |path| self.overwrite.check(option, path))?;
+            path.map_or(Ok(()), |path| self.overwrite.check_writable(option, path))?;
         }
         let calibration = if self.recording.is_empty() {
-            let motion = plan(&skin, &settings.bounds, &settings.sheet, settings.gravity);
-            let motion = motion.map_err(Failure::usage)?;
+            let motion = plan_motion(&skin, &settings.bounds, &settings.sheet, settings.gravity);
+            let motion = motion.map_err(Failure::usage_error)?;
             if self.dry_run {
-                return print_text(&json(&motion)?);
+                return print_text(&to_pretty_json(&motion)?);
             }
-            self.record_run(&skin, &text, &settings, motion)?
+            self.record_and_calibrate(&skin, &text, &settings, motion)?
         } else {
             calibrate_capture(&self.recording, &skin, &settings)?
         };
         if let Some(path) = &self.output {
-            let new = calibrated_text(&skin, &text, &calibration).map_err(Failure::usage)?;
+            let new = calibrated_text(&skin, &text, &calibration).map_err(Failure::usage_error)?;
             self.overwrite.write("-o", path, &new)?;
         }
-        let shown = if self.json { json(&calibration)? } else { report_text(&skin, &calibration) };
-        print_beside([self.output.as_deref(), self.page.as_deref()], &shown)?;
+        let shown = if self.json { to_pretty_json(&calibration)? } else { report_text(&skin, &calibration) };
+        print_beside_files([self.output.as_deref(), self.page.as_deref()], &shown)?;
         if let Some(path) = &self.page {
-            let page = picture::page(&self.skin, &skin, &calibration);
+            let page = picture::calibration_page(&self.skin, &skin, &calibration);
             self.overwrite.write("--page", path, &page)?;
         }
         match calibration.summary.troubled {
             0 => Ok(()),
-            troubled => Err(Failure::run(format!(
+            troubled => Err(Failure::run_error(format!(
                 "{}: {} of {} cannot be trusted: see the lines above",
                 skin.name,
                 troubled,
@@ -151,30 +151,31 @@ impl CalibrateCommand {
     }
 
     fn settings(&self, skin: &Skin) -> Result<Settings, Failure> {
-        let mut bounds = Bounds { within: self.within, length_s: self.duration, ..Bounds::from_skin(skin) };
+        let mut bounds =
+            PlanBounds { within: self.within, length_s: self.duration, ..PlanBounds::from_skin(skin) };
         if !(0.05..=6.3).contains(&self.within) {
-            return Err(Failure::usage(format!("--within {}: 0.05 to 6.3 is allowed", self.within)));
+            return Err(Failure::usage_error(format!("--within {}: 0.05 to 6.3 is allowed", self.within)));
         }
         if let Some(start) = &self.start {
             let number = |word: &str| {
                 let number = word.parse::<f64>().ok().filter(|number| number.is_finite());
                 number.ok_or_else(|| {
-                    Failure::usage(format!("--start {word}: it must be a number, in rad or m"))
+                    Failure::usage_error(format!("--start {word}: it must be a number, in rad or m"))
                 })
             };
             bounds.center = start.split_whitespace().map(number).collect::<Result<_, _>>()?;
         }
         let sheet = match &self.data_sheet {
             Some(path) => {
-                let text = document::read_text(path).map_err(Failure::usage)?;
-                let sheet = |given: DataSheetInput| given.sheet(&KeyPath::root());
-                document::parse(&path.display().to_string(), &text, sheet).map_err(Failure::usage)?
+                let text = document::read_text(path).map_err(Failure::usage_error)?;
+                let sheet = |given: DataSheetInput| given.data_sheet(&KeyPath::root());
+                document::parse(&path.display().to_string(), &text, sheet).map_err(Failure::usage_error)?
             }
             None => DataSheet::default(),
         };
         let spacing = self.spacing.map(|mm| {
             let fits = (1.0..=1_000.0).contains(&mm);
-            let wrong = || Failure::usage(format!("--spacing {mm}: 1 to 1000 mm are allowed"));
+            let wrong = || Failure::usage_error(format!("--spacing {mm}: 1 to 1000 mm are allowed"));
             fits.then(|| Spacing::with_distance(mm * 1e-3)).ok_or_else(wrong)
         });
         let threads = thread::available_parallelism().map_or(1, usize::from);
@@ -183,7 +184,7 @@ impl CalibrateCommand {
     }
 
     /// Moves the robot, and evaluates the recording.
-    fn record_run(
+    fn record_and_calibrate(
         &self,
         skin: &Skin,
         text: &str,
@@ -191,12 +192,12 @@ impl CalibrateCommand {
         motion: MotionPlan,
     ) -> Result<Calibration, Failure> {
         if matches!(skin.controller.kind, ControllerKind::External { .. }) {
-            return Err(Failure::usage(
+            return Err(Failure::usage_error(
                 "[controller] kind = \"external\": another program moves this robot; record it with `skinbus run --record` and \
                  give it with --recording",
             ));
         }
-        let folder = tempfile::tempdir().map_err(Failure::run)?;
+        let folder = tempfile::tempdir().map_err(Failure::run_error)?;
         let path = self.record.clone().unwrap_or_else(|| folder.path().join("calibration.mcap"));
         let mut options = self.options(skin, text, settings, motion, path.clone())?;
         let seconds = options.scenario.duration.0 / 1_000_000;
@@ -209,7 +210,7 @@ impl CalibrateCommand {
         let mut complaints = summary.end_messages(self.quiet);
         if summary.outcome != Outcome::Done {
             let last = complaints.pop().unwrap_or_else(|| "the run did not come to its end".to_owned());
-            return Err(Failure::run(last));
+            return Err(Failure::run_error(last));
         }
         complaints.iter().for_each(|line| print_note(format_args!("skinbus: {line}")));
         if summary.control.ticks_skipped > 0 {
@@ -239,7 +240,7 @@ impl CalibrateCommand {
         attachments.extend(robot.urdf.map(|text| attached("robot.urdf", "application/xml", text)));
         let command_line = protocol::usage::command_line();
         let mcap =
-            Mcap { path, split: SplitLimits::default(), attachments, robot: robot.robot, command_line };
+            McapOutput { path, split: SplitLimits::default(), attachments, robot: robot.robot, command_line };
         let length_us = (motion.length_s() * 1e6).round();
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "20 to 3600 s: checked")]
         let mut scenario = Scenario::idle(Span(length_us as u64));
@@ -259,7 +260,7 @@ impl CalibrateCommand {
             skin_file: self.skin.clone(),
             skin: sensing,
             scenario,
-            kinds: self.kinds.kinds_of(bus_names(skin))?,
+            kinds: self.kinds.kinds_of_buses(bus_names(skin))?,
             directory: None,
             spawn: !self.no_spawn,
             emulated: None,
@@ -281,7 +282,7 @@ impl CalibrateCommand {
 
 /// Reads the accelerations of a skin's cells from a capture, and calibrates the skin.
 fn calibrate_capture(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibration, Failure> {
-    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
+    let mut reader = Reader::open_all(files).map_err(Failure::usage_error)?;
     let name = reader.name().to_owned();
     if let Some(Ok(own)) = reader.extras().skin() {
         recorded::check_same_skin(&name, skin, &own)?;
@@ -289,26 +290,26 @@ fn calibrate_capture(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Res
     let mut seen = Observations::new(skin);
     let mut decoder = Decoder::new(None);
     let mut has_frames = false;
-    while let Some(entry) = reader.next().map_err(Failure::run)? {
+    while let Some(entry) = reader.next().map_err(Failure::run_error)? {
         let CaptureEntry::Frame(record) = entry else { continue };
         has_frames = true;
         let at = Micros(record.time.nanos / 1_000);
         if let (Decoded::Message(message), Some(bus)) =
-            (decoder.decode(at, record.interface, &record.frame), skin.bus_named(record.interface))
+            (decoder.decode(at, record.interface, &record.frame), skin.bus_index(record.interface))
         {
             seen.record(bus, at, &message);
         }
     }
     if !has_frames {
-        return Err(no_frame(&reader));
+        return Err(no_frame_failure(&reader));
     }
     if seen.cells.iter().all(Vec::is_empty) {
-        return Err(Failure::usage(format!(
+        return Err(Failure::usage_error(format!(
             "{name}: no cell of the skin sent an acceleration; record a bus with sensing = \"event\" and [events] \
              acceleration_g = 0"
         )));
     }
-    calibrate(skin, &seen, settings).map_err(|refusal| Failure::run(format_args!("{name}: {refusal}")))
+    calibrate(skin, &seen, settings).map_err(|refusal| Failure::run_error(format_args!("{name}: {refusal}")))
 }
 
 /// Returns the result as text.

@@ -15,7 +15,7 @@ use protocol::usage::{Failure, ignore_broken_pipe, print_text, printable_lines, 
 use self::show::{CellList, DescribedBus};
 use super::arguments::{BusKinds, find_bus, parse_duration};
 use super::input;
-use super::print::{json, json_line};
+use super::print::{json_line, to_pretty_json};
 
 /// Default listening time in s.
 const DEFAULT_LISTEN_S: f64 = 1.0;
@@ -55,22 +55,22 @@ pub(crate) struct CellsCommand {
 impl CellsCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let known = self.described_bus()?;
-        let kind = self.kinds.kinds_of([self.bus.as_str()])?.kind_of(&self.bus);
+        let kind = self.kinds.kinds_of_buses([self.bus.as_str()])?.kind_of(&self.bus);
         let stopped = input::stop_flag()?;
         let format = known.as_ref().map(|known| known.format);
         if Path::new(&self.bus).is_file() {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{} is a file: give the name of a bus here, and a skin with --skin",
                 self.bus
             )));
         }
-        let mut watch = CellWatch::open(&self.bus, kind, format).map_err(Failure::usage)?;
+        let mut watch = CellWatch::open(&self.bus, kind, format).map_err(Failure::usage_error)?;
         let seconds = self.duration.or_else(|| (!self.watch).then_some(DEFAULT_LISTEN_S));
         let show = |watch: &CellWatch| {
             let shown = CellList::from_watch(watch, known.as_ref());
             match (self.json, self.watch) {
                 (false, _) => Ok(shown.table()),
-                (true, false) => json(&shown),
+                (true, false) => to_pretty_json(&shown),
                 (true, true) => json_line(&shown),
             }
         };
@@ -79,12 +79,15 @@ impl CellsCommand {
         while seconds.is_none_or(|seconds| watch.elapsed().as_secs_f64() < seconds)
             && !stopped.load(Ordering::Relaxed)
         {
-            watch.query_cells(self.watch).and_then(|()| watch.receive(&stopped)).map_err(Failure::run)?;
+            watch
+                .query_cells(self.watch)
+                .and_then(|()| watch.receive(&stopped))
+                .map_err(Failure::run_error)?;
             if self.watch && drawn.elapsed() >= UPDATE_INTERVAL {
                 drawn = Instant::now();
                 let text = show(&watch)?;
                 let shown = if terminal {
-                    write_stdout(&show::redraw(&printable_lines(&text)))
+                    write_stdout(&show::terminal_redraw_text(&printable_lines(&text)))
                 } else {
                     write_stdout(&text)
                 };
@@ -98,11 +101,11 @@ impl CellsCommand {
         }
         if watch.listing().cells().len() == 0 {
             let (name, seconds) = (&self.bus, watch.elapsed().as_secs_f64());
-            let others = match watch.non_packets() {
+            let others = match watch.non_packet_count() {
                 0 => String::new(),
                 others => format!(" ({others} frames are not from cells; `skinbus dump` shows them)"),
             };
-            return Err(Failure::run(format!(
+            return Err(Failure::run_error(format!(
                 "no cell sent anything on {name} for {seconds:.1} s{others}: start the cells, or switch them on"
             )));
         }
@@ -112,7 +115,7 @@ impl CellsCommand {
     /// Returns this bus as the skin of `--skin` describes it, if there is one.
     fn described_bus(&self) -> Result<Option<DescribedBus>, Failure> {
         let Some(path) = &self.skin else { return Ok(None) };
-        let skin = Skin::read(path).map_err(Failure::usage)?;
+        let skin = Skin::read(path).map_err(Failure::usage_error)?;
         let file = path.display().to_string();
         let index = find_bus(&skin, &file, &self.bus)?;
         Ok(Some(DescribedBus::from_skin(&skin, index, file)))

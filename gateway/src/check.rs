@@ -53,7 +53,7 @@ impl CheckCommand {
         let has_skin = self.skin.is_some() || self.files.len() > 1;
         let described = self.files.iter().map(|file| Ok((file, read_description(file, has_skin)?)));
         let described = described.collect::<Result<Vec<_>, Failure>>()?;
-        let named = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
+        let named = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage_error)?;
         let mut skins = described.iter().filter_map(|(_, described)| match described {
             CheckedContent::Skin(skin) => Some(&**skin),
             CheckedContent::Scenario(_) => None,
@@ -67,12 +67,14 @@ impl CheckCommand {
         let (mut text, mut refused) = (String::new(), None);
         for (file, described) in &described {
             text += &match described {
-                CheckedContent::Skin(skin) => skin::summary(file, skin, listed, self.json)?,
+                CheckedContent::Skin(skin) => skin::check_and_summarize(file, skin, listed, self.json)?,
                 CheckedContent::Scenario(text) => {
                     let skin = match (&named, beside) {
                         (Some(skin), _) | (None, (Some(skin), None)) => skin,
-                        (None, (None, _)) => return Err(ambiguous_skin(file, "no skin is")),
-                        (None, (Some(_), Some(_))) => return Err(ambiguous_skin(file, "several skins are")),
+                        (None, (None, _)) => return Err(ambiguous_skin_failure(file, "no skin is")),
+                        (None, (Some(_), Some(_))) => {
+                            return Err(ambiguous_skin_failure(file, "several skins are"));
+                        }
                     };
                     let (text, refusal) = scenario::describe_scenario(file, text, skin, self.json)?;
                     refused = refused.or(refusal);
@@ -85,9 +87,11 @@ impl CheckCommand {
     }
 }
 
-fn ambiguous_skin(file: &Path, found: &str) -> Failure {
+fn ambiguous_skin_failure(file: &Path, found: &str) -> Failure {
     let file = file.display();
-    Failure::usage(format!("{file} is a scenario, and {found} among the files: name its skin with --skin"))
+    Failure::usage_error(format!(
+        "{file} is a scenario, and {found} among the files: name its skin with --skin"
+    ))
 }
 
 /// Reads a skin, or recognises a scenario by its tables, which differ from those of a skin. A file without any of these
@@ -96,7 +100,7 @@ fn read_description(file: &Path, has_skin: bool) -> Result<CheckedContent, Failu
     const SKIN_TABLES: [&str; 8] =
         ["robot", "chain", "bus", "cell", "timing", "controller", "contact", "safety"];
     const SCENARIO_TABLES: [&str; 5] = ["motion", "mode", "touch", "fault", "sensors"];
-    let text = document::read_text(file).map_err(Failure::usage)?;
+    let text = document::read_text(file).map_err(Failure::usage_error)?;
     let has = |names: &[&str]| {
         let tables = text.lines().filter_map(|line| line.trim_start().strip_prefix('['));
         let name = |line: &str| {
@@ -107,6 +111,6 @@ fn read_description(file: &Path, has_skin: bool) -> Result<CheckedContent, Failu
     if !has(&SKIN_TABLES) && (has(&SCENARIO_TABLES) || has_skin) {
         return Ok(CheckedContent::Scenario(text));
     }
-    let skin = Skin::parse(&file.display().to_string(), &text).map_err(Failure::usage)?;
+    let skin = Skin::parse(&file.display().to_string(), &text).map_err(Failure::usage_error)?;
     Ok(CheckedContent::Skin(Box::new(skin)))
 }

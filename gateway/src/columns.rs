@@ -50,7 +50,8 @@ impl<'a> CsvTable<'a> {
             .flexible(true)
             .from_reader(text.as_bytes());
         let mut lines = LineCounter { text, at: 0, line: 1 };
-        let names = reader.headers().map_err(|error| Failure::usage(format!("{file}: {error}")))?.clone();
+        let names =
+            reader.headers().map_err(|error| Failure::usage_error(format!("{file}: {error}")))?.clone();
         if !columns.match_header(&names) {
             let line = lines.line_at(0);
             let header = columns.needed.join(",");
@@ -63,7 +64,7 @@ impl<'a> CsvTable<'a> {
             let hint = if is_row { "write the header above it" } else { "correct it" };
             let got: String =
                 names.iter().collect::<Vec<_>>().join(",").chars().take(MAX_REPEATED_CHARS).collect();
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{file}: line {line}: the first line must be the header {header}{optional}, not {got:?}: {hint}"
             )));
         }
@@ -74,12 +75,12 @@ impl<'a> CsvTable<'a> {
     pub(crate) fn next_row(&mut self) -> Result<Option<CsvRow<'_>>, Failure> {
         let Some(values) = self.rows.next() else { return Ok(None) };
         let file = self.file.as_str();
-        let values = values.map_err(|error| Failure::usage(format!("{file}: {error}")))?;
+        let values = values.map_err(|error| Failure::usage_error(format!("{file}: {error}")))?;
         let byte = values.position().map_or(0, csv::Position::byte);
         let line = self.lines.line_at(usize::try_from(byte).unwrap_or_default());
         if values.len() != self.names.len() {
             let (got, names) = (count_with_noun(values.len(), "value"), comma_separated(&self.names));
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{file}: line {line} has {got}: write one value for each of the columns {names}"
             )));
         }
@@ -103,7 +104,7 @@ impl CsvRow<'_> {
     /// Returns the error for a wrong value in a column; `needed` names the allowed values.
     pub(crate) fn value_error(&self, column: &str, needed: &str) -> Failure {
         let (file, line, value) = (self.file, self.line, self.text(column));
-        Failure::usage(format!("{file}: line {line}: {column} = {value:?}: {needed}"))
+        Failure::usage_error(format!("{file}: line {line}: {column} = {value:?}: {needed}"))
     }
 }
 

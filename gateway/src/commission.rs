@@ -16,8 +16,8 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 
 use super::arguments::{BusKinds, bus_names, find_bus};
-use super::output::{OverwriteOption, check_distinct, print_beside};
-use super::print::{abbreviated, comma_separated};
+use super::output::{OverwriteOption, check_distinct_files, print_beside_files};
+use super::print::{abbreviate_names, comma_separated};
 use super::{input, output};
 
 /// Write a skin's description into its cells, and read it back
@@ -62,27 +62,28 @@ pub(crate) struct CommissionCommand {
 
 impl CommissionCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let text = document::read_text(&self.skin).map_err(Failure::usage)?;
+        let text = document::read_text(&self.skin).map_err(Failure::usage_error)?;
         let file = self.skin.display().to_string();
-        let skin = Skin::parse(&file, &text).map_err(Failure::usage)?;
+        let skin = Skin::parse(&file, &text).map_err(Failure::usage_error)?;
         let target = match &self.bus {
             Some(name) => vec![find_bus(&skin, &file, name)?],
             None => (0..skin.buses.len()).collect(),
         };
-        check_distinct([("--node-ids", self.node_ids.as_deref())], [self.skin.as_path()])?;
+        check_distinct_files([("--node-ids", self.node_ids.as_deref())], [self.skin.as_path()])?;
         // Open the file before cells are written, so that an error of the file is reported first.
         let begun =
             self.node_ids.as_ref().map(|path| self.overwrite.create("--node-ids", path)).transpose()?;
         let wish = CommissionOptions { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stop_flag()?;
-        let kinds = self.kinds.kinds_of(bus_names(&skin))?;
+        let kinds = self.kinds.kinds_of_buses(bus_names(&skin))?;
         // Open all buses before anything is sent.
         let benches = target.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
-        let benches = benches.map_err(Failure::usage)?;
+        let benches = benches.map_err(Failure::usage_error)?;
         let began = Instant::now();
         let mut line = Line::new(self.quiet);
-        let done = commission(benches, &skin, wish, &stopped, |far| line.show(|_width| progress_text(far)));
-        line.clear();
+        let done =
+            commission(benches, &skin, wish, &stopped, |far| line.show_line(|_width| progress_text(far)));
+        line.clear_line();
         let interrupted = stopped.load(Ordering::Relaxed);
         check_reached(&file, &done, interrupted)?;
         let whole = show::CommissionResult {
@@ -96,14 +97,15 @@ impl CommissionCommand {
         if !self.quiet && !self.json {
             whole.notes(self.node_ids.is_some()).iter().for_each(output::print_note);
         }
-        let shown = if self.json { super::print::json(&whole)? } else { whole.table() };
-        print_beside([self.node_ids.as_deref()], &shown)?;
+        let shown = if self.json { super::print::to_pretty_json(&whole)? } else { whole.table() };
+        print_beside_files([self.node_ids.as_deref()], &shown)?;
         if let Some((file, out)) = begun {
             let node_ids: NodeIds =
                 done.iter().flat_map(|done| &done.report.cells).map(|it| (it.serial, it.number)).collect();
             let copy = renumber_nodes(&skin, &text, &node_ids);
-            let copy =
-                copy.map_err(|error| Failure::run(format!("--node-ids {}: {error}", file.path().display())))?;
+            let copy = copy.map_err(|error| {
+                Failure::run_error(format!("--node-ids {}: {error}", file.path().display()))
+            })?;
             output::write_and_finish("--node-ids", file, out, &copy)?;
         }
         whole.outcome()
@@ -131,10 +133,10 @@ fn check_reached(file: &str, done: &[CommissionedBus], interrupted: bool) -> Res
         return Ok(());
     }
     if let Some(done) = done.iter().find(|done| done.failure.is_some()) {
-        return Err(Failure::run(done.failure.clone().unwrap_or_default()));
+        return Err(Failure::run_error(done.failure.clone().unwrap_or_default()));
     }
     if interrupted {
-        return Err(Failure::run("interrupted; nothing was written yet"));
+        return Err(Failure::run_error("interrupted; nothing was written yet"));
     }
     let found = done.iter().flat_map(|done| &done.report.cells).any(|it| it.number.is_some());
     if found {
@@ -142,7 +144,7 @@ fn check_reached(file: &str, done: &[CommissionedBus], interrupted: bool) -> Res
     }
     let unknown_nodes: Vec<_> = done.iter().flat_map(|done| &done.report.unknown_nodes).collect();
     let buses = comma_separated(done.iter().map(|done| &done.name));
-    Err(Failure::run(if unknown_nodes.is_empty() {
+    Err(Failure::run_error(if unknown_nodes.is_empty() {
         format!("no cells were found on {buses}: start them or switch them on, then run the command again")
     } else {
         let serials: Vec<_> =
@@ -150,7 +152,7 @@ fn check_reached(file: &str, done: &[CommissionedBus], interrupted: bool) -> Res
         format!(
             "none of the cells on {buses} is in {file}: their serial numbers are {}; name the skin file \
              with these numbers",
-            abbreviated(&serials)
+            abbreviate_names(&serials)
         )
     }))
 }

@@ -8,7 +8,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use analysis::compare::{CaptureSide, CompareOptions, CompareReport, Comparison, PerCapture};
-use analysis::explain::NotFound;
+use analysis::explain::JointsNotFound;
 use clap::Args;
 use model::decode::Decoder;
 use protocol::input::{can_be_read_again, is_standard_input};
@@ -19,11 +19,14 @@ use protocol::usage::Failure;
 use serde::Serialize;
 use trace::capture::{CaptureEntry, CaptureFormat, NoteKind, Reader};
 
-use self::files::{first_numbers, recording_parts};
+use self::files::{first_joints_numbers, recording_parts};
 use super::input;
-use super::input::{difference, format_name, location, no_frame, open_capture, require_frames, skin_of};
-use super::output::{self, OverwriteOption, check_distinct, print_beside};
-use super::print::{count_with_noun, json};
+use super::input::{
+    first_skin_difference, format_name, location, no_frame_failure, open_capture, require_frames,
+    skin_of_recording,
+};
+use super::output::{self, OverwriteOption, check_distinct_files, print_beside_files};
+use super::print::{count_with_noun, to_pretty_json};
 
 /// Compare two recordings or logs of one skin, epoch by epoch
 ///
@@ -137,7 +140,7 @@ impl CaptureInput {
                 self.missing.count(&note);
                 match note.kind {
                     NoteKind::Dropped(frames) => comparison.record_dropped(which, frames),
-                    NoteKind::Unreadable(why) if self.missing.unreadable() == 1 => {
+                    NoteKind::Unreadable(why) if self.missing.unreadable_count() == 1 => {
                         output::print_note(format_args!("{}: {why}", location(&self.name, note.line)));
                     }
                     NoteKind::Text | NoteKind::CanXl | NoteKind::Unreadable(_) => {}
@@ -147,11 +150,11 @@ impl CaptureInput {
                 if !self.reader.has_times() {
                     comparison.mark_untimed(which);
                 }
-                comparison.end(which, self.reader.extras().unfinished.is_some());
+                comparison.end_capture(which, self.reader.extras().unfinished.is_some());
             }
             Err(error) => {
-                self.damage = Some(Failure::run(error));
-                comparison.end(which, true);
+                self.damage = Some(Failure::run_error(error));
+                comparison.end_capture(which, true);
             }
         }
     }
@@ -161,16 +164,16 @@ impl CompareCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let began = Instant::now();
         let read = [&self.a, &self.b].into_iter().chain(&self.skin).map(PathBuf::as_path);
-        check_distinct([("--junit", self.junit.as_deref())], read)?;
+        check_distinct_files([("--junit", self.junit.as_deref())], read)?;
         if [&self.a, &self.b].iter().all(|file| is_standard_input(file)) {
-            return Err(Failure::usage(
+            return Err(Failure::usage_error(
                 "- and -: standard input can be read only once: name a file instead of one -",
             ));
         }
         let files = PerCapture { a: recording_parts(&self.a)?, b: recording_parts(&self.b)? };
-        let skin = self.skin(&files)?;
+        let skin = self.common_skin(&files)?;
         let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;
-        let mut comparison = Comparison::new(&skin, self.options(), first_numbers(&files, &skin)?);
+        let mut comparison = Comparison::new(&skin, self.options(), first_joints_numbers(&files, &skin)?);
         let PerCapture { a, b } = files;
         let mut inputs = PerCapture { a: CaptureInput::open(a)?, b: CaptureInput::open(b)? };
         for which in [CaptureSide::A, CaptureSide::B] {
@@ -180,7 +183,7 @@ impl CompareCommand {
             inputs.get_mut(which).read_entry(which, &mut comparison);
         }
         if stop::stop_flag().load(Ordering::Relaxed) {
-            return Err(Failure::run("stopped before all was compared"));
+            return Err(Failure::run_error("stopped before all was compared"));
         }
         for which in [CaptureSide::A, CaptureSide::B] {
             self.check_capture(inputs.get_mut(which), which, &mut comparison, &skin)?;
@@ -188,7 +191,7 @@ impl CompareCommand {
         let report = comparison.report();
         for which in [CaptureSide::A, CaptureSide::B] {
             let input = inputs.get(which);
-            input.missing.report(&input.reader, "left out");
+            input.missing.print_counts(&input.reader, "left out");
         }
         let shown = show::ComparisonText {
             inputs: PerCapture { a: capture_names(&inputs.a), b: capture_names(&inputs.b) },
@@ -204,8 +207,8 @@ impl CompareCommand {
             allow_missing: self.allow_missing,
             report: &report,
         };
-        let text = if self.json { json(&whole)? } else { shown.text() };
-        let printed = print_beside([self.junit.as_deref()], &text);
+        let text = if self.json { to_pretty_json(&whole)? } else { shown.text() };
+        let printed = print_beside_files([self.junit.as_deref()], &text);
         let reported = junit.map_or(Ok(()), |(file, out)| {
             output::write_and_finish("--junit", file, out, &shown.junit(began.elapsed()).to_xml())
         });
@@ -227,17 +230,17 @@ impl CompareCommand {
 
     /// Returns the skin of both captures: from the option, or else from a recording. Refuses a recording of another
     /// skin.
-    fn skin(&self, files: &PerCapture<Vec<PathBuf>>) -> Result<Skin, Failure> {
+    fn common_skin(&self, files: &PerCapture<Vec<PathBuf>>) -> Result<Skin, Failure> {
         let named = self.skin.as_deref().map(input::read_skin).transpose()?;
         let (mut skin, mut name) = (named, self.skin.clone());
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
             // A log has no skin attached. Standard input can be read only once, so its skin is compared at the end.
             if !can_be_read_again(path)
-                || Reader::open_all(files).map_err(Failure::usage)?.format() == CaptureFormat::Candump
+                || Reader::open_all(files).map_err(Failure::usage_error)?.format() == CaptureFormat::Candump
             {
                 continue;
             }
-            let own = match skin_of(files) {
+            let own = match skin_of_recording(files) {
                 Err(_) if skin.is_some() => continue,
                 own => own?,
             };
@@ -256,7 +259,7 @@ impl CompareCommand {
             }
         }
         let (a, b) = (self.a.display(), self.b.display());
-        Err(Failure::usage(format!("neither {a} nor {b} contains a skin: name one with --skin")))
+        Err(Failure::usage_error(format!("neither {a} nor {b} contains a skin: name one with --skin")))
     }
 
     /// Refuses a capture without frames or joints, or of another skin.
@@ -271,20 +274,20 @@ impl CompareCommand {
             return Err(damage);
         }
         if !input.has_frames {
-            return Err(no_frame(&input.reader));
+            return Err(no_frame_failure(&input.reader));
         }
         let name = &input.name;
         if let Some(Ok(own)) = input.reader.extras().skin() {
             let of = self.skin.as_ref().unwrap_or(&self.a);
             check_same_skin((of, skin), (Path::new(name), &own))?;
         }
-        if let Some(error) = comparison.not_found(which) {
+        if let Some(error) = comparison.not_found_reason(which) {
             let text = format!("{name}: {error}");
-            let is_other = matches!(error, NotFound::Buses { .. } | NotFound::Robot { .. });
-            return Err(if is_other { Failure::usage(text) } else { Failure::run(text) });
+            let is_other = matches!(error, JointsNotFound::Buses { .. } | JointsNotFound::Robot { .. });
+            return Err(if is_other { Failure::usage_error(text) } else { Failure::run_error(text) });
         }
-        comparison.other_configurations(which).map_or(Ok(()), |(all, same)| {
-            Err(Failure::usage(format!(
+        comparison.reported_and_matching_cells(which).map_or(Ok(()), |(all, same)| {
+            Err(Failure::usage_error(format!(
                 "{name} does not match the skin {}: of {}, only {same} have its parameters; name the right skin with --skin",
                 skin.name,
                 count_with_noun(all, "cell")
@@ -298,9 +301,9 @@ fn check_same_skin(
     (one, skin): (impl AsRef<Path>, &Skin),
     (other, own): (impl AsRef<Path>, &Skin),
 ) -> Result<(), Failure> {
-    let Some((what, is, was)) = difference(skin, own) else { return Ok(()) };
+    let Some((what, is, was)) = first_skin_difference(skin, own) else { return Ok(()) };
     let (one, other) = (one.as_ref().display(), other.as_ref().display());
-    Err(Failure::usage(format!(
+    Err(Failure::usage_error(format!(
         "{one} and {other} have different skins ({what}: {is}, in the other: {was}): compare captures of one skin"
     )))
 }

@@ -48,13 +48,13 @@ impl ManCommand {
         }
         if !self.folder.is_dir() {
             let folder = self.folder.display();
-            return Err(Failure::usage(format!("the folder {folder} does not exist: create it first")));
+            return Err(Failure::usage_error(format!("the folder {folder} does not exist: create it first")));
         }
         program.build();
         let mut pages = Vec::new();
-        pages_of(&program, &mut pages)?;
+        add_man_pages(&program, &mut pages)?;
         for (name, _) in &pages {
-            self.overwrite.check("", &self.folder.join(name))?;
+            self.overwrite.check_writable("", &self.folder.join(name))?;
         }
         for (name, text) in &pages {
             self.overwrite.write("", &self.folder.join(name), text)?;
@@ -65,11 +65,11 @@ impl ManCommand {
 }
 
 /// Adds the man page of a command and those of its subcommands: `skinbus-skin-import.1`.
-fn pages_of(command: &Command, pages: &mut Vec<(String, String)>) -> Result<(), Failure> {
+fn add_man_pages(command: &Command, pages: &mut Vec<(String, String)>) -> Result<(), Failure> {
     let mut page = Vec::new();
-    clap_mangen::Man::new(command.clone()).render(&mut page).map_err(Failure::run)?;
+    clap_mangen::Man::new(command.clone()).render(&mut page).map_err(Failure::run_error)?;
     let name = command.get_display_name().unwrap_or_else(|| command.get_name());
     pages.push((format!("{name}.1"), String::from_utf8_lossy(&page).into_owned()));
     let mut below = command.get_subcommands().filter(|it| it.get_name() != "help");
-    below.try_for_each(|it| pages_of(it, pages))
+    below.try_for_each(|it| add_man_pages(it, pages))
 }

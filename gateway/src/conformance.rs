@@ -19,7 +19,7 @@ use protocol::usage::Failure;
 
 use self::show::ConformanceResult;
 use super::arguments::{BusKinds, FORMATS, one_of_values};
-use super::output::{OverwriteOption, print_beside};
+use super::output::{OverwriteOption, print_beside_files};
 use super::{input, output};
 
 /// Maximum duration of a test, without the time to listen at the start and to restore the cell at the end.
@@ -77,15 +77,15 @@ pub(crate) struct ConformanceCommand {
 impl ConformanceCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let only = RequirementFilter::new(&self.requirement).map_err(|word| {
-            Failure::usage(format!(
+            Failure::usage_error(format!(
                 "--requirement {word}: no requirement has this id; CONF-7 and CONF are examples"
             ))
         })?;
         let stopped = input::stop_flag()?;
         let name = match (&self.bus, &self.cell.bus) {
-            (None, None) => return Err(Failure::usage("--bus is missing: name the bus of the cell")),
+            (None, None) => return Err(Failure::usage_error("--bus is missing: name the bus of the cell")),
             (Some(bus), Some(other)) if bus != other => {
-                return Err(Failure::usage(format!(
+                return Err(Failure::usage_error(format!(
                     "--cell {} is not on {bus}: correct --cell, or leave out --bus",
                     self.cell
                 )));
@@ -93,49 +93,56 @@ impl ConformanceCommand {
             (Some(bus), _) | (None, Some(bus)) => bus.as_str(),
         };
         let node = self.cell.node;
-        let kind = self.kinds.kinds_of([name])?.kind_of(name);
+        let kind = self.kinds.kinds_of_buses([name])?.kind_of(name);
         let path = self.save.clone().unwrap_or_else(|| format!("conformance-{name}-{}.json", node).into());
         if self.restore.is_none() && path.exists() {
             let path = path.display();
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{path} was left by an earlier test that did not restore the cell: restore it with --restore {path}, \
                  or delete the file"
             )));
         }
         let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;
-        let mut live = SocketBus::open(name, kind, stopped, self.restart.clone()).map_err(Failure::usage)?;
-        let survey = Survey::listen(&mut live, name).map_err(Failure::run)?;
+        let mut live =
+            SocketBus::open(name, kind, stopped, self.restart.clone()).map_err(Failure::usage_error)?;
+        let survey = Survey::listen(&mut live, name).map_err(Failure::run_error)?;
         let format = survey
-            .check(node, name, self.format, self.others_will_stop || self.restore.is_some())
-            .map_err(Failure::run)?;
+            .check_cell(node, name, self.format, self.others_will_stop || self.restore.is_some())
+            .map_err(Failure::run_error)?;
         let mut session = Session::new(&mut live, name, node, format, MAX_TEST_DURATION);
         if let Some(path) = &self.restore {
             return restore_cell(&mut session, &read_saved(path)?, path);
         }
         let began = Instant::now();
-        let saved = session.save().map_err(Failure::run)?;
-        let saved = saved.map_err(|why| Failure::run(format!("cell {} on {name}: {why}", node)))?;
-        OverwriteOption { overwrite: false }.write("--save", &path, &super::print::json(&saved)?)?;
+        let saved = session.save().map_err(Failure::run_error)?;
+        let saved = saved.map_err(|why| Failure::run_error(format!("cell {} on {name}: {why}", node)))?;
+        OverwriteOption { overwrite: false }.write(
+            "--save",
+            &path,
+            &super::print::to_pretty_json(&saved)?,
+        )?;
         let stopped = conformance::run(&mut session, &only).err();
         let back = restore_cell(&mut session, &saved, &path);
         let whole = ConformanceResult::new(
             &saved,
             format,
             began.elapsed(),
-            session.findings.list(&only, stopped.as_ref()),
+            session.findings.requested_findings(&only, stopped.as_ref()),
             stopped.as_ref(),
         );
         // If one output fails, the others are written nevertheless.
-        let shown = super::print::json(&whole).and_then(|json| {
+        let shown = super::print::to_pretty_json(&whole).and_then(|json| {
             let shown = if self.json { json } else { whole.text() };
-            print_beside([self.junit.as_deref()], &shown)
+            print_beside_files([self.junit.as_deref()], &shown)
         });
         let reported = junit
             .map_or(Ok(()), |(file, out)| output::write_and_finish("--junit", file, out, &whole.junit()));
         back.and(shown).and(reported)?;
         match stopped {
-            Some(StopReason::Interrupted) => Err(Failure::run("interrupted; the cell has been restored")),
-            Some(stopped) => Err(Failure::run(stopped)),
+            Some(StopReason::Interrupted) => {
+                Err(Failure::run_error("interrupted; the cell has been restored"))
+            }
+            Some(stopped) => Err(Failure::run_error(stopped)),
             None if whole.has_failed() => Err(Failure::already_reported()),
             None => Ok(()),
         }
@@ -144,9 +151,10 @@ impl ConformanceCommand {
 
 /// Reads the configuration that an earlier test saved.
 fn read_saved(path: &Path) -> Result<SavedCell, Failure> {
-    let wrong =
-        |error: &dyn std::fmt::Display| Failure::usage(format!("--restore {}: {error}", path.display()));
-    let text = protocol::document::read_text(path).map_err(Failure::usage)?;
+    let wrong = |error: &dyn std::fmt::Display| {
+        Failure::usage_error(format!("--restore {}: {error}", path.display()))
+    };
+    let text = protocol::document::read_text(path).map_err(Failure::usage_error)?;
     serde_json::from_str(&text).map_err(|error| wrong(&error))
 }
 
@@ -154,7 +162,7 @@ fn read_saved(path: &Path) -> Result<SavedCell, Failure> {
 fn restore_cell(session: &mut Session<'_>, saved: &SavedCell, path: &PathBuf) -> Result<(), Failure> {
     let keep = |why: &dyn std::fmt::Display| {
         let path = path.display();
-        Failure::run(format!(
+        Failure::run_error(format!(
             "the cell was not restored: {why}; {path} holds its configuration: restore it with --restore {path}"
         ))
     };
@@ -163,5 +171,5 @@ fn restore_cell(session: &mut Session<'_>, saved: &SavedCell, path: &PathBuf) ->
         return Err(keep(&left.join(", ")));
     }
     left.iter().for_each(output::print_note);
-    fs::remove_file(path).map_err(|error| Failure::run(format!("{}: {error}", path.display())))
+    fs::remove_file(path).map_err(|error| Failure::run_error(format!("{}: {error}", path.display())))
 }

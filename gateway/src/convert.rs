@@ -10,7 +10,7 @@ use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use analysis::explain::series::SeriesError;
+use analysis::explain::series::EpochSeriesError;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::input::can_be_read_again;
@@ -25,11 +25,15 @@ use trace::files::AtomicFile;
 
 use self::live::GrowingCapture;
 use super::arguments::{OptionValue, one_of_values};
-use super::input::{location, no_frame, open_capture, other_contents, skin_for};
-use super::output::{OverwriteOption, check_distinct, is_standard_output, print_note, write_refused};
+use super::input::{
+    describe_other_contents, location, named_or_recorded_skin, no_frame_failure, open_capture,
+};
+use super::output::{
+    OverwriteOption, check_distinct_files, is_standard_output, print_note, write_refused_failure,
+};
 
 /// Maximum number of unreadable lines that are reported one by one.
-const MAX_NAMED_LINES: u64 = 100;
+const MAX_REPORTED_LINES: u64 = 100;
 /// Number of bytes written at once.
 const WRITE_BYTES: usize = 1 << 18;
 
@@ -88,7 +92,7 @@ impl ConvertCommand {
             return self.write_torques();
         }
         if let Some(skin) = &self.skin {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "--skin {} is only for CSV output: name an OUT that ends in .csv",
                 skin.display()
             )));
@@ -98,44 +102,50 @@ impl ConvertCommand {
         let options =
             [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
         if let Some((option, _)) = options.iter().find(|(_, given)| *given && !text) {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{option} is only for a candump log: leave it out, because a recording keeps everything"
             )));
         }
         let to = self.to.display();
         if !is_standard_output(&self.to) {
-            check_distinct([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
-            self.overwrite.check("", &self.to)?;
+            check_distinct_files([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
+            self.overwrite.check_writable("", &self.to)?;
             if !text && input_bytes(&self.from).is_none() {
-                live::check_part_file(&self.to).map_err(|error| write_refused("", &self.to, &error))?;
+                live::check_part_file(&self.to)
+                    .map_err(|error| write_refused_failure("", &self.to, &error))?;
             }
         }
         if is_standard_output(&self.to) {
-            self.check_frames()?;
+            self.check_has_frame()?;
         }
         let (mut reader, bar, live) = self.open()?;
         let stopped = stop::stop_flag();
         let name = reader.name().to_owned();
         let of_log = reader.format() == CaptureFormat::Candump;
         if !text && !of_log && !reader.has_foreign_frames() {
-            return Err(Failure::usage(format!("{name} is already an MCAP recording: copy it instead")));
+            return Err(Failure::usage_error(format!(
+                "{name} is already an MCAP recording: copy it instead"
+            )));
         }
         let digits = self.digits.unwrap_or(if self.plain { TimeDigits::Six } else { TimeDigits::Own });
         let directions = !self.plain && (self.direction || reader.is_from_log());
         let style = LogStyle { digits, plain: self.plain, directions };
         let mut sink = if live && self.is_regular_output() {
-            let refused = |error: io::Error| write_refused("", &self.to, &error);
-            Sink::Live(
+            let refused = |error: io::Error| write_refused_failure("", &self.to, &error);
+            ConversionOutput::Live(
                 GrowingCapture::create(&self.to, self.overwrite.overwrite, (format, style, of_log), stopped)
                     .map_err(refused)?,
             )
         } else {
-            let (whole, out) = self.create(stopped)?;
+            let (whole, out) = self.create_output(stopped)?;
             let output = match format {
                 CaptureFormat::Candump => CaptureWriter::new(out, format, style),
                 CaptureFormat::Mcap => CaptureWriter::new_mcap(out, RecordingOrigin { of_log, file: None }),
             };
-            Sink::Whole(whole, output.map_err(|error| Failure::run(format!("{to}: {error}")))?)
+            ConversionOutput::Whole(
+                whole,
+                output.map_err(|error| Failure::run_error(format!("{to}: {error}")))?,
+            )
         };
         let mut named = 0;
         let done = convert(&mut reader, &mut sink, |line, why| {
@@ -144,10 +154,10 @@ impl ConvertCommand {
             if self.strict {
                 return Err(format!("{place}: {why}; without --strict, the line would be kept as it is"));
             }
-            if named <= MAX_NAMED_LINES {
+            if named <= MAX_REPORTED_LINES {
                 bar.suspend(|| print_note(format_args!("{place}: {why}")));
             }
-            if named == MAX_NAMED_LINES {
+            if named == MAX_REPORTED_LINES {
                 bar.suspend(|| print_note(format_args!("{name}: further unreadable lines are only counted")));
             }
             Ok(())
@@ -156,20 +166,22 @@ impl ConvertCommand {
         let done = match done {
             Ok(done) => done,
             Err(ConvertError::Write(error)) => return self.write_failure(&sink, error),
-            Err(error @ ConvertError::Strict(_)) => return Err(sink.discard(Failure::run(error))),
-            Err(error) => return Err(sink.close(Failure::run(error))),
+            Err(error @ ConvertError::Strict(_)) => return Err(sink.discard(Failure::run_error(error))),
+            Err(error) => return Err(sink.close_unfinished(Failure::run_error(error))),
         };
         if done.frames == 0 {
-            return Err(sink.discard(no_frame(&reader)));
+            return Err(sink.discard(no_frame_failure(&reader)));
         }
         if stopped.load(Ordering::Relaxed) && !live {
             let frames = done.frames;
-            return Err(Failure::run(format!("interrupted after {frames} frames: {to} is not written")));
+            return Err(Failure::run_error(format!(
+                "interrupted after {frames} frames: {to} is not written"
+            )));
         }
         if let Some(why) = &reader.extras().unfinished {
             let said = format!("{name}: {why}");
             if self.strict {
-                return Err(sink.discard(Failure::run(format!("{said}; {WITHOUT_STRICT_HINT}"))));
+                return Err(sink.discard(Failure::run_error(format!("{said}; {WITHOUT_STRICT_HINT}"))));
             }
             print_note(said);
         }
@@ -182,7 +194,7 @@ impl ConvertCommand {
     }
 
     /// Checks that the captures contain a frame, before any of their other lines is written to standard output.
-    fn check_frames(&self) -> Result<(), Failure> {
+    fn check_has_frame(&self) -> Result<(), Failure> {
         if !self.from.iter().all(|file| can_be_read_again(file)) {
             return Ok(());
         }
@@ -193,7 +205,7 @@ impl ConvertCommand {
             match reader.next() {
                 Ok(Some(CaptureEntry::Note(line))) => {
                     if let NoteKind::Unreadable(why) = &line.kind
-                        && (unreadable.len() as u64) < MAX_NAMED_LINES
+                        && (unreadable.len() as u64) < MAX_REPORTED_LINES
                     {
                         unreadable.push(format!("{}: {why}", location(&name, line.line)));
                     }
@@ -203,7 +215,7 @@ impl ConvertCommand {
                         && (!self.strict || unreadable.is_empty()) =>
                 {
                     unreadable.iter().for_each(print_note);
-                    return Err(no_frame(&reader));
+                    return Err(no_frame_failure(&reader));
                 }
                 // The error is reported when the file is read again.
                 Ok(_) | Err(_) => return Ok(()),
@@ -216,8 +228,8 @@ impl ConvertCommand {
         !is_standard_output(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
     }
 
-    fn write_failure(&self, sink: &Sink, error: io::Error) -> Result<(), Failure> {
-        let left = sink.remaining_file();
+    fn write_failure(&self, sink: &ConversionOutput, error: io::Error) -> Result<(), Failure> {
+        let left = sink.remaining_file_text();
         write_error(&self.to, &left, error)
     }
 
@@ -227,34 +239,40 @@ impl ConvertCommand {
         let options =
             [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
         if let Some((option, _)) = options.iter().find(|(_, given)| *given) {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{option} is only for a candump log, but {to} is a CSV file: leave it out"
             )));
         }
-        check_distinct([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
-        self.overwrite.check("", &self.to)?;
-        let skin = skin_for(&self.from, self.skin.as_deref())?;
+        check_distinct_files([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
+        self.overwrite.check_writable("", &self.to)?;
+        let skin = named_or_recorded_skin(&self.from, self.skin.as_deref())?;
         let (mut reader, bar, live) = self.open()?;
         let stopped = stop::stop_flag();
         let name = reader.name().to_owned();
-        let (whole, out) = self.create(stopped)?;
-        let done = torques::write(&mut reader, &skin, out);
+        let (whole, out) = self.create_output(stopped)?;
+        let done = torques::write_torque_rows(&mut reader, &skin, out);
         bar.finish_and_clear();
         let (epochs, missing) = done.map_err(|error| match error {
-            SeriesError::Consumer(error) => Failure::run(format!("{to}: {error}; no file was kept")),
-            error @ (SeriesError::Capture(_) | SeriesError::NotFound { .. }) => Failure::run(error),
+            EpochSeriesError::Consumer(error) => {
+                Failure::run_error(format!("{to}: {error}; no file was kept"))
+            }
+            error @ (EpochSeriesError::Capture(_) | EpochSeriesError::NotFound { .. }) => {
+                Failure::run_error(error)
+            }
         })?;
         if stopped.load(Ordering::Relaxed) && !live {
-            return Err(Failure::run(format!("interrupted after {epochs} epochs: {to} is not written")));
+            return Err(Failure::run_error(format!(
+                "interrupted after {epochs} epochs: {to} is not written"
+            )));
         }
         if let Some(why) = reader.extras().unfinished.as_ref().filter(|_| self.strict) {
-            return Err(Failure::run(format!("{name}: {why}; {WITHOUT_STRICT_HINT}")));
+            return Err(Failure::run_error(format!("{name}: {why}; {WITHOUT_STRICT_HINT}")));
         }
         if let Some(whole) = whole {
-            whole.finish().map_err(|error| Failure::run(format!("{to}: {error}")))?;
+            whole.finish().map_err(|error| Failure::run_error(format!("{to}: {error}")))?;
         }
-        missing.report(&reader, "left out");
-        if let Some(buses) = torques::summed_buses(&skin) {
+        missing.print_counts(&reader, "left out");
+        if let Some(buses) = torques::buses_with_sums(&skin) {
             print_note(format_args!(
                 "{name}: {buses} answers with sums: distributed torques and errors are empty"
             ));
@@ -273,17 +291,17 @@ impl ConvertCommand {
     }
 
     /// Opens the output. Standard output is written to directly.
-    fn create(
+    fn create_output(
         &self,
         stopped: &AtomicBool,
     ) -> Result<(Option<AtomicFile>, BufWriter<InterruptibleWriter<File>>), Failure> {
         let begun = if is_standard_output(&self.to) {
             io::stdout().as_fd().try_clone_to_owned().map(|file| (None, file.into()))
         } else {
-            AtomicFile::create_unless(&self.to, self.overwrite.overwrite, stopped)
+            AtomicFile::create_unless_stopped(&self.to, self.overwrite.overwrite, stopped)
                 .map(|(whole, file)| (Some(whole), file))
         };
-        let (whole, file) = begun.map_err(|error| write_refused("", &self.to, &error))?;
+        let (whole, file) = begun.map_err(|error| write_refused_failure("", &self.to, &error))?;
         Ok((whole, BufWriter::with_capacity(WRITE_BYTES, InterruptibleWriter::new(file))))
     }
 
@@ -291,7 +309,7 @@ impl ConvertCommand {
     fn format(&self) -> Result<CaptureFormat, Failure> {
         if is_standard_output(&self.to) && io::stdout().is_terminal() {
             let why = "standard output is a terminal, and a log may contain control characters";
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "-: {why}: pipe it to a program, name a file, or view it with `skinbus dump`"
             )));
         }
@@ -300,7 +318,7 @@ impl ConvertCommand {
             Some("mcap") => Ok(CaptureFormat::Mcap),
             Some("log" | "txt") => Ok(CaptureFormat::Candump),
             _ if is_standard_output(&self.to) || other => Ok(CaptureFormat::Candump),
-            _ => Err(Failure::usage(format!(
+            _ => Err(Failure::usage_error(format!(
                 "{}: unknown file type: use .mcap for a recording, .log or .txt for a candump log, .csv for torques, or - for \
                  standard output",
                 self.to.display()
@@ -321,31 +339,31 @@ fn write_error(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
     if is_standard_output(to) {
         return protocol::usage::ignore_broken_pipe(Err(error));
     }
-    Err(Failure::run(format!("{}: {error}; {left}", to.display())))
+    Err(Failure::run_error(format!("{}: {error}; {left}", to.display())))
 }
 
 /// Destination of the converted entries: a file that appears when it is complete, or one that grows.
-enum Sink {
+enum ConversionOutput {
     Whole(Option<AtomicFile>, CaptureWriter<BufWriter<InterruptibleWriter<File>>>),
     Live(GrowingCapture),
 }
 
-impl Sink {
+impl ConversionOutput {
     /// Returns text that names the file which holds the frames after an error.
-    fn remaining_file(&self) -> String {
+    fn remaining_file_text(&self) -> String {
         match self {
             Self::Whole(..) => "no file was kept".to_owned(),
-            Self::Live(live) => live.remaining_file(),
+            Self::Live(live) => live.remaining_file_text(),
         }
     }
 
     /// Closes the unfinished output. The file keeps the entries written so far.
-    fn close(self, why: Failure) -> Failure {
+    fn close_unfinished(self, why: Failure) -> Failure {
         match self {
             Self::Whole(..) => why,
             Self::Live(live) => {
-                let left = live.remaining_file();
-                live.close();
+                let left = live.remaining_file_text();
+                live.close_unfinished();
                 why.append(left)
             }
         }
@@ -361,7 +379,7 @@ impl Sink {
 
     /// Finishes the output. An error comes with text on the state of the file.
     fn finish(self) -> Result<(), (String, io::Error)> {
-        let left = self.remaining_file();
+        let left = self.remaining_file_text();
         let finished = match self {
             Self::Whole(whole, mut output) => {
                 output.finish().and_then(|()| whole.map_or(Ok(()), AtomicFile::finish))
@@ -372,7 +390,7 @@ impl Sink {
     }
 }
 
-impl EntrySink for Sink {
+impl EntrySink for ConversionOutput {
     fn write(&mut self, entry: &CaptureEntry<'_>) -> io::Result<WriteOutcome> {
         match self {
             Self::Whole(_, output) => output.write(entry),
@@ -429,7 +447,7 @@ fn remarks(reader: &Reader, done: &ConversionCounts, style: &LogStyle, text: boo
             lines.push(format!("{count} {}{what}", if count == 1 { one } else { more }));
         }
     }
-    match other_contents(reader) {
+    match describe_other_contents(reader) {
         others if others.is_empty() => {}
         others if text => lines.push(format!("a candump log cannot hold {others}")),
         others => lines.push(format!("only frames are written, without {others}")),

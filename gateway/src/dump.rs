@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use analysis::stats::StatsReport;
 use bench::bus::listen::now;
 use clap::Args;
-use model::decode::pick::{FrameFilter, IdMask, NodeSelector, Selector};
+use model::decode::pick::{FrameFilter, FrameSelector, IdMask, NodeSelector};
 use protocol::bus::BusOptions;
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
@@ -24,11 +24,11 @@ use trace::capture::{CaptureEntry, NoteKind, Reader, RecordingExtras, Topic};
 use self::show::{FrameOutput, OutputStyle};
 use super::arguments::{BusKinds, OptionValue, one_of_values, parse_time_ns};
 use super::input::{
-    self, BusReceiver, LossCounts, POLL_TIMEOUT, is_file, is_path, location, no_frame, note_other_skin,
-    open_capture, skin_so_far, stop_flag,
+    self, BusReceiver, LossCounts, POLL_TIMEOUT, is_file, is_path, location, no_frame_failure,
+    note_skin_difference, open_capture, skin_found_so_far, stop_flag,
 };
 use super::output;
-use super::print::{comma_separated, json};
+use super::print::{comma_separated, to_pretty_json};
 
 /// Show the traffic of a bus or a capture, decoded beside the raw frames
 ///
@@ -56,7 +56,7 @@ pub(crate) struct DumpCommand {
     /// Show only these kinds of frames: command (or only its halt, joints, sync, resume, report), sum, torque, sensors,
     /// network, configure, configured, stimulus, wire, foreign (includes damaged), damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
-    kind: Vec<Selector>,
+    kind: Vec<FrameSelector>,
     /// Show only packets from or to these nodes: cells, gateway or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_delimiter = ',')]
     cell: Vec<NodeSelector>,
@@ -137,21 +137,23 @@ impl DumpCommand {
             from: self.from,
             to: self.to,
         };
-        pick.check().map_err(Failure::usage)?;
+        pick.check_consistency().map_err(Failure::usage_error)?;
         if !is_capture {
             let names: Vec<_> = self.sources.iter().map(|source| source.display().to_string()).collect();
             if let Some(other) = pick.bus_names().find(|bus| !names.iter().any(|name| name == bus)) {
                 let names = comma_separated(&names);
-                return Err(Failure::usage(format!(
+                return Err(Failure::usage_error(format!(
                     "bus {other} is not among the dumped buses: name it in addition to {names}"
                 )));
             }
             if let Some(file) = self.sources.iter().find(|source| self.wait && is_path(source)) {
                 let file = file.display();
-                return Err(Failure::usage(format!("--wait is only for buses, and there is no file {file}")));
+                return Err(Failure::usage_error(format!(
+                    "--wait is only for buses, and there is no file {file}"
+                )));
             }
         } else if self.wait {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "--wait is only for buses, but {title} is a file: leave it out"
             )));
         }
@@ -159,8 +161,8 @@ impl DumpCommand {
         let to_out = BufWriter::new(InterruptibleWriter::new(&out));
         let mut show = FrameOutput::new(to_out, self.format, pick, self.contact, how, max);
         if let Some(path) = &self.skin {
-            let skin = Skin::read(path).map_err(Failure::usage)?;
-            note_other_skin(&self.sources, path, &skin);
+            let skin = Skin::read(path).map_err(Failure::usage_error)?;
+            note_skin_difference(&self.sources, path, &skin);
             show.set_units(&skin);
         }
         let (what, extras, done) = if is_capture {
@@ -168,7 +170,7 @@ impl DumpCommand {
             reader.name().clone_into(&mut title);
             if self.skin.is_none() && !self.stats {
                 let instead = "torques are read as Q3.12 and joints as revolute: name the skin with --skin";
-                if let Some(skin) = skin_so_far(&reader, instead) {
+                if let Some(skin) = skin_found_so_far(&reader, instead) {
                     show.set_units(&skin);
                 }
             }
@@ -181,7 +183,7 @@ impl DumpCommand {
         } else {
             // Signals must be caught before the dump reports that it listens.
             let stopped = stop_flag()?;
-            let kinds = self.kinds.any_kinds()?;
+            let kinds = self.kinds.kinds_of_any_buses()?;
             let until = self.wait.then_some(&*stopped);
             let mut receive_ends =
                 input::open_bus_receivers(&self.sources, &kinds, self.format, &BusOptions::default(), until)?;
@@ -193,8 +195,8 @@ impl DumpCommand {
         if let Some(report) = report {
             // Show the counts even if the dump ended with an error.
             print_text(&match self.json {
-                true => as_json(&title, what, &report, extras.as_ref())?,
-                false => table::text(&title, what, &report, extras.as_ref()),
+                true => statistics_json(&title, what, &report, extras.as_ref())?,
+                false => table::report_text(&title, what, &report, extras.as_ref()),
             })?;
         }
         done
@@ -206,20 +208,22 @@ impl DumpCommand {
         let other = sources.iter().find(|source| !is_file(source));
         if let (Some(bus), Some(file)) = (other, sources.iter().find(|source| is_file(source))) {
             let (bus, file) = (bus.display(), file.display());
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{file} is a file, but there is no file {bus}: name only the parts of one recording, or only buses"
             )));
         }
         if let Some(folder) = sources.iter().find(|source| source.is_dir()) {
             let folder = folder.display();
-            return Err(Failure::usage(format!("{folder} is a directory: name a candump log or buses")));
+            return Err(Failure::usage_error(format!(
+                "{folder} is a directory: name a candump log or buses"
+            )));
         }
         Ok(other.is_none())
     }
 }
 
 /// Returns the statistics as JSON.
-fn as_json(
+fn statistics_json(
     source: &str,
     format: &str,
     report: &StatsReport,
@@ -237,7 +241,7 @@ fn as_json(
     let other_topics = extras.map_or(&[][..], |extras| &extras.topics);
     let attachments = extras.iter().flat_map(|extras| &extras.attachments).map(|(name, _)| name.as_str());
     let whole = DumpStatistics { source, format, report, other_topics, attachments: attachments.collect() };
-    json(&whole)
+    to_pretty_json(&whole)
 }
 
 /// Shows the frames of a capture.
@@ -250,7 +254,7 @@ fn show_capture(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Resu
         {
             break Err(error);
         }
-        match reader.next().map_err(Failure::run)? {
+        match reader.next().map_err(Failure::run_error)? {
             None => break Ok(()),
             Some(CaptureEntry::Frame(record)) => {
                 frames += 1;
@@ -283,15 +287,15 @@ fn show_capture(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Resu
     }
     // Missing frames have been reported at their places, so they are not reported again at the end.
     missing.frames = 0;
-    missing.report(reader, "not shown");
+    missing.print_counts(reader, "not shown");
     if frames == 0 && !stop::stop_flag().load(Ordering::Relaxed) {
-        return Err(no_frame(reader));
+        return Err(no_frame_failure(reader));
     }
     Ok(())
 }
 
 /// Interval between checks whether frames that wait for the rest of their packet have timed out.
-const SETTLE_INTERVAL: Duration = Duration::from_millis(20);
+const PACKET_TIMEOUT_CHECK_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Shows buses until a signal, or until one is closed.
 fn show_live(
@@ -334,7 +338,7 @@ fn show_received(
     receive_ends: &mut [BusReceiver],
     show: &mut FrameOutput<impl Write>,
 ) -> Result<io::Result<bool>, Failure> {
-    let wait = if show.is_waiting() { SETTLE_INTERVAL } else { POLL_TIMEOUT };
+    let wait = if show.is_waiting() { PACKET_TIMEOUT_CHECK_INTERVAL } else { POLL_TIMEOUT };
     // With a single bus, the receiving call waits too, which takes one system call instead of two.
     let is_alone = receive_ends.len() == 1;
     if !is_alone {
@@ -342,7 +346,7 @@ fn show_received(
     }
     let mut any = false;
     for receive_end in receive_ends {
-        if !receive_end.receive(if is_alone { wait } else { Duration::ZERO }).map_err(Failure::run)? {
+        if !receive_end.receive(if is_alone { wait } else { Duration::ZERO }).map_err(Failure::run_error)? {
             continue;
         }
         any = true;

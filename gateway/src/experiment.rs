@@ -17,16 +17,16 @@ use bench::record::facts;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use model::quantiles::Quantiles;
-use paper::arm::Reply;
+use paper::arm::ReplyMode;
 use paper::moving::BenchRun;
 use paper::scale::ScaleBench;
-use paper::{Effort, Experiment as Named, Lab, Session, files};
+use paper::{Effort, Experiment as Named, ExperimentLab, Session, files};
 use protocol::usage::{Failure, print_text, shell_quoted_os};
 use serde_json::Value;
 
 use super::input::stop_flag;
 use super::output::{OverwriteOption, print_note};
-use super::print::{KeyValueTable, json};
+use super::print::{KeyValueTable, to_pretty_json};
 use benches::BenchRunner;
 use folder::ResultFolder;
 
@@ -90,7 +90,9 @@ impl ExperimentCommand {
             return list_experiments();
         }
         let Some(output) = &self.output else {
-            return Err(Failure::usage("-o DIR is missing: name the folder for report.html and the figures"));
+            return Err(Failure::usage_error(
+                "-o DIR is missing: name the folder for report.html and the figures",
+            ));
         };
         let is_selected = |named: &Named| {
             self.names.iter().any(|word| {
@@ -172,15 +174,15 @@ struct LocalLab {
     idle: Option<String>,
 }
 
-impl Lab for LocalLab {
+impl ExperimentLab for LocalLab {
     type Error = Failure;
 
-    fn now(&self) -> u64 {
-        realtime::now()
+    fn now_ns(&self) -> u64 {
+        realtime::monotonic_ns()
     }
 
-    fn run_bench(&mut self, reply: Reply, effort: Effort) -> Result<BenchRun, Failure> {
-        let run = self.benches.run(reply, effort);
+    fn run_bench(&mut self, reply: ReplyMode, effort: Effort) -> Result<BenchRun, Failure> {
+        let run = self.benches.run_arm_bench(reply, effort);
         // If a signal has ended the bench, return that it was interrupted, not that it failed.
         self.check_stopped()?;
         let run = run?;
@@ -199,7 +201,7 @@ impl Lab for LocalLab {
 
     fn check_stopped(&mut self) -> Result<(), Failure> {
         if self.stop.load(Ordering::Relaxed) {
-            return Err(Failure::run("ended by a signal: nothing was written"));
+            return Err(Failure::run_error("ended by a signal: nothing was written"));
         }
         Ok(())
     }
@@ -228,7 +230,7 @@ fn list_experiments() -> Result<(), Failure> {
 
 /// Writes the findings and the data of the figures, and publishes them with the recordings.
 fn write_results(page: &Page, folder: &ResultFolder) -> Result<(), Failure> {
-    folder.write("results.json", &json(&files::results(page))?)?;
+    folder.write("results.json", &to_pretty_json(&files::findings_json(page))?)?;
     for figure in page.sections.iter().flat_map(|section| &section.figures) {
         folder.write(&format!("{}.csv", figure.name), &files::csv(figure))?;
     }
@@ -237,9 +239,9 @@ fn write_results(page: &Page, folder: &ResultFolder) -> Result<(), Failure> {
 
 /// Writes the HTML page and the figures.
 fn write_report(page: &Page, folder: ResultFolder) -> Result<(), Failure> {
-    folder.write("report.html", &page::html(page))?;
+    folder.write("report.html", &page::page_html(page))?;
     for figure in page.sections.iter().flat_map(|section| &section.figures) {
-        folder.write(&format!("{}.svg", figure.name), &svg::draw(figure))?;
+        folder.write(&format!("{}.svg", figure.name), &svg::draw_figure(figure))?;
     }
     folder.finish()
 }

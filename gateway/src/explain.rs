@@ -5,7 +5,7 @@ mod torque;
 
 use std::path::PathBuf;
 
-use analysis::explain::{CellExplained, Explanation, RequestedJoints, explain, read_to_joints};
+use analysis::explain::{CellExplanation, RequestedJoints, TorqueExplanation, explain, read_to_joints};
 use clap::Args;
 use protocol::id::CellId;
 use protocol::packet::Epoch;
@@ -15,9 +15,9 @@ use serde::Serialize;
 use trace::capture::Reader;
 
 use super::arguments::{find_cell, parse_time_ns};
-use super::input::{is_file, is_path, no_frame, note_other_skin, skin_of};
+use super::input::{is_file, is_path, no_frame_failure, note_skin_difference, skin_of_recording};
 use super::output;
-use super::print::json;
+use super::print::to_pretty_json;
 
 /// Explain the torque of one epoch, or compute that of a force on a cell
 ///
@@ -77,7 +77,7 @@ struct ExplainOutput<'a> {
     source: String,
     epoch: u8,
     #[serde(flatten)]
-    explanation: &'a Explanation,
+    explanation: &'a TorqueExplanation,
 }
 
 impl ExplainCommand {
@@ -87,20 +87,20 @@ impl ExplainCommand {
         };
         if let Some(bus) = self.files.iter().find(|file| !is_file(file) && !is_path(file)) {
             let bus = bus.display();
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "there is no file {bus}; to explain a live bus, record it first: `skinbus dump {bus} | cut -f1 > run.log`"
             )));
         }
         let skin = match &self.skin {
-            Some(path) => Skin::read(path).map_err(Failure::usage)?,
-            None => skin_of(&self.files)?,
+            Some(path) => Skin::read(path).map_err(Failure::usage_error)?,
+            None => skin_of_recording(&self.files)?,
         };
-        self.check(&skin)?;
-        let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
+        self.check_cell_and_joint(&skin)?;
+        let mut reader = Reader::open_all(&self.files).map_err(Failure::usage_error)?;
         let name = reader.name().to_owned();
         let requested =
             RequestedJoints { epoch: Epoch(epoch), from_ns: self.at, occurrence: self.occurrence };
-        let found = read_to_joints(&mut reader, &skin, requested).map_err(Failure::run)?;
+        let found = read_to_joints(&mut reader, &skin, requested).map_err(Failure::run_error)?;
         for (count, what) in [
             (found.dropped, "frames are missing before this point; contact states may be out of date"),
             (found.unreadable, "lines before this point could not be read"),
@@ -113,17 +113,17 @@ impl ExplainCommand {
             output::print_note(format_args!("{name}: {why}"));
         }
         if found.is_empty {
-            return Err(no_frame(&reader));
+            return Err(no_frame_failure(&reader));
         }
-        let moments = found.moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
+        let moments = found.moments.map_err(|error| Failure::run_error(format!("{name}: {error}")))?;
         // An error above, which may be due to a different skin, is returned without this note.
         if let Some(path) = &self.skin {
-            note_other_skin(&self.files, path, &skin);
+            note_skin_difference(&self.files, path, &skin);
         }
         let mut explanation = explain(&skin, &moments);
         if let Some(target) = &self.cell {
-            let is_named = |cell: &CellExplained| {
-                CellId::new(cell.node.into()).is_ok_and(|node| target.fits(&cell.bus, node))
+            let is_named = |cell: &CellExplanation| {
+                CellId::new(cell.node.into()).is_ok_and(|node| target.matches_cell(&cell.bus, node))
             };
             explanation.cells.retain(is_named);
         }
@@ -135,7 +135,7 @@ impl ExplainCommand {
         }
         if self.json {
             let whole = ExplainOutput { source: name, epoch, explanation: &explanation };
-            return print_text(&json(&whole)?);
+            return print_text(&to_pretty_json(&whole)?);
         }
         let what = match (self.cell.is_some(), self.joint) {
             (true, _) => show::ExplainDetail::Cells,
@@ -152,10 +152,10 @@ impl ExplainCommand {
     }
 
     /// Checks that the skin has the cell and the joint.
-    fn check(&self, skin: &Skin) -> Result<(), Failure> {
+    fn check_cell_and_joint(&self, skin: &Skin) -> Result<(), Failure> {
         let joints = skin.robot.joints.len();
         if let Some(joint) = self.joint.filter(|joint| usize::from(*joint) > joints) {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "--joint {joint}: {} has joints 1 to {joints}",
                 skin.robot.name
             )));

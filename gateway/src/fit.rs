@@ -98,12 +98,12 @@ impl FitCommand {
         ];
         let file = skin.display();
         if let Some((option, _)) = of_traffic.iter().find(|(_, given)| *given) {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{option} is only for traffic, but {file} is a skin: leave the option out"
             )));
         }
         if self.data.is_some() && self.nominal.is_none() {
-            return Err(Failure::usage("--data for a skin also needs --nominal"));
+            return Err(Failure::usage_error("--data for a skin also needs --nominal"));
         }
         let skin = read_skin(skin)?;
         self.print_skin_fit(&skin)
@@ -123,7 +123,7 @@ impl FitCommand {
         match given {
             Some(option) if !is_skin => {
                 let names = comma_separated(self.sources.iter().map(|source| source.display()));
-                Err(Failure::usage(format!(
+                Err(Failure::usage_error(format!(
                     "{option} is only for a skin, but {names} is not a skin: leave the option out"
                 )))
             }

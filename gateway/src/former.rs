@@ -2,7 +2,7 @@
 //! help, completion or man page.
 
 /// Returns the line that gives the present name of a former command. `words` are the words of the command line.
-pub(crate) fn former_command(words: &[String], name: &str) -> Option<String> {
+pub(crate) fn former_command_hint(words: &[String], name: &str) -> Option<String> {
     let first = words.first().map(String::as_str).unwrap_or_default();
     let now = match (first, name) {
         ("ack", _) => "skinbus frame resume --bus BUS, or --skin SKIN for all of its buses",
@@ -21,7 +21,7 @@ pub(crate) fn former_command(words: &[String], name: &str) -> Option<String> {
 }
 
 /// Returns the line that gives the present name of a former option. `words` are the words of the command line.
-pub(crate) fn former_option(words: &[String], option: &str) -> Option<String> {
+pub(crate) fn former_option_hint(words: &[String], option: &str) -> Option<String> {
     let name = option.split([' ', '=']).next().unwrap_or_default();
     let command = words.first().map(String::as_str).unwrap_or_default();
     let now = match (command, name) {
@@ -71,14 +71,14 @@ mod tests {
 
     #[test]
     fn former_names_lead_to_the_present_ones() {
-        let of_command = |line: &str, name| former_command(&words(line), name).unwrap_or_default();
+        let of_command = |line: &str, name| former_command_hint(&words(line), name).unwrap_or_default();
         assert_eq!(of_command("dbc s.toml", "dbc"), "there is no command dbc; use skinbus skin dbc SKIN");
         assert_eq!(
             of_command("skin check s.toml", "check"),
             "there is no command skin check; use skinbus check SKIN"
         );
         assert_eq!(of_command("skin dbc s.toml", "x"), "");
-        let of_option = |line: &str, name| former_option(&words(line), name).unwrap_or_default();
+        let of_option = |line: &str, name| former_option_hint(&words(line), name).unwrap_or_default();
         assert_eq!(
             of_option("run s.toml --force", "--force"),
             "there is no option --force in run; use --overwrite"

@@ -9,7 +9,7 @@ use std::fmt::Write;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use bench::answers::Answers;
+use bench::answers::ReceivedAnswers;
 use bench::bus::listen::{self, Listener};
 use bench::sensing as switching;
 use clap::Args;
@@ -25,7 +25,7 @@ use protocol::usage::{Failure, print_text};
 use super::arguments::{BusKinds, FORMATS, find_bus, find_cell, one_of_values};
 use super::output;
 use super::print::comma_separated;
-use addressee::only_cell;
+use addressee::single_cell;
 use packets::PacketCommand;
 
 /// Time within which present cells send a heartbeat and their answers.
@@ -61,14 +61,14 @@ pub(crate) struct FrameCommand {
 
 impl FrameCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let message = self.what.message().map_err(Failure::usage)?;
+        let message = self.what.message().map_err(Failure::usage_error)?;
         let (targets, kinds) = self.targets()?;
         if targets.is_empty() {
             return print_text(&cansend_lines(&message, self.format.unwrap_or(Format::Fd)));
         }
         // Open all buses before anything is sent.
         let open = |(name, format): &(String, Format)| {
-            self.open(name, kinds.kind_of(name), *format).map_err(Failure::usage)
+            self.open(name, kinds.kind_of(name), *format).map_err(Failure::usage_error)
         };
         let buses = targets.iter().map(open).collect::<Result<Vec<_>, _>>()?;
         let done =
@@ -86,11 +86,12 @@ impl FrameCommand {
         let of_cell = to.and_then(|to| to.bus.as_ref());
         let mut targets: Vec<_> = match &self.skin {
             Some(path) => {
-                let skin = Skin::read(path).map_err(Failure::usage)?;
+                let skin = Skin::read(path).map_err(Failure::usage_error)?;
                 let file = path.display().to_string();
                 self.bus.iter().chain(of_cell).try_for_each(|name| find_bus(&skin, &file, name).map(drop))?;
                 // A node id on several buses names several cells.
-                let only = match to.filter(|_| self.bus.is_empty() && of_cell.is_none()).and_then(only_cell) {
+                let only = match to.filter(|_| self.bus.is_empty() && of_cell.is_none()).and_then(single_cell)
+                {
                     Some(node) => {
                         let index = find_cell(&skin, &CellName { bus: None, node }, "--cell")?;
                         skin.cells.get(index).map(|cell| cell.bus)
@@ -108,11 +109,11 @@ impl FrameCommand {
             }
         };
         let names = comma_separated(targets.iter().map(|(name, _)| name));
-        let kinds = self.kinds.kinds_of(targets.iter().map(|(name, _)| name.as_str()))?;
+        let kinds = self.kinds.kinds_of_buses(targets.iter().map(|(name, _)| name.as_str()))?;
         if let Some(NodeSelector { bus: Some(bus), node }) = to {
             targets.retain(|(name, _)| name == bus);
             if targets.is_empty() {
-                return Err(Failure::usage(format!(
+                return Err(Failure::usage_error(format!(
                     "--cell {bus}:{node} is not on --bus {names}: correct --cell or --bus"
                 )));
             }
@@ -124,21 +125,21 @@ impl FrameCommand {
     fn open(&self, name: &str, kind: KindChoice, format: Format) -> Result<Bus, BusError> {
         match self.what.addressee() {
             // A socket that only sends cannot show whether a cell is present.
-            Some(_) => switching::open(name, kind, format),
+            Some(_) => switching::open_bus(name, kind, format),
             None => {
                 let nothing = BusOptions { filters: Vec::new(), ..BusOptions::default() };
-                listen::open(name, kind, Some(format), nothing)
+                listen::open_bus(name, kind, Some(format), nothing)
             }
         }
     }
 
     /// Sends the frame on a bus, and waits for the cells' answers.
     fn send(&self, bus: Bus, format: Format, message: &Message) -> Result<(), Failure> {
-        let (name, only) = (bus.name().to_owned(), self.what.addressee().and_then(only_cell));
+        let (name, only) = (bus.name().to_owned(), self.what.addressee().and_then(single_cell));
         if let PacketCommand::Sensing(switch) = &self.what {
             return switch.send(bus, format);
         }
-        listen::send(&bus, message, format).map_err(Failure::run)?;
+        listen::send_message(&bus, message, format).map_err(Failure::run_error)?;
         output::print_note(format_args!("sent on {name} ({})", bus.kind()));
         let tag = if let Message::Configure { tag, .. } = message {
             Some(*tag)
@@ -147,8 +148,9 @@ impl FrameCommand {
         } else {
             return Ok(());
         };
-        let answers = wait_for_answers(Listener::new(bus, Some(format)), only, tag).map_err(Failure::run)?;
-        verdict(&answers, only, tag, (&name, format))
+        let answers =
+            wait_for_answers(Listener::new(bus, Some(format)), only, tag).map_err(Failure::run_error)?;
+        report_answers(&answers, only, tag, (&name, format))
     }
 }
 
@@ -157,11 +159,11 @@ fn wait_for_answers(
     mut listener: Listener,
     only: Option<CellId>,
     tag: Option<u8>,
-) -> Result<Answers, BusError> {
-    let mut answers = Answers::new(only, tag);
-    let are_complete = |answers: &Answers| match (only, tag) {
-        (_, None) => !answers.present().is_empty(),
-        (Some(_), Some(_)) => !answers.received().is_empty(),
+) -> Result<ReceivedAnswers, BusError> {
+    let mut answers = ReceivedAnswers::new(only, tag);
+    let are_complete = |answers: &ReceivedAnswers| match (only, tag) {
+        (_, None) => !answers.present_cells().is_empty(),
+        (Some(_), Some(_)) => !answers.received_answers().is_empty(),
         (None, Some(_)) => false,
     };
     let began = Instant::now();
@@ -172,17 +174,17 @@ fn wait_for_answers(
 }
 
 /// Prints the values that cells answered. Returns an error if a cell refused, or none is present or answered.
-fn verdict(
-    answers: &Answers,
+fn report_answers(
+    answers: &ReceivedAnswers,
     only: Option<CellId>,
     tag: Option<u8>,
     (bus, format): (&str, Format),
 ) -> Result<(), Failure> {
     let (mut lines, mut refused) = (String::new(), Vec::new());
-    for &(from, answer) in answers.received() {
+    for &(from, answer) in answers.received_answers() {
         let decoded = Decoded::Message(Message::Configured { from, tag: tag.unwrap_or_default(), answer });
         let line = decoded.to_string();
-        let line = line.trim_start_matches(decoded.verdict()).trim_start();
+        let line = line.trim_start_matches(decoded.verdict_word()).trim_start();
         match answer {
             Answer::Value { .. } => lines += &format!("{line}\n"),
             Answer::Refused { .. } => refused.push(line.to_owned()),
@@ -192,17 +194,17 @@ fn verdict(
     let who = only.map_or_else(|| "cell".to_owned(), |cell| format!("cell {cell}"));
     let (waited, other) = (ANSWER_TIMEOUT.as_secs_f64(), format.other_format().name());
     if !refused.is_empty() {
-        return Err(Failure::run(comma_separated(&refused)));
+        return Err(Failure::run_error(comma_separated(&refused)));
     }
-    if answers.present().is_empty() {
-        return Err(Failure::run(format!(
+    if answers.present_cells().is_empty() {
+        return Err(Failure::run_error(format!(
             "no {who} sent anything on {bus} for {waited} s: `skinbus cells {bus}` lists the cells; the format of the bus \
              may be --format {other}"
         )));
     }
     if tag.is_some() && lines.is_empty() {
         let why = format!("{who} is on {bus}, but did not answer within {waited} s: send the frame again");
-        return Err(Failure::run(why));
+        return Err(Failure::run_error(why));
     }
     Ok(())
 }

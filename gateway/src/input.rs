@@ -8,7 +8,7 @@ use std::sync::{Arc, OnceLock};
 use std::thread;
 use std::time::Duration;
 
-use bench::bus::follow::{FollowStep, Follower, OpenedOnce};
+use bench::bus::follow::{FollowStep, Follower, NeverReopenedBus};
 use bench::bus::listen;
 use bench::signals::catch_signals;
 use protocol::bus::{Bus, BusError, BusOptions, KindChoice, KindChoices, ReceivedFrame};
@@ -24,7 +24,7 @@ use trace::capture::{
 };
 
 use super::output;
-use super::print::{abbreviated, count_with_noun};
+use super::print::{abbreviate_names, count_with_noun};
 
 /// Interval between attempts to open an awaited bus.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
@@ -34,7 +34,7 @@ pub(crate) const POLL_TIMEOUT: Duration = Duration::from_millis(200);
 
 /// Catches SIGINT and SIGTERM, and returns the flag that they set.
 pub(crate) fn stop_flag() -> Result<Arc<AtomicBool>, Failure> {
-    catch_signals(&[SIGINT, SIGTERM]).map_err(Failure::run)
+    catch_signals(&[SIGINT, SIGTERM]).map_err(Failure::run_error)
 }
 
 /// Returns true for the name of a capture, false for that of a bus.
@@ -48,7 +48,7 @@ pub(crate) fn is_path(name: &Path) -> bool {
 }
 
 /// Returns the error for a source that is neither a file nor a bus that can be opened.
-pub(crate) fn no_such_source(name: &str, error: &BusError) -> Failure {
+pub(crate) fn no_such_source_failure(name: &str, error: &BusError) -> Failure {
     let is_absent = matches!(
         error,
         BusError::Name(_)
@@ -58,27 +58,29 @@ pub(crate) fn no_such_source(name: &str, error: &BusError) -> Failure {
             | BusError::NoSocketCan(_)
     );
     if is_path(Path::new(name)) && is_absent {
-        return Failure::usage(format!("there is no file {name}, and no bus of this name: correct the path"));
+        return Failure::usage_error(format!(
+            "there is no file {name}, and no bus of this name: correct the path"
+        ));
     }
-    Failure::usage(format!("there is no file {name}, and it does not open as a bus: {error}"))
+    Failure::usage_error(format!("there is no file {name}, and it does not open as a bus: {error}"))
 }
 
 /// Returns the named skin, or else that of a recording. Prints a note if the named skin differs from the recording's.
-pub(crate) fn skin_for(files: &[PathBuf], named: Option<&Path>) -> Result<Skin, Failure> {
-    let Some(path) = named else { return skin_of(files) };
-    let skin = Skin::read(path).map_err(Failure::usage)?;
-    note_other_skin(files, path, &skin);
+pub(crate) fn named_or_recorded_skin(files: &[PathBuf], named: Option<&Path>) -> Result<Skin, Failure> {
+    let Some(path) = named else { return skin_of_recording(files) };
+    let skin = Skin::read(path).map_err(Failure::usage_error)?;
+    note_skin_difference(files, path, &skin);
     Ok(skin)
 }
 
 /// Prints a note if a skin differs from the one at the beginning of a recording.
-pub(crate) fn note_other_skin(files: &[PathBuf], path: &Path, skin: &Skin) {
+pub(crate) fn note_skin_difference(files: &[PathBuf], path: &Path, skin: &Skin) {
     if !files.iter().all(|file| can_be_read_again(file)) {
         return;
     }
     let Ok(reader) = Reader::open_all(files) else { return };
     let Some(Ok(own)) = reader.extras().skin() else { return };
-    if let Some((what, is, was)) = difference(skin, &own) {
+    if let Some((what, is, was)) = first_skin_difference(skin, &own) {
         let (path, name) = (path.display(), reader.name());
         output::print_note(format_args!(
             "--skin {path} is not the skin that {name} was recorded with ({what}: {is}, recorded: {was})"
@@ -87,7 +89,7 @@ pub(crate) fn note_other_skin(files: &[PathBuf], path: &Path, skin: &Skin) {
 }
 
 /// Returns the first difference between two skins: its name, and the value in each skin.
-pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, String)> {
+pub(crate) fn first_skin_difference(one: &Skin, other: &Skin) -> Option<(String, String, String)> {
     let buses = |skin: &Skin| skin.buses.iter().map(|bus| bus.name.clone()).collect::<Vec<_>>().join(", ");
     let joints = |skin: &Skin| skin.robot.joints.len().to_string();
     let cells = |skin: &Skin| skin.cells.len().to_string();
@@ -113,7 +115,7 @@ pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, St
 }
 
 /// Reads the skin from a file, which is either a skin or a recording with a skin attached.
-pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
+pub(crate) fn read_skin_or_recording(file: &Path) -> Result<Skin, Failure> {
     // If the file is neither, the error is that of reading it as a skin.
     let is_recording =
         can_be_read_again(file) && Reader::open(file).is_ok_and(|it| it.format() == CaptureFormat::Mcap);
@@ -125,7 +127,7 @@ pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
 
 /// Reads a skin file. If the file is a capture, the error says so, as far as that can be recognised.
 pub(crate) fn read_skin(file: &Path) -> Result<Skin, Failure> {
-    Skin::read(file).map_err(|error| capture_error(file).unwrap_or_else(|| Failure::usage(error)))
+    Skin::read(file).map_err(|error| capture_error(file).unwrap_or_else(|| Failure::usage_error(error)))
 }
 
 /// Returns the error for a file that is a capture or other text instead of a skin, by its name or content, or `None`
@@ -135,29 +137,29 @@ fn capture_error(file: &Path) -> Option<Failure> {
         return None;
     }
     let mut reader = match Reader::open(file) {
-        Err(error @ CaptureError::OtherFormat { .. }) => return Some(Failure::usage(error)),
+        Err(error @ CaptureError::OtherFormat { .. }) => return Some(Failure::usage_error(error)),
         opened => opened.ok()?,
     };
     let name = file.display();
     Some(match reader.has_frame().ok()? {
-        true => Failure::usage(format!(
+        true => Failure::usage_error(format!(
             "{name} is a capture ({}), but a skin is needed: name the skin's own file",
             format_name(&reader)
         )),
         false if reader.text_kind().is_some_and(|(kind, _)| kind == SKIN_OR_SCENARIO) => return None,
-        false => no_frame(&reader),
+        false => no_frame_failure(&reader),
     })
 }
 
 /// Returns the skin attached to a recording.
-pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
+pub(crate) fn skin_of_recording(files: &[PathBuf]) -> Result<Skin, Failure> {
     if files.iter().any(|file| is_standard_input(file)) {
-        return Err(Failure::usage("standard input can be read only once: name the skin with --skin"));
+        return Err(Failure::usage_error("standard input can be read only once: name the skin with --skin"));
     }
     if let Some(pipe) =
         files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
     {
-        return Err(Failure::usage(format!(
+        return Err(Failure::usage_error(format!(
             "{} is not a regular file and can be read only once: name the skin with --skin",
             pipe.display()
         )));
@@ -172,20 +174,20 @@ fn attached_skin(
     hint: &str,
     check: impl Fn() -> Result<(), Failure>,
 ) -> Result<Skin, Failure> {
-    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
+    let mut reader = Reader::open_all(files).map_err(Failure::usage_error)?;
     // The attached skin may come after the frames, so read until it is found.
     while reader.format() == CaptureFormat::Mcap
         && reader.extras().skin().is_none()
-        && reader.next().map_err(Failure::run)?.is_some()
+        && reader.next().map_err(Failure::run_error)?.is_some()
     {}
     let name = reader.name();
     match reader.extras().skin() {
-        Some(skin) => skin.map_err(|error| Failure::usage(format!("{name}, {error}"))),
+        Some(skin) => skin.map_err(|error| Failure::usage_error(format!("{name}, {error}"))),
         None => {
             check()?;
             Err(match &reader.extras().unfinished {
-                Some(why) => Failure::run(format!("{name} contains no skin, and {why}: {hint}")),
-                None => Failure::usage(format!("{name} contains no skin: {hint}")),
+                Some(why) => Failure::run_error(format!("{name} contains no skin, and {why}: {hint}")),
+                None => Failure::usage_error(format!("{name} contains no skin: {hint}")),
             })
         }
     }
@@ -193,13 +195,13 @@ fn attached_skin(
 
 /// Returns an error for a capture without frames, because naming a skin would not help.
 pub(crate) fn require_frames(files: &[PathBuf]) -> Result<(), Failure> {
-    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
-    if reader.has_frame().map_err(Failure::run)? { Ok(()) } else { Err(no_frame(&reader)) }
+    let mut reader = Reader::open_all(files).map_err(Failure::usage_error)?;
+    if reader.has_frame().map_err(Failure::run_error)? { Ok(()) } else { Err(no_frame_failure(&reader)) }
 }
 
 /// Returns the skin that a reader has found so far. If the skin is unreadable, prints a note that says what is used
 /// `instead`.
-pub(crate) fn skin_so_far(reader: &Reader, instead: &str) -> Option<Skin> {
+pub(crate) fn skin_found_so_far(reader: &Reader, instead: &str) -> Option<Skin> {
     let name = reader.name();
     let skin = reader.extras().skin()?;
     skin.inspect_err(|error| output::print_note(format_args!("{name}, {error}; {instead}"))).ok()
@@ -219,10 +221,12 @@ pub(crate) fn location(name: &str, line: u64) -> String {
 }
 
 /// Returns the error for a capture without frames.
-pub(crate) fn no_frame(reader: &Reader) -> Failure {
+pub(crate) fn no_frame_failure(reader: &Reader) -> Failure {
     let name = reader.name();
     if let Some((what, hint)) = reader.text_kind() {
-        return Failure::usage(format!("{name} is {what}, not a candump log or MCAP recording: {hint}"));
+        return Failure::usage_error(format!(
+            "{name} is {what}, not a candump log or MCAP recording: {hint}"
+        ));
     }
     let what = match (reader.format(), reader.line_count()) {
         (CaptureFormat::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
@@ -231,23 +235,23 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
             count_with_noun(lines, "line")
         ),
-        (CaptureFormat::Mcap, _) => match other_contents(reader) {
+        (CaptureFormat::Mcap, _) => match describe_other_contents(reader) {
             others if others.is_empty() => "there is no frame in it".to_owned(),
             others => format!("there is no frame in it, only {others}"),
         },
     };
-    Failure::run(format!("{name}: {what}"))
+    Failure::run_error(format!("{name}: {what}"))
 }
 
 /// Describes the contents of a recording other than frames and notes.
-pub(crate) fn other_contents(reader: &Reader) -> String {
+pub(crate) fn describe_other_contents(reader: &Reader) -> String {
     let extras = reader.extras();
     let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
     let topics = topics.map(|topic| format!("{} ({} messages)", topic.name, topic.messages));
     let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
     let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN_METADATA);
     let facts = facts.map(|(name, _)| format!("metadata {name}"));
-    abbreviated(&topics.chain(attached).chain(facts).collect::<Vec<_>>())
+    abbreviate_names(&topics.chain(attached).chain(facts).collect::<Vec<_>>())
 }
 
 /// Numbers of the items of a capture that were unreadable, lost or not supported.
@@ -276,12 +280,12 @@ impl LossCounts {
     }
 
     /// Returns the number of unreadable lines and messages.
-    pub(crate) const fn unreadable(&self) -> u64 {
+    pub(crate) const fn unreadable_count(&self) -> u64 {
         self.lines + self.messages
     }
 
     /// Prints the counts at the end of a capture. `can_xl` says how CAN XL frames were handled.
-    pub(crate) fn report(&self, reader: &Reader, can_xl: &str) {
+    pub(crate) fn print_counts(&self, reader: &Reader, can_xl: &str) {
         let name = reader.name();
         // In a recording, candump lines are notes.
         let unread = match reader.line_count() {
@@ -328,7 +332,7 @@ pub(crate) fn open_bus_receivers(
                 (Ok(receive_end), _) => break opened.push(receive_end),
                 (Err(_), Some(stopped)) if stopped.load(Ordering::Relaxed) => return Ok(opened),
                 (Err(error), Some(_)) if error.may_open_later() => thread::sleep(RETRY_INTERVAL),
-                (Err(error), _) => return Err(no_such_source(&name, &error)),
+                (Err(error), _) => return Err(no_such_source_failure(&name, &error)),
             }
         }
     }
@@ -344,7 +348,7 @@ impl BusReceiver {
         format: Option<can::Format>,
         options: BusOptions,
     ) -> Result<Self, BusError> {
-        let bus = listen::open(name, kind, format, BusOptions { error_mask: EXTENDED_MASK, ..options })?;
+        let bus = listen::open_bus(name, kind, format, BusOptions { error_mask: EXTENDED_MASK, ..options })?;
         output::print_note(format_args!("{} is {}", bus.name(), bus.kind()));
         Ok(Self { bus, follower: Follower::default() })
     }
@@ -354,7 +358,7 @@ impl BusReceiver {
     /// # Errors
     /// Returns [`BusError`] if the bus is gone.
     pub(crate) fn receive(&mut self, wait: Duration) -> Result<bool, BusError> {
-        match self.follower.step(&mut OpenedOnce(&self.bus), wait) {
+        match self.follower.step(&mut NeverReopenedBus(&self.bus), wait) {
             FollowStep::Frames(_) | FollowStep::Leftover(_) => Ok(true),
             FollowStep::Nothing | FollowStep::Drained | FollowStep::Refused(_) => Ok(false),
             FollowStep::Down(error) => {
@@ -377,7 +381,7 @@ impl BusReceiver {
     /// Prints and returns the number of frames lost because they arrived faster than they were processed. `done` says
     /// in the note how they would have been processed.
     pub(crate) fn report_missing_frames(&self, done: &str) -> u64 {
-        let (name, missing) = (self.bus().name(), self.follower.dropped());
+        let (name, missing) = (self.bus().name(), self.follower.dropped_frames());
         if missing > 0 {
             output::print_note(format_args!(
                 "{name}: {missing} frames are missing: they came faster than they were {done}"
@@ -393,7 +397,7 @@ pub(crate) fn wait(receive_ends: &[BusReceiver], timeout: Duration) -> Result<()
         receive_ends.iter().map(|receive_end| PollFd::new(receive_end.bus(), PollFlags::IN)).collect();
     match poll(&mut fds, Timespec::try_from(timeout).ok().as_ref()) {
         Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
-        Err(errno) => Err(Failure::run(io::Error::from(errno))),
+        Err(errno) => Err(Failure::run_error(io::Error::from(errno))),
     }
 }
 
@@ -409,7 +413,7 @@ pub(crate) fn open_capture(
         let caught = || stop_flag().unwrap_or_else(|_| Arc::clone(stop::stop_flag()));
         through(InterruptibleFile { file, stopped: Arc::clone(flag.get_or_init(caught)) })
     };
-    Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)
+    Reader::open_wrapped(sources, Box::new(interruptible)).map_err(Failure::usage_error)
 }
 
 /// A file whose reading can be stopped: it then reports the end of the file.

@@ -118,7 +118,7 @@ fn main() -> ExitCode {
         // Print requested help and version unchanged.
         Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => Err(Failure::usage(usage_error(&wrong))),
+        Err(wrong) => Err(Failure::usage_error(usage_error(&wrong))),
     };
     exit_code("skinbus", done)
 }
@@ -132,7 +132,7 @@ fn usage_error(wrong: &clap::Error) -> String {
     let words: Vec<_> = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
     let first = words.first().map(String::as_str).unwrap_or_default();
     if let Some(name) = text(ContextKind::InvalidSubcommand) {
-        if let Some(now) = former::former_command(&words, name) {
+        if let Some(now) = former::former_command_hint(&words, name) {
             return now;
         }
         if first == name {
@@ -143,7 +143,7 @@ fn usage_error(wrong: &clap::Error) -> String {
         Some(file) if first == "run" && file.ends_with(".toml") => {
             format!("unexpected argument {file} after the skin: to use a scenario, write --scenario {file}")
         }
-        Some(option) => former::former_option(&words, option)
+        Some(option) => former::former_option_hint(&words, option)
             .unwrap_or_else(|| one_line_error(&wrong.render().to_string())),
         None => one_line_error(&wrong.render().to_string()),
     }

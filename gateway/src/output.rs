@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use protocol::usage::{Failure, eprint_line, eprint_lines, ignore_broken_pipe, print_raw, print_text};
-use trace::files::{AtomicFile, STANDARD_OUTPUT, check, parent_folder, with_hint};
+use trace::files::{AtomicFile, STANDARD_OUTPUT, check_writable, parent_folder, with_creation_hint};
 
 /// The option that allows existing files to be overwritten.
 #[derive(Args, Clone, Copy, Debug)]
@@ -20,12 +20,12 @@ pub(crate) struct OverwriteOption {
 impl OverwriteOption {
     /// Creates the file that an option names, so that errors show up before there is anything to write.
     pub(crate) fn create(self, option: &str, path: &Path) -> Result<(AtomicFile, File), Failure> {
-        AtomicFile::create(path, self.overwrite).map_err(|error| write_refused(option, path, &error))
+        AtomicFile::create(path, self.overwrite).map_err(|error| write_refused_failure(option, path, &error))
     }
 
     /// Checks that the file which an option names can be written, before its content is computed.
-    pub(crate) fn check(self, option: &str, path: &Path) -> Result<(), Failure> {
-        check(path, self.overwrite).map_err(|error| write_refused(option, path, &error))
+    pub(crate) fn check_writable(self, option: &str, path: &Path) -> Result<(), Failure> {
+        check_writable(path, self.overwrite).map_err(|error| write_refused_failure(option, path, &error))
     }
 
     /// Writes the file that an option names. On an error, a former file stays unchanged.
@@ -42,7 +42,7 @@ pub(crate) fn is_standard_output(path: &Path) -> bool {
 
 /// Prints a table. Prints it on standard error if one of these files is standard output, which then carries only that
 /// file.
-pub(crate) fn print_beside<'a>(
+pub(crate) fn print_beside_files<'a>(
     files: impl IntoIterator<Item = Option<&'a Path>>,
     text: &str,
 ) -> Result<(), Failure> {
@@ -60,7 +60,7 @@ pub(crate) fn print_table<'a>(
 ) -> Result<(), Failure> {
     let mut files = files.into_iter();
     if let Some(file) = files.find(|file| file.is_some_and(is_standard_output)) {
-        return print_beside([file], &text(false));
+        return print_beside_files([file], &text(false));
     }
     if !is_coloured(&io::stdout()) {
         return print_text(&text(false));
@@ -81,12 +81,12 @@ pub(crate) fn write_and_finish(
     }
     let name = option_and_path(option, whole.path());
     let written = file.write_all(text.as_bytes()).and_then(|()| whole.finish());
-    written.map_err(|error: io::Error| Failure::run(format!("{name}: {}", with_hint(error))))
+    written.map_err(|error: io::Error| Failure::run_error(format!("{name}: {}", with_creation_hint(error))))
 }
 
 /// Returns the error for a file that cannot be written, which counts as wrong use.
-pub(crate) fn write_refused(option: &str, path: &Path, error: &io::Error) -> Failure {
-    Failure::usage(format!("{}: {error}", option_and_path(option, path)))
+pub(crate) fn write_refused_failure(option: &str, path: &Path, error: &io::Error) -> Failure {
+    Failure::usage_error(format!("{}: {error}", option_and_path(option, path)))
 }
 
 fn option_and_path(option: &str, path: &Path) -> String {
@@ -95,7 +95,7 @@ fn option_and_path(option: &str, path: &Path) -> String {
 
 /// Checks that the files to be written differ from each other and from all files that the command reads, because
 /// `--overwrite` must not replace those.
-pub(crate) fn check_distinct<'a>(
+pub(crate) fn check_distinct_files<'a>(
     written: impl IntoIterator<Item = (&'a str, Option<&'a Path>)>,
     read: impl IntoIterator<Item = &'a Path>,
 ) -> Result<(), Failure> {
@@ -108,12 +108,12 @@ pub(crate) fn check_distinct<'a>(
         let there = absolute_path(path);
         if read.contains(&there) {
             let name = option_and_path(option, path);
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{name} is a file that this command reads: name another file"
             )));
         }
         if let Some((other, _)) = before.iter().find(|(_, place)| *place == there) {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{option} and {other} name the same file: name two different files"
             )));
         }

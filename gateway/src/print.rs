@@ -12,25 +12,25 @@ use serde::Serialize;
 pub(crate) const RED: &str = "\x1b[31m";
 pub(crate) const GREEN: &str = "\x1b[32m";
 pub(crate) const YELLOW: &str = "\x1b[33m";
-pub(crate) const PLAIN: &str = "\x1b[0m";
+pub(crate) const RESET_COLOUR: &str = "\x1b[0m";
 
 /// Indent of a name that is kept when the name takes two lines.
-const INDENT: &str = "\u{a0}";
+const NAME_INDENT: &str = "\u{a0}";
 /// Maximum width of a table in columns.
 const MAX_TABLE_WIDTH: u16 = 110;
 /// Maximum width of a row's name in one line.
 const MAX_NAME_WIDTH: u16 = 36;
 /// Maximum number of names in a line. Of more names, the first few are shown with the total number.
-const MAX_NAMES: usize = 12;
+const MAX_NAMES_IN_LINE: usize = 12;
 
 /// Formats a value as JSON in several lines.
-pub(crate) fn json(value: &impl Serialize) -> Result<String, Failure> {
-    serde_json::to_string_pretty(value).map(|text| escape_controls(text) + "\n").map_err(Failure::run)
+pub(crate) fn to_pretty_json(value: &impl Serialize) -> Result<String, Failure> {
+    serde_json::to_string_pretty(value).map(|text| escape_controls(text) + "\n").map_err(Failure::run_error)
 }
 
 /// Formats a value as JSON in one line.
 pub(crate) fn json_line(value: &impl Serialize) -> Result<String, Failure> {
-    serde_json::to_string(value).map(|text| escape_controls(text) + "\n").map_err(Failure::run)
+    serde_json::to_string(value).map(|text| escape_controls(text) + "\n").map_err(Failure::run_error)
 }
 
 /// Replaces terminal control characters in the strings of a JSON text by JSON escapes such as `\u009b`.
@@ -48,21 +48,21 @@ pub(crate) fn escape_controls(json: String) -> String {
 
 /// Joins items with commas.
 pub(crate) fn comma_separated(items: impl IntoIterator<Item: Display>) -> String {
-    joined(", ", items)
+    join_items(", ", items)
 }
 
 /// Joins items with spaces.
 pub(crate) fn space_separated(items: impl IntoIterator<Item: Display>) -> String {
-    joined(" ", items)
+    join_items(" ", items)
 }
 
-fn joined(between: &str, items: impl IntoIterator<Item: Display>) -> String {
+fn join_items(between: &str, items: impl IntoIterator<Item: Display>) -> String {
     items.into_iter().map(|item| item.to_string()).collect::<Vec<_>>().join(between)
 }
 
 /// Joins all names, or the first few of many names with the total number.
-pub(crate) fn abbreviated(names: &[String]) -> String {
-    let few = names.get(..MAX_NAMES).filter(|_| names.len() > MAX_NAMES);
+pub(crate) fn abbreviate_names(names: &[String]) -> String {
+    let few = names.get(..MAX_NAMES_IN_LINE).filter(|_| names.len() > MAX_NAMES_IN_LINE);
     few.map_or_else(
         || comma_separated(names),
         |few| format!("{}, ... ({} in all)", comma_separated(few), names.len()),
@@ -85,12 +85,12 @@ pub(crate) fn or_else_text(value: Option<impl Display>, none: &str) -> String {
 }
 
 /// Formats a number with this many decimals, or returns the text for an absent one.
-pub(crate) fn decimals(value: Option<f64>, decimals: usize, none: &str) -> String {
+pub(crate) fn format_decimals(value: Option<f64>, decimals: usize, none: &str) -> String {
     or_else_text(value.map(|value| format!("{value:.decimals$}")), none)
 }
 
 /// Formats the quantiles 50 %, 90 % and 99 %, and the maximum.
-pub(crate) fn quantiles(quantiles: &Quantiles) -> String {
+pub(crate) fn format_quantiles(quantiles: &Quantiles) -> String {
     let Quantiles { p50, p90, p99, max, .. } = quantiles;
     format!("{p50:.0} / {p90:.0} / {p99:.0} / {max:.0}")
 }
@@ -184,7 +184,7 @@ impl KeyValueTable {
     }
 
     /// Enables or disables colours.
-    pub(crate) fn coloured(mut self, is_coloured: bool) -> Self {
+    pub(crate) fn with_colours(mut self, is_coloured: bool) -> Self {
         self.table.force_no_tty();
         if is_coloured {
             self.table.enforce_styling();
@@ -193,7 +193,7 @@ impl KeyValueTable {
     }
 
     /// Width of the table in columns.
-    pub(crate) fn columns(&self) -> usize {
+    pub(crate) fn width_in_columns(&self) -> usize {
         self.table.width().unwrap_or(MAX_TABLE_WIDTH).into()
     }
 
@@ -205,7 +205,7 @@ impl KeyValueTable {
 
     /// Formats the table.
     pub(crate) fn to_text(&self) -> String {
-        format!("{}\n", self.table).replace(INDENT, " ")
+        format!("{}\n", self.table).replace(NAME_INDENT, " ")
     }
 
     pub(crate) fn add_section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
@@ -240,7 +240,7 @@ impl KeyValueTable {
     }
 
     /// Adds a row unless the count is zero.
-    pub(crate) fn row_unless_zero(
+    pub(crate) fn add_row_unless_zero(
         &mut self,
         name: impl Display,
         count: impl TryInto<u64>,
@@ -261,7 +261,7 @@ fn printable_row(name: impl Display, value: impl Display, beside: impl Display) 
 /// width.
 pub(crate) fn hanging_indent(begin: &str, text: &str, columns: usize) -> String {
     let indent = begin.chars().count();
-    let lines = fold_name(&format!("{}{text}", " ".repeat(indent)), Some(columns)).replace(INDENT, " ");
+    let lines = fold_name(&format!("{}{text}", " ".repeat(indent)), Some(columns)).replace(NAME_INDENT, " ");
     format!("{begin}{}", lines.get(indent..).unwrap_or_default())
 }
 
@@ -269,11 +269,11 @@ pub(crate) fn hanging_indent(begin: &str, text: &str, columns: usize) -> String 
 fn fold_name(name: &str, width: Option<usize>) -> String {
     let words = name.trim_start_matches(' ');
     let indent = name.len() - words.len();
-    let mut folded = INDENT.repeat(indent);
+    let mut folded = NAME_INDENT.repeat(indent);
     let (mut taken, mut is_first) = (indent, true);
     let begin_line = |folded: &mut String| {
         folded.push('\n');
-        folded.push_str(&INDENT.repeat(indent + 2));
+        folded.push_str(&NAME_INDENT.repeat(indent + 2));
         indent + 2
     };
     for word in words.split(' ') {
@@ -311,7 +311,8 @@ mod tests {
 
     #[test]
     fn a_long_name_is_folded_between_words_and_keeps_its_indent() {
-        let of = |width| fold_name("  joints not yet taken at heartbeats, µs", width).replace(INDENT, ".");
+        let of =
+            |width| fold_name("  joints not yet taken at heartbeats, µs", width).replace(NAME_INDENT, ".");
         assert_eq!(of(None), "..joints not yet taken at heartbeats, µs");
         assert_eq!(of(Some(24)), "..joints not yet taken\n....at heartbeats, µs");
         assert_eq!(

@@ -5,11 +5,11 @@ use std::path::PathBuf;
 use clap::Args;
 use protocol::input;
 use protocol::usage::{Failure, printable};
-use trace::files::with_hint;
+use trace::files::with_creation_hint;
 use trace::recording::recover::RecoverError;
 use trace::recording::{names, repair};
 
-use super::output::{OverwriteOption, check_distinct, print_beside};
+use super::output::{OverwriteOption, check_distinct_files, print_beside_files};
 
 /// Repair a recording that was cut off
 ///
@@ -32,27 +32,28 @@ pub(crate) struct RecoverCommand {
 impl RecoverCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = self.file.display();
-        let file = input::open(&self.file).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
+        let file =
+            input::open(&self.file).map_err(|error| Failure::usage_error(format!("{name}: {error}")))?;
         if names::is_locked(&file) {
-            return Err(Failure::usage(format!("{name} is being recorded: wait for the run's end")));
+            return Err(Failure::usage_error(format!("{name} is being recorded: wait for the run's end")));
         }
         if self.output.is_none() && self.file.as_os_str() == "-" {
-            return Err(Failure::usage(
+            return Err(Failure::usage_error(
                 "-: standard input has no name to derive the new file from: name the new file with -o",
             ));
         }
         let output = self.output.unwrap_or_else(|| names::recovered_name(&names::final_name(&self.file)));
         let out = output.display();
-        check_distinct([("-o", Some(output.as_path()))], [self.file.as_path()])?;
-        self.overwrite.check("-o", &output)?;
+        check_distinct_files([("-o", Some(output.as_path()))], [self.file.as_path()])?;
+        self.overwrite.check_writable("-o", &output)?;
         let failure = |error| {
             if let RecoverError::Write(error) = error {
-                return Failure::run(format!("-o {out}: {}", with_hint(error)));
+                return Failure::run_error(format!("-o {out}: {}", with_creation_hint(error)));
             }
-            Failure::run(format!("{name}: {error}"))
+            Failure::run_error(format!("{name}: {error}"))
         };
         let (recovered, bytes) =
-            repair::copy_unless_sound(&file, &output, self.overwrite.overwrite).map_err(failure)?;
+            repair::recover_unless_sound(&file, &output, self.overwrite.overwrite).map_err(failure)?;
         let line = match bytes {
             None if recovered.is_sound() => {
                 let rename = if names::final_name(&self.file) == self.file { "" } else { "; rename it" };
@@ -61,12 +62,16 @@ impl RecoverCommand {
                     recovered.messages
                 )
             }
-            None => return Err(Failure::run(format!("{name}: no message could be recovered: {recovered}"))),
+            None => {
+                return Err(Failure::run_error(format!(
+                    "{name}: no message could be recovered: {recovered}"
+                )));
+            }
             Some(bytes) => format!("{out}, {bytes} bytes: {recovered}"),
         };
         if recovered.lost_more_than_kept() {
-            return Err(Failure::run(format!("more of {name} is lost than was recovered: {line}")));
+            return Err(Failure::run_error(format!("more of {name} is lost than was recovered: {line}")));
         }
-        print_beside([Some(output.as_path())], &format!("{}\n", printable(&line)))
+        print_beside_files([Some(output.as_path())], &format!("{}\n", printable(&line)))
     }
 }

@@ -15,10 +15,10 @@ use protocol::usage::{Failure, printable, printable_lines};
 use super::arguments::{
     BusKinds, OptionValue, cells_per_process, environment_number, one_of_values, parse_time_ns,
 };
-use super::output::{self, OverwriteOption, check_distinct, print_table};
+use super::output::{self, OverwriteOption, check_distinct_files, print_table};
 use super::print::{
-    GREEN, KeyValueTable, PLAIN, YELLOW, comma_separated, count_with_noun, hanging_indent, json,
-    or_else_text, quantiles,
+    GREEN, KeyValueTable, RESET_COLOUR, YELLOW, comma_separated, count_with_noun, format_quantiles,
+    hanging_indent, or_else_text, to_pretty_json,
 };
 
 /// Receive buffer in bytes: all cells may answer a report at once.
@@ -142,17 +142,17 @@ impl ReplayCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let options = self.options()?;
         let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
-        check_distinct([("--summary", self.summary.as_deref())], read)?;
+        check_distinct_files([("--summary", self.summary.as_deref())], read)?;
         // Create the file before the replay, so that an error of the file is reported first.
         let file = self.summary.as_ref().map(|path| self.overwrite.create("--summary", path)).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
-        let json = json(&summary)?;
+        let json = to_pretty_json(&summary)?;
         let write = |(whole, file)| output::write_and_finish("--summary", whole, file, &json);
         let written = file.map_or(Ok(()), write);
         let files = [self.summary.as_deref()];
         print_table(files, |is_coloured| table(&summary, is_coloured)).and(written)?;
-        summary.verdict(self.shown.quiet).map_or(Ok(()), |why| Err(Failure::run(why)))
+        summary.failure_reason(self.shown.quiet).map_or(Ok(()), |why| Err(Failure::run_error(why)))
     }
 
     fn options(&self) -> Result<ReplayOptions, Failure> {
@@ -160,13 +160,13 @@ impl ReplayCommand {
         let needs = answered.into_iter().find_map(|(name, given)| given.then_some(name));
         if let Some(skin) = self.skin.as_ref().filter(|_| !self.spawn) {
             let skin = skin.display();
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "--skin {skin} is for the cells that --spawn starts: add --spawn"
             )));
         }
         let only = match (self.frames.only, needs) {
             (Some(SenderFilter::Replies | SenderFilter::All), Some(name)) => {
-                return Err(Failure::usage(format!(
+                return Err(Failure::usage_error(format!(
                     "{name} makes cells answer, but --only would send recorded answers too: leave out one of the \
                      two options"
                 )));
@@ -177,7 +177,7 @@ impl ReplayCommand {
         let timeout_ms = environment_number("SKINBUS_SEND_TIMEOUT_MS", 1..=60_000)?;
         Ok(ReplayOptions {
             files: self.files.clone(),
-            kinds: self.kinds.any_kinds()?,
+            kinds: self.kinds.kinds_of_any_buses()?,
             only,
             buses: self.frames.bus.clone(),
             map: self.frames.map.clone(),
@@ -206,24 +206,24 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         (None, false) => "done",
     };
     let mut rows = KeyValueTable::new(&summary.file, format!("{:.1} s, {ended}", summary.duration_s), "");
-    let (is_well, first) = summary.first_line();
-    let first_line = hanging_indent("", &printable(&first), rows.columns());
+    let (is_well, first) = summary.result_line();
+    let first_line = hanging_indent("", &printable(&first), rows.width_in_columns());
     let first_line = match is_coloured {
-        true if is_well => format!("{GREEN}{first_line}{PLAIN}\n"),
-        true => format!("{YELLOW}{first_line}{PLAIN}\n"),
+        true if is_well => format!("{GREEN}{first_line}{RESET_COLOUR}\n"),
+        true => format!("{YELLOW}{first_line}{RESET_COLOUR}\n"),
         false => format!("{first_line}\n"),
     };
     rows.add_section("frames", "", "");
     rows.add_row("sent", summary.sent, "");
-    rows.row_unless_zero("refused", summary.refused, "a bus stayed full");
-    rows.row_unless_zero("lost", summary.lost, "a bus was down");
+    rows.add_row_unless_zero("refused", summary.refused, "a bus stayed full");
+    rows.add_row_unless_zero("lost", summary.lost, "a bus was down");
     for (reason, count) in &summary.skipped {
         rows.add_row("not sent", count, reason);
     }
-    rows.row_unless_zero("sent at once", summary.sent_at_once, "older than frames sent before");
+    rows.add_row_unless_zero("sent at once", summary.sent_at_once, "older than frames sent before");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
         rows.add_section("lateness", "50 % / 90 % / 99 % / max, µs", "");
-        rows.add_row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));
+        rows.add_row("frames sent", format_quantiles(late), format!("idle {}", format_quantiles(idle)));
     }
     if summary.buses.len() > 1 || summary.buses.iter().any(|bus| bus.capture != bus.name) {
         for bus in &summary.buses {
@@ -263,16 +263,16 @@ fn comparison_rows(rows: &mut KeyValueTable, expect: &ReplyComparison) {
     };
     rows.add_row("missing", tally.missing, late);
     rows.add_row("extra", tally.extra, "");
-    rows.row_unless_zero("not requested", tally.not_requested, "a bus refused the joints");
-    for (reason, count) in tally.lacking.reasons() {
+    rows.add_row_unless_zero("not requested", tally.not_requested, "a bus refused the joints");
+    for (reason, count) in tally.lacking.reason_counts() {
         rows.add_row("not in the recording", count, reason);
     }
-    rows.row_unless_zero(
+    rows.add_row_unless_zero(
         "lost by the recorder",
         expect.recording_dropped,
         "inputs among them are missing here",
     );
-    rows.row_unless_zero(
+    rows.add_row_unless_zero(
         "unknown configurations",
         expect.unchecked_cells,
         "not recorded before they were changed",

@@ -11,8 +11,8 @@ use protocol::skin::Skin;
 use protocol::usage::{Failure, command_line, ignore_broken_pipe, print_text, printable};
 use protocol::wire_time::parse_bit_rate;
 
-use super::input::{difference, read_skin};
-use super::output::{OverwriteOption, check_distinct, is_standard_output, print_note};
+use super::input::{first_skin_difference, read_skin};
+use super::output::{OverwriteOption, check_distinct_files, is_standard_output, print_note};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
@@ -62,19 +62,19 @@ impl ReportCommand {
         let skin = self.skin.as_deref().map(read).transpose()?;
         let command = command_line().join(" ");
         let options = run::ReportOptions { command, nominal: self.nominal, data: self.data, skin };
-        let refused = |error| refused(error, options.skin.as_ref());
+        let refused = |error| report_failure(error, options.skin.as_ref());
         if let Err(taken) = self.check_writable(&output, "-o") {
             // Report errors of the input before those of an existing output.
-            return Err(run::check(&self.files, &options).err().map_or(taken, refused));
+            return Err(run::check_recordings(&self.files, &options).err().map_or(taken, refused));
         }
         let report = run::report(&self.files, &options).map_err(refused)?;
-        let mut files = vec![("-o", output.clone(), page::html(&report.page))];
+        let mut files = vec![("-o", output.clone(), page::page_html(&report.page))];
         if let Some(folder) = &self.svg {
-            for (name, drawing) in drawings(&report.page) {
+            for (name, drawing) in svg_drawings(&report.page) {
                 let path = folder.join(&name);
                 if folder.is_dir() {
                     if path.is_file() && !self.overwrite.overwrite {
-                        return Err(Failure::usage(format!(
+                        return Err(Failure::usage_error(format!(
                             "--svg {}: it already contains {name}: name another folder, or overwrite the file with --overwrite",
                             folder.display()
                         )));
@@ -98,7 +98,7 @@ impl ReportCommand {
         for remark in &report.remarks {
             print_note(format_args!("skinbus: {}: {remark}", report.name));
         }
-        let figures = drawings(&report.page).count();
+        let figures = svg_drawings(&report.page).count();
         let beside =
             self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
         let said = format!("{}: {figures} figures{beside}", output.display());
@@ -106,40 +106,40 @@ impl ReportCommand {
             print_text(&format!("{}\n", printable(&said)))?;
         }
         match report.missing.filter(|_| report.is_damaged) {
-            Some(missing) => Err(Failure::run(format!("{}: {missing}", report.name))),
+            Some(missing) => Err(Failure::run_error(format!("{}: {missing}", report.name))),
             None => Ok(()),
         }
     }
 
     /// Checks that a file may be written: existing files need `--overwrite`.
     fn check_writable(&self, path: &Path, option: &str) -> Result<(), Failure> {
-        check_distinct([(option, Some(path))], self.files.iter().map(PathBuf::as_path))?;
-        self.overwrite.check(option, path)
+        check_distinct_files([(option, Some(path))], self.files.iter().map(PathBuf::as_path))?;
+        self.overwrite.check_writable(option, path)
     }
 }
 
 /// Converts an error of a report into a failure. A file that is not a recording of a run counts as wrong use; an
 /// unreadable file does not.
-fn refused(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
+fn report_failure(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
     match (error, skin) {
-        (error @ (ReportError::Capture(_) | ReportError::Unfinished { .. }), _) => Failure::run(error),
+        (error @ (ReportError::Capture(_) | ReportError::Unfinished { .. }), _) => Failure::run_error(error),
         (ReportError::OtherSkin { name, recorded }, Some((file, skin))) => {
-            let first = difference(skin, &recorded);
+            let first = first_skin_difference(skin, &recorded);
             let first =
                 first.map_or_else(String::new, |(what, is, was)| format!(" ({what}: {is}, recorded: {was})"));
-            Failure::usage(format!(
+            Failure::usage_error(format!(
                 "{name} was recorded with another skin than {file}{first}; leave --skin out: the recording contains its skin"
             ))
         }
-        (error, _) => Failure::usage(error),
+        (error, _) => Failure::usage_error(error),
     }
 }
 
 /// Returns the file names and SVG drawings of all figures.
-fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
+fn svg_drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
     page.sections.iter().flat_map(|section| {
         let cells = section.drawings.iter().map(|drawing| (drawing.name(), svg::draw_cells(drawing)));
-        let figures = section.figures.iter().map(|figure| (figure.name.as_str(), svg::draw(figure)));
+        let figures = section.figures.iter().map(|figure| (figure.name.as_str(), svg::draw_figure(figure)));
         cells.chain(figures).map(|(name, drawing)| (format!("{name}.svg"), drawing))
     })
 }
@@ -149,14 +149,17 @@ fn create_folder(folder: &Path) -> Result<bool, Failure> {
     let new = !folder.is_dir();
     let made = fs::create_dir_all(folder).map(|()| new);
     made.map_err(|error| {
-        Failure::usage(format!("--svg {}: {error}; name a folder that can be written", folder.display()))
+        Failure::usage_error(format!(
+            "--svg {}: {error}; name a folder that can be written",
+            folder.display()
+        ))
     })
 }
 
 /// Writes all files, or none: each gets its name after all are complete. Each path comes with its option.
 fn write(files: &[(&str, PathBuf, String)], overwrite: OverwriteOption) -> Result<(), Failure> {
     let failed = |option: &str, path: &Path, error: io::Error| {
-        Failure::run(format!("{option} {}: {error}", path.display()))
+        Failure::run_error(format!("{option} {}: {error}", path.display()))
     };
     let mut whole = Vec::with_capacity(files.len());
     for (option, path, text) in files {

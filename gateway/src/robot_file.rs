@@ -34,7 +34,7 @@ impl SkinRobot {
         };
         let Some(path) = file else { return Ok(Self { robot: of_rows(), urdf: None }) };
         let hint = "correct the skin's path, or take the key out";
-        let wrong = |error: &dyn Display| Failure::usage(format!("robot.urdf: {error}; {hint}"));
+        let wrong = |error: &dyn Display| Failure::usage_error(format!("robot.urdf: {error}; {hint}"));
         let (urdf, text) = read_urdf(path).map_err(|error| wrong(&error))?;
         let robot = RecordedRobot::from_urdf(skin, urdf, text.clone());
         let robot = robot.or_else(|error| {
@@ -52,7 +52,7 @@ impl SkinRobot {
 pub(crate) fn read_urdf(path: &Path) -> Result<(Urdf, String), String> {
     let file = path.display().to_string();
     let bytes = input::read_bytes(path, MAX_FILE_BYTES).map_err(|error| format!("{file}: {error}"))?;
-    let text = robots::text(&file, &bytes).map_err(|error| error.to_string())?.into_owned();
+    let text = robots::decode_text(&file, &bytes).map_err(|error| error.to_string())?.into_owned();
     let urdf = Urdf::parse(&file, &text).map_err(|error| error.to_string())?;
     Ok((urdf, text))
 }

@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bench::emulate::EmulatedCells;
-use bench::processes::memory_file;
-use bench::record::{self, Candump};
+use bench::processes::create_memory_file;
+use bench::record::{self, CandumpOutput};
 use bench::remote::JsonPipe;
 use bench::run::{self, RunOptions};
 use bench::summary::Summary;
@@ -28,15 +28,15 @@ use super::arguments::{
     parse_time,
 };
 use super::buses;
-use super::output::{self, OverwriteOption, check_distinct, print_note, print_table};
-use super::print::json;
+use super::output::{self, OverwriteOption, check_distinct_files, print_note, print_table};
+use super::print::to_pretty_json;
 use super::robot_file::{SkinRobot, urdf_path};
 use super::view::{PageOptions, PageProcess};
 use show::TableStyle;
 
 /// Skin and scenario of the demonstration.
-const SKIN: &str = include_str!("../examples/ur5-253.toml");
-const SCENARIO: &str = include_str!("../examples/demo.toml");
+const DEMO_SKIN_TOML: &str = include_str!("../examples/ur5-253.toml");
+const DEMO_SCENARIO_TOML: &str = include_str!("../examples/demo.toml");
 
 /// Maximum duration in s of a run with `--view`.
 const MAX_VIEW_DURATION_S: f64 = 24.0 * 3600.0;
@@ -114,7 +114,7 @@ impl RecordingArguments {
     /// Returns the outputs of the recording, with the files attached.
     fn options(
         &self,
-        candump: Option<Candump>,
+        candump: Option<CandumpOutput>,
         files: RunTexts,
         limits: &[SplitLimit],
     ) -> record::RecordOptions {
@@ -135,7 +135,7 @@ impl RecordingArguments {
             attachments.extend(files.scenario.map(|text| file("scenario.toml", "application/toml", text)));
             attachments.extend(files.robot.urdf.map(|text| file("robot.urdf", "application/xml", text)));
             let command_line = command_line();
-            record::Mcap { path, split, attachments, robot: files.robot.robot, command_line }
+            record::McapOutput { path, split, attachments, robot: files.robot.robot, command_line }
         });
         record::RecordOptions { candump, mcap, force: self.overwrite.overwrite }
     }
@@ -222,17 +222,17 @@ pub(crate) struct RunCommand {
 
 impl DemoCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let (_file, skin_file) = memory_file(SKIN.as_bytes()).map_err(Failure::run)?;
-        let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
-        let scenario =
-            Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
+        let (_file, skin_file) = create_memory_file(DEMO_SKIN_TOML.as_bytes()).map_err(Failure::run_error)?;
+        let skin = Skin::parse("the demonstration's skin", DEMO_SKIN_TOML).map_err(Failure::usage_error)?;
+        let scenario = Scenario::parse("the demonstration's scenario", DEMO_SCENARIO_TOML, &skin)
+            .map_err(Failure::usage_error)?;
         let mut options = self.common.options(skin_file, skin, scenario);
         options.cells_per_process = cells_per_process()?;
         options.kinds = self
             .kinds
-            .kinds_or(KindChoice::Only(BusKind::Embedded))?
+            .kinds_or_default(KindChoice::Only(BusKind::Embedded))?
             .restrict_to(bus_names(&options.skin))
-            .map_err(Failure::usage)?;
+            .map_err(Failure::usage_error)?;
         let kind = options.kinds.kind_of("vcan0").resolve("vcan0");
         let given = std::env::var_os("SKINBUS_DIR").filter(|given| !given.is_empty()).map(PathBuf::from);
         let own = given.is_none() && !kind.is_interface();
@@ -247,12 +247,16 @@ impl DemoCommand {
         let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
-        let candump = Some(Candump { path, numbered });
+        let candump = Some(CandumpOutput { path, numbered });
         let robot = match recording.record {
             Some(_) => SkinRobot::read(&options.skin, None)?,
             None => SkinRobot::default(),
         };
-        let files = RunTexts { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
+        let files = RunTexts {
+            skin: DEMO_SKIN_TOML.to_owned(),
+            scenario: Some(DEMO_SCENARIO_TOML.to_owned()),
+            robot,
+        };
         options.record = recording.options(candump, files, &[]);
         let page = view.then(|| PageProcess::start(&options, listen, &PageOptions::default())).transpose()?;
         run_bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], page)
@@ -262,12 +266,14 @@ impl DemoCommand {
 impl RunCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = |path: &Path| path.display().to_string();
-        let skin_text = document::read_text(&self.skin).map_err(Failure::usage)?;
-        let skin = Skin::parse(&name(&self.skin), &skin_text).map_err(Failure::usage)?;
+        let skin_text = document::read_text(&self.skin).map_err(Failure::usage_error)?;
+        let skin = Skin::parse(&name(&self.skin), &skin_text).map_err(Failure::usage_error)?;
         let scenario_text =
-            self.scenario.as_deref().map(document::read_text).transpose().map_err(Failure::usage)?;
+            self.scenario.as_deref().map(document::read_text).transpose().map_err(Failure::usage_error)?;
         let scenario = match (&self.scenario, &scenario_text) {
-            (Some(path), Some(text)) => Scenario::parse(&name(path), text, &skin).map_err(Failure::usage)?,
+            (Some(path), Some(text)) => {
+                Scenario::parse(&name(path), text, &skin).map_err(Failure::usage_error)?
+            }
             _ => Scenario::idle(DEFAULT_DURATION),
         };
         let urdf = self.common.recording.record.as_ref().and(skin.robot.urdf.as_deref());
@@ -282,7 +288,7 @@ impl RunCommand {
         let (_file, skin_file) = if can_be_read_again(&self.skin) {
             (None, self.skin)
         } else {
-            let (file, path) = memory_file(skin_text.as_bytes()).map_err(Failure::run)?;
+            let (file, path) = create_memory_file(skin_text.as_bytes()).map_err(Failure::run_error)?;
             (Some(file), path)
         };
         for remark in scenario.warnings(&skin) {
@@ -290,8 +296,8 @@ impl RunCommand {
         }
         let mut options = self.common.options(skin_file, skin, scenario);
         let CommonOptions { recording, summary, verbose, view, listen, .. } = self.common;
-        options.kinds = self.kinds.kinds_of(bus_names(&options.skin))?;
-        let candump = self.candump.map(|path| Candump { path, numbered: false });
+        options.kinds = self.kinds.kinds_of_buses(bus_names(&options.skin))?;
+        let candump = self.candump.map(|path| CandumpOutput { path, numbered: false });
         let files = RunTexts { skin: skin_text, scenario: scenario_text, robot };
         options.record = recording.options(candump, files, &self.record_split);
         options.spawn = !self.no_spawn;
@@ -317,7 +323,9 @@ fn emulated(
     for named in named {
         let cell = find_cell(skin, named, "--emulate")?;
         if cells.contains(&cell) {
-            return Err(Failure::usage(format!("--emulate {named} is given twice: name each cell once")));
+            return Err(Failure::usage_error(format!(
+                "--emulate {named} is given twice: name each cell once"
+            )));
         }
         cells.push(cell);
     }
@@ -362,7 +370,7 @@ fn run_bench(
         ("--record", options.record.mcap.as_ref().map(|mcap| mcap.path.as_path())),
         ("--summary", summary_file),
     ];
-    check_distinct(written, read.iter().map(PathBuf::as_path))?;
+    check_distinct_files(written, read.iter().map(PathBuf::as_path))?;
     // Create the file before the run, so that an error of the file is reported first.
     let summary = summary_file.map(|path| overwrite.create("--summary", path)).transpose()?;
     // The summary reports a panic too.
@@ -376,7 +384,9 @@ fn run_bench(
         }
     };
     let unwritten = summary.and_then(|(whole, file)| {
-        json(&ended).and_then(|text| output::write_and_finish("--summary", whole, file, &text)).err()
+        to_pretty_json(&ended)
+            .and_then(|text| output::write_and_finish("--summary", whole, file, &text))
+            .err()
     });
     if let Some(panic) = panicked {
         panic::resume_unwind(panic);

@@ -9,13 +9,13 @@ mod urdf;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use model::generate::{Reply as Answers, SkinRequest, generate};
+use model::generate::{ReplyMode as Answers, SkinRequest, generate};
 use protocol::can::Format;
 use protocol::usage::{Failure, print_text};
 
 use super::arguments::{FORMATS, OptionValue, one_of_values};
 use super::output::OverwriteOption;
-pub(crate) use show::still_view;
+pub(crate) use show::still_page;
 
 const REPLIES: &[OptionValue<Answers>] =
     &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];
@@ -82,7 +82,7 @@ impl GenerateCommand {
     fn run(self) -> Result<(), Failure> {
         let Self { cells, buses, broadcast_hz, reply, format, output, overwrite } = self;
         let target = SkinRequest { cells, buses, broadcast_hz, reply, format, ..SkinRequest::default() };
-        let text = generate(&target).map_err(Failure::usage)?;
+        let text = generate(&target).map_err(Failure::usage_error)?;
         match output {
             Some(path) => overwrite.write("-o", &path, &text),
             None => print_text(&text),

@@ -26,9 +26,9 @@ struct PlacedPart {
 
 /// Returns the drawing of the robot that a skin's file describes: triangles for each row, simplified to at most `most`
 /// in all. The list is empty if the skin names no URDF. Prints a note on parts that cannot be drawn.
-pub(crate) fn shells(file: &Path, skin: &Skin, packages: &PackageOptions, most: usize) -> Vec<RowMesh> {
+pub(crate) fn robot_meshes(file: &Path, skin: &Skin, packages: &PackageOptions, most: usize) -> Vec<RowMesh> {
     let Some(path) = skin.robot.urdf.as_deref().map(|urdf| urdf_path(file, urdf)) else { return Vec::new() };
-    let parts = read_urdf(&path).and_then(|(urdf, _)| parts(&urdf, &path, skin, packages));
+    let parts = read_urdf(&path).and_then(|(urdf, _)| placed_parts(&urdf, &path, skin, packages));
     let parts = parts
         .map_err(|error| print_note(format_args!("the robot is not drawn: {error}")))
         .unwrap_or_default();
@@ -44,14 +44,14 @@ pub(crate) fn shells(file: &Path, skin: &Skin, packages: &PackageOptions, most: 
     shells.map(|((chain, row), all)| RowMesh { chain, row, triangles: points(all) }).collect()
 }
 
-fn parts(
+fn placed_parts(
     urdf: &Urdf,
     file: &Path,
     skin: &Skin,
     packages: &PackageOptions,
 ) -> Result<Vec<PlacedPart>, String> {
     let found = skin.robot.chains.iter().map(|chain| {
-        chain_of(urdf, chain).ok_or_else(|| {
+        matching_urdf_chain(urdf, chain).ok_or_else(|| {
             format!(
                 "{} has no chain that matches the rows of {} in the skin: import the skin from it again",
                 urdf.file, chain.name
@@ -65,7 +65,7 @@ fn parts(
         match visuals.link_parts(link) {
             Err(error) => missing.push(error),
             Ok(all) => {
-                let Some((chain, row, frame)) = attachment(urdf, &chains, link) else { continue };
+                let Some((chain, row, frame)) = link_attachment(urdf, &chains, link) else { continue };
                 let put = |part: LinkMesh| LinkMesh { pose: frame * part.pose, ..part };
                 parts.extend(all.into_iter().map(|part| PlacedPart { chain, row, part: put(part) }));
             }
@@ -78,7 +78,7 @@ fn parts(
 }
 
 /// Finds the chain of the URDF that has the same rows as a skin's chain.
-fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::UrdfChain> {
+fn matching_urdf_chain(urdf: &Urdf, chain: &Chain) -> Option<robots::UrdfChain> {
     // The skin does not say at which link of the URDF the chain begins.
     let mut roots = urdf.links().filter_map(|root| urdf.chain(Some(root), &chain.name).ok());
     roots.find(|found| {
@@ -99,7 +99,7 @@ fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::UrdfChain> {
 
 /// Returns the index of the chain and the row to which a link is fixed, and the pose of the link in the row's frame.
 /// Joints outside all chains are at rest. Links that no chain moves are fixed to the start of the first chain.
-fn attachment(
+fn link_attachment(
     urdf: &Urdf,
     chains: &[robots::UrdfChain],
     link: &str,

@@ -19,15 +19,15 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 use trace::capture::{CaptureError, CaptureFormat, Reader};
 use view::RowMesh;
-use view::play::{self, play};
+use view::play::{self, play_recording};
 use view::player::PlayError;
 use view::serve::{ServeError, ServeOptions, serve};
-use view::server::{PageAccess, url};
+use view::server::{PageAccess, page_url};
 
 use super::arguments::{BusKinds, bus_names, find_bus, parse_time_ns};
-use super::input::{no_frame, note_other_skin, read_skin, skin_of, stop_flag};
+use super::input::{no_frame_failure, note_skin_difference, read_skin, skin_of_recording, stop_flag};
 use super::output::print_note;
-use super::surface::shells;
+use super::surface::robot_meshes;
 use super::visuals::PackageOptions;
 use address::AddressFile;
 
@@ -116,7 +116,7 @@ impl ViewCommand {
         let is_recording = self.is_recording()?;
         let may_act = !self.read_only && !is_recording;
         let (listener, token) = if self.of_run {
-            (inherited_listener().map_err(|error| failed(&error))?, token::chosen_token(None)?)
+            (inherited_listener().map_err(|error| view_failure(&error))?, token::chosen_token(None)?)
         } else {
             let listen = self.listen;
             let token = token::chosen_token(self.token_file.as_deref())?;
@@ -124,8 +124,8 @@ impl ViewCommand {
             let listener = bound.map_err(|error| bind_error(listen, &error))?;
             (listener, token::required_token(token, may_act, listen)?)
         };
-        let address = listener.local_addr().map_err(|error| failed(&error))?;
-        let url = (!self.of_run).then(|| url(address, token.as_ref()));
+        let address = listener.local_addr().map_err(|error| view_failure(&error))?;
+        let url = (!self.of_run).then(|| page_url(address, token.as_ref()));
         let of_file = self.address_file.as_deref().zip(url.as_deref());
         let _file = of_file.map(|(path, url)| AddressFile::write(path, url)).transpose()?;
         let served =
@@ -137,19 +137,19 @@ impl ViewCommand {
     fn serve_live(self, served: PageServer) -> Result<(), Failure> {
         let (skin, surface) = match self.sources.as_slice() {
             [one, ..] if !one.exists() => self.skin_on_named_buses()?,
-            [one] if self.skin.is_none() && self.at.is_none() => self.read(one)?,
+            [one] if self.skin.is_none() && self.at.is_none() => self.read_skin_with_meshes(one)?,
             [one] => {
                 let why = "is for a recording, and this is a skin";
-                return Err(Failure::usage(format!("{}: --skin or --at {why}", one.display())));
+                return Err(Failure::usage_error(format!("{}: --skin or --at {why}", one.display())));
             }
             _ => {
                 let why = "several files are the parts of one recording, and a skin is shown alone";
-                return Err(Failure::usage(why));
+                return Err(Failure::usage_error(why));
             }
         };
-        let kinds = self.kinds.kinds_of(bus_names(&skin))?;
+        let kinds = self.kinds.kinds_of_buses(bus_names(&skin))?;
         let stop = stop_flag()?;
-        let bench = self.of_run.then(connect_to_run).transpose().map_err(|error| failed(&error))?;
+        let bench = self.of_run.then(connect_to_run).transpose().map_err(|error| view_failure(&error))?;
         let PageServer { listener, access, url } = served;
         let options = ServeOptions {
             skin,
@@ -161,7 +161,7 @@ impl ViewCommand {
             waits_for_buses: self.wait,
             bench,
         };
-        serve(options, &stop, || print_address(url)).map_err(Failure::usage)?;
+        serve(options, &stop, || print_address(url)).map_err(Failure::usage_error)?;
         Ok(())
     }
 
@@ -169,14 +169,14 @@ impl ViewCommand {
     fn skin_on_named_buses(&self) -> Result<(Skin, Vec<RowMesh>), Failure> {
         let Some(file) = &self.skin else {
             let name = self.sources.first().map(|it| it.display().to_string()).unwrap_or_default();
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "there is no file {name}: name a skin (to show its buses), a recording, or a bus with --skin"
             )));
         };
         if self.at.is_some() {
-            return Err(Failure::usage("--at is for a recording, not for live buses"));
+            return Err(Failure::usage_error("--at is for a recording, not for live buses"));
         }
-        let (skin, surface) = self.read(file)?;
+        let (skin, surface) = self.read_skin_with_meshes(file)?;
         let of = |source: &PathBuf| find_bus(&skin, &file.display().to_string(), &source.to_string_lossy());
         let mut buses = self.sources.iter().map(of).collect::<Result<Vec<_>, _>>()?;
         buses.sort_unstable();
@@ -193,21 +193,21 @@ impl ViewCommand {
         let warns = |what: &str| print_note(format_args!("{what}"));
         let PageServer { listener, access, url } = served;
         let options = play::PlayOptions { paths: self.sources, skin, surface, listener, access, at_s };
-        play(options, &stop, || print_address(url), warns).map_err(|error| match error {
+        play_recording(options, &stop, || print_address(url), warns).map_err(|error| match error {
             ServeError::Play(PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. })) => {
-                Failure::run(error)
+                Failure::run_error(error)
             }
             ServeError::Bus(_) | ServeError::Play(_) | ServeError::Thread(_) | ServeError::Server(_) => {
-                Failure::usage(error)
+                Failure::usage_error(error)
             }
         })?;
         Ok(())
     }
 
     /// Reads a skin with the meshes of its robot, as far as they are found.
-    fn read(&self, path: &Path) -> Result<(Skin, Vec<RowMesh>), Failure> {
+    fn read_skin_with_meshes(&self, path: &Path) -> Result<(Skin, Vec<RowMesh>), Failure> {
         let skin = read_skin(path)?;
-        let surface = shells(path, &skin, &self.packages, MAX_TRIANGLES);
+        let surface = robot_meshes(path, &skin, &self.packages, MAX_TRIANGLES);
         Ok((skin, surface))
     }
 
@@ -215,12 +215,12 @@ impl ViewCommand {
     fn recorded_skin(&self) -> Result<(Skin, Vec<RowMesh>), Failure> {
         match &self.skin {
             Some(path) => {
-                let (skin, shells) = self.read(path)?;
-                note_other_skin(&self.sources, path, &skin);
+                let (skin, shells) = self.read_skin_with_meshes(path)?;
+                note_skin_difference(&self.sources, path, &skin);
                 Ok((skin, shells))
             }
             None => {
-                let skin = skin_of(&self.sources)?;
+                let skin = skin_of_recording(&self.sources)?;
                 if skin.robot.urdf.is_some() {
                     print_note(
                         "the recording does not have the robot's meshes: with the --skin beside its URDF they are shown",
@@ -239,15 +239,15 @@ impl ViewCommand {
         }
         if first.metadata().is_ok_and(|about| !about.is_file()) {
             let what = "is not a regular file: name a skin, to show its buses, or a recording";
-            return Err(Failure::usage(format!("{} {what}", first.display())));
+            return Err(Failure::usage_error(format!("{} {what}", first.display())));
         }
-        let mut reader = Reader::open(first).map_err(Failure::usage)?;
-        if reader.format() == CaptureFormat::Mcap || reader.has_frame().map_err(Failure::usage)? {
+        let mut reader = Reader::open(first).map_err(Failure::usage_error)?;
+        if reader.format() == CaptureFormat::Mcap || reader.has_frame().map_err(Failure::usage_error)? {
             return Ok(true);
         }
         // A file named with --skin or --at is meant as a recording, unless it is a readable skin.
         if (self.skin.is_some() || self.at.is_some()) && Skin::read(first).is_err() {
-            return Err(no_frame(&reader));
+            return Err(no_frame_failure(&reader));
         }
         Ok(false)
     }
@@ -263,7 +263,7 @@ fn bind_error(listen: SocketAddr, error: &io::Error) -> Failure {
     } else {
         "name another port"
     };
-    Failure::usage(format!(
+    Failure::usage_error(format!(
         "--listen {listen}: {error}; {hint}, or leave --listen out for a free port of this machine"
     ))
 }
@@ -284,8 +284,8 @@ fn inherited_listener() -> io::Result<TcpListener> {
     Ok(io::stdin().as_fd().try_clone_to_owned()?.into())
 }
 
-fn failed(error: &io::Error) -> Failure {
-    Failure::run(format!("--view: {error}"))
+fn view_failure(error: &io::Error) -> Failure {
+    Failure::run_error(format!("--view: {error}"))
 }
 
 /// The page of a run in a process of its own; dropping it ends the process.
@@ -304,7 +304,7 @@ impl PageProcess {
         options: &PageOptions,
     ) -> Result<(Self, JsonPipe), Failure> {
         let run::RunOptions { skin_file, skin, kinds, directory, .. } = run;
-        let program = std::env::current_exe().map_err(|error| failed(&error))?;
+        let program = std::env::current_exe().map_err(|error| view_failure(&error))?;
         let mut command = Command::new(program);
         command.args(["view", "--wait", "--of-run"]).arg(skin_file);
         for bus in &skin.buses {
@@ -322,16 +322,18 @@ impl PageProcess {
             None => command.env_remove(token::TOKEN_VARIABLE),
         };
         let listener = TcpListener::bind(listen).map_err(|error| bind_error(listen, &error))?;
-        let address = listener.local_addr().map_err(|error| failed(&error))?;
-        let url = url(address, token.as_ref());
+        let address = listener.local_addr().map_err(|error| view_failure(&error))?;
+        let url = page_url(address, token.as_ref());
         let address_file = options.address_file.as_deref();
         let address_file = address_file.map(|path| AddressFile::write(path, &url)).transpose()?.flatten();
-        let (here, there) = UnixStream::pair().map_err(|error| failed(&error))?;
-        let lines =
-            here.try_clone().and_then(|input| JsonPipe::new(input, here)).map_err(|error| failed(&error))?;
+        let (here, there) = UnixStream::pair().map_err(|error| view_failure(&error))?;
+        let lines = here
+            .try_clone()
+            .and_then(|input| JsonPipe::new(input, here))
+            .map_err(|error| view_failure(&error))?;
         // Put the page into its own process group, so that Ctrl-C does not reach it: the run ends the page.
         command.process_group(0).stdin(OwnedFd::from(listener)).stdout(OwnedFd::from(there));
-        let process = command.spawn().map_err(|error| failed(&error))?;
+        let process = command.spawn().map_err(|error| view_failure(&error))?;
         print_address(Some(url));
         Ok((Self { process, _address_file: address_file }, lines))
     }

@@ -22,7 +22,7 @@ pub(crate) struct PackageOptions {
 
 impl PackageOptions {
     /// Creates a search in the directory of the URDF and those above it, for commands without the option.
-    pub(crate) fn beside_urdf() -> Self {
+    pub(crate) fn search_beside_urdf() -> Self {
         Self { package: Vec::new(), only_beside: true }
     }
 }
@@ -56,12 +56,13 @@ impl<'a> Visuals<'a> {
     /// Returns the parts of a link's shape. The list is empty if the URDF has no visual for the link.
     pub(crate) fn link_parts(&self, link: &str) -> Result<Vec<LinkMesh>, String> {
         let shapes = self.urdf.visuals(link).map_err(|error| error.to_string())?;
-        let part =
-            |shape| self.part(shape).map_err(|error| format!("{}: link {link}: {error}", self.urdf.file));
+        let part = |shape| {
+            self.read_link_mesh(shape).map_err(|error| format!("{}: link {link}: {error}", self.urdf.file))
+        };
         shapes.iter().map(part).collect()
     }
 
-    fn part(&self, shape: &Shape) -> Result<LinkMesh, String> {
+    fn read_link_mesh(&self, shape: &Shape) -> Result<LinkMesh, String> {
         let plain =
             |mesh: Result<Mesh, MeshError>| mesh.map(LinkMesh::new).map_err(|error| error.to_string());
         let part = match &shape.geometry {
@@ -87,13 +88,13 @@ impl<'a> Visuals<'a> {
         let of_package = uri.strip_prefix("package://").or_else(|| uri.strip_prefix("model://"));
         let Some((name, rest)) = of_package.map(|path| path.split_once('/').unwrap_or((path, ""))) else {
             let local = path_of_uri(uri);
-            let tried = spellings(local, local != uri).map(|path| self.folder.join(path));
+            let tried = path_spellings(local, local != uri).map(|path| self.folder.join(path));
             let tried: Vec<_> = tried.collect();
             let shown = tried.first().map_or_else(String::new, |path| path.display().to_string());
             let found = tried.into_iter().find(|path| path.is_file());
             return found.ok_or_else(|| format!("mesh {uri}: {shown} is not a file: correct the path"));
         };
-        let rests: Vec<_> = spellings(rest, true).collect();
+        let rests: Vec<_> = path_spellings(rest, true).collect();
         let given = self.packages.package.iter().find(|(known, _)| known == name);
         let tried: Vec<_> = match given {
             Some((_, folder)) => rests.iter().map(|rest| folder.join(rest)).collect(),
@@ -146,7 +147,7 @@ fn path_of_uri(uri: &str) -> &str {
 }
 
 /// Returns a path as written and, for a URI, also with its escapes such as `%20` decoded.
-fn spellings(path: &str, is_uri: bool) -> impl Iterator<Item = String> {
+fn path_spellings(path: &str, is_uri: bool) -> impl Iterator<Item = String> {
     let decoded = is_uri.then(|| percent_decode(path)).flatten().filter(|decoded| decoded != path);
     core::iter::once(path.to_owned()).chain(decoded)
 }
@@ -174,7 +175,7 @@ mod tests {
                 .unwrap_err()
         };
         assert!(hint(&PackageOptions::default()).ends_with("name its directory with --package p=DIR"));
-        let beside = hint(&PackageOptions::beside_urdf());
+        let beside = hint(&PackageOptions::search_beside_urdf());
         assert!(beside.ends_with("put the folder of package p beside the URDF, or above it"), "{beside}");
     }
 
@@ -189,11 +190,11 @@ mod tests {
         ] {
             assert_eq!(path_of_uri(uri), path);
         }
-        let of_uri = |path| spellings(path, true).collect::<Vec<_>>();
+        let of_uri = |path| path_spellings(path, true).collect::<Vec<_>>();
         assert_eq!(of_uri("a%20b%C3%BC.stl"), ["a%20b%C3%BC.stl", "a b\u{fc}.stl"]);
         for plain in ["ab", "a%2", "a%zz", "a%ff"] {
             assert_eq!(of_uri(plain), [plain]);
         }
-        assert_eq!(spellings("a%20b", false).collect::<Vec<_>>(), ["a%20b"]);
+        assert_eq!(path_spellings("a%20b", false).collect::<Vec<_>>(), ["a%20b"]);
     }
 }

@@ -10,7 +10,7 @@ use protocol::packet::{Epoch, Packet};
 use protocol::wire_time::FrameBits;
 
 /// Returns the replies of cells 1 to 253 in one epoch.
-fn replies(format: Format) -> Vec<Frame> {
+fn reply_frames(format: Format) -> Vec<Frame> {
     let packets = CellId::all().take(253).map(|cell| {
         let word = i16::from(cell.get()).wrapping_mul(-0x3D4D);
         let words: [i16; 6] = std::array::from_fn(|at| word.rotate_left(u32::try_from(at).unwrap_or(0)));
@@ -24,7 +24,7 @@ fn replies(format: Format) -> Vec<Frame> {
     packets.flat_map(|packet| packet.frames(format)).collect()
 }
 
-fn long_frames() -> Vec<Frame> {
+fn max_length_fd_frames() -> Vec<Frame> {
     let bytes: [u8; 64] = std::array::from_fn(|at| u8::try_from(at * 37 % 256).unwrap_or(0));
     (0..253).map(|id| Frame::fd(0x200 + id, BIT_RATE_SWITCH, &bytes).expect("64 bytes fit")).collect()
 }
@@ -37,18 +37,24 @@ fn main() {
         .configure_from_args();
     let mut group = criterion.benchmark_group("frame time");
     for (name, frames) in [
-        ("FD, 16 bytes", replies(Format::Fd)),
-        ("FD, 64 bytes", long_frames()),
-        ("classic, 8 bytes", replies(Format::Classic)),
+        ("FD, 16 bytes", reply_frames(Format::Fd)),
+        ("FD, 64 bytes", max_length_fd_frames()),
+        ("classic, 8 bytes", reply_frames(Format::Classic)),
     ] {
         assert!(
-            frames.iter().all(|frame| FrameBits::from_frame(frame).is_some_and(|bits| bits.total() > 100)),
+            frames
+                .iter()
+                .all(|frame| FrameBits::from_frame(frame).is_some_and(|bits| bits.total_bits() > 100)),
             "{name}"
         );
         group.throughput(Throughput::Elements(frames.len() as u64));
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
-                black_box(&frames).iter().filter_map(FrameBits::from_frame).map(FrameBits::total).sum::<u32>()
+                black_box(&frames)
+                    .iter()
+                    .filter_map(FrameBits::from_frame)
+                    .map(FrameBits::total_bits)
+                    .sum::<u32>()
             });
         });
     }

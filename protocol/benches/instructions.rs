@@ -46,13 +46,13 @@ fn decode(frame: Frame) -> Packet {
     Packet::from_fd(black_box(&frame)).expect("a whole packet")
 }
 
-const SIX: Lengths = Lengths::only(Length::Six);
+const SIX_WORDS: Lengths = Lengths::only(Length::Six);
 
 fn reassemble(id: Id, frames: [Frame; 2]) -> Packet {
     let mut segment = Reassembler::NONE;
     let [first, second] = black_box(&frames);
-    let waiting = segment.push(Micros(0), id, SIX, first.data());
-    match (waiting, segment.push(Micros(134), id, SIX, second.data())) {
+    let waiting = segment.push(Micros(0), id, SIX_WORDS, first.data());
+    match (waiting, segment.push(Micros(134), id, SIX_WORDS, second.data())) {
         (Ok(Reassembly::Waiting), Ok(Reassembly::Complete(packet))) => packet,
         paired => unreachable!("two segments of one packet: {paired:?}"),
     }

@@ -191,7 +191,7 @@ impl Bus {
     /// Returns the size of the receive buffer in bytes, as granted and counted by the kernel: twice the
     /// requested size if it was granted in full.
     #[must_use]
-    pub const fn receive_buffer(&self) -> usize {
+    pub const fn receive_buffer_bytes(&self) -> usize {
         self.receive_buffer
     }
 
@@ -212,7 +212,7 @@ impl Bus {
     ///
     /// # Errors
     /// Returns an error if the system call fails.
-    pub fn wait_with(&self, other: &Self, timeout: Duration) -> Result<bool, BusError> {
+    pub fn wait_for_either(&self, other: &Self, timeout: Duration) -> Result<bool, BusError> {
         if self.has_error() || other.has_error() {
             return Ok(true);
         }
@@ -311,7 +311,7 @@ impl Bus {
             let cause = BusError::FdFrame(self.name.clone());
             return Err(SendError { sent: 0, total: frames.len(), cause });
         }
-        self.send_all(frames.len(), |sent| self.send_batch(frames.get(sent..).unwrap_or_default()))
+        self.send_items(frames.len(), |sent| self.send_batch(frames.get(sent..).unwrap_or_default()))
     }
 
     /// Returns true if the bus was opened for the formats of all these frames: FD frames need [`Options::fd`].
@@ -321,7 +321,7 @@ impl Bus {
 
     /// Sends `target` items, and waits for room whenever the socket accepts no more. `some` sends the items from the
     /// given index on and returns the number that the socket accepted.
-    fn send_all(&self, target: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
+    fn send_items(&self, target: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
         let (mut sent, mut give_up) = (0, None);
         while sent < target {
             let waited = match some(sent) {

@@ -1,6 +1,6 @@
 //! Checks of invariants that hold for every run, whatever faults it has: counters add up.
 
-use model::table::{Event, Replies, Uplink};
+use model::table::{FrameEvent, Replies, UplinkCounts};
 use protocol::can::Format;
 use protocol::id::Kind;
 
@@ -28,7 +28,7 @@ pub fn check(bench: &Bench) {
 fn cells(bench: &Bench) {
     for (place, cell) in bench.gateway.table.cells().iter().enumerate() {
         let (uplink, replies, node) = (cell.uplink(), cell.replies, cell.node);
-        let Uplink { sent, delivered, rejected, lost, surplus, .. } = uplink;
+        let UplinkCounts { sent, delivered, rejected, lost, surplus, .. } = uplink;
         assert_eq!(sent + surplus, delivered + rejected + lost, "packets of cell {node}: {uplink:?}");
         let Replies {
             due,
@@ -63,8 +63,8 @@ fn torques(bench: &Bench) {
     let (table, tally) = (&bench.gateway.table, bench.oracle.tally);
     let replies = Replies::total(table.cells().iter().map(|cell| cell.replies));
     let used = replies.in_time + replies.late + replies.unasked;
-    let dropped = |event| table.counters().events(event);
-    let (stale, repeated) = (dropped(Event::StaleTorque), dropped(Event::RepeatedTorque));
+    let dropped = |event| table.counters().event_count(event);
+    let (stale, repeated) = (dropped(FrameEvent::StaleTorque), dropped(FrameEvent::RepeatedTorque));
     if bench.oracle.compares {
         assert_eq!((used, stale, repeated), (tally.used, tally.stale, tally.repeated), "torques");
     } else {
@@ -76,34 +76,35 @@ fn torques(bench: &Bench) {
 fn frames(bench: &Bench) {
     let (table, tally) = (&bench.gateway.table, bench.oracle.tally);
     let counters = table.counters();
-    let count = |event| counters.events(event);
-    let by_kind: u64 = Kind::ALL.into_iter().map(|kind| counters.received(kind) + counters.sent(kind)).sum();
-    let elsewhere = count(Event::Foreign) + count(Event::ErrorFrame);
+    let count = |event| counters.event_count(event);
+    let by_kind: u64 =
+        Kind::ALL.into_iter().map(|kind| counters.received_count(kind) + counters.sent_count(kind)).sum();
+    let elsewhere = count(FrameEvent::Foreign) + count(FrameEvent::ErrorFrame);
     // Flipped bits may produce an unused identifier, also in a frame that is truncated.
-    let foreign = count(Event::Foreign);
+    let foreign = count(FrameEvent::Foreign);
     if tally.babbled == 0 {
         assert!(
-            (tally.truncated.saturating_sub(foreign)..=tally.truncated).contains(&count(Event::Length)),
+            (tally.truncated.saturating_sub(foreign)..=tally.truncated).contains(&count(FrameEvent::Length)),
             "truncated frames"
         );
     }
     if is_fd(bench) {
         assert_eq!(by_kind + elsewhere, tally.frames, "frames by kind");
         if tally.babbled == 0 {
-            let harmed = count(Event::Length) + count(Event::Crc) + foreign;
+            let harmed = count(FrameEvent::Length) + count(FrameEvent::Crc) + foreign;
             assert_eq!(
                 harmed,
                 tally.truncated + tally.flipped,
                 "frames with flipped bits, and truncated ones"
             );
         }
-        assert_eq!(count(Event::Incomplete), 0);
+        assert_eq!(count(FrameEvent::Incomplete), 0);
         return;
     }
     // A packet has two segments; an incomplete one has one, and one may be waiting for each identifier.
-    let odd = count(Event::Incomplete) + count(Event::Length);
+    let odd = count(FrameEvent::Incomplete) + count(FrameEvent::Length);
     let segments = 2 * (by_kind - odd) + odd;
     let waiting = tally.frames - elsewhere - segments;
     assert!(waiting <= 1 << 11, "{waiting} segments wait");
-    assert_eq!(count(Event::Crc), 0);
+    assert_eq!(count(FrameEvent::Crc), 0);
 }

@@ -117,7 +117,7 @@ impl Bench {
     #[must_use]
     pub fn with(skin: &Skin, scenario: &Scenario, seed: u64, start: impl Fn(usize) -> Micros) -> Self {
         let mut gateway = Gateway::new(skin, scenario);
-        gateway.table.set_comparing(true);
+        gateway.table.set_torque_comparison(true);
         let mut bench = Self {
             skin: skin.clone(),
             gateway,

@@ -4,8 +4,8 @@
 use std::collections::VecDeque;
 
 use control::cycle::carried::BusInput;
-use control::cycle::{Cycle, Tick, TickRecord};
-use control::motion::controller_of;
+use control::cycle::{ControlCycle, Tick, TickRecord};
+use control::motion::controller_for_motion;
 use control::robot::SimulatedArm;
 use model::scenario::{Scenario, Touches};
 use model::table::{BusTable, Notice, Snapshot};
@@ -35,7 +35,7 @@ pub struct Gateway {
     pub reminds: bool,
     /// The number of broadcasts skipped with their ticks.
     pub broadcasts_skipped: u64,
-    cycle: Cycle,
+    cycle: ControlCycle,
     snapshot: Snapshot,
     positions: VecDeque<(Epoch, [f64; MAX_JOINTS])>,
     touches: Touches,
@@ -57,7 +57,7 @@ impl Gateway {
     #[must_use]
     pub fn new(skin: &Skin, scenario: &Scenario) -> Self {
         let table = BusTable::new(skin, 0);
-        let controller = controller_of(skin, &scenario.motion).expect("a controller of our own");
+        let controller = controller_for_motion(skin, &scenario.motion).expect("a controller of our own");
         let robot = SimulatedArm::new(skin, scenario.motion.start);
         Self {
             snapshot: table.snapshot().clone(),
@@ -67,7 +67,7 @@ impl Gateway {
             works: true,
             reminds: true,
             broadcasts_skipped: 0,
-            cycle: Cycle::new(skin, controller, Box::new(robot)),
+            cycle: ControlCycle::new(skin, controller, Box::new(robot)),
             positions: VecDeque::new(),
             touches: Touches::new(scenario, skin),
             script_epoch: 0,
@@ -145,7 +145,7 @@ impl Gateway {
         let mut messages = Vec::new();
         if let Some(epoch) = outcome.broadcast {
             self.positions.push_back((epoch, self.cycle.chain_positions(0)));
-            messages.push(Message::Joints { epoch, joints: self.cycle.joints(0) });
+            messages.push(Message::Joints { epoch, joints: self.cycle.broadcast_joints(0) });
         }
         match outcome.command {
             Some(Command::Halt) => messages.push(Message::Halt),
@@ -172,7 +172,7 @@ impl Gateway {
             }
             self.script_epoch += 1;
         }
-        let notices: Vec<_> = self.table.notices().collect();
+        let notices: Vec<_> = self.table.drain_notices().collect();
         for notice in notices {
             self.notices.push((now, notice));
             let Notice::Restarted(node) = notice else { continue };

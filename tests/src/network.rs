@@ -27,7 +27,7 @@ use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10, Q7_8};
 use protocol::message::{Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, StimulusStart};
 use protocol::packet::{self, Epoch, WORDS};
-use protocol::parameters::{LinksDown, Parameter, Reply, SumSchedule};
+use protocol::parameters::{LinksDown, Parameter, ReplyKind, SumSchedule};
 use protocol::port::{PORTS, PortMessage, UPLINK};
 use protocol::time::{Micros, Span};
 use rand::seq::{IndexedRandom, SliceRandom};
@@ -37,7 +37,7 @@ use rand_pcg::Pcg64Mcg;
 use crate::agenda::Agenda;
 use crate::life::PowerState;
 use place::Inlet;
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 
 pub use place::WiredCell;
 
@@ -309,7 +309,7 @@ impl Wiring {
         let now = self.agenda.now;
         let place = &mut self.cells[cell];
         if let (PowerState::Runs(node), Inlet::Frame(frame)) = (&place.life, inlet)
-            && packet::data_id(&frame).is_ok_and(|id| node.may_defer(id))
+            && packet::data_frame_id(&frame).is_ok_and(|id| node.may_receive_deferred(id))
         {
             place.deferred.push_back((stood, frame));
             return;
@@ -378,8 +378,9 @@ impl Wiring {
                     self.cells[cell].ports = Some(ports);
                 }
                 Message::Network { page: NetworkPage::Heartbeat(_), .. } => {
-                    self.uplinks
-                        .mark_used(self.cells[cell].node_id.expect("a cell that sends has a node id"));
+                    self.uplinks.mark_node_id_used(
+                        self.cells[cell].node_id.expect("a cell that sends has a node id"),
+                    );
                 }
                 _ => {}
             }
@@ -419,7 +420,7 @@ impl Wiring {
         self.epoch = Some(epoch);
         self.root_sums.clear();
         self.took.push(EpochSums::default());
-        let joints = Joints { positions: padded(&positions()), in_use: 6 };
+        let joints = Joints { positions: pad_with_defaults(&positions()), in_use: 6 };
         self.send(&Message::Joints { epoch, joints });
         self.agenda.enter_in(PERIOD, Event::Joints);
     }
@@ -439,7 +440,7 @@ impl Wiring {
     pub fn switch(&mut self, deepest: u8, carry: bool) {
         self.deepest = deepest;
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).expect("a slot");
-        let reply = Reply::Sum(SumSchedule { slot_us, deepest, carry });
+        let reply = ReplyKind::Sum(SumSchedule { slot_us, deepest, carry });
         let request = Request::Write { number: Parameter::Reply.number(), words: reply.words() };
         self.send(&Message::Configure { to: protocol::id::Node::Everyone, tag: 0, request });
     }

@@ -182,7 +182,7 @@ impl Oracle {
             Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
                 mirror.arrived += 1;
                 // An address claim does not change the owner's state.
-                let claims = heartbeat.state.has(State::CLAIMING);
+                let claims = heartbeat.state.has(State::CLAIMING_NODE_ID);
                 let challenges = claims && mirror.holder.is_some_and(|holder| holder != truth.from);
                 if !heartbeat.state.has(State::ACTIVE) && !challenges {
                     mirror.release();

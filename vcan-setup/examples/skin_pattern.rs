@@ -17,7 +17,7 @@ use protocol::can::{BIT_RATE_SWITCH, Frame};
 use rustix::time::{ClockId, clock_gettime};
 use vcan_setup::embedded::Server;
 
-const PERIOD: Duration = Duration::from_millis(16);
+const EPOCH_PERIOD: Duration = Duration::from_millis(16);
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = protocol::usage::command_line().into_iter().skip(1);
@@ -52,12 +52,14 @@ fn main() -> Result<(), Box<dyn Error>> {
     let start = Instant::now();
     let mut due = start;
     for cycle in 0..cycles {
-        due += PERIOD;
+        due += EPOCH_PERIOD;
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
         let sent = Instant::now();
         gateway.send(&[Frame::fd(0x001, BIT_RATE_SWITCH, &u128::from(cycle).to_le_bytes())?])?;
         let mut got = 0;
-        while got < cells && gateway.wait(Some((due + PERIOD).saturating_duration_since(Instant::now())))? {
+        while got < cells
+            && gateway.wait(Some((due + EPOCH_PERIOD).saturating_duration_since(Instant::now())))?
+        {
             gateway.receive(&mut inbox)?;
             got += inbox
                 .frames()
@@ -86,7 +88,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         took.as_secs_f64()
     );
     println!("last reply after the broadcast: p50 {:.2?}, p99 {:.2?}, max {:.2?}", at(50), at(99), at(100));
-    println!("dropped {}, garbage {}", inbox.dropped(), totals.garbage);
+    println!("dropped {}, garbage {}", inbox.dropped_count(), totals.garbage);
     println!(
         "the bus: {:.2} ms of CPU per cycle, {:.1} % of one core",
         1e3 * cpu.as_secs_f64() / f64::from(cycles),

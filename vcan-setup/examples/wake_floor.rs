@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 
 use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, recv, send, socketpair};
 
-const PERIOD: Duration = Duration::from_millis(16);
-const FRAME: [u8; 72] = [0; 72];
+const WAKE_PERIOD: Duration = Duration::from_millis(16);
+const ZERO_FRAME: [u8; 72] = [0; 72];
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = protocol::usage::command_line().into_iter().skip(1);
@@ -32,12 +32,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (before, own, began) = (cpu(), processor_seconds(std::process::id()), Instant::now());
     let mut due = began;
     for _ in 0..cycles {
-        due += PERIOD;
+        due += WAKE_PERIOD;
         for (_, socket) in &echoes {
-            send(socket, &FRAME, SendFlags::empty())?;
+            send(socket, &ZERO_FRAME, SendFlags::empty())?;
         }
         for (_, socket) in &echoes {
-            recv(socket, &mut FRAME.clone(), RecvFlags::empty())?;
+            recv(socket, &mut ZERO_FRAME.clone(), RecvFlags::empty())?;
         }
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
     }
@@ -60,7 +60,7 @@ fn start_echo_process() -> Result<(Child, OwnedFd), Box<dyn Error>> {
 }
 
 fn echo_datagrams() -> rustix::io::Result<()> {
-    let mut bytes = FRAME;
+    let mut bytes = ZERO_FRAME;
     let socket = std::io::stdin();
     while recv(&socket, &mut bytes, RecvFlags::empty())?.0 > 0 {
         send(&socket, &bytes, SendFlags::NOSIGNAL)?;

@@ -22,9 +22,9 @@ mod interface;
 pub use facts::{BusFacts, MachineFacts, ObservedTraffic, Program, User};
 
 /// The size that the kernel counts for one frame in a receive buffer, in bytes.
-const FRAME_BYTES: usize = 1_024;
+const FRAME_BUFFER_BYTES: usize = 1_024;
 /// The number of replies from every cell that a receive buffer should hold.
-const BUFFERED_ANSWERS: usize = 4;
+const BUFFERED_REPLIES_PER_CELL: usize = 4;
 
 /// The severity of a finding.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
@@ -75,12 +75,12 @@ impl Finding {
     }
 
     /// Adds a hint.
-    fn hint(mut self, hint: impl Into<String>) -> Self {
+    fn with_hint(mut self, hint: impl Into<String>) -> Self {
         self.hints.push(hint.into());
         self
     }
 
-    fn hints(mut self, hints: Vec<String>) -> Self {
+    fn with_hints(mut self, hints: Vec<String>) -> Self {
         self.hints.extend(hints);
         self
     }
@@ -88,17 +88,17 @@ impl Finding {
 
 /// Returns true if none of the findings is a fault, so that a bench would run.
 #[must_use]
-pub fn would_run(findings: &[Finding]) -> bool {
+pub fn would_bench_run(findings: &[Finding]) -> bool {
     findings.iter().all(|finding| finding.level != FindingLevel::Fault)
 }
 
 /// Assesses the facts about a machine. The findings are sorted: causes come before their consequences.
 #[must_use]
-pub fn assess(facts: &MachineFacts) -> Vec<Finding> {
+pub fn assess_machine(facts: &MachineFacts) -> Vec<Finding> {
     let mut findings = vec![facts.check_bus_kind()];
     let kind = facts.bus_kind();
     if !kind.is_interface() {
-        findings.push(facts.check_embedded());
+        findings.push(facts.check_embedded_directory());
         findings.extend(facts.buses.iter().filter_map(|bus| facts.check_absent_interface(bus)));
         findings.extend(facts.buses.iter().flat_map(|bus| facts.check_traffic(bus, kind.display_name())));
     } else if facts.kernel.has_can {
@@ -106,7 +106,7 @@ pub fn assess(facts: &MachineFacts) -> Vec<Finding> {
         findings.extend(facts.buses.iter().flat_map(|bus| facts.check_interface(bus)));
         findings.extend(facts.check_any_interface());
         findings.extend(facts.check_receive_buffer());
-        findings.extend(facts.check_backlog());
+        findings.extend(facts.check_kernel_backlog());
     }
     // Without CAN in the kernel there are no interfaces to check.
     findings.extend(facts.check_cell_node());
@@ -130,7 +130,7 @@ impl MachineFacts {
     }
 
     /// Returns the text of a `vcan-setup` command that root has to run.
-    fn own_command(&self, command: &str) -> String {
+    fn vcan_setup_command(&self, command: &str) -> String {
         self.with_sudo(&format!("{} {command}", self.program))
     }
 
@@ -141,12 +141,12 @@ impl MachineFacts {
     /// Returns the `vcan-setup up` command that makes a bus, named by its skin or by its own name.
     fn up_command(&self, target: &InterfaceTarget) -> String {
         let what = target.skin.as_ref().map_or(&target.name, |skin| &skin.file);
-        self.own_command(&format!("up {what}"))
+        self.vcan_setup_command(&format!("up {what}"))
     }
 
     fn check_bus_kind(&self) -> Finding {
         let Kernel { release, has_can, can_raw, .. } = &self.kernel;
-        let hints = || self.kernel.hints(*can_raw);
+        let hints = || self.kernel.setup_hints(*can_raw);
         match (self.choice, has_can) {
             (KindChoice::Only(kind), _) if !kind.is_interface() => {
                 Finding::ok(format!("{} was chosen, which needs no support by the kernel", kind.display_name()))
@@ -158,11 +158,11 @@ impl MachineFacts {
                 "the kernel ({release}) has no CAN, so the bench runs on the embedded bus: no candump, no real cell; \
                  for a kernel with CAN:"
             ))
-            .hints(hints()),
+            .with_hints(hints()),
             (KindChoice::Only(_), false) => {
                 Finding::fault(format!("the kernel ({release}) has no CAN, and --bus-kind socketcan needs it"))
-                    .hints(hints())
-                    .hint("# leave out --bus-kind socketcan: the bench then runs on the embedded bus")
+                    .with_hints(hints())
+                    .with_hint("# leave out --bus-kind socketcan: the bench then runs on the embedded bus")
             }
         }
     }
@@ -179,7 +179,7 @@ impl MachineFacts {
         let (all, count) = (format_node_ids(&heard.cells), heard.cells.len());
         let gateway = heard.gateway.then(|| {
             Finding::fault(format!("another gateway sends joints on {on}"))
-                .hint("pgrep -a skinbus  # and stop it, or take another bus")
+                .with_hint("pgrep -a skinbus  # and stop it, or take another bus")
         });
         let absent = || {
             let missing = |cells: &BTreeSet<_>| cells.difference(&heard.cells).copied().collect();
@@ -187,17 +187,14 @@ impl MachineFacts {
         };
         let cells = match (self.no_spawn, count) {
             (false, 0) => None,
-            (false, 1..) => {
-                Some(Finding::fault(format!("cells are on {on} already: {all}")).hint(
-                    "skinbus run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them",
-                ))
-            }
+            (false, 1..) => Some(Finding::fault(format!("cells are on {on} already: {all}")).with_hint(
+                "skinbus run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them",
+            )),
             (true, 0) => Some(
-                Finding::fault(format!("no cell sends on {on}, but --no-spawn needs running cells")).hint(
-                    format!(
+                Finding::fault(format!("no cell sends on {on}, but --no-spawn needs running cells"))
+                    .with_hint(format!(
                         "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
-                    ),
-                ),
+                    )),
             ),
             (true, 1..) if absent().is_empty() => Some(Finding::ok(format!("{count} cells are on {on}"))),
             (true, 1..) => {
@@ -217,30 +214,30 @@ impl MachineFacts {
         let frames =
             |bus: &BusFacts| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_per_packet(&bus.target);
         let frames = self.buses.iter().map(frames).max().unwrap_or(all);
-        let needed = BUFFERED_ANSWERS * frames * FRAME_BYTES;
+        let needed = BUFFERED_REPLIES_PER_CELL * frames * FRAME_BUFFER_BYTES;
         let (has, wants) = (granted >> 10, needed >> 10);
         let hint = self.with_sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
         Some(if granted >= needed {
             Finding::ok(format!(
-                "receive buffers of {has} KiB hold all answers ({frames} frames) {BUFFERED_ANSWERS} times"
+                "receive buffers of {has} KiB hold all answers ({frames} frames) {BUFFERED_REPLIES_PER_CELL} times"
             ))
-        } else if granted >= frames * FRAME_BYTES {
+        } else if granted >= frames * FRAME_BUFFER_BYTES {
             Finding::note(format!(
-                "receive buffers are limited to {has} KiB; to hold all answers ({frames} frames) {BUFFERED_ANSWERS} times, they need \
+                "receive buffers are limited to {has} KiB; to hold all answers ({frames} frames) {BUFFERED_REPLIES_PER_CELL} times, they need \
                  {wants} KiB, else a delayed gateway loses answers"
             ))
-            .hint(hint)
+            .with_hint(hint)
         } else {
             Finding::fault(format!(
                 "receive buffers are limited to {has} KiB and cannot hold all answers ({frames} frames) even once; \
                  {wants} KiB are needed"
             ))
-            .hint(hint)
+            .with_hint(hint)
         })
     }
 
     /// Checks that the kernel's queue between sender and receiver can hold one reply of every cell.
-    fn check_backlog(&self) -> Option<Finding> {
+    fn check_kernel_backlog(&self) -> Option<Finding> {
         let frames =
             |bus: &BusFacts| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_per_packet(&bus.target);
         let frames: usize = self.buses.iter().map(frames).sum();
@@ -249,7 +246,7 @@ impl MachineFacts {
         }
         Some(match self.backlog {
             None => Finding::note("the kernel's backlog cannot be seen from this network namespace")
-                .hint("sysctl net.core.netdev_max_backlog  # in the first one"),
+                .with_hint("sysctl net.core.netdev_max_backlog  # in the first one"),
             Some(backlog) if backlog >= frames => Finding::ok(format!(
                 "the kernel's backlog of {backlog} holds the answers of all cells ({frames} frames)"
             )),
@@ -257,11 +254,11 @@ impl MachineFacts {
                 "the kernel's backlog of {backlog} does not hold the answers of all cells ({frames} frames): some would \
                  be lost silently"
             ))
-            .hint(self.with_sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
+            .with_hint(self.with_sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
         })
     }
 
-    fn check_embedded(&self) -> Finding {
+    fn check_embedded_directory(&self) -> Finding {
         match &self.embedded {
             Ok(directory) => Finding::ok(format!("embedded buses can be served in {}", directory.display())),
             Err(why) => Finding::fault(why),
@@ -275,11 +272,9 @@ impl MachineFacts {
         match (self.no_spawn, there) {
             (true, _) => None,
             (false, true) => Some(Finding::ok("cell-node is beside vcan-setup")),
-            (false, false) => {
-                Some(Finding::fault(absent).hint(
-                    "cargo build --release  # in the project's folder; or name it in SKINBUS_CELL_NODE",
-                ))
-            }
+            (false, false) => Some(Finding::fault(absent).with_hint(
+                "cargo build --release  # in the project's folder; or name it in SKINBUS_CELL_NODE",
+            )),
         }
     }
 }

@@ -52,23 +52,23 @@ impl Kernel {
             machine: uname.machine().to_string_lossy().into_owned(),
             distribution: distribution(&os_release),
             has_can,
-            can_raw: lists.module("can_raw", has_can),
-            vcan: lists.module("vcan", loaded("vcan")),
-            vxcan: lists.module("vxcan", loaded("vxcan")),
+            can_raw: lists.find_module_state("can_raw", has_can),
+            vcan: lists.find_module_state("vcan", loaded("vcan")),
+            vxcan: lists.find_module_state("vxcan", loaded("vxcan")),
             release,
         }
     }
 
     /// Returns the state of the module for a kind of virtual interface, `vcan` or `vxcan`.
     #[must_use]
-    pub fn module(&self, kind: &str) -> ModuleState {
+    pub fn module_state(&self, kind: &str) -> ModuleState {
         if kind == "vxcan" { self.vxcan } else { self.vcan }
     }
 
     /// Returns shell commands by which CAN or `vcan` can be made available, each with a comment; the simplest comes
     /// first.
     #[must_use]
-    pub fn hints(&self, module: ModuleState) -> Vec<String> {
+    pub fn setup_hints(&self, module: ModuleState) -> Vec<String> {
         let modprobe = "sudo modprobe -a can_raw vcan vxcan";
         let here = match module {
             ModuleState::Available => None,
@@ -125,7 +125,7 @@ impl ModuleLists {
         Self { built_in: read("modules.builtin"), on_disk: read("modules.dep"), takes_modules }
     }
 
-    fn module(&self, name: &str, works: bool) -> ModuleState {
+    fn find_module_state(&self, name: &str, works: bool) -> ModuleState {
         let lists = |list: &Option<String>| list.as_deref().is_some_and(|list| lists_module(list, name));
         if works || lists(&self.built_in) {
             ModuleState::Available
@@ -178,13 +178,13 @@ mod tests {
             on_disk: Some(DEP.into()),
             takes_modules: true,
         };
-        assert_eq!(lists.module("can", false), ModuleState::Available);
-        assert_eq!(lists.module("vcan", false), ModuleState::Loadable);
-        assert_eq!(lists.module("vcan", true), ModuleState::Available);
-        assert_eq!(lists.module("vxcan", false), ModuleState::Missing);
+        assert_eq!(lists.find_module_state("can", false), ModuleState::Available);
+        assert_eq!(lists.find_module_state("vcan", false), ModuleState::Loadable);
+        assert_eq!(lists.find_module_state("vcan", true), ModuleState::Available);
+        assert_eq!(lists.find_module_state("vxcan", false), ModuleState::Missing);
         let none = |takes_modules| ModuleLists { built_in: None, on_disk: None, takes_modules };
-        assert_eq!(none(true).module("vcan", false), ModuleState::Unknown);
-        assert_eq!(none(false).module("vcan", false), ModuleState::Missing);
+        assert_eq!(none(true).find_module_state("vcan", false), ModuleState::Unknown);
+        assert_eq!(none(false).find_module_state("vcan", false), ModuleState::Missing);
     }
 
     fn first(release: &str, os_release: &str, module: ModuleState) -> String {
@@ -197,7 +197,7 @@ mod tests {
             vcan: module,
             vxcan: module,
         };
-        kernel.hints(module).remove(0)
+        kernel.setup_hints(module).remove(0)
     }
 
     #[test]

@@ -99,7 +99,7 @@ pub struct HardwareRates {
 impl CanHardware {
     /// Returns the bit rates in use; a controller in classic mode has no data bit rate.
     #[must_use]
-    pub fn rates(&self) -> HardwareRates {
+    pub fn bit_rates(&self) -> HardwareRates {
         HardwareRates { bitrate: self.bitrate, data_bitrate: self.data_bitrate.filter(|_| self.fd) }
     }
 }

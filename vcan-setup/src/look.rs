@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
-use protocol::bus::embedded::{address, default_directory, open_directory, seqpacket, socket_name};
+use protocol::bus::embedded::{
+    default_directory, open_directory, seqpacket_socket, socket_address, socket_name,
+};
 use protocol::bus::{self, BusError, BusKind, BusOptions, GATEWAY_RECEIVE_BUFFER_BYTES, Inbox, KindChoice};
 use protocol::can::Format;
 use protocol::id::{CellId, Command, Id, Kind, Node};
@@ -37,7 +39,7 @@ pub fn collect_facts(
     for bus in &mut buses {
         bus.interface = present.iter().find(|interface| interface.name == bus.target.name).cloned();
     }
-    let all_heard = observe_all(&buses, choice);
+    let all_heard = observe_all_buses(&buses, choice);
     for (bus, heard) in buses.iter_mut().zip(all_heard) {
         if let Some(heard) = heard {
             bus.traffic = heard;
@@ -49,7 +51,7 @@ pub fn collect_facts(
         program: own_program_command(),
         kernel: Kernel::detect(),
         user: User { root: rustix::process::geteuid().is_root(), admin: is_admin() },
-        receive_buffer: granted_receive_buffer().ok(),
+        receive_buffer: granted_receive_buffer_bytes().ok(),
         backlog: fs::read_to_string("/proc/sys/net/core/netdev_max_backlog")
             .ok()
             .and_then(|text| text.trim().parse().ok()),
@@ -61,11 +63,11 @@ pub fn collect_facts(
 }
 
 fn is_usable(target: &InterfaceTarget, interface: &Interface) -> bool {
-    interface.is_can() && interface.up && target.carried_by(interface.mtu)
+    interface.is_can() && interface.up && target.fits_mtu(interface.mtu)
 }
 
 /// Observes all buses that can be opened, at the same time. Returns the result for each bus, in their order.
-fn observe_all(
+fn observe_all_buses(
     buses: &[BusFacts],
     choice: KindChoice,
 ) -> Vec<Option<Result<Option<ObservedTraffic>, String>>> {
@@ -80,7 +82,8 @@ fn observe_all(
     thread::scope(|scope| {
         let begin = |bus: &'_ BusFacts| {
             let (target, kind) = (bus.target.clone(), kind_of(bus));
-            is_open(&bus).then(|| thread::Builder::new().spawn_scoped(scope, move || observe(&target, kind)))
+            is_open(&bus)
+                .then(|| thread::Builder::new().spawn_scoped(scope, move || observe_bus(&target, kind)))
         };
         let begun: Vec<_> = buses.iter().map(begin).collect();
         let end = |thread: io::Result<ScopedJoinHandle<'_, _>>| match thread.map(ScopedJoinHandle::join) {
@@ -94,7 +97,7 @@ fn observe_all(
 
 /// Observes a bus and returns the gateway and the cells that send on it. Returns `None` if the embedded bus is not
 /// served.
-fn observe(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTraffic>, String> {
+fn observe_bus(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTraffic>, String> {
     let options = BusOptions { fd: target.format == Format::Fd, ..BusOptions::default() };
     let until = Instant::now() + OBSERVATION_TIME;
     let hear = || {
@@ -105,7 +108,7 @@ fn observe(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTra
                 bus.receive(&mut inbox)?;
                 let data = inbox.frames().filter(|it| !it.frame.is_extended() && !it.frame.is_error());
                 for id in data.filter_map(|it| u16::try_from(it.frame.id()).ok()).map(Id::from_bits) {
-                    heard.record(id);
+                    heard.record_sender(id);
                 }
             }
         }
@@ -120,7 +123,7 @@ fn observe(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTra
 
 impl ObservedTraffic {
     /// Records which node sent a frame with this identifier.
-    pub fn record(&mut self, id: Id) {
+    pub fn record_sender(&mut self, id: Id) {
         let node = Node::from_byte(id.node);
         match id.kind {
             // Only joints show that a gateway runs. A user may send the other commands from a shell.
@@ -136,7 +139,7 @@ impl ObservedTraffic {
 
 /// Returns the size of the receive buffer that the kernel grants if a gateway requests its usual size, in bytes. The
 /// kernel grants the same to all kinds of sockets.
-fn granted_receive_buffer() -> io::Result<usize> {
+fn granted_receive_buffer_bytes() -> io::Result<usize> {
     let socket =
         rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
     bus::set_receive_buffer(&socket, GATEWAY_RECEIVE_BUFFER_BYTES as usize)
@@ -176,7 +179,7 @@ fn find_cell_node() -> Program {
 /// Returns the directory for embedded buses, or an error text if no bus can be served in it.
 fn embedded_directory() -> Result<PathBuf, String> {
     let directory = default_directory();
-    address(&directory, "a23456789012345").map_err(|error| error.to_string())?;
+    socket_address(&directory, "a23456789012345").map_err(|error| error.to_string())?;
     match open_directory(&directory) {
         Ok(_) => {}
         // A missing directory is not an error, because it is created when a bus is served.
@@ -227,8 +230,8 @@ pub fn embedded_buses() -> Vec<EmbeddedBus> {
 
 /// Returns true if a server listens on the socket of a bus. Connecting is refused only if none does.
 fn is_served(directory: &Path, name: &str) -> bool {
-    let socket = seqpacket(SocketFlags::NONBLOCK);
-    let (Ok(socket), Ok(address)) = (socket, address(directory, name)) else { return false };
+    let socket = seqpacket_socket(SocketFlags::NONBLOCK);
+    let (Ok(socket), Ok(address)) = (socket, socket_address(directory, name)) else { return false };
     matches!(rustix::net::connect(&socket, &address), Ok(()) | Err(rustix::io::Errno::AGAIN))
 }
 
@@ -240,7 +243,7 @@ mod tests {
     fn a_gateway_is_known_by_what_nobody_types_at_a_shell() {
         let heard = |id| {
             let mut heard = ObservedTraffic::default();
-            heard.record(id);
+            heard.record_sender(id);
             (heard.gateway, heard.cells.len())
         };
         let cell = Node::Cell(CellId::new(7).unwrap());

@@ -26,7 +26,7 @@ use crate::plan::{Step, StepAction};
 
 mod reading;
 
-use reading::{decode_interface, driver};
+use reading::{decode_interface, driver_name};
 
 /// The length in bytes of the header before the attributes of a namespace message.
 const NSID_HEADER_BYTES: usize = 4;
@@ -69,7 +69,7 @@ impl Netlink {
     /// Returns an error if the kernel does not answer.
     pub fn interfaces(&mut self) -> io::Result<Vec<Interface>> {
         let mut interfaces: Vec<_> =
-            self.query_all()?.iter().filter_map(|link| decode_interface(link)).collect();
+            self.query_all_interfaces()?.iter().filter_map(|link| decode_interface(link)).collect();
         interfaces.sort_by_key(|interface| interface.index);
         let names: HashMap<_, _> =
             interfaces.iter().map(|interface| (interface.index, interface.name.clone())).collect();
@@ -83,9 +83,9 @@ impl Netlink {
                     let known = namespaces.get_or_insert_with(|| self.named_namespaces());
                     *namespace = known.get(id).cloned();
                     // The kernel tells the name of the other end only to users with access to its namespace.
-                    *name = self.name_in(*id, *index).ok().flatten();
+                    *name = self.interface_name_in(*id, *index).ok().flatten();
                 }
-                InterfaceKind::Hardware(hardware) => hardware.driver = driver(&interface.name),
+                InterfaceKind::Hardware(hardware) => hardware.driver = driver_name(&interface.name),
                 InterfaceKind::Vcan | InterfaceKind::Vxcan(None) | InterfaceKind::Other(_) => {}
             }
         }
@@ -93,7 +93,7 @@ impl Netlink {
     }
 
     /// Returns the kernel's message about each interface.
-    fn query_all(&mut self) -> io::Result<Vec<Vec<u8>>> {
+    fn query_all_interfaces(&mut self) -> io::Result<Vec<Vec<u8>>> {
         self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)
     }
 
@@ -126,13 +126,13 @@ impl Netlink {
         names
     }
 
-    fn name_in(&mut self, namespace: i32, index: u32) -> io::Result<Option<String>> {
+    fn interface_name_in(&mut self, namespace: i32, index: u32) -> io::Result<Option<String>> {
         let queried = link_message(index, [LinkAttribute::IfNetnsId(namespace)]);
-        Ok(self.query(queried)?.map(|interface| interface.name))
+        Ok(self.query_interface(queried)?.map(|interface| interface.name))
     }
 
     /// Queries the interface that a message identifies. Returns `None` if it does not exist.
-    fn query(&mut self, about: LinkMessage) -> io::Result<Option<Interface>> {
+    fn query_interface(&mut self, about: LinkMessage) -> io::Result<Option<Interface>> {
         let answers = self.exchange.request(RouteNetlinkMessage::GetLink(about), 0)?;
         Ok(answers.iter().find_map(|answer| decode_interface(answer)))
     }
@@ -152,7 +152,7 @@ impl Netlink {
     ///
     /// # Errors
     /// Returns the kernel's error. The pair was then not made, or was removed again.
-    pub fn make_pair(
+    pub fn make_vxcan_pair(
         &mut self,
         name: &str,
         peer: &str,
@@ -181,7 +181,7 @@ impl Netlink {
 
     /// Returns an index that is higher than those of all interfaces.
     fn free_index(&mut self) -> io::Result<u32> {
-        let links = self.query_all()?;
+        let links = self.query_all_interfaces()?;
         let indices = links.iter().filter_map(|link| LinkHeader::parse(link).ok()).map(|header| header.index);
         Ok(indices.max().unwrap_or(0) + 1)
     }
@@ -225,11 +225,11 @@ impl Netlink {
     fn mark_and_set_up(&mut self, index: u32) -> io::Result<()> {
         // The alias is set first. If a later step fails, the next command then recognises the interface and can remove
         // it.
-        self.change(link_message(index, [LinkAttribute::IfAlias(ALIAS_MARK.to_owned())]))?;
-        self.set_up(index, true)
+        self.change_link(link_message(index, [LinkAttribute::IfAlias(ALIAS_MARK.to_owned())]))?;
+        self.set_interface_up(index, true)
     }
 
-    fn change(&mut self, message: LinkMessage) -> io::Result<()> {
+    fn change_link(&mut self, message: LinkMessage) -> io::Result<()> {
         self.exchange.request(RouteNetlinkMessage::NewLink(message), 0).map(|_| ())
     }
 
@@ -237,11 +237,11 @@ impl Netlink {
     ///
     /// # Errors
     /// Returns the kernel's error.
-    pub fn set_up(&mut self, index: u32, up: bool) -> io::Result<()> {
+    pub fn set_interface_up(&mut self, index: u32, up: bool) -> io::Result<()> {
         let mut message = link_message(index, []);
         message.header.change_mask = LinkFlags::Up;
         message.header.flags = if up { LinkFlags::Up } else { LinkFlags::empty() };
-        self.change(message)
+        self.change_link(message)
     }
 
     /// Sets the MTU of an interface, which must be down.
@@ -249,27 +249,28 @@ impl Netlink {
     /// # Errors
     /// Returns the kernel's error.
     pub fn set_mtu(&mut self, index: u32, mtu: u32) -> io::Result<()> {
-        self.change(link_message(index, [LinkAttribute::Mtu(mtu)]))
+        self.change_link(link_message(index, [LinkAttribute::Mtu(mtu)]))
     }
 
     /// Sets the bit rates of CAN hardware, which must be down. Without a data rate it is switched to classic CAN.
     ///
     /// # Errors
     /// Returns the driver's error.
-    pub fn set_rates(&mut self, index: u32, rates: HardwareRates) -> io::Result<()> {
+    pub fn set_bit_rates(&mut self, index: u32, rates: HardwareRates) -> io::Result<()> {
         let fd = if rates.data_bitrate.is_some() { CanCtrlModeFlags::Fd } else { CanCtrlModeFlags::empty() };
         let mut data = vec![InfoCan::CtrlMode(CanCtrlMode { mask: CanCtrlModeFlags::Fd, flags: fd })];
         data.extend(rates.bitrate.map(|rate| InfoCan::BitTiming(CanBitTiming::new(rate))));
         data.extend(rates.data_bitrate.map(|rate| InfoCan::DataBitTiming(CanBitTiming::new(rate))));
         let info = vec![LinkInfo::Kind(InfoKind::Can), LinkInfo::Data(InfoData::Can(data))];
-        self.change(link_message(index, [LinkAttribute::LinkInfo(info)]))
+        self.change_link(link_message(index, [LinkAttribute::LinkInfo(info)]))
     }
 
     /// Checks that the actual bit rates are close enough to the requested ones, because drivers accept deviations of up
     /// to 5 %.
-    fn check_rates(&mut self, index: u32, target: HardwareRates) -> io::Result<()> {
-        let nearest =
-            self.query(link_message(index, []))?.and_then(|it| it.hardware().map(CanHardware::rates));
+    fn check_bit_rates(&mut self, index: u32, target: HardwareRates) -> io::Result<()> {
+        let nearest = self
+            .query_interface(link_message(index, []))?
+            .and_then(|it| it.hardware().map(CanHardware::bit_rates));
         match nearest.filter(|nearest| !nearest.matches(target)) {
             Some(nearest) => Err(io::Error::other(format!("the nearest that its clock allows is {nearest}"))),
             None => Ok(()),
@@ -288,29 +289,33 @@ impl Netlink {
     ///
     /// # Errors
     /// Returns the kernel's error. The part of the step that was already executed is then undone.
-    pub fn execute(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
+    pub fn execute_step(
+        &mut self,
+        step: &Step,
+        there: Option<(&File, &mut Self)>,
+    ) -> io::Result<Option<Undo>> {
         let restore = |index, mtu, up| Undo::Restore { index, mtu, rates: None, up };
         let Step { name, action } = step;
         match *action {
             StepAction::MakeVcan => self.make_vcan(name).map(|index| Some(Undo::Remove { index })),
             StepAction::MakePair { ref peer, .. } => {
-                self.make_pair(name, peer, there).map(|index| Some(Undo::Remove { index }))
+                self.make_vxcan_pair(name, peer, there).map(|index| Some(Undo::Remove { index }))
             }
             StepAction::BringUp { index } => {
-                self.set_up(index, true).map(|()| Some(restore(index, None, false)))
+                self.set_interface_up(index, true).map(|()| Some(restore(index, None, false)))
             }
             StepAction::Widen { index, from, was_up } => {
-                let done = self.set_up(index, false).and_then(|()| self.set_mtu(index, FD_MTU));
-                let done = done.and_then(|()| self.set_up(index, true));
+                let done = self.set_interface_up(index, false).and_then(|()| self.set_mtu(index, FD_MTU));
+                let done = done.and_then(|()| self.set_interface_up(index, true));
                 self.undo_on_error(done, restore(index, Some(from), was_up)).map(Some)
             }
             StepAction::SetRates { index, rates, before, was_up } => {
                 let undo = Undo::Restore { index, mtu: None, rates: Some(before), up: was_up };
-                let down = if was_up { self.set_up(index, false) } else { Ok(()) };
+                let down = if was_up { self.set_interface_up(index, false) } else { Ok(()) };
                 let done = down
-                    .and_then(|()| self.set_rates(index, rates))
-                    .and_then(|()| self.check_rates(index, rates))
-                    .and_then(|()| self.set_up(index, true));
+                    .and_then(|()| self.set_bit_rates(index, rates))
+                    .and_then(|()| self.check_bit_rates(index, rates))
+                    .and_then(|()| self.set_interface_up(index, true));
                 self.undo_on_error(done, undo).map(Some)
             }
             StepAction::Remove { index } => self.remove(index).map(|()| None),
@@ -333,15 +338,15 @@ impl Netlink {
         match *undo {
             Undo::Remove { index } => self.remove(index),
             Undo::Restore { index, mtu, rates, up } => {
-                self.set_up(index, false)?;
+                self.set_interface_up(index, false)?;
                 if let Some(mtu) = mtu {
                     self.set_mtu(index, mtu)?;
                 }
                 // The kernel cannot remove a bit rate that was set once.
                 if let Some(rates @ HardwareRates { bitrate: Some(_), .. }) = rates {
-                    self.set_rates(index, rates)?;
+                    self.set_bit_rates(index, rates)?;
                 }
-                if up { self.set_up(index, true) } else { Ok(()) }
+                if up { self.set_interface_up(index, true) } else { Ok(()) }
             }
         }
     }

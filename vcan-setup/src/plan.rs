@@ -69,7 +69,7 @@ impl InterfaceTarget {
 
     /// Restricts a target without a skin to the frame format that the hardware of this name is set to.
     pub fn adopt_hardware_format(&mut self, present: &[Interface]) {
-        let there = find(present, &self.name).filter(|it| it.hardware().is_some());
+        let there = find_interface(present, &self.name).filter(|it| it.hardware().is_some());
         if self.skin.is_none() && there.is_some_and(|it| it.mtu < FD_MTU) {
             self.format = Format::Classic;
         }
@@ -82,7 +82,7 @@ impl InterfaceTarget {
     }
 
     /// Returns a refusal if another skin states different bit rates for the same bus.
-    fn conflict(&self, others: &[Self]) -> Option<PlanRefusal> {
+    fn rate_conflict(&self, others: &[Self]) -> Option<PlanRefusal> {
         let own = self.hardware()?;
         let mut skins = others.iter().filter(|other| other.name == self.name).filter_map(Self::hardware);
         let other = skins.find(|skin| skin.rates != own.rates)?;
@@ -92,7 +92,7 @@ impl InterfaceTarget {
 
     /// Returns true if an interface with this MTU (in bytes) can carry the frames of the target.
     #[must_use]
-    pub const fn carried_by(&self, mtu: u32) -> bool {
+    pub const fn fits_mtu(&self, mtu: u32) -> bool {
         matches!(self.format, Format::Classic) || mtu >= FD_MTU
     }
 }
@@ -127,7 +127,7 @@ pub struct Plan {
     pub unchanged: Vec<String>,
 }
 
-fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
+fn find_interface<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
     present.iter().find(|interface| interface.name == name)
 }
 
@@ -141,14 +141,15 @@ pub fn plan_up(
     set_bit_rates: bool,
 ) -> Result<Plan, PlanRefusal> {
     let mut plan = Plan::default();
-    if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.conflict(target.get(..at)?)) {
+    if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.rate_conflict(target.get(..at)?))
+    {
         return Err(refusal);
     }
     for target in target {
         if plan.has_step_for(&target.name) {
             continue;
         }
-        let Some(interface) = find(present, &target.name) else {
+        let Some(interface) = find_interface(present, &target.name) else {
             if let Some(SkinBus { file, .. }) = target.hardware() {
                 return Err(PlanRefusal::Absent { name: target.name.clone(), file: file.clone() });
             }
@@ -178,7 +179,7 @@ pub fn plan_pair_up(target: &TargetPair<'_>, present: &[Interface]) -> Result<Pl
         return Err(PlanRefusal::OneName(name.to_owned()));
     }
     let present_there = there.map_or(present, |there| &there.present);
-    let ends = (find(present, name), find(present_there, peer));
+    let ends = (find_interface(present, name), find_interface(present_there, peer));
     let mut plan = Plan::default();
     let (here, other) = match ends {
         (None, None) => {
@@ -250,7 +251,7 @@ impl Plan {
     fn plan_virtual(&mut self, target: &InterfaceTarget, interface: &Interface) -> Result<(), PlanRefusal> {
         let Interface { index, mtu, .. } = *interface;
         let name = interface.name.clone();
-        let wide = target.carried_by(mtu);
+        let wide = target.fits_mtu(mtu);
         let action = match (wide, interface.up, interface.ours) {
             (true, true, ours) => {
                 let whose = if ours { "" } else { ", made by another program" };
@@ -279,9 +280,9 @@ impl Plan {
         set: bool,
     ) -> Result<(), PlanRefusal> {
         let (name, file, what) = (interface.name.clone(), skin.file.clone(), interface.description());
-        let (before, rates) = (hardware.rates(), skin.rates);
+        let (before, rates) = (hardware.bit_rates(), skin.rates);
         let agrees = before.matches(rates);
-        let wide = target.carried_by(interface.mtu);
+        let wide = target.fits_mtu(interface.mtu);
         if agrees && wide && interface.up {
             let checked = if rates.bitrate.is_some() { ", as the skin requires" } else { "" };
             self.add_unchanged(format!("{name} is {what}, at {before}{checked}, and is left as it is"));
@@ -328,7 +329,7 @@ pub fn plan_down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Pl
         if plan.has_step_for(&name) {
             continue;
         }
-        match (find(present, &name), &target.skin) {
+        match (find_interface(present, &name), &target.skin) {
             (None, _) => plan.add_unchanged(format!("{name} is not there")),
             (Some(interface), _) if interface.ours && interface.is_virtual() => {
                 if !is_removed_with_peer(&plan, interface, present) {

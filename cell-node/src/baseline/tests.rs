@@ -16,7 +16,7 @@ fn rule() -> BaselineSettings {
 
 fn with(rule: BaselineSettings) -> Baseline {
     let mut baseline = Baseline::default();
-    baseline.set(Rule::On(rule));
+    baseline.set_rule(Rule::On(rule));
     baseline
 }
 
@@ -44,7 +44,7 @@ impl Baseline {
 /// Returns the baseline of a sensor that reads 0.3 N without a touch, at 25 °C.
 fn tared(rule: BaselineSettings) -> Baseline {
     let mut baseline = with(rule);
-    baseline.run(STEADY_JOINTS.into(), &reads(0.3, 25.0));
+    baseline.run(STEADY_MESSAGES_BEFORE_TARE.into(), &reads(0.3, 25.0));
     assert!(baseline.is_tared());
     baseline
 }
@@ -55,13 +55,13 @@ fn without_a_baseline_nothing_is_subtracted_and_nothing_told() {
     let raw = reads(0.3, 25.0);
     baseline.run(100, &raw);
     assert_eq!((baseline.subtract_zero(&raw), baseline.page()), (raw, None));
-    assert_eq!(baseline.tare(&raw, TareCommand::Untouched), Err(TareRefused::Off));
+    assert_eq!(baseline.tare(&raw, TareCommand::Untouched), Err(TareRefusal::Off));
 }
 
 #[test]
 fn a_steady_reading_within_the_limit_is_the_zero_after_a_start() {
     let mut baseline = with(rule());
-    for joints in 0..STEADY_JOINTS {
+    for joints in 0..STEADY_MESSAGES_BEFORE_TARE {
         assert!(!baseline.is_tared(), "{joints}");
         assert_eq!(baseline.run(1, &reads(0.3, 25.0)), 0.0, "what is within the limit is none");
     }
@@ -123,7 +123,7 @@ fn the_zero_moves_with_the_temperature_in_contact_too() {
 fn the_coefficient_is_learned_from_a_warm_up_without_a_touch() {
     for (slope, start) in [(0.02, 25.0), (-0.015, 25.0), (0.02, 35.0)] {
         let mut baseline = with(rule());
-        baseline.run(STEADY_JOINTS.into(), &reads(0.1, start));
+        baseline.run(STEADY_MESSAGES_BEFORE_TARE.into(), &reads(0.1, start));
         let up = if start > 30.0 { -1.0 } else { 1.0 };
         // One degree per minute, in steps of 1/64 °C.
         for step in 0..640 {
@@ -152,19 +152,19 @@ fn a_tare_needs_that_nothing_touches_it_unless_it_is_forced() {
     let mut baseline = tared(rule());
     let touched = reads(0.45, 25.0);
     baseline.run(50, &touched);
-    assert_eq!(baseline.tare(&touched, TareCommand::Untouched), Err(TareRefused::Touched));
+    assert_eq!(baseline.tare(&touched, TareCommand::Untouched), Err(TareRefusal::Touched));
     let page = baseline.page().unwrap();
     assert_eq!((page.refused, page.zero, page.touched), (1, Q5_10::nearest(0.3), true));
     assert_eq!(baseline.tare(&touched, TareCommand::Forced), Ok(()));
     assert_eq!(baseline.run(1, &touched), 0.0);
     let more = reads(0.95, 25.0);
     baseline.run(50, &more);
-    assert_eq!(baseline.tare(&more, TareCommand::Forced), Err(TareRefused::Limit), "0.95 N");
+    assert_eq!(baseline.tare(&more, TareCommand::Forced), Err(TareRefusal::Limit), "0.95 N");
     baseline.tare(&more, TareCommand::Forget).unwrap();
     assert!(!baseline.is_tared());
     assert_eq!(
         with(rule()).tare(&more, TareCommand::Untouched),
-        Err(TareRefused::Touched),
+        Err(TareRefusal::Touched),
         "it has read nothing"
     );
 }
@@ -214,7 +214,7 @@ proptest! {
                         prop_assert_eq!(before.zero, baseline.zero);
                     }
                 }
-                prop_assert!(baseline.zero.abs() <= i32::from(limit) << EXTRA_FRACTION_BITS);
+                prop_assert!(baseline.zero.abs() <= i32::from(limit) << ZERO_EXTRA_FRACTION_BITS);
             }
         }
     }
@@ -226,7 +226,7 @@ proptest! {
     ) {
         let Some(rule) = Rule::from_words(words) else { return Ok(()) };
         let mut baseline = Baseline::default();
-        baseline.set(rule);
+        baseline.set_rule(rule);
         for (contact, temperature, period, tare) in readings {
             let raw = SkinSensors {
                 contact: contact.map(Q5_10::from_bits),

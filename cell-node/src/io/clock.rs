@@ -5,7 +5,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use protocol::time::{Micros, Span};
 
 /// Interval between measurements of the offset to the wall clock.
-const MEASURE_INTERVAL: Span = Span::from_millis(250);
+const OFFSET_MEASURE_INTERVAL: Span = Span::from_millis(250);
 
 /// A monotonic clock with a known offset to the wall clock.
 #[derive(Debug)]
@@ -26,12 +26,12 @@ impl Clock {
     }
 
     pub(super) fn now(&self) -> Micros {
-        Micros::since_start(self.start.elapsed())
+        Micros::from_elapsed(self.start.elapsed())
     }
 
     /// Measures the offset to the wall clock again if the interval between measurements has passed.
-    pub(super) fn remeasure(&mut self, now: Micros) {
-        if now.elapsed_since(self.measured) >= MEASURE_INTERVAL {
+    pub(super) fn measure_offset_if_due(&mut self, now: Micros) {
+        if now.elapsed_since(self.measured) >= OFFSET_MEASURE_INTERVAL {
             self.measure_offset(now);
         }
     }
@@ -43,7 +43,7 @@ impl Clock {
     }
 
     /// Converts a time of this clock to wall clock time in ns since 1970.
-    pub(super) const fn wall_nanos(&self, at: Micros) -> u64 {
+    pub(super) const fn wall_clock_nanos(&self, at: Micros) -> u64 {
         (self.wall + at.0).saturating_mul(1_000)
     }
 

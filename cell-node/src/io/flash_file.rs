@@ -55,7 +55,7 @@ impl FlashFile {
     /// Returns an error if the file exists but cannot be read, or another process uses it.
     pub fn load(&mut self) -> io::Result<Result<FlashContent, FlashError>> {
         let Some(path) = &self.path else { return Ok(Ok(FlashContent::default())) };
-        lock_current(path, &mut self.held)?;
+        lock_file_at(path, &mut self.held)?;
         if self.held.is_none() {
             return Ok(Ok(FlashContent::default()));
         }
@@ -68,7 +68,7 @@ impl FlashFile {
     /// Returns an error if writing fails, or another process uses the file.
     pub fn store(&mut self, kept: &FlashContent) -> io::Result<()> {
         let Some(path) = &self.path else { return Ok(()) };
-        lock_current(path, &mut self.held)?;
+        lock_file_at(path, &mut self.held)?;
         let part = path.with_extension("flash.part");
         let store = || {
             // Left over from an earlier attempt or another program.
@@ -100,7 +100,7 @@ impl FlashFile {
 }
 
 /// Opens and locks the file at this path, and stores it in `held`.
-fn lock_current(path: &Path, held: &mut Option<File>) -> io::Result<()> {
+fn lock_file_at(path: &Path, held: &mut Option<File>) -> io::Result<()> {
     loop {
         let file = match input::open(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
@@ -109,9 +109,9 @@ fn lock_current(path: &Path, held: &mut Option<File>) -> io::Result<()> {
             }
             opened => opened?,
         };
-        let is = identity(&file)?;
+        let is = device_and_inode(&file)?;
         if let Some(held) = held
-            && identity(held)? == is
+            && device_and_inode(held)? == is
         {
             return Ok(());
         }
@@ -128,7 +128,7 @@ fn lock_current(path: &Path, held: &mut Option<File>) -> io::Result<()> {
 fn lock_file(file: &File) -> io::Result<()> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
         Err(Errno::WOULDBLOCK) => {
-            let who = holder(file).unwrap_or_else(|| "another process".to_owned());
+            let who = lock_holder(file).unwrap_or_else(|| "another process".to_owned());
             let why =
                 format!("{who} is using it: stop that process first, or choose another --flash directory");
             Err(io::Error::new(io::ErrorKind::ResourceBusy, why))
@@ -138,14 +138,14 @@ fn lock_file(file: &File) -> io::Result<()> {
 }
 
 /// Returns the device and inode numbers of a file.
-fn identity(file: &File) -> io::Result<(u64, u64)> {
+fn device_and_inode(file: &File) -> io::Result<(u64, u64)> {
     let about = file.metadata()?;
     Ok((about.dev(), about.ino()))
 }
 
 /// Returns the id and name of the process that has locked a file, from the kernel's list of locks.
-fn holder(file: &File) -> Option<String> {
-    let (device, inode) = identity(file).ok()?;
+fn lock_holder(file: &File) -> Option<String> {
+    let (device, inode) = device_and_inode(file).ok()?;
     let place = format!("{:02x}:{:02x}:{inode}", rustix::fs::major(device), rustix::fs::minor(device));
     let locks = fs::read_to_string("/proc/locks").ok()?;
     let line =

@@ -38,7 +38,7 @@ impl Outbox {
     }
 
     /// Removes all frames, which are lost. Returns, for each packet among them, the index of the cell that counted it.
-    pub(super) fn drop_all(&mut self) -> impl Iterator<Item = usize> {
+    pub(super) fn drop_all_frames(&mut self) -> impl Iterator<Item = usize> {
         self.frames.clear();
         self.ends.drain(..).flatten()
     }
@@ -62,7 +62,7 @@ mod tests {
             let mut outbox = filled();
             outbox.mark_sent(sent);
             assert_eq!(outbox.frames().len(), 4 - sent);
-            assert_eq!(outbox.drop_all().collect::<Vec<_>>(), lost, "{sent}");
+            assert_eq!(outbox.drop_all_frames().collect::<Vec<_>>(), lost, "{sent}");
             assert!(outbox.frames().is_empty());
         }
     }

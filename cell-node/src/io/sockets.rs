@@ -21,7 +21,7 @@ pub(super) struct ReceiveFilters {
 }
 
 /// Time for which frames may still arrive at the deferred socket after one of its filters was removed.
-const SETTLING_TIME: Duration = Duration::from_millis(50);
+const FILTER_SETTLING_TIME: Duration = Duration::from_millis(50);
 /// Number of batches that are read from the deferred socket at once. They hold as many frames as its receive buffer.
 const MAX_DEFERRED_BATCHES: usize = 16;
 
@@ -94,8 +94,8 @@ impl Sockets {
     ) -> Result<(), BusError> {
         // A filter that moves between the sockets is set on both for a moment, so that no frame is lost.
         let (update, old) = (
-            difference(&hearing.deferred, &before.deferred),
-            difference(&before.deferred, &hearing.deferred),
+            filter_difference(&hearing.deferred, &before.deferred),
+            filter_difference(&before.deferred, &hearing.deferred),
         );
         if !update.is_empty() {
             self.deferred.set_filters(&[&before.deferred[..], &update].concat())?;
@@ -105,7 +105,7 @@ impl Sockets {
         }
         if !old.is_empty() {
             self.deferred.set_filters(&hearing.deferred)?;
-            self.settled = Some(Instant::now() + SETTLING_TIME);
+            self.settled = Some(Instant::now() + FILTER_SETTLING_TIME);
         }
         self.has_deferred_filters = !hearing.deferred.is_empty();
         Ok(())
@@ -118,7 +118,7 @@ impl Sockets {
     /// Receives pending frames without waiting, before a timer is handled that was due at a wall clock time in ns.
     /// Returns true if any frames were pending.
     pub(super) fn receive_pending(&mut self, due_nanos: u64) -> Result<bool, BusError> {
-        self.clear();
+        self.clear_frames();
         self.bus.receive(&mut self.woke)?;
         // Includes frames that a slow server delivered after the settling time.
         self.receive_deferred()?;
@@ -127,11 +127,11 @@ impl Sockets {
     }
 
     /// Waits for a frame that wakes the process, and receives it together with the deferred frames.
-    pub(super) fn wait(&mut self, wait: Duration) -> Result<(), BusError> {
-        self.clear();
+    pub(super) fn wait_for_frames(&mut self, wait: Duration) -> Result<(), BusError> {
+        self.clear_frames();
         if let Some(settled) = self.settled {
             let left = settled.saturating_duration_since(Instant::now());
-            if self.bus.wait_with(&self.deferred, wait.min(left))? {
+            if self.bus.wait_for_either(&self.deferred, wait.min(left))? {
                 self.bus.receive(&mut self.woke)?;
                 self.receive_deferred()?;
                 self.merge_by_time(0);
@@ -155,7 +155,7 @@ impl Sockets {
         Ok(())
     }
 
-    fn clear(&mut self) {
+    fn clear_frames(&mut self) {
         self.woke.clear();
         self.arrived.clear();
     }
@@ -198,6 +198,6 @@ impl Sockets {
 }
 
 /// Returns the elements of the first list that are not in the second.
-fn difference(these: &[Filter], those: &[Filter]) -> Vec<Filter> {
+fn filter_difference(these: &[Filter], those: &[Filter]) -> Vec<Filter> {
     these.iter().filter(|filter| !those.contains(filter)).copied().collect()
 }

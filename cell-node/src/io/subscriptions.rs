@@ -10,7 +10,7 @@ use protocol::port::{LinkId, WIRE_FLAG};
 use super::sockets::ReceiveFilters;
 
 /// Filter that passes the frames of all simulated wires on a bus.
-const ALL_WIRES: Filter = Filter { id: EXTENDED | WIRE_FLAG, mask: EXTENDED | REMOTE | WIRE_FLAG };
+const ALL_WIRES_FILTER: Filter = Filter { id: EXTENDED | WIRE_FLAG, mask: EXTENDED | REMOTE | WIRE_FLAG };
 
 /// For each identifier and link id, the cells that receive it, as indices within the process.
 #[derive(Debug, Default)]
@@ -35,7 +35,7 @@ impl Subscriptions {
 
     /// Replaces all subscriptions to identifiers. Each item is a cell, an identifier, and true if the cell can receive
     /// it deferred.
-    pub(super) fn replace(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
+    pub(super) fn replace_subscriptions(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
         self.by_id.clear();
         for (cell, id, deferred) in hears {
             let heard = self.by_id.entry(id).or_default();
@@ -66,7 +66,7 @@ impl Subscriptions {
             };
         }
         let kinds: BTreeSet<_> = self.by_id.keys().map(|id| id.kind).collect();
-        let wires = (link_ids.len() > 0).then_some(ALL_WIRES);
+        let wires = (link_ids.len() > 0).then_some(ALL_WIRES_FILTER);
         ReceiveFilters {
             at_once: kinds.into_iter().map(Filter::for_kind).chain(wires).collect(),
             deferred: Vec::new(),
@@ -88,7 +88,7 @@ mod tests {
         let id = |kind, cell| Id::new(kind, Node::Cell(cell));
         let cells = || CellId::all().take(cells).enumerate();
         let hears = |(at, cell)| [Kind::Network, Kind::Sum].map(|kind| (at, id(kind, cell), false));
-        subscriptions.replace(cells().flat_map(hears));
+        subscriptions.replace_subscriptions(cells().flat_map(hears));
         for (at, cell) in cells() {
             subscriptions.subscribe_port(LinkId { wire: cell.get().into(), back: true }, at, 2);
         }
@@ -134,7 +134,8 @@ mod tests {
         let mut subscriptions = subscriptions(3);
         let id = |kind, number| Id::new(kind, Node::Cell(CellId::new(number).unwrap()));
         assert_eq!(subscriptions.cells_for_id(id(Kind::Sum, 2)), [1]);
-        subscriptions.replace([(0, id(Kind::Sum, 2), false), (2, id(Kind::Sum, 2), true)].into_iter());
+        subscriptions
+            .replace_subscriptions([(0, id(Kind::Sum, 2), false), (2, id(Kind::Sum, 2), true)].into_iter());
         assert_eq!(subscriptions.cells_for_id(id(Kind::Sum, 2)), [0, 2]);
         assert_eq!(subscriptions.cells_for_id(id(Kind::Sum, 1)), [0; 0]);
         assert_eq!(subscriptions.port_for_link(LinkId { wire: 2, back: true }), Some((1, 2)));
@@ -145,8 +146,9 @@ mod tests {
     fn an_identifier_is_deferred_only_if_all_its_receivers_defer_it() {
         let mut subscriptions = Subscriptions::default();
         let id = |number| Id::new(Kind::Sum, Node::Cell(CellId::new(number).unwrap()));
-        subscriptions
-            .replace([(0, id(1), true), (1, id(2), true), (2, id(2), false), (2, id(3), false)].into_iter());
+        subscriptions.replace_subscriptions(
+            [(0, id(1), true), (1, id(2), true), (2, id(2), false), (2, id(3), false)].into_iter(),
+        );
         let ReceiveFilters { at_once, deferred } = subscriptions.filters();
         assert_eq!(at_once, [id(2), id(3)].map(Filter::exact));
         assert_eq!(deferred, [id(1)].map(Filter::exact));

@@ -32,12 +32,12 @@ impl Joint {
 
     /// Returns the element of an array that belongs to this joint.
     #[inline(always)]
-    pub(super) fn get<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
+    pub(super) fn element_of<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
         joints.get(self as usize)
     }
 
     #[inline(always)]
-    pub(super) fn get_mut<T>(self, joints: &mut [T; MAX_JOINTS]) -> Option<&mut T> {
+    pub(super) fn element_of_mut<T>(self, joints: &mut [T; MAX_JOINTS]) -> Option<&mut T> {
         joints.get_mut(self as usize)
     }
 }

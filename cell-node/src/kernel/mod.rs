@@ -31,13 +31,13 @@ mod rounding;
 mod scalar;
 mod wrench;
 
-pub use scalar::{Number, Operations, Scalar, Steps, Word};
+pub use scalar::{FixedPoint, Number, Operations, Scalar, Word};
 pub use wrench::Wrench;
 
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
-use crate::sine::FINE_FRACTION_BITS;
+use crate::sine::PRECISE_SINE_FRACTION_BITS;
 
 /// A method to compute the Jacobian J of the contact force on a cell.
 pub trait Kernel<S: Scalar = Q1_14>: Sized {
@@ -64,14 +64,14 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
 
 /// Returns the rows from the base to the cell. Returns no rows if the number of rows with a joint is inconsistent, as
 /// in parameters that [`Parameters::check`] rejects.
-fn chain(parameters: &Parameters) -> &[Row] {
-    let chain = parameters.chain();
+fn checked_chain_rows(parameters: &Parameters) -> &[Row] {
+    let chain = parameters.rows_to_cell();
     let joints = chain.iter().filter(|row| row.has_joint()).count();
     if joints == usize::from(parameters.joint) && joints <= MAX_JOINTS { chain } else { &[] }
 }
 
 /// Returns a length of the robot's table; `None` for zero, for which the multiplications are omitted.
-fn length<N: Number>(word: Q1_14) -> Option<N> {
+fn nonzero_length<N: Number>(word: Q1_14) -> Option<N> {
     (word != Q1_14::ZERO).then(|| N::from_word(word))
 }
 
@@ -82,8 +82,11 @@ const fn cold_path() {}
 
 /// Returns sine and cosine of a constant angle.
 fn constant_sine_cosine<N: Number>(angle: Q1_14) -> [N; 2] {
-    let [sine, cosine, _] = N::fine_sine_cosine_one(angle);
-    [N::round_constant::<FINE_FRACTION_BITS>(sine), N::round_constant::<FINE_FRACTION_BITS>(cosine)]
+    let [sine, cosine, _] = N::unrounded_sine_cosine_one(angle);
+    [
+        N::round_constant::<PRECISE_SINE_FRACTION_BITS>(sine),
+        N::round_constant::<PRECISE_SINE_FRACTION_BITS>(cosine),
+    ]
 }
 
 /// The rotation of the y and z axes by the twist alpha of a link, by the operations that it needs.

@@ -5,9 +5,9 @@ use super::Number;
 /// A way to round sums to words, with saturation or without it.
 pub(super) trait Rounding {
     /// Rounds the sum of two products. In each product one factor must be within [-1, 1].
-    fn sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N;
+    fn rounded_sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N;
     /// Rounds the difference of two products. In each product one factor must be within [-1, 1].
-    fn difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N;
+    fn rounded_difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N;
     /// Rounds the sum of a number and a product.
     fn add_product<N: Number>(number: N, product: N::WideSum) -> N;
     /// Rounds the difference of a number and a product.
@@ -15,20 +15,20 @@ pub(super) trait Rounding {
     /// Rounds a number plus the product `more` minus the product `less`.
     fn add_and_subtract<N: Number>(number: N, more: N::WideSum, less: N::WideSum) -> N;
     /// Negates a number.
-    fn negative<N: Number>(number: N) -> N;
+    fn negated<N: Number>(number: N) -> N;
 }
 
 /// Rounding with saturation, for sums that may leave the range of a word.
-pub(super) enum Saturating {}
+pub(super) enum SaturatingRounding {}
 
-impl Rounding for Saturating {
+impl Rounding for SaturatingRounding {
     #[inline(always)]
-    fn sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
+    fn rounded_sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
         N::rounded_sum(lhs, rhs)
     }
 
     #[inline(always)]
-    fn difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
+    fn rounded_difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
         N::rounded_difference(lhs, rhs)
     }
 
@@ -48,22 +48,22 @@ impl Rounding for Saturating {
     }
 
     #[inline(always)]
-    fn negative<N: Number>(number: N) -> N {
-        number.negative()
+    fn negated<N: Number>(number: N) -> N {
+        number.negated()
     }
 }
 
 /// Rounding without saturation, for sums that are known to fit a word.
-pub(super) enum Bounded {}
+pub(super) enum NonSaturatingRounding {}
 
-impl Rounding for Bounded {
+impl Rounding for NonSaturatingRounding {
     #[inline(always)]
-    fn sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
+    fn rounded_sum<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
         N::round_bounded(N::bounded_plus(lhs, rhs))
     }
 
     #[inline(always)]
-    fn difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
+    fn rounded_difference<N: Number>(lhs: N::WideSum, rhs: N::WideSum) -> N {
         N::round_bounded(N::bounded_minus(lhs, rhs))
     }
 
@@ -83,7 +83,7 @@ impl Rounding for Bounded {
     }
 
     #[inline(always)]
-    fn negative<N: Number>(number: N) -> N {
+    fn negated<N: Number>(number: N) -> N {
         number.bounded_negative()
     }
 }

@@ -6,7 +6,7 @@ use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::{Accumulator, Q1_14};
 
-use crate::sine::{FINE_FRACTION_BITS, fine_sine_cosine, sine_cosine};
+use crate::sine::{PRECISE_SINE_FRACTION_BITS, precise_sine_cosine, sine_cosine};
 
 /// The result type of a kernel, and the number type of its computation.
 pub trait Scalar: Copy {
@@ -25,11 +25,11 @@ pub trait Number: Copy + Debug + PartialEq {
     type WideSum: Copy;
     /// The type for constants, which are computed once when a kernel is created. For integers a constant is a number of
     /// steps; the size of a step is passed to [`Number::round_constant`].
-    type FineNumber: Copy
-        + Add<Output = Self::FineNumber>
-        + Sub<Output = Self::FineNumber>
-        + Mul<Output = Self::FineNumber>
-        + Neg<Output = Self::FineNumber>;
+    type UnroundedConstant: Copy
+        + Add<Output = Self::UnroundedConstant>
+        + Sub<Output = Self::UnroundedConstant>
+        + Mul<Output = Self::UnroundedConstant>
+        + Neg<Output = Self::UnroundedConstant>;
 
     /// Converts a word of the parameters to a number.
     fn from_word(word: Q1_14) -> Self;
@@ -61,7 +61,7 @@ pub trait Number: Copy + Debug + PartialEq {
     }
     /// Negates a number.
     #[must_use]
-    fn negative(self) -> Self;
+    fn negated(self) -> Self;
     /// Adds two sums whose result is known to fit a word.
     fn bounded_plus(lhs: Self::WideSum, rhs: Self::WideSum) -> Self::WideSum {
         Self::plus(lhs, rhs)
@@ -88,27 +88,27 @@ pub trait Number: Copy + Debug + PartialEq {
     /// Negates a number that is known not to be the smallest word.
     #[must_use]
     fn bounded_negative(self) -> Self {
-        self.negative()
+        self.negated()
     }
     /// Returns the length of a vector in steps of 2^-14, rounded up; `None` if it is unknown.
-    fn norm(vector: [Self; 3]) -> Option<u32>;
+    fn norm_upper_bound(vector: [Self; 3]) -> Option<u32>;
     /// Returns sine and cosine of an angle in quarter turns.
     fn sine_cosine(angle: Q1_14) -> [Self; 2];
     /// Adds two angles in quarter turns. The sum wraps into one turn.
     #[must_use]
-    fn plus_angle(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
+    fn add_angles(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
         lhs.wrapping_add(rhs)
     }
 
     /// Converts a word of the parameters for the computation of a constant.
-    fn fine_from_word(word: Q1_14) -> Self::FineNumber;
+    fn unrounded_from_word(word: Q1_14) -> Self::UnroundedConstant;
     /// Returns the sine and cosine of an angle in quarter turns, and one, all in the same steps: 2^-28 for integers.
-    fn fine_sine_cosine_one(angle: Q1_14) -> [Self::FineNumber; 3];
+    fn unrounded_sine_cosine_one(angle: Q1_14) -> [Self::UnroundedConstant; 3];
     /// Rounds a computed constant to a number. For integers, the constant is in steps of 2^-F.
-    fn round_constant<const F: u32>(constant: Self::FineNumber) -> Self;
+    fn round_constant<const F: u32>(constant: Self::UnroundedConstant) -> Self;
 }
 
-/// A 16-bit number in the format Q1.14, for computations with [`Steps`].
+/// A 16-bit number in the format Q1.14, for computations with [`FixedPoint`].
 pub trait Word: Copy + Debug + PartialEq {
     /// Creates the number from a word.
     fn from_word(word: Q1_14) -> Self;
@@ -155,10 +155,10 @@ impl Word for Q1_14 {
 }
 
 impl<W: Word> Scalar for W {
-    type Number = Steps<W>;
+    type Number = FixedPoint<W>;
 
     #[inline]
-    fn from_number(number: Steps<W>) -> Self {
+    fn from_number(number: FixedPoint<W>) -> Self {
         let [low, high, ..] = number.steps.to_le_bytes();
         Self::from_word(Q1_14::from_bits(i16::from_le_bytes([low, high])))
     }
@@ -167,12 +167,12 @@ impl<W: Word> Scalar for W {
 /// A number within the range of a word, in steps of 2^-14. It is stored in 32 bits, the width of a register. Products
 /// and sums also take 32 bits.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Steps<W> {
+pub struct FixedPoint<W> {
     steps: i32,
     of: PhantomData<W>,
 }
 
-impl<W> Steps<W> {
+impl<W> FixedPoint<W> {
     #[inline]
     const fn new(steps: i32) -> Self {
         Self { steps, of: PhantomData }
@@ -192,7 +192,7 @@ impl<W> Steps<W> {
 /// Rounds steps of 2^-28 to steps of 2^-14, ties up. The shift is done in two parts, so that the added half is small
 /// enough for an immediate operand of the processor.
 #[inline]
-const fn to_steps(sum: i32) -> i32 {
+const fn round_to_steps(sum: i32) -> i32 {
     ((sum >> 13) + 1) >> 1
 }
 
@@ -204,11 +204,11 @@ fn debug_assert_fits_word(steps: i32) -> i32 {
 }
 
 /// Half a step of 2^-14 in steps of 2^-28.
-const HALF: i32 = 1 << 13;
+const HALF_STEP: i32 = 1 << 13;
 
-impl<W: Word> Number for Steps<W> {
+impl<W: Word> Number for FixedPoint<W> {
     type WideSum = i32;
-    type FineNumber = i64;
+    type UnroundedConstant = i64;
 
     #[inline]
     fn from_word(word: Q1_14) -> Self {
@@ -241,7 +241,7 @@ impl<W: Word> Number for Steps<W> {
     #[inline]
     fn round(sum: i32) -> Self {
         W::record_operation(|done| done.roundings += 1);
-        Self::saturate_sum(sum.saturating_add(HALF))
+        Self::saturate_sum(sum.saturating_add(HALF_STEP))
     }
 
     /// The sum of a number and a product is at most 2^29 + 2^30 steps of 2^-28, so 32 bits suffice.
@@ -250,8 +250,11 @@ impl<W: Word> Number for Steps<W> {
         W::record_operation(|done| {
             (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1)
         });
-        debug_assert!(lhs.checked_add(rhs).and_then(|sum| sum.checked_add(HALF)).is_some(), "{lhs} + {rhs}");
-        Self::saturate_sum(lhs.wrapping_add(rhs).wrapping_add(HALF))
+        debug_assert!(
+            lhs.checked_add(rhs).and_then(|sum| sum.checked_add(HALF_STEP)).is_some(),
+            "{lhs} + {rhs}"
+        );
+        Self::saturate_sum(lhs.wrapping_add(rhs).wrapping_add(HALF_STEP))
     }
 
     #[inline]
@@ -259,8 +262,11 @@ impl<W: Word> Number for Steps<W> {
         W::record_operation(|done| {
             (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1)
         });
-        debug_assert!(lhs.checked_sub(rhs).and_then(|sum| sum.checked_add(HALF)).is_some(), "{lhs} - {rhs}");
-        Self::saturate_sum(lhs.wrapping_sub(rhs).wrapping_add(HALF))
+        debug_assert!(
+            lhs.checked_sub(rhs).and_then(|sum| sum.checked_add(HALF_STEP)).is_some(),
+            "{lhs} - {rhs}"
+        );
+        Self::saturate_sum(lhs.wrapping_sub(rhs).wrapping_add(HALF_STEP))
     }
 
     #[inline]
@@ -278,7 +284,7 @@ impl<W: Word> Number for Steps<W> {
     #[inline]
     fn round_bounded(sum: i32) -> Self {
         W::record_operation(|done| done.roundings += 1);
-        Self::new(debug_assert_fits_word(to_steps(sum)))
+        Self::new(debug_assert_fits_word(round_to_steps(sum)))
     }
 
     #[inline]
@@ -286,7 +292,7 @@ impl<W: Word> Number for Steps<W> {
         W::record_operation(|done| {
             (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1)
         });
-        Self::new(debug_assert_fits_word(self.steps + to_steps(product)))
+        Self::new(debug_assert_fits_word(self.steps + round_to_steps(product)))
     }
 
     #[inline]
@@ -294,7 +300,7 @@ impl<W: Word> Number for Steps<W> {
         W::record_operation(|done| {
             (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1)
         });
-        Self::new(debug_assert_fits_word(self.steps + to_steps(product.wrapping_neg())))
+        Self::new(debug_assert_fits_word(self.steps + round_to_steps(product.wrapping_neg())))
     }
 
     #[inline]
@@ -304,7 +310,7 @@ impl<W: Word> Number for Steps<W> {
         Self::new(-self.steps)
     }
 
-    fn norm(vector: [Self; 3]) -> Option<u32> {
+    fn norm_upper_bound(vector: [Self; 3]) -> Option<u32> {
         // At most 3 * 2^30.
         let square: u32 = vector.iter().map(|it| it.steps.unsigned_abs().pow(2)).sum();
         Some(square.isqrt() + 1)
@@ -312,7 +318,7 @@ impl<W: Word> Number for Steps<W> {
 
     /// Negates the number. The smallest word becomes the largest.
     #[inline]
-    fn negative(self) -> Self {
+    fn negated(self) -> Self {
         W::record_operation(|done| done.negations += 1);
         let negative = -self.steps;
         Self::new(if negative > 0x7FFF { 0x7FFF } else { negative })
@@ -325,18 +331,18 @@ impl<W: Word> Number for Steps<W> {
     }
 
     #[inline]
-    fn plus_angle(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
+    fn add_angles(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
         W::record_operation(|done| done.angle_additions += 1);
         lhs.wrapping_add(rhs)
     }
 
-    fn fine_from_word(word: Q1_14) -> i64 {
+    fn unrounded_from_word(word: Q1_14) -> i64 {
         i64::from(word.to_bits())
     }
 
-    fn fine_sine_cosine_one(angle: Q1_14) -> [i64; 3] {
-        let [sine, cosine] = fine_sine_cosine(angle);
-        [sine, cosine, 1 << FINE_FRACTION_BITS]
+    fn unrounded_sine_cosine_one(angle: Q1_14) -> [i64; 3] {
+        let [sine, cosine] = precise_sine_cosine(angle);
+        [sine, cosine, 1 << PRECISE_SINE_FRACTION_BITS]
     }
 
     fn round_constant<const F: u32>(constant: i64) -> Self {

@@ -25,10 +25,12 @@ use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
 use self::fold::constant_wrench;
-use self::range::bound;
+use self::range::moment_bound;
 use super::joint::Joint;
-use super::rounding::{Bounded, Rounding, Saturating};
-use super::{Kernel, Number, Scalar, Twist, chain, cold_path, constant_sine_cosine, length};
+use super::rounding::{NonSaturatingRounding, Rounding, SaturatingRounding};
+use super::{
+    Kernel, Number, Scalar, Twist, checked_chain_rows, cold_path, constant_sine_cosine, nonzero_length,
+};
 use crate::contact::{MAX_JACOBIAN_STEPS, TorqueRounding};
 
 /// The wrench kernel of one cell.
@@ -62,11 +64,11 @@ struct PerComponent<T> {
 type UsedComponents = PerComponent<bool>;
 
 impl UsedComponents {
-    const NOTHING: Self = Self { force: [false; 3], moment: [false; 3] };
-    const ALL: Self = Self { force: [true; 3], moment: [true; 3] };
+    const NONE_USED: Self = Self { force: [false; 3], moment: [false; 3] };
+    const ALL_USED: Self = Self { force: [true; 3], moment: [true; 3] };
 
     /// Applies a function to the components of the force and to those of the moment.
-    fn map(self, before: impl Fn([bool; 3]) -> [bool; 3]) -> Self {
+    fn map_vectors(self, before: impl Fn([bool; 3]) -> [bool; 3]) -> Self {
         Self { force: before(self.force), moment: before(self.moment) }
     }
 }
@@ -94,7 +96,7 @@ struct ChainLink<N> {
 impl<S: Scalar> Wrench<S> {
     /// Returns an upper bound of |J| in steps of 2^-14, for any joint positions; [`MAX_JACOBIAN_STEPS`] if it is unknown.
     #[must_use]
-    pub const fn bound(&self) -> u16 {
+    pub const fn jacobian_bound(&self) -> u16 {
         self.bound
     }
 
@@ -109,7 +111,7 @@ impl<S: Scalar> Wrench<S> {
         Self {
             joint: 0,
             contact: PerComponent { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] },
-            links: const { [ChainLink::NOTHING; MAX_ROWS] },
+            links: const { [ChainLink::UNUSED_LINK; MAX_ROWS] },
             rows: 0,
             bound: MAX_JACOBIAN_STEPS,
             rounding: TorqueRounding::new(TorqueFormat::default(), MAX_JACOBIAN_STEPS),
@@ -119,8 +121,8 @@ impl<S: Scalar> Wrench<S> {
     /// Prepares the kernel for these parameters. This is done in place, because a kernel is too large for a small
     /// stack.
     pub(crate) fn prepare(&mut self, parameters: &Parameters) {
-        let chain = chain(parameters);
-        let mut read = UsedComponents::NOTHING; // by the rows further down: nothing below joint 1
+        let chain = checked_chain_rows(parameters);
+        let mut read = UsedComponents::NONE_USED; // by the rows further down: nothing below joint 1
         let mut joints = Joint::ALL.into_iter().peekable();
         for (index, link) in self.links.iter_mut().enumerate() {
             let row = chain.get(index).copied().unwrap_or_default();
@@ -135,19 +137,19 @@ impl<S: Scalar> Wrench<S> {
         let is_fixed = |row: Option<&Row>| row.is_some_and(|row| row.kind == RowKind::Fixed);
         while is_fixed(rows.checked_sub(1).and_then(|last| chain.get(last))) {
             let above: ChainLink<S::Number> =
-                ChainLink::new(&chain.get(rows - 1).copied().unwrap_or_default(), UsedComponents::ALL).0;
+                ChainLink::new(&chain.get(rows - 1).copied().unwrap_or_default(), UsedComponents::ALL_USED).0;
             rows -= 1;
             above.turn_by_offset(&mut contact);
             if let Some(row) = rows.checked_sub(1).and_then(|last| chain.get(last)) {
                 // Without the position of a prismatic joint.
-                let link = ChainLink::new(row, UsedComponents::ALL).0;
-                link.twist_and_shift::<Saturating>(&mut contact, length(row.d));
+                let link = ChainLink::new(row, UsedComponents::ALL_USED).0;
+                link.twist_and_shift::<SaturatingRounding>(&mut contact, nonzero_length(row.d));
             }
         }
         self.links.get_mut(..rows).unwrap_or_default().reverse();
         let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
         let below = chain.get(..rows.saturating_sub(1)).unwrap_or_default();
-        self.bound = if slides { None } else { bound(&contact, below) }.unwrap_or(MAX_JACOBIAN_STEPS);
+        self.bound = if slides { None } else { moment_bound(&contact, below) }.unwrap_or(MAX_JACOBIAN_STEPS);
         self.rounding = TorqueRounding::new(parameters.torque_format, self.bound);
         self.joint = if rows == 0 { 0 } else { parameters.joint.into() };
         (self.contact, self.rows) = (contact, rows);
@@ -170,7 +172,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
             let moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
             let positions = joints.get(..self.joint).unwrap_or_default().iter().rev();
             cold_path();
-            down_saturating(self.contact, links, moving, positions);
+            write_jacobian_saturating(self.contact, links, moving, positions);
         }
     }
 }
@@ -187,31 +189,33 @@ fn write_jacobian_bounded<S: Scalar>(
     let mut links = links.iter();
     let Some(mut link) = links.next() else { return };
     loop {
-        let (Some(row), Some(position)) = (link.joint.get_mut(jacobian), link.joint.get(joints)) else {
+        let (Some(row), Some(position)) =
+            (link.joint.element_of_mut(jacobian), link.joint.element_of(joints))
+        else {
             return;
         };
         let [.., moment] = wrench.moment;
         *row = S::from_number(moment);
         let Some(next) = links.next() else { return };
-        link.turn::<Bounded>(&mut wrench, *position);
+        link.turn_about_z::<NonSaturatingRounding>(&mut wrench, *position);
         link = next;
-        if link.is_due(due::TWIST_OR_NO_JOINT) {
-            while link.is_due(due::NO_JOINT) {
+        if link.has_due_bit(due::HAS_TWIST_OR_NO_JOINT) {
+            while link.has_due_bit(due::HAS_NO_JOINT) {
                 cold_path();
-                link.apply_fixed(&mut wrench);
+                link.apply_fixed_row(&mut wrench);
                 let Some(next) = links.next() else { return };
                 link = next;
             }
-            link.twist_by_alpha::<Bounded>(&mut wrench);
+            link.twist_by_alpha::<NonSaturatingRounding>(&mut wrench);
         }
         // Only now, because it would delay the twist.
-        ChainLink::shift::<Bounded>(&mut wrench, link.own_d(), link.own_a());
+        ChainLink::shift_moment::<NonSaturatingRounding>(&mut wrench, link.offset_d(), link.length_a());
     }
 }
 
 /// Like [`down_bounded`], with saturation, for any chain.
 #[inline(never)]
-fn down_saturating<'a, S: Scalar + 'a>(
+fn write_jacobian_saturating<'a, S: Scalar + 'a>(
     mut wrench: PerComponent<S::Number>,
     links: &[ChainLink<S::Number>],
     mut moving: impl Iterator<Item = &'a mut S>,
@@ -225,22 +229,22 @@ fn down_saturating<'a, S: Scalar + 'a>(
         let slide = (link.kind == RowKind::Prismatic).then_some(position);
         if index > 0 {
             let d = slide.map_or_else(
-                || link.own_d(),
+                || link.offset_d(),
                 |slide| Some(S::Number::from_word(link.d.saturating_add(slide))),
             );
-            link.twist_and_shift::<Saturating>(&mut wrench, d);
+            link.twist_and_shift::<SaturatingRounding>(&mut wrench, d);
         } else if let Some(slide) = slide {
             // The own row is folded without the position of its joint.
             let d = Some(S::Number::from_word(slide));
-            ChainLink::shift::<Saturating>(&mut wrench, d, None);
+            ChainLink::shift_moment::<SaturatingRounding>(&mut wrench, d, None);
         }
         let PerComponent { force: [.., force], moment: [.., moment] } = wrench;
         if let Some(row) = &mut row {
             **row = S::from_number(if slide.is_some() { force } else { moment });
         }
         match link.kind {
-            RowKind::Revolute if link.is_due(due::ALL_ROTATION) => {
-                link.turn::<Saturating>(&mut wrench, position)
+            RowKind::Revolute if link.has_due_bit(due::TURN_RESULTS_MASK) => {
+                link.turn_about_z::<SaturatingRounding>(&mut wrench, position)
             }
             RowKind::Revolute => {}
             RowKind::Prismatic | RowKind::Fixed => link.turn_by_offset(&mut wrench),
@@ -250,7 +254,7 @@ fn down_saturating<'a, S: Scalar + 'a>(
 
 impl<N: Number> ChainLink<N> {
     /// The initial value of links that are not in use.
-    const NOTHING: Self = {
+    const UNUSED_LINK: Self = {
         let (joint, kind, zero) = (Joint::J1, RowKind::Revolute, Q1_14::ZERO);
         Self { due: 0, joint, kind, a: zero, d: zero, offset: zero, twist: Twist::None, constant: None }
     };
@@ -266,7 +270,8 @@ impl<N: Number> ChainLink<N> {
         let slides = row.kind == RowKind::Prismatic;
 
         // Backwards: the turn, the shift (whose m_z is J), the twist.
-        let shifted = if turns || constant.is_some() { read.map(needed_before_turn) } else { read };
+        let shifted =
+            if turns || constant.is_some() { read.map_vectors(needed_components_before_turn) } else { read };
         let ([fx, fy, mut fz], [mx, my, mut mz]) = (shifted.force, shifted.moment);
         (fz, mz) = (fz || slides, mz || turns);
         let moves = slides || d;
@@ -277,65 +282,65 @@ impl<N: Number> ChainLink<N> {
         let [_, twisted_fy, twisted_fz] = twisted.force;
         let ([turned_fx, turned_fy, _], [turned_mx, turned_my, _]) = (read.force, read.moment);
         let due = [
-            (turned_fx, due::TURNED_FX),
-            (turned_fy, due::TURNED_FY),
-            (turned_mx, due::TURNED_MX),
-            (turned_my, due::TURNED_MY),
-            ((mx || my) && moves, due::SHIFT_BY_D),
-            ((my || mz) && a, due::SHIFT_BY_A),
-            (twisted_fy, due::TWISTED_FY),
-            (twisted_fz, due::TWISTED_FZ),
-            (my, due::TWISTED_MY),
-            (mz, due::TWISTED_MZ),
-            (twist == Twist::Ahead, due::QUARTER_TURN),
-            (twist == Twist::Back, due::QUARTER_TURN_BACK),
-            (twist == Twist::Half, due::HALF_TURN),
-            (row.kind == RowKind::Fixed, due::NO_JOINT),
-            (row.kind == RowKind::Fixed || twist != Twist::None, due::TWIST_OR_NO_JOINT),
-            (turned_fx && turned_fy && turned_mx && turned_my, due::ALL),
+            (turned_fx, due::NEEDS_TURNED_FX),
+            (turned_fy, due::NEEDS_TURNED_FY),
+            (turned_mx, due::NEEDS_TURNED_MX),
+            (turned_my, due::NEEDS_TURNED_MY),
+            ((mx || my) && moves, due::NEEDS_SHIFT_BY_D),
+            ((my || mz) && a, due::NEEDS_SHIFT_BY_A),
+            (twisted_fy, due::NEEDS_TWISTED_FY),
+            (twisted_fz, due::NEEDS_TWISTED_FZ),
+            (my, due::NEEDS_TWISTED_MY),
+            (mz, due::NEEDS_TWISTED_MZ),
+            (twist == Twist::Ahead, due::TWISTS_QUARTER_TURN),
+            (twist == Twist::Back, due::TWISTS_QUARTER_TURN_BACK),
+            (twist == Twist::Half, due::TWISTS_HALF_TURN),
+            (row.kind == RowKind::Fixed, due::HAS_NO_JOINT),
+            (row.kind == RowKind::Fixed || twist != Twist::None, due::HAS_TWIST_OR_NO_JOINT),
+            (turned_fx && turned_fy && turned_mx && turned_my, due::ALL_TURN_RESULTS_READ),
         ];
         let due = due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all });
         let (kind, offset) = (row.kind, row.theta_offset);
         let link = Self { kind, joint: Joint::J1, due, twist, a: row.a, d: row.d, offset, constant };
-        (link, twisted.map(|live| needed_before_twist(twist, live)))
+        (link, twisted.map_vectors(|live| needed_components_before_twist(twist, live)))
     }
 
-    fn is_due(&self, bit: u32) -> bool {
+    fn has_due_bit(&self, bit: u32) -> bool {
         self.due & bit != 0
     }
 
     /// Returns the offset d; `None` if no row reads the shift by d, or if d includes the position of a prismatic joint.
     #[inline(always)]
-    fn own_d(&self) -> Option<N> {
-        self.is_due(due::SHIFT_BY_D).then(|| N::from_word(self.d))
+    fn offset_d(&self) -> Option<N> {
+        self.has_due_bit(due::NEEDS_SHIFT_BY_D).then(|| N::from_word(self.d))
     }
 
     /// Returns the length a; `None` if no row reads the shift by a.
     #[inline(always)]
-    fn own_a(&self) -> Option<N> {
-        self.is_due(due::SHIFT_BY_A).then(|| N::from_word(self.a))
+    fn length_a(&self) -> Option<N> {
+        self.has_due_bit(due::NEEDS_SHIFT_BY_A).then(|| N::from_word(self.a))
     }
 
     /// Transforms the wrench by `Tz(d) Tx(a) Rx(alpha)`.
     #[inline(always)]
     fn twist_and_shift<R: Rounding>(&self, wrench: &mut PerComponent<N>, d: Option<N>) {
         self.twist_by_alpha::<R>(wrench);
-        Self::shift::<R>(wrench, d, self.own_a());
+        Self::shift_moment::<R>(wrench, d, self.length_a());
     }
 
     /// Transforms the wrench by `Rx(alpha)`.
     #[inline(always)]
     fn twist_by_alpha<R: Rounding>(&self, wrench: &mut PerComponent<N>) {
         let PerComponent { force: [_, fy, fz], moment: [_, my, mz] } = wrench;
-        if self.is_due(due::QUARTER_TURN) {
-            (*fy, *fz) = (R::negative(*fz), *fy);
-            (*my, *mz) = (R::negative(*mz), *my);
-        } else if self.is_due(due::QUARTER_TURN_BACK) {
-            (*fy, *fz) = (*fz, R::negative(*fy));
-            (*my, *mz) = (*mz, R::negative(*my));
-        } else if self.is_due(due::HALF_TURN) {
-            (*fy, *fz) = (R::negative(*fy), R::negative(*fz));
-            (*my, *mz) = (R::negative(*my), R::negative(*mz));
+        if self.has_due_bit(due::TWISTS_QUARTER_TURN) {
+            (*fy, *fz) = (R::negated(*fz), *fy);
+            (*my, *mz) = (R::negated(*mz), *my);
+        } else if self.has_due_bit(due::TWISTS_QUARTER_TURN_BACK) {
+            (*fy, *fz) = (*fz, R::negated(*fy));
+            (*my, *mz) = (*mz, R::negated(*my));
+        } else if self.has_due_bit(due::TWISTS_HALF_TURN) {
+            (*fy, *fz) = (R::negated(*fy), R::negated(*fz));
+            (*my, *mz) = (R::negated(*my), R::negated(*mz));
         } else if let Twist::Other { sine, cosine } = self.twist {
             cold_path();
             self.twist_by([sine, cosine], wrench);
@@ -350,23 +355,23 @@ impl<N: Number> ChainLink<N> {
         let along = |y: N, z: N| N::rounded_difference(cosine.times(y), sine.times(z));
         let across = |y: N, z: N| N::rounded_sum(sine.times(y), cosine.times(z));
         let PerComponent { force: [_, new_fy, new_fz], moment: [_, new_my, new_mz] } = wrench;
-        if self.is_due(due::TWISTED_FY) {
+        if self.has_due_bit(due::NEEDS_TWISTED_FY) {
             *new_fy = along(fy, fz);
         }
-        if self.is_due(due::TWISTED_FZ) {
+        if self.has_due_bit(due::NEEDS_TWISTED_FZ) {
             *new_fz = across(fy, fz);
         }
-        if self.is_due(due::TWISTED_MY) {
+        if self.has_due_bit(due::NEEDS_TWISTED_MY) {
             *new_my = along(my, mz);
         }
-        if self.is_due(due::TWISTED_MZ) {
+        if self.has_due_bit(due::NEEDS_TWISTED_MZ) {
             *new_mz = across(my, mz);
         }
     }
 
     /// Moves the point about which the moment is taken by (a, 0, d) towards the base.
     #[inline(always)]
-    fn shift<R: Rounding>(wrench: &mut PerComponent<N>, d: Option<N>, a: Option<N>) {
+    fn shift_moment<R: Rounding>(wrench: &mut PerComponent<N>, d: Option<N>, a: Option<N>) {
         let PerComponent { force: [fx, fy, fz], moment: [mx, my, mz] } = wrench;
         match (d, a) {
             (None, None) => {}
@@ -389,28 +394,28 @@ impl<N: Number> ChainLink<N> {
     /// Transforms the wrench by `Rz(theta)` of a revolute joint at this position. Computes only the components that are
     /// read later.
     #[inline(always)]
-    fn turn<R: Rounding>(&self, wrench: &mut PerComponent<N>, position: Q1_14) {
-        let turn = Rotation(N::sine_cosine(N::plus_angle(position, self.offset)));
-        if self.is_due(due::ALL) {
-            turn.apply_all::<R>(wrench);
+    fn turn_about_z<R: Rounding>(&self, wrench: &mut PerComponent<N>, position: Q1_14) {
+        let turn = Rotation(N::sine_cosine(N::add_angles(position, self.offset)));
+        if self.has_due_bit(due::ALL_TURN_RESULTS_READ) {
+            turn.rotate_all_components::<R>(wrench);
         } else {
-            turn.apply_due::<R>(wrench, self.due);
+            turn.rotate_due_components::<R>(wrench, self.due);
         }
     }
 
     /// Transforms the wrench by `Rz(theta_offset)` of a row without a revolute joint.
     fn turn_by_offset(&self, wrench: &mut PerComponent<N>) {
         if let Some(turn) = self.constant
-            && self.is_due(due::ALL_ROTATION)
+            && self.has_due_bit(due::TURN_RESULTS_MASK)
         {
-            Rotation(turn).apply_due::<Saturating>(wrench, self.due);
+            Rotation(turn).rotate_due_components::<SaturatingRounding>(wrench, self.due);
         }
     }
 
     /// Transforms the wrench by a whole row without a joint.
     #[inline(never)]
-    fn apply_fixed(&self, wrench: &mut PerComponent<N>) {
-        self.twist_and_shift::<Saturating>(wrench, self.own_d());
+    fn apply_fixed_row(&self, wrench: &mut PerComponent<N>) {
+        self.twist_and_shift::<SaturatingRounding>(wrench, self.offset_d());
         self.turn_by_offset(wrench);
     }
 }
@@ -422,17 +427,17 @@ impl<N: Number> Rotation<N> {
     #[inline(always)]
     fn rotated_x<R: Rounding>(&self, x: N, y: N) -> N {
         let Self([sine, cosine]) = self;
-        R::difference(cosine.times(x), sine.times(y))
+        R::rounded_difference(cosine.times(x), sine.times(y))
     }
 
     #[inline(always)]
     fn rotated_y<R: Rounding>(&self, x: N, y: N) -> N {
         let Self([sine, cosine]) = self;
-        R::sum(sine.times(x), cosine.times(y))
+        R::rounded_sum(sine.times(x), cosine.times(y))
     }
 
     #[inline(always)]
-    fn apply_all<R: Rounding>(
+    fn rotate_all_components<R: Rounding>(
         &self,
         PerComponent { force: [fx, fy, _], moment: [mx, my, _] }: &mut PerComponent<N>,
     ) {
@@ -442,26 +447,26 @@ impl<N: Number> Rotation<N> {
 
     /// Computes only the results of the turn whose bits are set in `due`.
     #[inline(always)]
-    fn apply_due<R: Rounding>(&self, wrench: &mut PerComponent<N>, due: u32) {
+    fn rotate_due_components<R: Rounding>(&self, wrench: &mut PerComponent<N>, due: u32) {
         let PerComponent { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
         let PerComponent { force: [new_fx, new_fy, _], moment: [new_mx, new_my, _] } = wrench;
-        if due & due::TURNED_FX != 0 {
+        if due & due::NEEDS_TURNED_FX != 0 {
             *new_fx = self.rotated_x::<R>(fx, fy);
         }
-        if due & due::TURNED_FY != 0 {
+        if due & due::NEEDS_TURNED_FY != 0 {
             *new_fy = self.rotated_y::<R>(fx, fy);
         }
-        if due & due::TURNED_MX != 0 {
+        if due & due::NEEDS_TURNED_MX != 0 {
             *new_mx = self.rotated_x::<R>(mx, my);
         }
-        if due & due::TURNED_MY != 0 {
+        if due & due::NEEDS_TURNED_MY != 0 {
             *new_my = self.rotated_y::<R>(mx, my);
         }
     }
 }
 
 /// Returns the components before a twist that are needed to compute the given components after it.
-fn needed_before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
+fn needed_components_before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
     match twist {
         Twist::None | Twist::Half => [x, y, z],
         Twist::Ahead | Twist::Back => [x, z, y],
@@ -470,6 +475,6 @@ fn needed_before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
 }
 
 /// Returns the components before a turn about z that are needed to compute the given components after it.
-fn needed_before_turn([x, y, z]: [bool; 3]) -> [bool; 3] {
+fn needed_components_before_turn([x, y, z]: [bool; 3]) -> [bool; 3] {
     [x || y, x || y, z]
 }

@@ -26,7 +26,7 @@ use protocol::port::{Hello, PORTS, PortMessage, TreeRank, UPLINK};
 use protocol::time::{Micros, Span};
 
 use crate::phase;
-use node_ids::NodeIds;
+use node_ids::NodeIdState;
 use port::Port;
 
 /// Interval of hellos.
@@ -34,18 +34,18 @@ const HELLO_INTERVAL: Span = Span::from_millis(250);
 /// Maximum time to wait for the answer to a join before another port is tried.
 const JOIN_TIMEOUT: Span = Span::from_millis(5);
 /// Intervals between local repairs: the first, and the maximum.
-const REPAIR_INTERVALS: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
+const MIN_AND_MAX_REPAIR_INTERVAL: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
 /// Interval at which a leave to the gateway's side is repeated until it is acknowledged. The gateway's side accepts
 /// sums until then.
 const LEAVE_INTERVAL: Span = Span::from_millis(20);
 /// Number of ports, including a root's wire to the gateway's side.
-const ALL_PORTS: usize = PORTS + 1;
+const PORT_COUNT_WITH_UPLINK: usize = PORTS + 1;
 /// Capacity for outgoing messages. The caller collects them after every call.
 const OUTBOX_CAPACITY: usize = 32;
 
 /// The reason for the loss of a parent. It determines whether the parent may still accept sums of this cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(crate) enum LossReason {
+pub(crate) enum ParentLossReason {
     /// The parent did not accept the last sums, or rejects this cell as its child. It accepts no more sums.
     Done,
     /// The link fails in one direction, or the parent itself is unreachable. The parent may accept sums until it
@@ -87,8 +87,8 @@ pub(crate) struct Network {
     wired: u8,
     /// Ports whose messages are ignored; bit p stands for port p.
     pub(crate) ignored_ports: u8,
-    node_ids: NodeIds,
-    ports: [Port; ALL_PORTS],
+    node_ids: NodeIdState,
+    ports: [Port; PORT_COUNT_WITH_UPLINK],
     parent: Option<Parent>,
     /// The best rank that this cell has ever had. It accepts a parent only with a better rank.
     best: Option<TreeRank>,
@@ -124,7 +124,7 @@ impl Network {
     /// Sets the ports that have wires. The serial number spreads the hellos of many cells over time.
     pub(crate) fn set_wired_ports(&mut self, wired: u8, number: Option<CellId>, serial: u32) {
         (self.wired, self.node_ids.own) = (wired, number);
-        self.next_hello = self.next_hello + phase::offset_by_serial(HELLO_INTERVAL, serial);
+        self.next_hello = self.next_hello + phase::send_offset_by_serial(HELLO_INTERVAL, serial);
     }
 
     /// Returns true if the cell has wires.
@@ -133,7 +133,7 @@ impl Network {
     }
 
     /// Returns true if a port has a wire and its messages are not ignored.
-    pub(crate) const fn receives(&self, port: usize) -> bool {
+    pub(crate) const fn is_receiving_port(&self, port: usize) -> bool {
         self.wired & !self.ignored_ports & 1 << port != 0
     }
 
@@ -149,16 +149,16 @@ impl Network {
 
     /// Returns the rank that this cell announces to cells below it.
     fn rank(&self) -> Option<TreeRank> {
-        self.parent.map(|parent| parent.rank.child())
+        self.parent.map(|parent| parent.rank.child_rank())
     }
 
     /// Returns the round of the cell's rank.
-    pub(crate) fn round(&self) -> u8 {
+    pub(crate) fn rank_round(&self) -> u8 {
         self.best.map_or(0, |rank| rank.round)
     }
 
     /// Returns the parent's node id, 0 for the gateway's side; `None` without a parent.
-    pub(crate) fn parent_node(&self) -> Option<u8> {
+    pub(crate) fn parent_node_id(&self) -> Option<u8> {
         match self.parent_port()? {
             UPLINK => Some(0),
             port => self.node_id_at(port).map(CellId::get),
@@ -176,13 +176,13 @@ impl Network {
     }
 
     /// Returns the port of the child with this node id.
-    pub(crate) fn child_with(&self, number: CellId) -> Option<usize> {
+    pub(crate) fn child_port_of(&self, number: CellId) -> Option<usize> {
         (0..PORTS).find(|&port| self.is_child(port) && self.node_id_at(port) == Some(number))
     }
 
     /// Returns true if no former parent can accept sums of this cell any more: there is none, or it has acknowledged
     /// the leave.
-    pub(crate) fn is_released(&self) -> bool {
+    pub(crate) fn is_former_parent_released(&self) -> bool {
         self.former_parent.is_none_or(|former_parent| former_parent.acknowledged)
     }
 
@@ -201,7 +201,7 @@ impl Network {
 
     /// Returns a mask of the working ports: bit p is set if port p works in both directions.
     pub(crate) fn working_port_mask(&self, now: Micros) -> u8 {
-        self.port_mask(|port| port.works(now))
+        self.port_mask(|port| port.is_working(now))
     }
 
     fn port_mask(&self, target: impl Fn(&Port) -> bool) -> u8 {
@@ -215,13 +215,13 @@ impl Network {
     }
 
     /// Returns true if the state of any port has changed since the last call.
-    pub(crate) fn ports_changed(&mut self, now: Micros) -> bool {
+    pub(crate) fn poll_ports_changed(&mut self, now: Micros) -> bool {
         let states = self.port_states(now);
         self.reported.replace(states) != Some(states)
     }
 
     /// Returns the node id that a walk has assigned to this cell, once; `None` afterwards.
-    pub(crate) const fn take_assigned(&mut self) -> Option<CellId> {
+    pub(crate) const fn take_assigned_id(&mut self) -> Option<CellId> {
         self.node_ids.given.take()
     }
 
@@ -252,14 +252,14 @@ impl Network {
     }
 
     fn send_hello(&mut self, now: Micros, port: usize) {
-        let hears = self.ports.get(port).is_some_and(|port| port.hello(now).is_some());
+        let hears = self.ports.get(port).is_some_and(|port| port.recent_hello(now).is_some());
         let hello = Hello {
             version: VERSION,
             number: self.node_ids.own.map_or(0, CellId::get),
             port: port.to_le_bytes()[0],
             receives: hears,
             is_parent: self.parent_port() == Some(port),
-            unnumbered: self.is_unnumbered(),
+            unnumbered: self.lacks_node_ids(),
             rank: self.rank(),
         };
         if hello.rank.is_some() {
@@ -270,24 +270,24 @@ impl Network {
 
     fn send_hellos(&mut self, now: Micros) {
         self.announced = self.rank();
-        for port in 0..ALL_PORTS {
+        for port in 0..PORT_COUNT_WITH_UPLINK {
             self.send_hello(now, port);
         }
     }
 
     /// Handles a message that arrived at a port, except the messages `State` and `Nack` about sums.
-    pub(crate) fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
+    pub(crate) fn handle_message(&mut self, now: Micros, port: usize, message: PortMessage) {
         match message {
             PortMessage::Hello(hello) => self.handle_hello(now, port, hello),
             PortMessage::Join => self.handle_join(now, port),
             PortMessage::Grant(rank) => self.handle_grant(now, port, rank),
             PortMessage::Refuse if self.parent_port() == Some(port) => {
-                self.lose_parent(now, LossReason::Done)
+                self.handle_parent_loss(now, ParentLossReason::Done)
             }
             PortMessage::Refuse if self.joining.is_some_and(|(requested, _)| requested == port) => {
-                self.reject_port(now, port);
+                self.distrust_port(now, port);
                 self.joining = None;
-                self.search(now);
+                self.search_parent(now);
             }
             PortMessage::Leave => {
                 self.ports.get_mut(port).into_iter().for_each(|port| port.child = None);
@@ -303,7 +303,7 @@ impl Network {
             PortMessage::Return(walk) => self.continue_walk(port, walk),
             PortMessage::Refuse | PortMessage::NodeId(_) | PortMessage::State(_) | PortMessage::Nack(_) => {}
         }
-        self.report_unnumbered(now);
+        self.report_missing_node_ids(now);
     }
 
     fn handle_hello(&mut self, now: Micros, port: usize, hello: Hello) {
@@ -324,26 +324,26 @@ impl Network {
         }
         match self.parent {
             Some(parent) if parent.port == port => match hello.rank {
-                _ if !hello.receives => self.lose_parent(now, LossReason::Unsure),
+                _ if !hello.receives => self.handle_parent_loss(now, ParentLossReason::Unsure),
                 // The parent is as near as before, nearer, or of a later round.
                 Some(rank) if !parent.rank.is_better_than(rank) => self.set_parent(now, port, rank),
                 // The parent is unreachable and repairs its route. This cell helps, and its sums are NACKed
                 // meanwhile.
                 None => self.forward_repair(now, port, parent.rank.round),
                 // The parent restarted.
-                Some(_) => self.lose_parent(now, LossReason::Unsure),
+                Some(_) => self.handle_parent_loss(now, ParentLossReason::Unsure),
             },
             Some(parent) => self.join_better_parent(now, port, parent),
-            None => self.search(now),
+            None => self.search_parent(now),
         }
     }
 
     /// Sends now the hellos that would be due by the time `until`, so that the cell need not wake up for them.
     pub(crate) fn send_hellos_due_by(&mut self, now: Micros, until: Micros) {
         if self.has_wires() && until >= self.next_hello {
-            self.next_hello = phase::next_due(self.next_hello, HELLO_INTERVAL, now);
+            self.next_hello = phase::next_send_time(self.next_hello, HELLO_INTERVAL, now);
             let before = self.child_mask();
-            self.ports.iter_mut().for_each(|port| port.expire_child(now));
+            self.ports.iter_mut().for_each(|port| port.remove_silent_child(now));
             self.tree_changed |= before != self.child_mask();
             self.send_hellos(now);
         }
@@ -357,7 +357,7 @@ impl Network {
     }
 
     /// Handles timers that are due at `now`. Does nothing if called early.
-    pub(crate) fn handle_time(&mut self, now: Micros) {
+    pub(crate) fn handle_timeout(&mut self, now: Micros) {
         if !self.has_wires() {
             return;
         }
@@ -371,24 +371,25 @@ impl Network {
             });
             self.send(former_parent.port, PortMessage::Leave);
         }
-        let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());
+        let silent =
+            |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.recent_hello(now).is_none());
         if self.parent.as_ref().is_some_and(silent) {
             if self.parent_port() == Some(UPLINK) {
                 // The gateway's side may notice it later, and accepts sums until then.
                 self.joining = Some((UPLINK, now + HELLO_INTERVAL));
             }
-            self.lose_parent(now, LossReason::Unsure);
+            self.handle_parent_loss(now, ParentLossReason::Unsure);
         }
         if self.parent.is_none() {
-            self.search(now);
+            self.search_parent(now);
         } else {
             self.joining.take_if(|(_, requested)| now.elapsed_since(*requested) >= JOIN_TIMEOUT);
         }
-        self.report_unnumbered(now);
+        self.report_missing_node_ids(now);
     }
 
     /// Announces to the parent that it is to receive the sums from this epoch on.
-    pub(crate) fn send_state(&mut self, epoch: Epoch) {
+    pub(crate) fn announce_sums_to_parent(&mut self, epoch: Epoch) {
         if let Some(up) = self.parent_port().filter(|up| *up != UPLINK) {
             self.send(up, PortMessage::State(epoch));
         }

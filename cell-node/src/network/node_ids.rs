@@ -9,7 +9,7 @@ use super::port::Port;
 
 /// The cell's node id, and the state of an assignment walk in the part of the tree below it.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct NodeIds {
+pub(super) struct NodeIdState {
     /// The cell's node id, if it has one.
     pub(super) own: Option<CellId>,
     /// The node id that a walk has assigned to this cell and that has not been read yet.
@@ -21,8 +21,8 @@ pub(super) struct NodeIds {
 }
 
 impl Network {
-    pub(super) fn is_unnumbered(&self) -> bool {
-        self.node_ids.own.is_none() || self.ports.iter().any(Port::is_unnumbered)
+    pub(super) fn lacks_node_ids(&self) -> bool {
+        self.node_ids.own.is_none() || self.ports.iter().any(Port::lacks_node_ids)
     }
 
     /// Starts a walk at this cell: the cell takes the first free node id if it has none. The walk then visits each
@@ -50,7 +50,7 @@ impl Network {
     }
 
     fn walk_from(&mut self, first: usize, walk: NodeIdWalk) {
-        let wants = |port: &usize| self.ports.get(*port).is_some_and(Port::is_unnumbered);
+        let wants = |port: &usize| self.ports.get(*port).is_some_and(Port::lacks_node_ids);
         let next = (first..PORTS).find(wants).filter(|_| walk.first <= walk.last);
         self.node_ids.walking = next.map(|at| (walk, at));
         match (next, self.parent_port()) {
@@ -60,8 +60,8 @@ impl Network {
         }
     }
 
-    pub(super) fn report_unnumbered(&mut self, now: Micros) {
-        let unnumbered = self.is_unnumbered();
+    pub(super) fn report_missing_node_ids(&mut self, now: Micros) {
+        let unnumbered = self.lacks_node_ids();
         if core::mem::replace(&mut self.node_ids.was_unnumbered, unnumbered) != unnumbered
             && let Some(up) = self.parent_port()
         {

@@ -26,7 +26,7 @@ pub(super) struct Port {
 impl Port {
     /// Records a hello. Returns true if no hello arrived shortly before it.
     pub(super) fn record_hello(&mut self, now: Micros, hello: Hello) -> bool {
-        let restarted = self.hello(now).is_none();
+        let restarted = self.recent_hello(now).is_none();
         self.last_hello = Some((hello, now));
         // The child has had time to learn of the grant but names another parent.
         let forgot =
@@ -38,7 +38,7 @@ impl Port {
     }
 
     /// Returns the last hello, unless it is so old that the port counts as disconnected.
-    pub(super) fn hello(&self, now: Micros) -> Option<&Hello> {
+    pub(super) fn recent_hello(&self, now: Micros) -> Option<&Hello> {
         self.last_hello
             .as_ref()
             .filter(|(_, at)| now.elapsed_since(*at) <= HELLO_TIMEOUT)
@@ -46,15 +46,17 @@ impl Port {
     }
 
     /// Returns true if the port works in both directions, and the cell at the other end uses the same protocol version.
-    pub(super) fn works(&self, now: Micros) -> bool {
-        self.hello(now).is_some_and(|hello| hello.receives && hello.version == VERSION)
+    pub(super) fn is_working(&self, now: Micros) -> bool {
+        self.recent_hello(now).is_some_and(|hello| hello.receives && hello.version == VERSION)
     }
 
     /// Returns the rank of the cell at the other end; `None` if that cell cannot be a parent.
     pub(super) fn rank(&self, now: Micros) -> Option<TreeRank> {
         let at = self.last_hello.map(|(_, at)| at)?;
         let trusted = self.distrusted.is_none_or(|since| at > since);
-        self.hello(now).filter(|_| trusted && self.works(now) && self.child.is_none()).and_then(|it| it.rank)
+        self.recent_hello(now)
+            .filter(|_| trusted && self.is_working(now) && self.child.is_none())
+            .and_then(|it| it.rank)
     }
 
     /// Returns the node id of the cell at the other end; `None` if it is unknown.
@@ -63,16 +65,16 @@ impl Port {
     }
 
     /// Returns true if the cell at the other end is a child that has no node id, or has a cell without one below it.
-    pub(super) fn is_unnumbered(&self) -> bool {
+    pub(super) fn lacks_node_ids(&self) -> bool {
         self.child.is_some() && self.last_hello.is_some_and(|(hello, _)| hello.unnumbered)
     }
 
     /// Returns true if a new round must be announced at this port at once, because a child or an unreachable cell is
     /// there.
-    pub(super) fn needs_round(&self, now: Micros) -> bool {
+    pub(super) fn must_announce_round(&self, now: Micros) -> bool {
         self.child.is_some()
             || self.round_requested
-            || self.hello(now).is_some_and(|hello| hello.rank.is_none())
+            || self.recent_hello(now).is_some_and(|hello| hello.rank.is_none())
     }
 
     pub(super) const fn is_child(&self) -> bool {
@@ -80,8 +82,8 @@ impl Port {
     }
 
     /// Ends the role of the other end as a child if its hellos have stopped.
-    pub(super) fn expire_child(&mut self, now: Micros) {
-        if self.hello(now).is_none() {
+    pub(super) fn remove_silent_child(&mut self, now: Micros) {
+        if self.recent_hello(now).is_none() {
             self.child = None;
         }
     }
@@ -93,7 +95,7 @@ impl Port {
 
     /// Returns the state of the port for network page 4.
     pub(super) fn state(&self, now: Micros) -> PortState {
-        let Some(hello) = self.hello(now) else { return PortState::default() };
+        let Some(hello) = self.recent_hello(now) else { return PortState::default() };
         PortState {
             number: hello.number,
             port: hello.port,

@@ -4,11 +4,14 @@ use protocol::port::{PortMessage, TreeRank, UPLINK};
 use protocol::time::{Micros, Span};
 
 use super::port::Port;
-use super::{ALL_PORTS, FormerParent, JOIN_TIMEOUT, LossReason, Network, Parent, REPAIR_INTERVALS};
+use super::{
+    FormerParent, JOIN_TIMEOUT, MIN_AND_MAX_REPAIR_INTERVAL, Network, PORT_COUNT_WITH_UPLINK, Parent,
+    ParentLossReason,
+};
 
 impl Network {
     /// Returns true if the cell can change its parent without losing sums: none are sent, or the parent is unreachable.
-    const fn may_move(&self) -> bool {
+    const fn may_change_parent(&self) -> bool {
         !self.busy || self.parent_unreachable
     }
 
@@ -16,7 +19,7 @@ impl Network {
     pub(super) fn join_better_parent(&mut self, now: Micros, port: usize, parent: Parent) {
         let rank = self.ports.get(port).and_then(|port| port.rank(now));
         let nearer = rank.is_some_and(|rank| rank.is_better_than(parent.rank));
-        if nearer && self.may_move() && self.joining.is_none() {
+        if nearer && self.may_change_parent() && self.joining.is_none() {
             self.joining = Some((port, now));
             self.send(port, PortMessage::Join);
         }
@@ -29,7 +32,7 @@ impl Network {
         if before == self.parent {
             return;
         }
-        let own = rank.child();
+        let own = rank.child_rank();
         self.best = Some(own);
         self.parent_unreachable = false;
         let offered = self.announced.replace(own);
@@ -38,8 +41,8 @@ impl Network {
         if !is_as_deep && !self.busy {
             return self.send_hellos(now);
         }
-        for port in (0..ALL_PORTS).filter(|_| offered != Some(own)) {
-            if self.ports.get(port).is_some_and(|port| port.needs_round(now)) {
+        for port in (0..PORT_COUNT_WITH_UPLINK).filter(|_| offered != Some(own)) {
+            if self.ports.get(port).is_some_and(|port| port.must_announce_round(now)) {
                 self.send_hello(now, port);
             }
         }
@@ -72,7 +75,8 @@ impl Network {
         if self.parent_port() == Some(port) {
             return;
         }
-        let moves = self.parent.is_none_or(|parent| self.may_move() && rank.is_better_than(parent.rank));
+        let moves =
+            self.parent.is_none_or(|parent| self.may_change_parent() && rank.is_better_than(parent.rank));
         if !moves || !self.is_better_than_best(rank) {
             return self.send(port, PortMessage::Leave);
         }
@@ -91,23 +95,23 @@ impl Network {
     }
 
     /// Handles the loss of the parent, and searches for another route.
-    pub(crate) fn lose_parent(&mut self, now: Micros, how: LossReason) {
+    pub(crate) fn handle_parent_loss(&mut self, now: Micros, how: ParentLossReason) {
         let Some(parent) = self.parent.take() else { return };
         self.tree_changed = true;
         self.parent_unreachable = false;
-        self.former_parent = Some(FormerParent::new(parent.port, how == LossReason::Done, now));
+        self.former_parent = Some(FormerParent::new(parent.port, how == ParentLossReason::Done, now));
         self.send(parent.port, PortMessage::Leave);
-        self.reject_port(now, parent.port);
-        self.search(now);
+        self.distrust_port(now, parent.port);
+        self.search_parent(now);
     }
 
-    pub(super) fn reject_port(&mut self, now: Micros, port: usize) {
+    pub(super) fn distrust_port(&mut self, now: Micros, port: usize) {
         self.ports.get_mut(port).into_iter().for_each(|port| port.distrusted = Some(now));
     }
 
     /// Sends a join to the port with the best rank, if it is better than any rank that this cell has had. Otherwise
     /// starts a local repair.
-    pub(super) fn search(&mut self, now: Micros) {
+    pub(super) fn search_parent(&mut self, now: Micros) {
         if self.parent.is_some() {
             return;
         }
@@ -116,7 +120,7 @@ impl Network {
                 return;
             }
             self.joining = None;
-            self.reject_port(now, requested);
+            self.distrust_port(now, requested);
         }
         let ranked = || self.ports.iter().enumerate().filter_map(|(port, it)| Some((port, it.rank(now)?)));
         let good = ranked().filter(|(_, rank)| self.is_better_than_best(*rank));
@@ -128,22 +132,22 @@ impl Network {
         }
         // A cell that never had a rank accepts any rank, so it waits for the first hello with one.
         let Some(best) = self.best else { return };
-        let (at, wait) = self.repair.unwrap_or((now, REPAIR_INTERVALS.0));
+        let (at, wait) = self.repair.unwrap_or((now, MIN_AND_MAX_REPAIR_INTERVAL.0));
         if now >= at {
-            self.repair = Some((now + wait, Span(wait.0 * 2).min(REPAIR_INTERVALS.1)));
+            self.repair = Some((now + wait, Span(wait.0 * 2).min(MIN_AND_MAX_REPAIR_INTERVAL.1)));
             // If no other port leads to the gateway, or the first repair found no route, it may be through a
             // child or a former parent.
-            let is_first = wait == REPAIR_INTERVALS.0;
+            let is_first = wait == MIN_AND_MAX_REPAIR_INTERVAL.0;
             let leads = self.ports.iter().any(|port| port.rank(now).is_some());
-            self.repair_at(now, best.round, None, !(leads && is_first));
+            self.request_later_round(now, best.round, None, !(leads && is_first));
         }
     }
 
     /// Requests a round later than `round`: on the ports that lead to the gateway, or on all working ports if `all` is
     /// true. The port `but` is excluded.
-    fn repair_at(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
-        for port in (0..ALL_PORTS).filter(|port| Some(*port) != but) {
-            let leads = |port: &Port| port.rank(now).is_some() || (all && port.works(now));
+    fn request_later_round(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
+        for port in (0..PORT_COUNT_WITH_UPLINK).filter(|port| Some(*port) != but) {
+            let leads = |port: &Port| port.rank(now).is_some() || (all && port.is_working(now));
             if self.ports.get(port).is_some_and(leads) {
                 self.send(port, PortMessage::Repair(round));
             }
@@ -164,14 +168,16 @@ impl Network {
         // A repair that went to the parent only does not count for a deserted cell: the parent may have two
         // wires to this cell, and repair on both.
         let again = |(of, everywhere, at)| {
-            of == round && now.elapsed_since(at) < REPAIR_INTERVALS.0 && (everywhere || !is_deserted)
+            of == round
+                && now.elapsed_since(at) < MIN_AND_MAX_REPAIR_INTERVAL.0
+                && (everywhere || !is_deserted)
         };
         if self.forwarded_repair.is_some_and(again) {
             return;
         }
         self.forwarded_repair = Some((round, is_deserted, now));
         if is_deserted {
-            self.repair_at(now, round, Some(port), true);
+            self.request_later_round(now, round, Some(port), true);
         } else {
             self.send(parent.port, PortMessage::Repair(round));
         }

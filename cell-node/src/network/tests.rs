@@ -32,17 +32,17 @@ fn neighbour(number: u8, rank: Option<TreeRank>) -> Hello {
 /// Returns a cell that has joined a parent of this rank at port 0, at a time in ms.
 fn below(at: u64, parent: TreeRank) -> Network {
     let mut network = network(0b1111);
-    network.handle(Micros(at * MS), 0, PortMessage::Hello(neighbour(1, Some(parent))));
+    network.handle_message(Micros(at * MS), 0, PortMessage::Hello(neighbour(1, Some(parent))));
     assert_eq!(asked(&mut network), [(0, PortMessage::Join)]);
-    network.handle(Micros(at * MS), 0, PortMessage::Grant(parent));
+    network.handle_message(Micros(at * MS), 0, PortMessage::Grant(parent));
     assert_eq!((asked(&mut network), network.parent_port()), (vec![], Some(0)));
     network
 }
 
 /// Makes the cell at this port a child of the tested cell.
 fn adopt(network: &mut Network, now: Micros, port: usize, number: u8) {
-    network.handle(now, port, PortMessage::Hello(neighbour(number, None)));
-    network.handle(now, port, PortMessage::Join);
+    network.handle_message(now, port, PortMessage::Hello(neighbour(number, None)));
+    network.handle_message(now, port, PortMessage::Join);
     assert!(network.is_child(port));
     said(network);
 }
@@ -52,7 +52,7 @@ fn adopt(network: &mut Network, now: Micros, port: usize, number: u8) {
 fn a_port_receives_when_it_is_wired_and_its_link_is_not_down() {
     let mut network = network(0b0011);
     network.ignored_ports = 0b0110;
-    assert_eq!([0, 1, 2, 3].map(|port| network.receives(port)), [true, false, false, false]);
+    assert_eq!([0, 1, 2, 3].map(|port| network.is_receiving_port(port)), [true, false, false, false]);
 }
 
 // HELLO-3
@@ -60,7 +60,7 @@ fn a_port_receives_when_it_is_wired_and_its_link_is_not_down() {
 fn a_port_leads_to_the_cell_whose_hellos_come_there() {
     let mut network = network(0b1111);
     let hello = Hello { port: 2, receives: false, ..neighbour(7, None) };
-    network.handle(Micros(0), 1, PortMessage::Hello(hello));
+    network.handle_message(Micros(0), 1, PortMessage::Hello(hello));
     let there = PortState { number: 7, port: 2, receives: true, works: false, other_version: false };
     let nothing = PortState::default();
     assert_eq!(network.port_states(Micros(600 * MS)), [nothing, there, nothing, nothing]);
@@ -73,12 +73,12 @@ fn only_the_parent_refuses_a_child_and_begins_a_walk() {
     let now = Micros(100 * MS);
     let mut network = below(100, rank(1, 1));
     let walk = NodeIdWalk { walk: 1, first: 20, last: 30 };
-    network.handle(now, 1, PortMessage::Refuse);
-    network.handle(now, 1, PortMessage::NodeId(walk));
+    network.handle_message(now, 1, PortMessage::Refuse);
+    network.handle_message(now, 1, PortMessage::NodeId(walk));
     assert_eq!((said(&mut network), network.parent_port()), (vec![], Some(0)));
-    network.handle(now, 0, PortMessage::NodeId(walk));
+    network.handle_message(now, 0, PortMessage::NodeId(walk));
     assert_eq!(said(&mut network), [(0, PortMessage::Return(walk))]);
-    network.handle(now, 0, PortMessage::Refuse);
+    network.handle_message(now, 0, PortMessage::Refuse);
     assert_eq!((asked(&mut network).first(), network.parent_port()), (Some(&(0, PortMessage::Leave)), None));
 }
 
@@ -87,9 +87,9 @@ fn only_the_parent_refuses_a_child_and_begins_a_walk() {
 fn a_lost_parent_is_asked_again_after_a_later_hello() {
     let now = Micros(100 * MS);
     let mut network = below(100, rank(1, 1));
-    network.handle(now, 0, PortMessage::Refuse);
+    network.handle_message(now, 0, PortMessage::Refuse);
     assert!(!asked(&mut network).contains(&(0, PortMessage::Join)), "its hello is from before");
-    network.handle(Micros(now.0 + 1), 0, PortMessage::Hello(neighbour(1, Some(rank(1, 1)))));
+    network.handle_message(Micros(now.0 + 1), 0, PortMessage::Hello(neighbour(1, Some(rank(1, 1)))));
     assert_eq!(asked(&mut network), [(0, PortMessage::Join)]);
 }
 
@@ -98,11 +98,11 @@ fn a_lost_parent_is_asked_again_after_a_later_hello() {
 fn a_port_that_does_not_answer_a_join_is_left_for_the_next() {
     let mut network = network(0b1111);
     for (port, depth) in [(2, 3), (1, 2), (3, 4)] {
-        network.handle(Micros(MS), port, PortMessage::Hello(neighbour(1, Some(rank(1, depth)))));
+        network.handle_message(Micros(MS), port, PortMessage::Hello(neighbour(1, Some(rank(1, depth)))));
     }
     assert_eq!(asked(&mut network), [(2, PortMessage::Join)], "the first that was heard");
     for (now, joins) in [(5_999, None), (6_000, Some(1)), (10_999, None), (11_000, Some(3))] {
-        network.handle_time(Micros(now));
+        network.handle_timeout(Micros(now));
         let expected: Vec<_> = joins.into_iter().map(|port| (port, PortMessage::Join)).collect();
         assert_eq!(asked(&mut network), expected, "{now} us");
     }
@@ -132,7 +132,7 @@ fn a_grant_is_taken_while_it_is_good_enough_and_no_sums_are_sent() {
     let after = |busy, granted| {
         let mut network = below(100, rank(1, 3));
         network.busy = busy;
-        network.handle(now, 1, PortMessage::Grant(granted));
+        network.handle_message(now, 1, PortMessage::Grant(granted));
         (asked(&mut network), network.parent_port())
     };
     assert_eq!(after(false, rank(1, 2)), (vec![(0, PortMessage::Leave)], Some(1)), "nearer");
@@ -141,9 +141,9 @@ fn a_grant_is_taken_while_it_is_good_enough_and_no_sums_are_sent() {
     // Without a parent, the rank must be better than the cell's own.
     for (granted, up) in [(rank(1, 4), None), (rank(1, 3), Some(1))] {
         let mut network = below(100, rank(1, 3));
-        network.handle(now, 0, PortMessage::Refuse);
+        network.handle_message(now, 0, PortMessage::Refuse);
         said(&mut network);
-        network.handle(now, 1, PortMessage::Grant(granted));
+        network.handle_message(now, 1, PortMessage::Grant(granted));
         assert_eq!(network.parent_port(), up);
     }
 }
@@ -157,7 +157,11 @@ fn the_tree_changes_with_the_node_id_of_the_parent_or_a_child() {
     let mut changes = |port, number, up| {
         network.tree_changed = false;
         let rank = Some(rank(1, 1)).filter(|_| port == 0);
-        network.handle(now, port, PortMessage::Hello(Hello { is_parent: up, ..neighbour(number, rank) }));
+        network.handle_message(
+            now,
+            port,
+            PortMessage::Hello(Hello { is_parent: up, ..neighbour(number, rank) }),
+        );
         network.tree_changed
     };
     assert_eq!([changes(0, 1, false), changes(1, 7, true)], [false; 2], "they are the same");
@@ -170,12 +174,12 @@ fn the_tree_changes_with_the_node_id_of_the_parent_or_a_child() {
 fn a_leave_is_repeated_every_quarter_of_a_second_until_it_is_acknowledged() {
     let mut network = below(100, rank(1, 1));
     let deaf = Hello { receives: false, ..neighbour(1, Some(rank(1, 1))) };
-    network.handle(Micros(100 * MS), 0, PortMessage::Hello(deaf));
+    network.handle_message(Micros(100 * MS), 0, PortMessage::Hello(deaf));
     let mut leaves = |now| {
-        network.handle_time(Micros(now * MS));
+        network.handle_timeout(Micros(now * MS));
         let leaves = said(&mut network).into_iter().filter(|said| *said == (0, PortMessage::Leave)).count();
         if now == 600 {
-            network.handle(Micros(now * MS), 0, PortMessage::LeaveAck);
+            network.handle_message(Micros(now * MS), 0, PortMessage::LeaveAck);
         }
         leaves
     };
@@ -191,11 +195,11 @@ fn a_repair_goes_where_a_rank_is_and_else_to_all_ports_that_work() {
         let mut network = below(100, rank(1, 1));
         adopt(&mut network, now, 1, 7);
         if with_rank {
-            network.handle(now, 2, PortMessage::Hello(neighbour(8, Some(rank(1, 9)))));
+            network.handle_message(now, 2, PortMessage::Hello(neighbour(8, Some(rank(1, 9)))));
         }
-        network.handle(now, 0, PortMessage::Refuse);
+        network.handle_message(now, 0, PortMessage::Refuse);
         [100, 119, 120, 159, 160].map(|at| {
-            network.handle_time(Micros(at * MS));
+            network.handle_timeout(Micros(at * MS));
             let mut ports = asked(&mut network);
             ports.retain(|(_, message)| *message == PortMessage::Repair(1));
             ports.into_iter().map(|(port, _)| port).collect::<Vec<_>>()
@@ -211,7 +215,7 @@ fn a_repair_is_forwarded_to_the_parent_and_one_of_the_parent_to_all_others() {
     let mut network = below(100, rank(1, 1));
     adopt(&mut network, Micros(100 * MS), 1, 7);
     let mut forwarded = |now, port, round| {
-        network.handle(Micros(now), port, PortMessage::Repair(round));
+        network.handle_message(Micros(now), port, PortMessage::Repair(round));
         said(&mut network)
     };
     let answer = forwarded(100_000, 1, 0);
@@ -234,7 +238,7 @@ fn a_walk_goes_to_the_children_below_which_a_cell_has_no_node_id() {
     adopt(&mut network, now, 1, 7);
     adopt(&mut network, now, 2, 8);
     let unnumbered = |network: &mut Network, port, unnumbered| {
-        network.handle(
+        network.handle_message(
             now,
             port,
             PortMessage::Hello(Hello { is_parent: true, unnumbered, ..neighbour(8, None) }),
@@ -243,16 +247,16 @@ fn a_walk_goes_to_the_children_below_which_a_cell_has_no_node_id() {
             let (0, PortMessage::Hello(hello)) = said else { return None };
             Some(hello.unnumbered)
         });
-        (network.is_unnumbered(), announced)
+        (network.lacks_node_ids(), announced)
     };
     assert_eq!(unnumbered(&mut network, 2, false), (false, None));
     assert_eq!(unnumbered(&mut network, 3, true), (false, None), "no child");
     assert_eq!(unnumbered(&mut network, 2, true), (true, Some(true)));
     let walk = NodeIdWalk { walk: 1, first: 20, last: 30 };
-    network.handle(now, 0, PortMessage::NodeId(walk));
+    network.handle_message(now, 0, PortMessage::NodeId(walk));
     assert_eq!(said(&mut network), [(2, PortMessage::NodeId(walk))]);
     let rest = NodeIdWalk { first: 21, ..walk };
-    network.handle(now, 2, PortMessage::Return(rest));
+    network.handle_message(now, 2, PortMessage::Return(rest));
     assert_eq!(said(&mut network), [(0, PortMessage::Return(rest))]);
     assert_eq!(unnumbered(&mut network, 2, false), (false, Some(false)));
 }

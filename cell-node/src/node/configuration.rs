@@ -40,29 +40,33 @@ impl Configuration {
     }
 
     /// Activates the parameters from flash, unless they are invalid.
-    pub(super) fn start(&mut self, parameters: &Parameters) {
+    pub(super) fn restore_parameters(&mut self, parameters: &Parameters) {
         if parameters.check().is_ok() {
             self.activate(parameters);
         }
     }
 
     /// Returns the parameters in use; `None` if the cell is not configured.
-    pub(super) fn in_use(&self) -> Option<&ActiveParameters> {
+    pub(super) fn active_parameters(&self) -> Option<&ActiveParameters> {
         self.is_configured.then_some(&self.in_use)
     }
 
     /// Returns the hash of the parameters in use; 0 for an unconfigured cell.
-    pub(super) fn hash(&self) -> u16 {
-        self.in_use().map_or(0, |in_use| in_use.hash)
+    pub(super) fn parameters_hash(&self) -> u16 {
+        self.active_parameters().map_or(0, |in_use| in_use.hash)
     }
 
     /// Returns the words of a stored parameter: those in use, or if the cell is not configured the staged ones.
-    pub(super) fn read(&self, parameter: Parameter) -> [i16; WORDS] {
-        self.in_use().map_or(&self.staged, |in_use| &in_use.parameters).words(parameter)
+    pub(super) fn stored_parameter_words(&self, parameter: Parameter) -> [i16; WORDS] {
+        self.active_parameters().map_or(&self.staged, |in_use| &in_use.parameters).words(parameter)
     }
 
     /// Stages one parameter. Returns the staged words, or the reason of the refusal.
-    pub(super) fn stage(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Result<[i16; WORDS], i16> {
+    pub(super) fn stage_parameter(
+        &mut self,
+        parameter: Parameter,
+        words: [i16; WORDS],
+    ) -> Result<[i16; WORDS], i16> {
         self.staged.set(parameter, words).map_err(ParameterError::code)?;
         Ok(self.staged.words(parameter))
     }
@@ -71,7 +75,11 @@ impl Configuration {
     /// or have another hash.
     pub(super) fn staged_for_commit(&self, [hash, ..]: [i16; WORDS]) -> Result<&Parameters, i16> {
         self.staged.check().map_err(ParameterError::code)?;
-        if self.staged.hash() == hash.cast_unsigned() { Ok(&self.staged) } else { Err(Answer::WRONG_HASH) }
+        if self.staged.hash() == hash.cast_unsigned() {
+            Ok(&self.staged)
+        } else {
+            Err(Answer::REFUSED_WRONG_HASH)
+        }
     }
 
     /// Activates these parameters and prepares the kernel.
@@ -86,12 +94,12 @@ impl Configuration {
 
 impl ActiveParameters {
     /// Returns the packet length of joints, torques and sums for this chain.
-    pub(super) fn length(&self) -> Length {
+    pub(super) fn packet_length(&self) -> Length {
         Length::for_joints(self.parameters.joints.into())
     }
 
     /// Returns the period of the joint broadcast.
-    pub(super) fn period(&self) -> Span {
+    pub(super) fn broadcast_period(&self) -> Span {
         Span(self.parameters.period_us.into())
     }
 }

@@ -35,7 +35,7 @@ use protocol::time::{Micros, Span};
 use crate::baseline::Baseline;
 use crate::contact::{Force, Torque};
 use crate::flash::{FlashContent, FlashState};
-use crate::identity::{Identity, OWN_IDS};
+use crate::identity::{CELL_RECEIVED_ID_COUNT, Identity};
 use crate::kernel::Kernel;
 use crate::sum::SumWords;
 use claim::AddressClaim;
@@ -44,16 +44,16 @@ use outbox::Outbox;
 use parameters::{PendingStore, VolatileParameters};
 use receiver::Receiver;
 use rest::RestState;
-use sensing::{DuePages, Sensing};
-use stimuli::{Arrival, Stimuli};
-use summing::Summing;
+use sensing::{DuePages, SensorPageState};
+use stimuli::{Stimuli, StimulusOutcome};
+use summing::NetworkSums;
 use zero::ReportedBaseline;
 
-pub use claim::{CLAIM_TIME, HEARTBEAT_INTERVAL};
-pub use stimuli::MAX_PENDING;
+pub use claim::{HEARTBEAT_INTERVAL, MIN_CLAIM_TIME};
+pub use stimuli::MAX_PENDING_STIMULI;
 
 /// Maximum number of identifiers that a cell receives: those of its node id, and the sums of the cells at its ports.
-pub const MAX_RECEIVED_IDS: usize = OWN_IDS + PORTS;
+pub const MAX_RECEIVED_IDS: usize = CELL_RECEIVED_ID_COUNT + PORTS;
 
 /// The identifier of joints, which a cell receives most.
 const JOINTS: Id = Id::command(Command::Joints);
@@ -70,8 +70,8 @@ pub struct Node {
     stimuli: Stimuli,
     baseline: Baseline,
     reported: ReportedBaseline,
-    sensing: Sensing,
-    summing: Summing,
+    sensing: SensorPageState,
+    summing: NetworkSums,
     receiver: Receiver,
     received: ReceivedCounts,
     /// Stored flags of the state word, such as halted and duplicate. The other flags are added in each heartbeat.
@@ -113,11 +113,11 @@ impl Node {
             stimuli: Stimuli::default(),
             baseline: Baseline::default(),
             reported: ReportedBaseline::default(),
-            sensing: Sensing::default(),
-            summing: Summing::new(now),
+            sensing: SensorPageState::default(),
+            summing: NetworkSums::new(now),
             receiver: Receiver::new(format),
             received: ReceivedCounts::default(),
-            flags: State::default().with(State::TEST_MODE, test_mode),
+            flags: State::default().with_flags(State::TEST_MODE, test_mode),
             epoch: None,
             active: false,
             rest: RestState::default(),
@@ -131,9 +131,9 @@ impl Node {
 
     /// Loads the contents of flash, which contain the parameters.
     pub fn restore(&mut self, flash: &FlashState) {
-        self.flags = self.flags.with(State::FLASH_DAMAGED, *flash == FlashState::Damaged);
+        self.flags = self.flags.with_flags(State::FLASH_DAMAGED, *flash == FlashState::Damaged);
         if let FlashState::Valid(parameters) = flash {
-            self.configuration.start(parameters);
+            self.configuration.restore_parameters(parameters);
         }
     }
 
@@ -161,7 +161,7 @@ impl Node {
     /// Returns true if the identifiers that the cell receives, or those that must wake it, have changed since the last
     /// call.
     pub fn poll_received_ids(&mut self) -> bool {
-        let rest = self.rest.poll();
+        let rest = self.rest.poll_rest_changed();
         self.summing.poll_received_ids() || rest
     }
 
@@ -187,7 +187,7 @@ impl Node {
 
     /// Corrects the counter of sent packets for a packet that the caller collected but could not send. Packets that
     /// were collected after it must not have been sent either.
-    pub const fn handle_unsent(&mut self) {
+    pub const fn handle_unsent_packet(&mut self) {
         self.sent = self.sent.wrapping_sub(1);
     }
 
@@ -195,7 +195,7 @@ impl Node {
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
         let next = self.claim.next_heartbeat.min(self.summing.poll_timeout());
-        self.sensing_due().map_or(next, |due| next.min(due))
+        self.next_sensor_page_time().map_or(next, |due| next.min(due))
     }
 
     /// Returns the contents to write to flash, if any. The caller reports the result with [`Node::handle_stored`].
@@ -203,7 +203,7 @@ impl Node {
     pub fn poll_store(&self) -> Option<FlashContent> {
         let parameters = match self.storing.as_ref()? {
             PendingStore::Parameters(parameters, _) => Some(*parameters),
-            PendingStore::NodeId => self.configuration.in_use().map(|in_use| in_use.parameters),
+            PendingStore::NodeId => self.configuration.active_parameters().map(|in_use| in_use.parameters),
         };
         Some(FlashContent { number: self.identity.cell, parameters })
     }
@@ -219,16 +219,18 @@ impl Node {
     /// holds for joints, while the cell must wait for its children's sums after them anyway, or while it is not
     /// touched.
     #[must_use]
-    pub fn may_defer(&self, id: Id) -> bool {
+    pub fn may_receive_deferred(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {
-            return self.summing.waits_for_children || self.rest.is_deferring();
+            return self.summing.waits_for_children || self.rest.is_deferring_joints();
         }
-        self.summing.received_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
+        self.summing
+            .parent_with_received_sums()
+            .is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
 
     /// Returns the packet length of joints, torques and sums; `None` if the cell is not configured.
-    fn length(&self) -> Option<Length> {
-        self.configuration.in_use().map(ActiveParameters::length)
+    fn packet_length(&self) -> Option<Length> {
+        self.configuration.active_parameters().map(ActiveParameters::packet_length)
     }
 
     /// Returns the identifier for each of the [`HEARD`] reassembly buffers.
@@ -239,7 +241,7 @@ impl Node {
 
     /// Handles timers that are due at `now`. Does nothing if called early.
     pub fn handle_timeout(&mut self, now: Micros) {
-        self.summing.handle_time(now);
+        self.summing.handle_timeout(now);
         self.apply_network_changes(now);
         self.handle_sums(now);
         self.send_due_pages(now);
@@ -249,16 +251,16 @@ impl Node {
     /// Handles a frame that arrived `age` before `now`. Frames with identifiers that this cell does not receive are
     /// ignored.
     pub fn handle_frame(&mut self, now: Micros, age: Span, frame: &Frame) {
-        let Ok(id) = packet::data_id(frame) else {
+        let Ok(id) = packet::data_frame_id(frame) else {
             increment(&mut self.receiver.refused.foreign);
             return;
         };
-        let lengths = Lengths::for_chain(self.length());
+        let lengths = Lengths::from_chain_length(self.packet_length());
         if id == JOINTS {
             return self.handle_joints_frame(now, age, lengths, frame);
         }
         let Some(slot) = self.received_id_slots().position(|heard| heard == Some(id)) else { return };
-        let packet = self.receiver.receive(now - age, id, slot, lengths, frame);
+        let packet = self.receiver.receive_frame(now - age, id, slot, lengths, frame);
         let Some(packet) = packet.map(|packet| packet.to_packet()) else { return };
         match Message::decode(&packet) {
             Ok(message) => self.handle_message(now, age, message),
@@ -271,7 +273,7 @@ impl Node {
         if self.identity.cell.is_none() {
             return;
         }
-        let packet = self.receiver.receive(now - age, JOINTS, JOINTS_SLOT, lengths, frame);
+        let packet = self.receiver.receive_frame(now - age, JOINTS, JOINTS_SLOT, lengths, frame);
         let Some(packet) = packet else { return };
         let epoch = packet.epoch();
         let Ok(count) = read_joints(&packet, &mut self.positions) else {
@@ -282,10 +284,10 @@ impl Node {
         // Stimuli latched at joints that were too old are sent with the next ones.
         if self.received.joints != accepted {
             self.send_changed_pages(now);
-            self.report_zero();
+            self.report_zero_if_changed();
         }
         self.send_pages_before_next_joints(now);
-        self.send_before_next_joints(now);
+        self.send_due_before_next_joints(now);
     }
 
     fn handle_message(&mut self, now: Micros, age: Span, message: Message) {
@@ -294,36 +296,38 @@ impl Node {
         }
         match message {
             Message::Halt => {
-                self.flags = self.flags.with(State::HALTED, true);
+                self.flags = self.flags.with_flags(State::HALTED, true);
                 self.active = false;
             }
-            Message::Resume => self.flags = self.flags.with(State::HALTED, false),
+            Message::Resume => self.flags = self.flags.with_flags(State::HALTED, false),
             Message::Stimulus { from, page, .. } => self.handle_stimulus(from, page),
             Message::Network { page, .. } => self.handle_own_node_id(now, &page),
             // A cell does not answer until it owns its node id.
-            Message::Sync | Message::Report | Message::Configure { .. } if !self.claim.is_settled() => {}
-            Message::Sync if self.summing.sum.is_settled(now) => self.push_heartbeat(),
+            Message::Sync | Message::Report | Message::Configure { .. } if !self.claim.owns_node_id() => {}
+            Message::Sync if self.summing.sum.are_all_sums_sent(now) => self.push_heartbeat(),
             Message::Sync => {
                 self.claim.sync_waits = true;
-                self.summing.sum.schedule_check();
+                self.summing.sum.schedule_missing_check();
             }
             Message::Report => {
-                self.push_network(NetworkPage::Received(self.received));
-                self.push_network(NetworkPage::Rejected(self.receiver.refused));
-                self.push_sensors(DuePages::ALL);
-                self.push_zero();
+                self.push_network_page(NetworkPage::Received(self.received));
+                self.push_network_page(NetworkPage::Rejected(self.receiver.refused));
+                self.push_sensor_pages(DuePages::ALL);
+                self.push_zero_page();
                 if self.summing.network.has_wires() {
-                    self.push_tree(now);
-                    self.push_ports(now);
+                    self.push_tree_page(now);
+                    self.push_ports_page(now);
                 }
             }
             Message::Configure { tag, request, .. } => {
-                self.configure(now, tag, request);
+                self.handle_request(now, tag, request);
                 // A new mode starts from the present state, and a cell that leaves test mode has no contact.
                 self.send_changed_pages(now);
-                self.report_zero();
+                self.report_zero_if_changed();
             }
-            Message::Sum { torque, .. } if self.length().is_some_and(|length| torque.length() != length) => {
+            Message::Sum { torque, .. }
+                if self.packet_length().is_some_and(|length| torque.length() != length) =>
+            {
                 increment(&mut self.receiver.refused.meaning);
             }
             Message::Sum { from, epoch, torque, count } => {
@@ -348,8 +352,8 @@ impl Node {
             return;
         }
         // All frames before these joints have been received.
-        self.check_missing(now);
-        let in_use = self.configuration.in_use();
+        self.check_missing_sums(now);
+        let in_use = self.configuration.active_parameters();
         if in_use.is_some_and(|in_use| in_use.parameters.joints != count) {
             increment(&mut self.receiver.refused.meaning);
             return;
@@ -357,17 +361,17 @@ impl Node {
         // Old joints are not answered, but their stimuli are latched. Otherwise a cell that hung would keep
         // its previous contact state.
         self.epoch = Some(epoch);
-        self.stimuli.latch(epoch);
+        self.stimuli.apply_stimuli_until(epoch);
         if let Some(in_use) = in_use {
             self.baseline.process_joints(&self.stimuli.sensed.skin, in_use.parameters.period_us);
         }
-        if in_use.is_some_and(|in_use| age > in_use.period()) {
+        if in_use.is_some_and(|in_use| age > in_use.broadcast_period()) {
             increment(&mut self.received.joints_late);
             self.rest.end_rest();
             return self.summing.sum.skip_epoch();
         }
         increment(&mut self.received.joints);
-        let answers = self.claim.is_settled() && !self.flags.has(State::HALTED);
+        let answers = self.claim.owns_node_id() && !self.flags.has(State::HALTED);
         let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip_epoch() };
         let sensed = &self.stimuli.sensed.skin;
         let contact = self.baseline.net_contact(sensed);
@@ -379,7 +383,7 @@ impl Node {
             self.active = force.is_active();
             let moved = self.jacobian.get(..in_use.parameters.joint.into()).unwrap_or_default();
             let torque = force.is_active().then(|| Torque::new(moved, force));
-            self.summing.begin_epoch(now, age, (epoch, in_use.period()), torque);
+            self.summing.begin_epoch(now, age, (epoch, in_use.broadcast_period()), torque);
             return self.handle_sums(now);
         }
         self.answer_joints(epoch, force);
@@ -388,7 +392,9 @@ impl Node {
     /// Replies with the cell's own torque, for the J that has been computed. A single reply of zero marks the end of a
     /// contact.
     fn answer_joints(&mut self, epoch: Epoch, force: Force) {
-        let (Some(from), Some(in_use)) = (self.identity.cell, self.configuration.in_use()) else { return };
+        let (Some(from), Some(in_use)) = (self.identity.cell, self.configuration.active_parameters()) else {
+            return;
+        };
         if force.is_active() {
             self.active = true;
         } else if core::mem::take(&mut self.active) {
@@ -400,11 +406,11 @@ impl Node {
             // A cell of a network stays awake for its neighbours.
             return;
         } else {
-            return self.rest.count_quiet();
+            return self.rest.count_quiet_joints();
         }
         let Some(packet) = self.outbox.push() else { return };
         (packet.id, packet.epoch, packet.count) = (Id::new(Kind::Torque, Address::Cell(from)), epoch, 1);
-        packet.words = packet::Words::zeros(in_use.length());
+        packet.words = packet::Words::zeros(in_use.packet_length());
         if force.is_active() {
             let moved = self.jacobian.get(..in_use.parameters.joint.into()).unwrap_or_default();
             Torque::new(moved, force).write_words(in_use.kernel.rounding(), packet.words.as_mut_slice());
@@ -416,43 +422,44 @@ impl Node {
 
     /// Sends hellos and a heartbeat now if they are due before the next joints, so that the cell need not wake up
     /// again.
-    fn send_before_next_joints(&mut self, now: Micros) {
-        let Some(in_use) = self.configuration.in_use() else { return };
-        let next_joints = now + in_use.period();
+    fn send_due_before_next_joints(&mut self, now: Micros) {
+        let Some(in_use) = self.configuration.active_parameters() else { return };
+        let next_joints = now + in_use.broadcast_period();
         self.summing.network.send_hellos_due_by(now, next_joints);
         self.report_tree(now);
-        if self.claim.is_settled() && next_joints > self.claim.next_heartbeat {
+        if self.claim.owns_node_id() && next_joints > self.claim.next_heartbeat {
             self.send_regular_heartbeat(now);
         }
     }
 
     fn handle_stimulus(&mut self, from: StimulusStart, page: SensorPage) {
         let obeys = self.flags.has(State::TEST_MODE);
-        let arrival = if obeys { self.stimuli.push(from, page, self.epoch) } else { Arrival::Refused };
+        let arrival =
+            if obeys { self.stimuli.push_stimulus(from, page, self.epoch) } else { StimulusOutcome::Refused };
         match arrival {
-            Arrival::InTime => increment(&mut self.received.stimuli),
-            Arrival::Late => {
+            StimulusOutcome::InTime => increment(&mut self.received.stimuli),
+            StimulusOutcome::Late => {
                 increment(&mut self.received.stimuli);
                 increment(&mut self.received.stimuli_late);
             }
-            Arrival::Refused => increment(&mut self.receiver.refused.stimuli),
+            StimulusOutcome::Refused => increment(&mut self.receiver.refused.stimuli),
         }
     }
 
     /// Sets the *saturated* flag of the next heartbeat if a word that was sent is saturated.
     fn mark_saturated(&mut self, saturated: bool) {
-        self.flags = self.flags.with(State::SATURATED, saturated || self.flags.has(State::SATURATED));
+        self.flags = self.flags.with_flags(State::SATURATED, saturated || self.flags.has(State::SATURATED));
     }
 
-    fn push_network(&mut self, page: NetworkPage) {
+    fn push_network_page(&mut self, page: NetworkPage) {
         let Some(cell) = self.identity.cell else { return };
         let from = Address::Cell(cell);
-        self.push(Message::Network { from, epoch: self.epoch.unwrap_or_default(), page });
+        self.queue_message(Message::Network { from, epoch: self.epoch.unwrap_or_default(), page });
     }
 
     /// Queues a message. There is always room, because one frame causes at most four packets and the caller collects
     /// them after each frame.
-    fn push(&mut self, message: Message) {
+    fn queue_message(&mut self, message: Message) {
         let slot = self.outbox.push();
         debug_assert!(slot.is_some(), "a shell takes what is to be sent after each call");
         if let Some(packet) = slot {

@@ -25,7 +25,7 @@ impl Receiver {
     }
 
     /// Returns the packet that a frame contains or completes, if any. Joints, torques and sums have one of `lengths`.
-    pub(super) fn receive<'f>(
+    pub(super) fn receive_frame<'f>(
         &'f mut self,
         arrived: Micros,
         id: Id,

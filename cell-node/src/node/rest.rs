@@ -2,7 +2,7 @@
 
 /// Number of consecutive joints without a reply before the cell rests, so that a flickering touch does not change the
 /// receive filters each time.
-const QUIET_JOINTS: u8 = 16;
+const QUIET_JOINTS_BEFORE_REST: u8 = 16;
 
 /// The state of a cell that may rest.
 #[derive(Debug, Default)]
@@ -15,8 +15,8 @@ pub(super) struct RestState {
 
 impl RestState {
     /// Counts joints that arrived in time and needed no reply.
-    pub(super) fn count_quiet(&mut self) {
-        self.quiet = self.quiet.saturating_add(1).min(QUIET_JOINTS);
+    pub(super) fn count_quiet_joints(&mut self) {
+        self.quiet = self.quiet.saturating_add(1).min(QUIET_JOINTS_BEFORE_REST);
     }
 
     /// Ends the rest: joints wake the cell again.
@@ -25,13 +25,13 @@ impl RestState {
     }
 
     /// Returns true if joints need not wake the cell (deferred receive).
-    pub(super) const fn is_deferring(&self) -> bool {
+    pub(super) const fn is_deferring_joints(&self) -> bool {
         self.rests
     }
 
     /// Returns true if the cell has begun or ended to rest since the last call.
-    pub(super) fn poll(&mut self) -> bool {
-        let rests = self.quiet == QUIET_JOINTS;
+    pub(super) fn poll_rest_changed(&mut self) -> bool {
+        let rests = self.quiet == QUIET_JOINTS_BEFORE_REST;
         core::mem::replace(&mut self.rests, rests) != rests
     }
 }

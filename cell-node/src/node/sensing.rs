@@ -21,7 +21,7 @@ use super::{Node, VolatileParameters};
 use crate::phase;
 
 /// Number of heartbeats per page other than the skin's; such a page shows no touch and is rarely needed.
-const HEARTBEATS_PER_OTHER_PAGE: u8 = 4;
+const HEARTBEATS_PER_NON_SKIN_PAGE: u8 = 4;
 
 /// The sensor pages that are to be sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -37,7 +37,7 @@ impl DuePages {
     pub(super) const ALL: Self = Self { skin: true, acceleration: true, others: true };
 
     /// Returns true if they contain the page with this index in [`Readings::pages`].
-    const fn contain(self, index: usize) -> bool {
+    const fn contains_page(self, index: usize) -> bool {
         match index {
             0 => self.skin,
             1 => self.acceleration,
@@ -48,7 +48,7 @@ impl DuePages {
 
 /// The values that were sent last, and the time of the next page.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Sensing {
+pub(super) struct SensorPageState {
     mode: Mode,
     /// The time of the next page in continuous mode.
     due: Option<Micros>,
@@ -62,9 +62,9 @@ pub(super) struct Sensing {
     beats: u8,
 }
 
-impl Sensing {
+impl SensorPageState {
     /// Returns the pages to send after sensor values or the mode may have changed.
-    fn update(
+    fn update_due_pages(
         &mut self,
         now: Micros,
         switches: &VolatileParameters,
@@ -73,23 +73,23 @@ impl Sensing {
     ) -> DuePages {
         let VolatileParameters { sensing, events, .. } = switches;
         if *sensing != self.mode {
-            return self.switch(now, switches, cell, sensed);
+            return self.switch_mode(now, switches, cell, sensed);
         }
         if *sensing != Mode::Event {
             return DuePages::NONE;
         }
         let SensorReadings { skin, acceleration, .. } = sensed;
-        let turned = self.track(skin, events);
+        let turned = self.update_touch_states(skin, events);
         let pages = DuePages {
-            skin: *skin != self.sent.skin && (turned || has_moved(skin, &self.sent.skin, events)),
-            acceleration: is_far(acceleration, &self.sent.acceleration, events.acceleration),
+            skin: *skin != self.sent.skin && (turned || have_sensors_changed(skin, &self.sent.skin, events)),
+            acceleration: differs_by_threshold(acceleration, &self.sent.acceleration, events.acceleration),
             others: false,
         };
-        self.mark_sent(now, pages)
+        self.mark_pages_sent(now, pages)
     }
 
     /// Switches to another mode, which starts with the present contact state.
-    fn switch(
+    fn switch_mode(
         &mut self,
         now: Micros,
         switches: &VolatileParameters,
@@ -102,17 +102,17 @@ impl Sensing {
             Mode::Off => return DuePages::NONE,
             Mode::Continuous { period_ms } => {
                 let period = Span::from_millis(period_ms.into());
-                self.due = Some(now + period + phase::offset_by_node_id(period, cell));
+                self.due = Some(now + period + phase::send_offset_by_node_id(period, cell));
             }
             Mode::Event => {
-                self.track(&sensed.skin, &switches.events);
+                self.update_touch_states(&sensed.skin, &switches.events);
             }
         }
-        self.mark_sent(now, DuePages::ALL)
+        self.mark_pages_sent(now, DuePages::ALL)
     }
 
     /// Updates the touch states of contact and proximity. Returns true if one of them was touched or released.
-    fn track(&mut self, skin: &SkinSensors, events: &Events) -> bool {
+    fn update_touch_states(&mut self, skin: &SkinSensors, events: &Events) -> bool {
         let contact = self.contact.next(contact_force(skin), events.contact.to_bits(), events.hysteresis);
         let proximity = i32::from(skin.proximity.to_bits());
         let proximity = self.proximity.next(proximity, events.proximity.to_bits(), events.hysteresis);
@@ -126,10 +126,10 @@ impl Sensing {
         if self.mode == Mode::Off {
             return DuePages::NONE;
         }
-        self.beats = (self.beats + 1) % HEARTBEATS_PER_OTHER_PAGE;
+        self.beats = (self.beats + 1) % HEARTBEATS_PER_NON_SKIN_PAGE;
         let skin = self.mode == Mode::Event && self.last_sent_at != Some(now);
         let is_due = self.beats == 0;
-        self.mark_sent(now, DuePages { skin, acceleration: is_due, others: is_due })
+        self.mark_pages_sent(now, DuePages { skin, acceleration: is_due, others: is_due })
     }
 
     /// Returns the page that is due before `until` in continuous mode. Periods that have passed are skipped; the phase
@@ -142,11 +142,11 @@ impl Sensing {
             return DuePages::NONE;
         }
         let period = Span::from_millis(period_ms.into());
-        self.due = Some(phase::next_due(due, period, now));
-        self.mark_sent(now, DuePages { skin: true, ..DuePages::NONE })
+        self.due = Some(phase::next_send_time(due, period, now));
+        self.mark_pages_sent(now, DuePages { skin: true, ..DuePages::NONE })
     }
 
-    const fn mark_sent(&mut self, now: Micros, pages: DuePages) -> DuePages {
+    const fn mark_pages_sent(&mut self, now: Micros, pages: DuePages) -> DuePages {
         if pages.skin {
             self.last_sent_at = Some(now);
         }
@@ -154,15 +154,15 @@ impl Sensing {
     }
 }
 
-fn has_moved(now: &SkinSensors, sent: &SkinSensors, events: &Events) -> bool {
-    is_far(&now.contact, &sent.contact, events.contact)
-        || is_far(&now.temperature, &sent.temperature, events.temperature)
-        || is_far(&[now.proximity], &[sent.proximity], events.proximity)
+fn have_sensors_changed(now: &SkinSensors, sent: &SkinSensors, events: &Events) -> bool {
+    differs_by_threshold(&now.contact, &sent.contact, events.contact)
+        || differs_by_threshold(&now.temperature, &sent.temperature, events.temperature)
+        || differs_by_threshold(&[now.proximity], &[sent.proximity], events.proximity)
 }
 
 /// Returns true if a value differs from the sent one by at least the threshold. With a threshold of 0, any difference
 /// counts.
-fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
+fn differs_by_threshold<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
     let threshold = u32::from(threshold.to_bits().unsigned_abs().max(1));
     let far = |(now, sent): (&Q<F>, &Q<F>)| i32::from(now.to_bits()).abs_diff(sent.to_bits().into());
     now.iter().zip(sent).any(|pair| far(pair) >= threshold)
@@ -173,51 +173,55 @@ impl Node {
     pub(super) fn send_changed_pages(&mut self, now: Micros) {
         // Pages are sent only once the cell owns its node id. The comparison with the last sent values
         // ensures that no change is lost.
-        let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
+        let Some(cell) = self.identity.cell.filter(|_| self.claim.owns_node_id()) else { return };
         if self.sensing.mode == self.switches.sensing && self.sensing.mode != Mode::Event {
             return;
         }
-        let pages = self.sensing.update(now, &self.switches, cell, &self.net_readings());
-        self.push_sensors(pages);
+        let pages = self.sensing.update_due_pages(now, &self.switches, cell, &self.net_readings());
+        self.push_sensor_pages(pages);
     }
 
     /// Returns the time of the next page in continuous mode; `None` until the cell owns its node id.
-    pub(super) fn sensing_due(&self) -> Option<Micros> {
-        self.sensing.due.filter(|_| self.claim.is_settled())
+    pub(super) fn next_sensor_page_time(&self) -> Option<Micros> {
+        self.sensing.due.filter(|_| self.claim.owns_node_id())
     }
 
     /// Sends the page of continuous mode if it is due.
     pub(super) fn send_due_pages(&mut self, now: Micros) {
-        if self.sensing_due().is_some() {
+        if self.next_sensor_page_time().is_some() {
             let pages = self.sensing.due_pages(now, now + Span(1));
-            self.push_sensors(pages);
+            self.push_sensor_pages(pages);
         }
     }
 
     /// Sends a page now if it is due before the next joints, so that the cell need not wake up again. Does nothing if
     /// the period is not longer than that of joints: otherwise all cells would send at the same time in each epoch.
     pub(super) fn send_pages_before_next_joints(&mut self, now: Micros) {
-        let Some(in_use) = self.configuration.in_use() else { return };
-        let joints = in_use.period();
+        let Some(in_use) = self.configuration.active_parameters() else { return };
+        let joints = in_use.broadcast_period();
         if let Mode::Continuous { period_ms } = self.switches.sensing
             && Span::from_millis(period_ms.into()) > joints
         {
             let pages = self.sensing.due_pages(now, now + joints);
-            self.push_sensors(pages);
+            self.push_sensor_pages(pages);
         }
     }
 
     /// Sends pages with the present contact state.
-    pub(super) fn push_sensors(&mut self, pages: DuePages) {
+    pub(super) fn push_sensor_pages(&mut self, pages: DuePages) {
         if pages == DuePages::NONE {
             return;
         }
         let Some(from) = self.identity.cell else { return };
-        for (_, page) in
-            self.net_readings().pages().into_iter().enumerate().filter(|(index, _)| pages.contain(*index))
+        for (_, page) in self
+            .net_readings()
+            .simulated_pages()
+            .into_iter()
+            .enumerate()
+            .filter(|(index, _)| pages.contains_page(*index))
         {
-            self.sensing.sent.set(&page);
-            self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
+            self.sensing.sent.set_page(&page);
+            self.queue_message(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
         }
     }
 }

@@ -8,11 +8,11 @@ use protocol::message::{SensorPage, SensorReadings, StimulusStart};
 use protocol::packet::Epoch;
 
 /// Maximum number of stimuli that wait for their epoch.
-pub const MAX_PENDING: usize = 8;
+pub const MAX_PENDING_STIMULI: usize = 8;
 
 /// The result of receiving a stimulus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Arrival {
+pub(super) enum StimulusOutcome {
     /// The stimulus waits for the joints of its epoch.
     InTime,
     /// The joints of its epoch have already been accepted. The stimulus waits for the next joints.
@@ -24,7 +24,7 @@ pub(super) enum Arrival {
 /// The simulated sensors of a cell in test mode.
 #[derive(Debug, Default)]
 pub(super) struct Stimuli {
-    pending: Vec<(StimulusStart, SensorPage), MAX_PENDING>,
+    pending: Vec<(StimulusStart, SensorPage), MAX_PENDING_STIMULI>,
     /// The present contact state.
     pub(super) sensed: SensorReadings,
 }
@@ -32,22 +32,27 @@ pub(super) struct Stimuli {
 impl Stimuli {
     /// Queues a stimulus that applies from the given joints on. `last` is the epoch of the last joints that the cell
     /// accepted.
-    pub(super) fn push(&mut self, from: StimulusStart, page: SensorPage, last: Option<Epoch>) -> Arrival {
+    pub(super) fn push_stimulus(
+        &mut self,
+        from: StimulusStart,
+        page: SensorPage,
+        last: Option<Epoch>,
+    ) -> StimulusOutcome {
         let (from, arrival) = match (from, last) {
             (StimulusStart::Epoch(first), Some(last)) if last.epochs_since(first) >= 0 => {
-                (StimulusStart::Next, Arrival::Late)
+                (StimulusStart::Next, StimulusOutcome::Late)
             }
-            (from @ (StimulusStart::Epoch(_) | StimulusStart::Next), _) => (from, Arrival::InTime),
+            (from @ (StimulusStart::Epoch(_) | StimulusStart::Next), _) => (from, StimulusOutcome::InTime),
         };
-        if self.pending.push((from, page)).is_ok() { arrival } else { Arrival::Refused }
+        if self.pending.push((from, page)).is_ok() { arrival } else { StimulusOutcome::Refused }
     }
 
     /// Applies all stimuli for `epoch` or earlier epochs, in order of arrival.
-    pub(super) fn latch(&mut self, epoch: Epoch) {
+    pub(super) fn apply_stimuli_until(&mut self, epoch: Epoch) {
         self.pending.retain(|(from, page)| {
             let waits = matches!(from, StimulusStart::Epoch(first) if epoch.epochs_since(*first) < 0);
             if !waits {
-                self.sensed.set(page);
+                self.sensed.set_page(page);
             }
             waits
         });
@@ -83,10 +88,16 @@ mod tests {
     fn a_stimulus_waits_for_its_epoch_even_around_the_corner() {
         let mut stimuli = Stimuli::default();
         let last = Some(Epoch(253));
-        assert_eq!(stimuli.push(StimulusStart::Epoch(Epoch(1)), press(2.0), last), Arrival::InTime);
-        assert_eq!(stimuli.push(StimulusStart::Epoch(Epoch(255)), press(1.0), last), Arrival::InTime);
+        assert_eq!(
+            stimuli.push_stimulus(StimulusStart::Epoch(Epoch(1)), press(2.0), last),
+            StimulusOutcome::InTime
+        );
+        assert_eq!(
+            stimuli.push_stimulus(StimulusStart::Epoch(Epoch(255)), press(1.0), last),
+            StimulusOutcome::InTime
+        );
         let course = [254, 255, 0, 1, 2].map(|epoch| {
-            stimuli.latch(Epoch(epoch));
+            stimuli.apply_stimuli_until(Epoch(epoch));
             sensed(&stimuli)
         });
         assert!(course.iter().eq(&[0.0, 1.0, 1.0, 2.0, 2.0]), "{course:?}");
@@ -96,10 +107,13 @@ mod tests {
     #[test]
     fn a_late_stimulus_holds_from_the_next_joints() {
         let mut stimuli = Stimuli::default();
-        stimuli.latch(Epoch(7));
-        assert_eq!(stimuli.push(StimulusStart::Epoch(Epoch(7)), press(1.0), Some(Epoch(7))), Arrival::Late);
+        stimuli.apply_stimuli_until(Epoch(7));
+        assert_eq!(
+            stimuli.push_stimulus(StimulusStart::Epoch(Epoch(7)), press(1.0), Some(Epoch(7))),
+            StimulusOutcome::Late
+        );
         assert!(sensed(&stimuli) < 0.5, "not before the next joints");
-        stimuli.latch(Epoch(40));
+        stimuli.apply_stimuli_until(Epoch(40));
         assert!(sensed(&stimuli) > 0.5);
     }
 
@@ -107,9 +121,9 @@ mod tests {
     #[test]
     fn the_ninth_waiting_stimulus_is_refused() {
         let mut stimuli = Stimuli::default();
-        for _ in 0..MAX_PENDING {
-            assert_eq!(stimuli.push(StimulusStart::Next, press(1.0), None), Arrival::InTime);
+        for _ in 0..MAX_PENDING_STIMULI {
+            assert_eq!(stimuli.push_stimulus(StimulusStart::Next, press(1.0), None), StimulusOutcome::InTime);
         }
-        assert_eq!(stimuli.push(StimulusStart::Next, press(1.0), None), Arrival::Refused);
+        assert_eq!(stimuli.push_stimulus(StimulusStart::Next, press(1.0), None), StimulusOutcome::Refused);
     }
 }

@@ -9,27 +9,27 @@ use protocol::time::{Micros, Span};
 
 use super::{AddressClaim, Node, PendingStore};
 use crate::contact::Torque;
-use crate::network::{LossReason, Network};
-use crate::sum::{EpochStart, Sum, SumWords};
+use crate::network::{Network, ParentLossReason};
+use crate::sum::{EpochStart, SubtreeSum, SumWords};
 
 /// Increase of the tolerance, in sixteenths of an epoch. It is applied each time a parent that was lost for lack of
 /// answers acknowledges the leave, and so was alive all the time.
-const TOLERANCE_STEP: u16 = 2 * EPOCHS_PER_DECREASE;
+const PARENT_TOLERANCE_STEP: u16 = 2 * EPOCHS_PER_TOLERANCE_DECREASE;
 /// Maximum of the tolerance, in sixteenths of an epoch.
-const MAX_TOLERANCE: u16 = 12 * EPOCHS_PER_DECREASE;
+const MAX_PARENT_TOLERANCE: u16 = 12 * EPOCHS_PER_TOLERANCE_DECREASE;
 /// Number of epochs with a sum of the parent after which the tolerance has decreased by one epoch.
-const EPOCHS_PER_DECREASE: u16 = 16;
+const EPOCHS_PER_TOLERANCE_DECREASE: u16 = 16;
 /// Number of consecutive complete epochs after which joints do not wake the cell any more, but the children's sums do.
-const STEADY_EPOCHS: u8 = 8;
+const COMPLETE_EPOCHS_BEFORE_REST: u8 = 8;
 /// Maximum lateness of a check for missing sums. A check that is later than this is skipped, because the sums may still
 /// be unread in the socket.
-const MAX_CHECK_LATENESS: Span = Span::from_millis(1);
+const MAX_SUM_CHECK_LATENESS: Span = Span::from_millis(1);
 /// Minimum interval between two reports of the place in the tree (network page 3).
 const TREE_REPORT_INTERVAL: Span = Span::from_millis(50);
 
 /// The neighbour that receives the sum of an epoch.
 #[derive(Clone, Copy, Debug, Default)]
-enum EpochParent {
+enum SumReceiver {
     /// There is no parent.
     #[default]
     None,
@@ -42,7 +42,7 @@ enum EpochParent {
 
 /// The state of the reports of the place in the tree.
 #[derive(Debug, Default)]
-pub(super) struct TreeReport {
+pub(super) struct TreeReportState {
     /// True if the place in the tree has changed since the last report.
     pub(super) due: bool,
     /// The earliest time at which the next report may be sent.
@@ -53,13 +53,13 @@ pub(super) struct TreeReport {
 
 /// A cell's network part, its sums, and the state that connects the two.
 #[derive(Debug, Default)]
-pub(super) struct Summing {
+pub(super) struct NetworkSums {
     pub(super) network: Network,
-    pub(super) sum: Sum,
+    pub(super) sum: SubtreeSum,
     /// For each port, the cell whose sums are received there.
     pub(super) received: [Option<CellId>; PORTS],
     received_changed: bool,
-    parent: EpochParent,
+    parent: SumReceiver,
     /// True if the cell sent a sum in the previous epoch.
     sent_before: bool,
     /// Number of consecutive epochs without an answer of the parent. It is set while the parent may have missed a sum
@@ -76,26 +76,28 @@ pub(super) struct Summing {
     pub(super) waits_for_children: bool,
     /// Number of parent changes that the network had counted at the last read.
     changes: u16,
-    pub(super) report: TreeReport,
+    pub(super) report: TreeReportState,
 }
 
-impl Summing {
+impl NetworkSums {
     /// Creates the state of a cell without wires.
     #[inline(never)]
     pub(super) fn new(now: Micros) -> Self {
-        let report = TreeReport { due: true, next: now, round: 0 };
+        let report = TreeReportState { due: true, next: now, round: 0 };
         Self { network: Network::new(now), report, ..Self::default() }
     }
 
     /// Returns the parent if its sums are received.
-    pub(super) fn received_parent(&self) -> Option<CellId> {
+    pub(super) fn parent_with_received_sums(&self) -> Option<CellId> {
         self.received.get(self.network.parent_port()?).copied().flatten()
     }
 
     /// Returns true if the identifiers that the cell receives, or those that must wake it, have changed since the last
     /// call.
     pub(super) fn poll_received_ids(&mut self) -> bool {
-        let waits = self.steady == STEADY_EPOCHS && self.unanswered.is_none() && self.sum.awaits_children();
+        let waits = self.steady == COMPLETE_EPOCHS_BEFORE_REST
+            && self.unanswered.is_none()
+            && self.sum.awaits_children();
         self.received_changed |= core::mem::replace(&mut self.waits_for_children, waits) != waits;
         core::mem::take(&mut self.received_changed)
     }
@@ -105,22 +107,22 @@ impl Summing {
         [self.sum.poll_timeout(), look].into_iter().flatten().fold(self.network.poll_timeout(), Micros::min)
     }
 
-    pub(super) fn handle_time(&mut self, now: Micros) {
+    pub(super) fn handle_timeout(&mut self, now: Micros) {
         if self.waits_for_children && now >= self.sum.next_late_send_time() {
             // No joints arrived: from now on they wake the cell again.
             self.steady = 0;
         }
-        self.network.handle_time(now);
+        self.network.handle_timeout(now);
     }
 
     /// Handles a message from a port whose messages are not ignored.
-    fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
+    fn handle_port_message(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         let is_parent = self.network.parent_port() == Some(port);
-        self.sum.note_delay(age);
-        self.network.busy = self.sum.is_busy();
+        self.sum.note_frame_delay(age);
+        self.network.busy = self.sum.is_sending_sums();
         if let PortMessage::State(epoch) = message {
             if self.network.is_child(port) {
-                self.sum.handle_state(now, port, epoch);
+                self.sum.handle_state_message(now, port, epoch);
             }
             return;
         }
@@ -137,13 +139,13 @@ impl Summing {
         if message == PortMessage::LeaveAck
             && self.suspected.take_if(|suspected| *suspected == port).is_some()
         {
-            self.tolerance = (self.tolerance + TOLERANCE_STEP).min(MAX_TOLERANCE);
+            self.tolerance = (self.tolerance + PARENT_TOLERANCE_STEP).min(MAX_PARENT_TOLERANCE);
         }
-        self.network.handle(now, port, message);
+        self.network.handle_message(now, port, message);
     }
 
     /// Applies changes of parent and children to the sums.
-    fn follow_network(&mut self) {
+    fn update_parent_and_children(&mut self) {
         for port in (0..PORTS).filter(|&port| !self.network.is_child(port)) {
             self.sum.remove_child(port);
         }
@@ -181,27 +183,27 @@ impl Summing {
             self.network.forget_former_parent(at);
         }
         self.parent = match up {
-            None => EpochParent::None,
-            Some(UPLINK) => EpochParent::Gateway,
-            Some(port) => EpochParent::Cell { port, number: self.network.node_id_at(port), heard: false },
+            None => SumReceiver::None,
+            Some(UPLINK) => SumReceiver::Gateway,
+            Some(port) => SumReceiver::Cell { port, number: self.network.node_id_at(port), heard: false },
         };
         let begin = EpochStart {
             epoch,
             at,
             period,
             depth: self.network.depth(),
-            may_send: up.is_some() && self.network.is_released(),
+            may_send: up.is_some() && self.network.is_former_parent_released(),
             children: self.network.child_mask(),
         };
-        self.sum.begin(&begin, own.map(|torque| torque.exact_torques()).as_ref());
+        self.sum.begin_epoch(&begin, own.map(|torque| torque.exact_torques()).as_ref());
         // The age of deferred frames does not indicate a slow machine.
         if !self.waits_for_children {
-            self.sum.note_delay(age);
+            self.sum.note_frame_delay(age);
         }
         if let Some(unanswered) = self.unanswered {
             // Without an answer the parent is lost in this epoch, and a sum not sent yet may go to another
             // parent.
-            if unanswered >= self.tolerance() {
+            if unanswered >= self.parent_tolerance() {
                 self.sum.held = true;
             }
             self.probe_parent();
@@ -217,58 +219,60 @@ impl Summing {
         epoch: Epoch,
         words: SumWords,
     ) -> bool {
-        if let EpochParent::Cell { port, number, heard } = &mut self.parent
+        if let SumReceiver::Cell { port, number, heard } = &mut self.parent
             && *number == Some(from)
         {
             // A late sum of an earlier epoch also shows that the parent is alive.
-            *heard |= self.network.receives(*port);
+            *heard |= self.network.is_receiving_port(*port);
             return false;
         }
-        let Some(port) = self.network.child_with(from).filter(|&port| self.network.receives(port)) else {
+        let Some(port) =
+            self.network.child_port_of(from).filter(|&port| self.network.is_receiving_port(port))
+        else {
             return false;
         };
         // Unlike a parent's sum, a child's is not deferred.
-        self.sum.note_delay(age);
-        self.sum.receive(now, port, epoch, words);
+        self.sum.note_frame_delay(age);
+        self.sum.receive_sum(now, port, epoch, words);
         true
     }
 
     /// Sends a NACK to each child whose sum of this epoch is missing, once per epoch. Returns true if the parent counts
     /// as lost.
-    fn check_missing(&mut self, now: Micros) -> bool {
-        let Some((epoch, nack)) = self.sum.check_missing() else { return false };
+    fn nack_missing_sums(&mut self, now: Micros) -> bool {
+        let Some((epoch, nack)) = self.sum.take_missing_children() else { return false };
         for port in (0..PORTS).filter(|port| nack >> port & 1 == 1) {
             self.network.send(port, PortMessage::Nack(epoch));
         }
         let said = self.sum.was_sent_in(epoch);
-        let tolerated = self.tolerance();
+        let tolerated = self.parent_tolerance();
         let mut lost = None;
         match (&mut self.unanswered, self.parent) {
             (Some(unanswered), _) => {
                 *unanswered += 1;
                 // A cell that sent nothing in this epoch has no lease any more.
                 lost = (*unanswered > tolerated).then_some(if said {
-                    LossReason::Unsure
+                    ParentLossReason::Unsure
                 } else {
-                    LossReason::Done
+                    ParentLossReason::Done
                 });
             }
-            (None, EpochParent::Cell { heard: true, .. }) => {
+            (None, SumReceiver::Cell { heard: true, .. }) => {
                 self.tolerance = self.tolerance.saturating_sub(1)
             }
-            (None, EpochParent::Cell { heard: false, .. }) => self.unanswered = said.then_some(0),
-            (None, EpochParent::Gateway | EpochParent::None) => {}
+            (None, SumReceiver::Cell { heard: false, .. }) => self.unanswered = said.then_some(0),
+            (None, SumReceiver::Gateway | SumReceiver::None) => {}
         }
         if let Some(how) = lost {
             // The parent did not answer.
             self.unanswered = None;
             self.suspected = self.network.parent_port();
             self.sum.stop_sending();
-            self.network.lose_parent(now, how);
-            self.follow_network();
+            self.network.handle_parent_loss(now, how);
+            self.update_parent_and_children();
         }
         let well = said && nack == 0 && self.unanswered.is_none() && self.sum.awaits_children();
-        self.steady = if well { (self.steady + 1).min(STEADY_EPOCHS) } else { 0 };
+        self.steady = if well { (self.steady + 1).min(COMPLETE_EPOCHS_BEFORE_REST) } else { 0 };
         lost.is_some()
     }
 
@@ -285,8 +289,8 @@ impl Summing {
     }
 
     /// Returns the tolerated number of consecutive epochs without an answer of the parent.
-    const fn tolerance(&self) -> u16 {
-        self.tolerance.div_ceil(EPOCHS_PER_DECREASE)
+    const fn parent_tolerance(&self) -> u16 {
+        self.tolerance.div_ceil(EPOCHS_PER_TOLERANCE_DECREASE)
     }
 
     /// Sends a probe to the parent. Its answer is checked before the next joints.
@@ -294,15 +298,15 @@ impl Summing {
         if let Some(up) = self.network.parent_port() {
             self.network.send(up, PortMessage::Probe);
         }
-        self.sum.schedule_check();
+        self.sum.schedule_missing_check();
     }
 }
 
 impl Node {
     /// Handles a message that arrived at a port `age` before `now`.
     pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
-        if self.summing.network.receives(port) {
-            self.summing.handle_port(now, age, port, message);
+        if self.summing.network.is_receiving_port(port) {
+            self.summing.handle_port_message(now, age, port, message);
             self.apply_network_changes(now);
         }
     }
@@ -312,13 +316,13 @@ impl Node {
         if !self.summing.network.has_wires() {
             return;
         }
-        if let Some(cell) = self.summing.network.take_assigned() {
+        if let Some(cell) = self.summing.network.take_assigned_id() {
             self.identity.cell = Some(cell);
             self.claim = AddressClaim::new(self.identity, now);
             self.storing = Some(PendingStore::NodeId);
             self.summing.received_changed = true;
         }
-        self.summing.follow_network();
+        self.summing.update_parent_and_children();
         self.report_tree(now);
     }
 
@@ -328,17 +332,17 @@ impl Node {
         let summing = &mut self.summing;
         if let Some((epoch, SumWords { torque, count }, restarted)) = summing.sum.poll_sum(now) {
             if restarted {
-                summing.network.send_state(epoch);
+                summing.network.announce_sums_to_parent(epoch);
             }
             self.mark_saturated(torque.iter().any(|word| word.is_saturated()));
-            let length = self.length().unwrap_or_default();
+            let length = self.packet_length().unwrap_or_default();
             let torque = packet::Words::new(length, torque.map(Q7_8::to_bits));
-            self.push(Message::Sum { from, epoch, torque, count });
+            self.queue_message(Message::Sum { from, epoch, torque, count });
         }
-        let Some(late) = self.summing.sum.poll_check(now) else { return };
+        let Some(late) = self.summing.sum.poll_check_lateness(now) else { return };
         // A late check is left to the next joints, when all frames before them have been received.
-        if late <= MAX_CHECK_LATENESS {
-            self.check_missing(now);
+        if late <= MAX_SUM_CHECK_LATENESS {
+            self.check_missing_sums(now);
             if self.summing.unanswered.is_some() {
                 self.summing.probe_parent();
             }
@@ -349,8 +353,8 @@ impl Node {
     }
 
     /// Checks for missing sums of children in this epoch, once per epoch.
-    pub(super) fn check_missing(&mut self, now: Micros) {
-        if self.summing.sum.is_enabled() && self.summing.check_missing(now) {
+    pub(super) fn check_missing_sums(&mut self, now: Micros) {
+        if self.summing.sum.is_enabled() && self.summing.nack_missing_sums(now) {
             self.apply_network_changes(now);
         }
     }
@@ -358,31 +362,31 @@ impl Node {
     /// Reports the place in the tree if it has changed, at most every 50 ms.
     pub(super) fn report_tree(&mut self, now: Micros) {
         let report = &mut self.summing.report;
-        let may = self.summing.network.has_wires() && self.claim.is_settled();
+        let may = self.summing.network.has_wires() && self.claim.owns_node_id();
         if may && report.due && now >= report.next {
             (report.due, report.next) = (false, now + TREE_REPORT_INTERVAL);
-            self.push_tree(now);
+            self.push_tree_page(now);
         }
     }
 
     /// Reports changes of the place in the tree and of the ports, with a regular heartbeat.
-    pub(super) fn report_with_heartbeat(&mut self, now: Micros) {
-        let Summing { network, report, .. } = &mut self.summing;
+    pub(super) fn report_tree_with_heartbeat(&mut self, now: Micros) {
+        let NetworkSums { network, report, .. } = &mut self.summing;
         if network.has_wires() {
             // A new round alone waits for the heartbeat.
-            report.due |= report.round != network.round();
+            report.due |= report.round != network.rank_round();
             self.report_tree(now);
-            if self.summing.network.ports_changed(now) {
-                self.push_ports(now);
+            if self.summing.network.poll_ports_changed(now) {
+                self.push_ports_page(now);
             }
         }
     }
 
-    pub(super) fn push_tree(&mut self, now: Micros) {
-        let Summing { network, sum, report, .. } = &mut self.summing;
-        report.round = network.round();
+    pub(super) fn push_tree_page(&mut self, now: Micros) {
+        let NetworkSums { network, sum, report, .. } = &mut self.summing;
+        report.round = network.rank_round();
         let tree = TreePage {
-            parent: network.parent_node(),
+            parent: network.parent_node_id(),
             parent_port: network.parent_port().map_or(0, |up| up.to_le_bytes()[0]),
             depth: network.depth().unwrap_or(0),
             round: report.round,
@@ -392,12 +396,12 @@ impl Node {
             accepted: sum.taken,
             dropped: sum.dropped,
         };
-        self.push_network(NetworkPage::Tree(tree));
+        self.push_network_page(NetworkPage::Tree(tree));
     }
 
-    pub(super) fn push_ports(&mut self, now: Micros) {
-        let Summing { network, .. } = &self.summing;
+    pub(super) fn push_ports_page(&mut self, now: Micros) {
+        let NetworkSums { network, .. } = &self.summing;
         let ports = PortsPage { ports: network.port_states(now), changes: network.changes };
-        self.push_network(NetworkPage::Ports(ports));
+        self.push_network_page(NetworkPage::Ports(ports));
     }
 }

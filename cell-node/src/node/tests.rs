@@ -209,7 +209,7 @@ fn heartbeats_come_four_times_a_second_at_the_cells_own_phase() {
         assert_eq!(drain(&mut node), [], "early is harmless");
         node.handle_timeout(at);
         let heartbeat = heartbeat(&drain(&mut node));
-        assert_eq!(heartbeat.state.has(State::CLAIMING), times.is_empty());
+        assert_eq!(heartbeat.state.has(State::CLAIMING_NODE_ID), times.is_empty());
         times.push((at.0, heartbeat.sent));
     }
     assert_eq!(times, [(44_000, 0), (305_764, 1), (555_764, 2), (805_764, 3)]);
@@ -294,14 +294,14 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     }
     let commit = |hash: u16| Request::Write { number: 127, words: pad_with_zeros([hash.cast_signed()]) };
     let refused = |reason| Some(Answer::Refused { number: 127, reason });
-    assert_eq!(request(&mut node, commit(wheel().hash() ^ 1)), refused(Answer::WRONG_HASH));
+    assert_eq!(request(&mut node, commit(wheel().hash() ^ 1)), refused(Answer::REFUSED_WRONG_HASH));
     assert_eq!(tell(&mut node, &joints(0)), [], "still not configured");
 
     assert_eq!(request(&mut node, commit(wheel().hash())), None, "flash first");
     assert_eq!(node.poll_store(), Some(FlashContent { number: Some(cell()), parameters: Some(wheel()) }));
     node.handle_stored(false);
     let failed =
-        Message::Configured { from: cell(), tag: 77, answer: refused(Answer::FLASH_FAILED).unwrap() };
+        Message::Configured { from: cell(), tag: 77, answer: refused(Answer::REFUSED_FLASH_FAILED).unwrap() };
     assert_eq!(drain(&mut node), [failed]);
 
     request(&mut node, commit(wheel().hash()));
@@ -322,7 +322,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
     assert_eq!(
         request(&mut node, Request::Read { number: 99 }),
-        Some(Answer::Refused { number: 99, reason: Answer::UNKNOWN_PARAMETER })
+        Some(Answer::Refused { number: 99, reason: Answer::REFUSED_UNKNOWN_PARAMETER })
     );
 }
 
@@ -451,7 +451,7 @@ fn skipped_joints_leave_active_as_it_is() {
 
 #[test]
 fn joints_need_not_wake_a_cell_that_nothing_touches() {
-    let rests = |node: &Node| node.may_defer(Id::command(Command::Joints));
+    let rests = |node: &Node| node.may_receive_deferred(Id::command(Command::Joints));
     let mut node = settled(FlashState::Valid(wheel()));
     let mut epochs = 0..;
     let mut hear = |node: &mut Node, count| {

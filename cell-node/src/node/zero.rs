@@ -6,7 +6,7 @@ use super::Node;
 use crate::baseline::BaselineStatus;
 
 /// Number of heartbeats per report.
-const HEARTBEATS_PER_PAGE: u8 = 4;
+const HEARTBEATS_PER_ZERO_REPORT: u8 = 4;
 
 /// The state of the zero in the last report.
 #[derive(Clone, Copy, Debug, Default)]
@@ -23,26 +23,26 @@ impl Node {
     }
 
     /// Reports the zero if its state has changed since the last report, and the cell owns its node id.
-    pub(super) fn report_zero(&mut self) {
-        if self.claim.is_settled() && self.reported.status != self.baseline.status() {
-            self.push_zero();
+    pub(super) fn report_zero_if_changed(&mut self) {
+        if self.claim.owns_node_id() && self.reported.status != self.baseline.status() {
+            self.push_zero_page();
         }
     }
 
     /// Reports the zero with every fourth regular heartbeat.
     pub(super) fn report_zero_with_heartbeat(&mut self) {
-        self.reported.beats = (self.reported.beats + 1) % HEARTBEATS_PER_PAGE;
+        self.reported.beats = (self.reported.beats + 1) % HEARTBEATS_PER_ZERO_REPORT;
         if self.reported.beats == 0 {
-            self.push_zero();
+            self.push_zero_page();
         }
     }
 
     /// Reports the zero, unless the baseline is off.
     #[inline(never)]
-    pub(super) fn push_zero(&mut self) {
+    pub(super) fn push_zero_page(&mut self) {
         self.reported.status = self.baseline.status();
         let (Some(from), Some(page)) = (self.identity.cell, self.baseline.page()) else { return };
         let page = SensorPage::Baseline(page);
-        self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
+        self.queue_message(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
     }
 }

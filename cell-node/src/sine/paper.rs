@@ -4,18 +4,18 @@ use core::f64::consts::FRAC_PI_2;
 
 use protocol::fixed::Q1_14;
 
-use super::{ONE_Q16, QUARTER, evaluate, odd_polynomial};
+use super::{ONE_Q16, QUARTER_TURN, evaluate_odd_polynomial, evaluate_sine_cosine};
 
 /// The paper's polynomial (Eq. 13, 16): `a z - b z^3 + c z^5` with a = pi/2, c = pi/2 - 3/2, and b such that
 /// the sum is one.
-const FIFTH_ORDER: [i32; 3] = {
-    let (a, c) = (nearest(FRAC_PI_2), nearest(FRAC_PI_2 - 1.5));
+const FIFTH_ORDER_COEFFICIENTS: [i32; 3] = {
+    let (a, c) = (round_to_q16(FRAC_PI_2), round_to_q16(FRAC_PI_2 - 1.5));
     [a, ONE_Q16 - a - c, c]
 };
 
 /// Rounds a positive constant to an integer with 16 fraction bits.
 #[expect(clippy::cast_possible_truncation, reason = "the constants above are below 2")]
-const fn nearest(constant: f64) -> i32 {
+const fn round_to_q16(constant: f64) -> i32 {
     (constant * 65_536.0 + 0.5) as i32
 }
 
@@ -25,17 +25,17 @@ const fn nearest(constant: f64) -> i32 {
 /// [`sine`](super::sine), for one multiplication less.
 #[must_use]
 pub fn paper_sine(angle: Q1_14) -> Q1_14 {
-    odd_polynomial(angle, FIFTH_ORDER)
+    evaluate_odd_polynomial(angle, FIFTH_ORDER_COEFFICIENTS)
 }
 
 /// Returns the paper's cosine (Eq. 19): [`paper_sine`] a quarter turn later.
 #[must_use]
 pub fn paper_cosine(angle: Q1_14) -> Q1_14 {
-    paper_sine(angle.wrapping_add(QUARTER))
+    paper_sine(angle.wrapping_add(QUARTER_TURN))
 }
 
 /// Returns [`paper_sine`] and [`paper_cosine`] of one angle in steps of 2^-14.
 #[inline]
 pub(crate) fn paper_sine_cosine(angle: Q1_14) -> [i32; 2] {
-    evaluate(angle, FIFTH_ORDER)
+    evaluate_sine_cosine(angle, FIFTH_ORDER_COEFFICIENTS)
 }

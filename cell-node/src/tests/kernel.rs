@@ -26,12 +26,12 @@ fn the_bound_of_j_is_little_more_than_an_arms_reach_and_of_a_slide_not_known() {
     let length = |words: &[Q1_14]| words.iter().map(|word| word.to_f64().powi(2)).sum::<f64>().sqrt();
     for case in Case::all().into_iter().filter(|case| case.joint == 6) {
         let mut parameters = case.parameters();
-        let links: f64 = parameters.chain().iter().map(|row| length(&[row.a, row.d])).sum();
+        let links: f64 = parameters.rows_to_cell().iter().map(|row| length(&[row.a, row.d])).sum();
         let reach = links + length(&parameters.pose.position);
-        let bound = f64::from(Wrench::<Q1_14>::new(&parameters).bound()) / 16_384.0;
+        let bound = f64::from(Wrench::<Q1_14>::new(&parameters).jacobian_bound()) / 16_384.0;
         assert!(bound <= 1.02 * reach, "{bound} m for an arm of {reach} m");
         parameters.rows[2].kind = RowKind::Prismatic;
-        assert_eq!(Wrench::<Q1_14>::new(&parameters).bound(), MAX_JACOBIAN_STEPS);
+        assert_eq!(Wrench::<Q1_14>::new(&parameters).jacobian_bound(), MAX_JACOBIAN_STEPS);
     }
 }
 
@@ -46,7 +46,7 @@ fn a_pressed_cell_lets_the_joint_give_way() {
         let jacobian = Wrench::<Q1_14>::new(&parameters).jacobian(&joints);
         assert_eq!(jacobian, per_joint(&[-0.5]).map(Q1_14::nearest));
         let torque = Torque::new(&jacobian, Force::from_steps(2 << 16));
-        assert_eq!(torque.words(TorqueFormat::Q3_12)[0], Q3_12::nearest(-1.0).to_bits(), "tau = -r F");
+        assert_eq!(torque.torque_words(TorqueFormat::Q3_12)[0], Q3_12::nearest(-1.0).to_bits(), "tau = -r F");
     }
 }
 
@@ -135,7 +135,7 @@ fn an_offset_is_added_to_the_position_and_wraps() {
 fn operations<K: Kernel<CountingWord>>() -> Operations {
     let last = Case::all().into_iter().find(|case| case.joint == 6).unwrap();
     let kernel = K::new(&last.parameters());
-    Operations::count(|| kernel.jacobian(&last.words())).1
+    Operations::count_operations(|| kernel.jacobian(&last.words())).1
 }
 
 #[test]
@@ -155,7 +155,7 @@ fn unused_components_are_not_computed_behind_an_odd_twist_either() {
     let mut parameters = Case::all().into_iter().find(|case| case.joint == 2).unwrap().parameters();
     parameters.rows[0] = Row { alpha: Q1_14::nearest(0.3), ..Row::default() };
     let kernel = Wrench::<CountingWord>::new(&parameters);
-    let (_, done) = Operations::count(|| kernel.jacobian(&[Q1_14::nearest(0.7); MAX_JOINTS]));
+    let (_, done) = Operations::count_operations(|| kernel.jacobian(&[Q1_14::nearest(0.7); MAX_JOINTS]));
     assert_eq!((done.multiplications, done.additions, done.sines, done.cosines), (4, 2, 1, 1));
 }
 
@@ -211,7 +211,7 @@ fn any_chain() -> impl Strategy<Value = Parameters> {
 fn chain_in_reach() -> impl Strategy<Value = (Parameters, [Q1_14; MAX_JOINTS])> {
     let positions = any::<[i16; MAX_JOINTS]>();
     (in_reach(any_chain()), positions).prop_map(|(mut parameters, positions)| {
-        let slides = parameters.chain().iter().filter(|row| row.kind == RowKind::Prismatic).count();
+        let slides = parameters.rows_to_cell().iter().filter(|row| row.kind == RowKind::Prismatic).count();
         let moving: Vec<RowKind> =
             parameters.all_rows().iter().filter(|row| row.has_joint()).map(|row| row.kind).collect();
         let mut positions = positions.map(Q1_14::from_bits);
@@ -244,7 +244,7 @@ fn in_reach(any: impl Strategy<Value = Parameters>) -> impl Strategy<Value = Par
     let direction = (-1.0..1.0_f64, -1.0..1.0_f64, -1.0..1.0_f64)
         .prop_filter("has a direction", |(x, y, z)| (0.1..1.0).contains(&(x * x + y * y + z * z)));
     (any, direction, 0.1..2.0_f64).prop_map(|(mut parameters, (x, y, z), reach)| {
-        let rows = parameters.chain().iter().flat_map(|row| [row.a, row.d]);
+        let rows = parameters.rows_to_cell().iter().flat_map(|row| [row.a, row.d]);
         let all: f64 = rows.chain(parameters.pose.position).map(|word| word.to_f64().abs()).sum();
         let scale = if all > reach { reach / all } else { 1.0 };
         let shorter = |word: Q1_14| Q1_14::nearest((f64::from(word.to_bits()) * scale).trunc() / 16_384.0);
@@ -268,7 +268,7 @@ fn apart(lhs: [f64; MAX_JOINTS], rhs: [f64; MAX_JOINTS]) -> f64 {
 const STEPS_OF_J: u32 = 8;
 
 fn steps_of_j(parameters: &Parameters) -> u32 {
-    STEPS_OF_J + u32::try_from(parameters.chain().len().saturating_sub(6)).unwrap()
+    STEPS_OF_J + u32::try_from(parameters.rows_to_cell().len().saturating_sub(6)).unwrap()
 }
 
 /// Returns the largest difference between a kernel's J and the nearest word of the exact value, in steps of 2^-14.
@@ -322,7 +322,7 @@ proptest! {
         prop_assert!(apart(projection, exact) <= 1e-9, "{projection:?} is not {exact:?}");
         // J-3
         let steps = steps_apart::<Wrench>(&parameters, &joints, exact);
-        prop_assert!(steps <= steps_of_j(&parameters), "{steps} steps in {} rows", parameters.chain().len());
+        prop_assert!(steps <= steps_of_j(&parameters), "{steps} steps in {} rows", parameters.rows_to_cell().len());
     }
 
     #[test]
@@ -331,7 +331,7 @@ proptest! {
     ) {
         let kernel = Wrench::<Q1_14>::new(&parameters);
         for row in kernel.jacobian(&joints.map(Q1_14::from_bits)) {
-            prop_assert!(row.to_bits().unsigned_abs() <= kernel.bound(), "{row:?} is beyond {}", kernel.bound());
+            prop_assert!(row.to_bits().unsigned_abs() <= kernel.jacobian_bound(), "{row:?} is beyond {}", kernel.jacobian_bound());
         }
     }
 

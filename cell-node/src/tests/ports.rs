@@ -82,7 +82,7 @@ fn a_cell_without_ports_does_not_sum_and_one_with_ports_reads_back_what_it_was_t
             other => panic!("{other:?}"),
         }
     });
-    let refused = Answer::Refused { number: REPLY, reason: Answer::INVALID_WORDS };
+    let refused = Answer::Refused { number: REPLY, reason: Answer::REFUSED_INVALID_WORDS };
     let taken = Answer::Value { number: REPLY, written: true, words: padded_words([1, 1_500, 6, 1]) };
     assert_eq!(answers, [refused, taken]);
 }

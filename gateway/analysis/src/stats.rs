@@ -23,7 +23,7 @@ mod foreign;
 
 /// Counts the frames of a capture by bus, kind and cell.
 #[derive(Debug, Default)]
-pub struct Stats {
+pub struct CaptureStats {
     /// Times of the earliest and the latest frame, in ns.
     span: Option<(u64, u64)>,
     counts: StatsReport,
@@ -80,13 +80,13 @@ impl TimedCount {
     }
 
     /// Returns the time from the first to the last packet, in ns.
-    const fn span(self) -> u64 {
+    const fn span_ns(self) -> u64 {
         self.last.saturating_sub(self.first)
     }
 
     /// Returns the packets per second from the first to the last; `None` if these have the same time.
     fn packets_per_s(self) -> Option<f64> {
-        rate(self.packets.saturating_sub(1), self.span())
+        rate_per_second(self.packets.saturating_sub(1), self.span_ns())
     }
 }
 
@@ -101,7 +101,7 @@ struct LastJoints {
 impl LastJoints {
     /// Returns the number of the joints with this epoch, which were sent shortly before the last ones; `None` if there
     /// are no such joints.
-    fn number_of(self, epoch: Epoch) -> Option<u64> {
+    fn joints_number_of(self, epoch: Epoch) -> Option<u64> {
         let age = u64::try_from(self.epoch.epochs_since(epoch)).ok()?;
         self.number.checked_sub(age)
     }
@@ -156,7 +156,7 @@ pub struct BusReport {
     /// Counts of packets by kind, for the kinds that occur.
     pub kinds: Vec<KindReport>,
     /// Counts of joints by epoch.
-    pub epochs: Epochs,
+    pub epochs: EpochStatistics,
     /// Counts of damaged frames and of packets that cannot be decoded, by reason.
     pub refused: RefusedFrames,
     /// Counts of frames that do not belong to this protocol.
@@ -182,7 +182,7 @@ pub struct KindReport {
 
 /// Counts of the joints on a bus by epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Epochs {
+pub struct EpochStatistics {
     /// Epoch of the first joints.
     pub first: Option<u8>,
     /// Epoch of the last joints.
@@ -211,7 +211,7 @@ pub struct RefusedFrames {
 impl RefusedFrames {
     /// Returns the reasons by name, each with its number of frames.
     #[must_use]
-    pub const fn by_reason(&self) -> [(&'static str, u64); 4] {
+    pub const fn counts_by_reason(&self) -> [(&'static str, u64); 4] {
         let Self { length, crc, meaning, incomplete } = *self;
         [("length", length), ("CRC", crc), ("meaning", meaning), ("incomplete", incomplete)]
     }
@@ -260,7 +260,7 @@ pub struct CellReport {
     pub state: Vec<&'static str>,
 }
 
-impl Stats {
+impl CaptureStats {
     /// Counts a frame.
     pub fn record(&mut self, record: &Record<'_>, decoded: &Decoded) {
         let nanos = record.time.nanos;
@@ -271,7 +271,7 @@ impl Stats {
             self.counts.frames_of_other_buses += 1;
             return;
         };
-        bus_stats.take(record, decoded);
+        bus_stats.count_frame(record, decoded);
         // Buses are read in turn, so only frames of the same bus are ordered.
         let back = nanos < std::mem::replace(&mut bus_stats.last, nanos);
         self.counts.times_backwards += u64::from(back);
@@ -321,7 +321,7 @@ impl Stats {
     fn timed_report(&self) -> StatsReport {
         let span @ (earliest, latest) = self.span.unwrap_or_default();
         StatsReport {
-            duration_s: seconds(latest - earliest),
+            duration_s: nanos_to_seconds(latest - earliest),
             buses: self.bus_stats.iter().map(|bus_stats| bus_stats.report(span)).collect(),
             ..self.counts.clone()
         }
@@ -329,13 +329,13 @@ impl Stats {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "for display")]
-fn seconds(nanos: u64) -> f64 {
+fn nanos_to_seconds(nanos: u64) -> f64 {
     nanos as f64 / 1e9
 }
 
 /// Returns the rate per second of `count` events in `nanos` ns; `None` if either number is zero.
 #[expect(clippy::cast_precision_loss, reason = "for display")]
-fn rate(count: u64, nanos: u64) -> Option<f64> {
+fn rate_per_second(count: u64, nanos: u64) -> Option<f64> {
     (count > 0 && nanos > 0).then(|| count as f64 * 1e9 / nanos as f64)
 }
 
@@ -353,7 +353,7 @@ impl BusStats {
         }
     }
 
-    fn take(&mut self, record: &Record<'_>, decoded: &Decoded) {
+    fn count_frame(&mut self, record: &Record<'_>, decoded: &Decoded) {
         let nanos = record.time.nanos;
         if let Decoded::Wire(..) = decoded {
             self.wires.record(nanos);
@@ -364,7 +364,7 @@ impl BusStats {
         let refused = &mut self.counts.refused;
         match decoded {
             Decoded::Wire(..) | Decoded::Segment { .. } => {}
-            Decoded::Message(message) => self.message(nanos, message),
+            Decoded::Message(message) => self.count_message(nanos, message),
             Decoded::Meaningless { .. } => refused.meaning += 1,
             Decoded::Foreign(foreign) => self.foreign.record(nanos, &record.frame, *foreign),
             Decoded::Damaged { fault, .. } => match fault {
@@ -376,7 +376,7 @@ impl BusStats {
         }
     }
 
-    fn message(&mut self, nanos: u64, message: &Message) {
+    fn count_message(&mut self, nanos: u64, message: &Message) {
         let id = message.id();
         if let Some(count) =
             PACKET_KINDS.iter().position(|it| *it == id.name()).and_then(|at| self.kinds.get_mut(at))
@@ -387,7 +387,7 @@ impl BusStats {
             self.record_joints(*epoch);
         }
         if let Some(cell) = id.sender().and_then(|from| self.cells.get_mut(from.index())) {
-            cell.get_or_insert_default().take(nanos, message, self.joints);
+            cell.get_or_insert_default().count_packet(nanos, message, self.joints);
         }
     }
 
@@ -416,14 +416,15 @@ impl BusStats {
             kind,
             packets: count.packets,
             packets_per_s: count.packets_per_s(),
-            span_s: seconds(count.span()),
+            span_s: nanos_to_seconds(count.span_ns()),
         });
         let cells = CellId::all().zip(&self.cells);
+        let packets_per_s = self.all.packets_per_s();
         BusReport {
-            frames_per_s: self.all.packets_per_s().and_then(|_| rate(self.counts.frames, latest - earliest)),
+            frames_per_s: packets_per_s.and_then(|_| rate_per_second(self.counts.frames, latest - earliest)),
             wires: self.wires.packets,
             wires_per_s: self.wires.packets_per_s(),
-            wires_span_s: seconds(self.wires.span()),
+            wires_span_s: nanos_to_seconds(self.wires.span_ns()),
             kinds: kinds.collect(),
             foreign: self.foreign.report(earliest),
             cells: cells.filter_map(|(node, cell)| Some(cell.as_ref()?.report(node))).collect(),
@@ -433,9 +434,9 @@ impl BusStats {
 }
 
 impl CellStats {
-    fn take(&mut self, nanos: u64, message: &Message, joints: Option<LastJoints>) {
+    fn count_packet(&mut self, nanos: u64, message: &Message, joints: Option<LastJoints>) {
         self.counts.packets += 1;
-        let word = self.tracked.receive(Micros(nanos / 1_000), message, None).word;
+        let word = self.tracked.record_packet(Micros(nanos / 1_000), message, None).word;
         if let Message::Torque { epoch, torque, .. } = message {
             let still = !torque.is_zero();
             self.counts.saturated += u64::from(torque.is_saturated());
@@ -448,7 +449,7 @@ impl CellStats {
             self.counts.heartbeats += 1;
             // A report older than the last torque does not end the contact.
             let is_over = !heartbeat.state.has(State::ACTIVE)
-                && joints.and_then(|joints| joints.number_of(*epoch)) >= self.last_answered;
+                && joints.and_then(|joints| joints.joints_number_of(*epoch)) >= self.last_answered;
             if matches!(word, Some(HeartbeatKind::Started { .. }))
                 || is_over && word != Some(HeartbeatKind::Claimant)
             {
@@ -462,10 +463,10 @@ impl CellStats {
         let [first, last] = self.torque_span.unwrap_or([(nanos, epoch); 2]);
         let again = self.counts.torques > 1
             && last.1 == epoch
-            && joints.is_some_and(|joints| joints.number_of(epoch) == self.last_answered);
+            && joints.is_some_and(|joints| joints.joints_number_of(epoch) == self.last_answered);
         self.counts.repeated += u64::from(again);
         self.torque_span = Some([first, (nanos, epoch)]);
-        let number = joints.and_then(|joints| joints.number_of(epoch));
+        let number = joints.and_then(|joints| joints.joints_number_of(epoch));
         if let (Some(before), Some(number)) = (self.last_answered, number) {
             self.counts.unanswered += number.saturating_sub(before + 1);
         }
@@ -480,8 +481,8 @@ impl CellStats {
         let says = |bit| heartbeat.is_some_and(|heartbeat| heartbeat.state.has(bit));
         CellReport {
             node: node.get(),
-            torques_per_s: rate(self.counts.torques.saturating_sub(1), time),
-            torques_span_s: seconds(time),
+            torques_per_s: rate_per_second(self.counts.torques.saturating_sub(1), time),
+            torques_span_s: nanos_to_seconds(time),
             parent: tree.and_then(|tree| tree.parent),
             depth: tree.filter(|tree| tree.parent.is_some()).map(|tree| tree.depth),
             first_epoch: span.map(|[first, _]| first.1.0),

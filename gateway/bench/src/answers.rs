@@ -12,14 +12,14 @@ use crate::bus::listen::Listener;
 
 /// Answers received from the cells that a request addresses, and the cells that are present.
 #[derive(Debug)]
-pub struct Answers {
+pub struct ReceivedAnswers {
     only: Option<CellId>,
     tag: Option<u8>,
     present: BTreeSet<CellId>,
     received: Vec<(CellId, Answer)>,
 }
 
-impl Answers {
+impl ReceivedAnswers {
     /// Collects answers of one cell (`only`) or of all cells. `tag` is the tag of the request, or `None` if the packet
     /// asks for no answer.
     #[must_use]
@@ -33,21 +33,21 @@ impl Answers {
     /// Returns [`BusError`] if the bus is down, gone or closed.
     pub fn receive(&mut self, listener: &mut Listener) -> Result<(), BusError> {
         listener.receive(Duration::from_millis(20))?;
-        for (_, decoded) in listener.decoded() {
+        for (_, decoded) in listener.decoded_frames() {
             if let Decoded::Message(message) = decoded {
-                self.record(&message);
+                self.record_message(&message);
             }
         }
         Ok(())
     }
 
     /// Records the sender of a packet as present. Keeps the packet if it answers the request.
-    pub fn record(&mut self, message: &Message) {
+    pub fn record_message(&mut self, message: &Message) {
         let Some(from) = message.sender().filter(|&from| self.only.is_none_or(|only| only == from)) else {
             return;
         };
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message
-            && heartbeat.state.has(State::CLAIMING)
+            && heartbeat.state.has(State::CLAIMING_NODE_ID)
         {
             // A claiming cell does not own its node id yet.
             return;
@@ -62,19 +62,19 @@ impl Answers {
 
     /// The cells that are present, including those that have not answered.
     #[must_use]
-    pub const fn present(&self) -> &BTreeSet<CellId> {
+    pub const fn present_cells(&self) -> &BTreeSet<CellId> {
         &self.present
     }
 
     /// The answers, in the order of arrival.
     #[must_use]
-    pub fn received(&self) -> &[(CellId, Answer)] {
+    pub fn received_answers(&self) -> &[(CellId, Answer)] {
         &self.received
     }
 
     /// Returns the cells that have not answered, out of the present cells and the addressed cell.
     #[must_use]
-    pub fn missing(&self) -> BTreeSet<CellId> {
+    pub fn missing_cells(&self) -> BTreeSet<CellId> {
         let answered = |cell: &CellId| self.received.iter().any(|(from, _)| from == cell);
         self.present.iter().copied().chain(self.only).filter(|cell| !answered(cell)).collect()
     }

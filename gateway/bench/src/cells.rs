@@ -11,7 +11,7 @@ use protocol::id::{Command, Id, Kind};
 use protocol::message::Message;
 use protocol::time::Micros;
 
-use crate::bus::listen::{self, Listener, send, tolerate_transient};
+use crate::bus::listen::{self, Listener, send_message, tolerate_transient_error};
 
 /// Time to wait for a heartbeat (sent four times a second), which shows the cells' frame format.
 const FORMAT_TIMEOUT: Duration = Duration::from_millis(300);
@@ -44,7 +44,7 @@ impl CellWatch {
         filters.push(Filter::exact(Id::command(Command::Joints)));
         let receive_buffer = GATEWAY_RECEIVE_BUFFER_BYTES as usize;
         let options = BusOptions { filters, receive_buffer, ..BusOptions::default() };
-        let listener = Listener::new(listen::open(name, kind, None, options)?, None);
+        let listener = Listener::new(listen::open_bus(name, kind, None, options)?, None);
         let listing = CellListing::new();
         Ok(Self { listener, began: Instant::now(), listing, non_packets: 0, format, requested: None })
     }
@@ -63,7 +63,7 @@ impl CellWatch {
 
     /// Number of received frames that are not packets of the protocol.
     #[must_use]
-    pub const fn non_packets(&self) -> u64 {
+    pub const fn non_packet_count(&self) -> u64 {
         self.non_packets
     }
 
@@ -76,7 +76,7 @@ impl CellWatch {
     /// The present time on the listing's clock.
     #[must_use]
     pub fn now(&self) -> Micros {
-        Micros::since_start(self.began.elapsed())
+        Micros::from_elapsed(self.began.elapsed())
     }
 
     /// Queries the cells as soon as the format of their frames is known. If `again` is set, repeats the query at
@@ -92,11 +92,11 @@ impl CellWatch {
         };
         self.requested = Some(Instant::now());
         let requested =
-            [Message::Report, Message::Sync].iter().try_for_each(|it| send(self.bus(), it, format));
+            [Message::Report, Message::Sync].iter().try_for_each(|it| send_message(self.bus(), it, format));
         match requested {
             // Cells that cannot be queried can still be received.
             Err(BusError::FdFrame { .. }) => Ok(()),
-            requested => tolerate_transient(requested, Duration::ZERO).map(|_| ()),
+            requested => tolerate_transient_error(requested, Duration::ZERO).map(|_| ()),
         }
     }
 
@@ -109,10 +109,10 @@ impl CellWatch {
         if stopped.load(Ordering::Relaxed) {
             heard?;
         } else {
-            tolerate_transient(heard, POLL_TIMEOUT)?;
+            tolerate_transient_error(heard, POLL_TIMEOUT)?;
         }
         let now = self.now();
-        for (received, decoded) in self.listener.decoded() {
+        for (received, decoded) in self.listener.decoded_frames() {
             if let Decoded::Message(message) = decoded {
                 self.listing.receive(now, received.frame.format(), &message);
             } else {

@@ -14,7 +14,7 @@ use protocol::id::{Command, Id, Kind};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use crate::bus::listen::{self, Listener, send, tolerate_transient};
+use crate::bus::listen::{self, Listener, send_message, tolerate_transient_error};
 use crate::bus::roots::RootWires;
 
 /// Maximum time between two checks for a signal.
@@ -24,7 +24,7 @@ const PROGRESS_INTERVAL: Duration = Duration::from_millis(20);
 /// Pause while an interface is down.
 const INTERFACE_DOWN_PAUSE: Duration = Duration::from_millis(20);
 /// Bytes that the kernel counts in a socket's buffer for each waiting frame.
-const FRAME_BYTES: usize = 1_024;
+const SOCKET_BYTES_PER_FRAME: usize = 1_024;
 
 /// An open bus whose cells are to be commissioned.
 #[derive(Debug)]
@@ -66,7 +66,7 @@ pub fn open(skin: &Skin, index: usize, kinds: &KindChoices) -> Result<BusCommiss
     filters.extend(roots.iter().flat_map(RootWires::filters));
     let receive_buffer = GATEWAY_RECEIVE_BUFFER_BYTES as usize;
     let options = BusOptions { filters, receive_buffer, ..BusOptions::default() };
-    let bus = listen::open(name, kinds.kind_of(name), Some(format), options)?;
+    let bus = listen::open_bus(name, kinds.kind_of(name), Some(format), options)?;
     if roots.is_some() && !bus.is_virtual()? {
         // Real cells have real wires; do not simulate wires among them.
         roots = None;
@@ -129,11 +129,16 @@ impl BusCommissioner {
             Format::Fd => 1,
             Format::Classic => 2,
         };
-        let room = self.listener.bus().receive_buffer().checked_div(FRAME_BYTES * frames).unwrap_or(0);
+        let room = self
+            .listener
+            .bus()
+            .receive_buffer_bytes()
+            .checked_div(SOCKET_BYTES_PER_FRAME * frames)
+            .unwrap_or(0);
         let began = Instant::now();
-        let clock = || Micros::since_start(began.elapsed());
+        let clock = || Micros::from_elapsed(began.elapsed());
         let mut commission = Commission::new(skin, self.index, wish, room, clock());
-        let lost = self.exchange(&mut commission, &clock, stopped, tell).err();
+        let lost = self.exchange_messages(&mut commission, &clock, stopped, tell).err();
         if lost.is_some() {
             commission.stop();
         }
@@ -145,11 +150,11 @@ impl BusCommissioner {
             kind: bus.kind().to_string(),
             report,
             failure: lost.map(|lost| lost.to_string()).or(trouble),
-            dropped: self.listener.dropped(),
+            dropped: self.listener.dropped_frames(),
         }
     }
 
-    fn exchange(
+    fn exchange_messages(
         &mut self,
         commission: &mut Commission,
         clock: &impl Fn() -> Micros,
@@ -164,18 +169,23 @@ impl BusCommissioner {
             commission.handle_time(clock());
             on_progress(commission.progress());
             if let Some(roots) = roots.as_mut().filter(|_| commission.may_send()) {
-                roots.send_due(listener.bus());
+                roots.send_due_messages(listener.bus());
             }
             while let Some(message) = commission.poll_transmit() {
                 // A packet that was not sent gets no answer, and is sent again.
-                tolerate_transient(send(listener.bus(), &message, *format), INTERFACE_DOWN_PAUSE)?;
+                tolerate_transient_error(
+                    send_message(listener.bus(), &message, *format),
+                    INTERFACE_DOWN_PAUSE,
+                )?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
-            let quiet =
-                roots.as_ref().filter(|_| commission.may_send()).map_or(POLL_TIMEOUT, RootWires::timeout);
+            let quiet = roots
+                .as_ref()
+                .filter(|_| commission.may_send())
+                .map_or(POLL_TIMEOUT, RootWires::next_message_timeout);
             let wait = Duration::from_micros(next.elapsed_since(clock()).0).min(quiet).min(POLL_TIMEOUT);
-            tolerate_transient(listener.receive(wait), INTERFACE_DOWN_PAUSE)?;
-            for (received, decoded) in listener.decoded() {
+            tolerate_transient_error(listener.receive(wait), INTERFACE_DOWN_PAUSE)?;
+            for (received, decoded) in listener.decoded_frames() {
                 if roots.as_mut().is_some_and(|roots| roots.handle_frame(&received.frame)) {
                     continue;
                 }

@@ -13,7 +13,7 @@ use thiserror::Error;
 
 use crate::bus::served::ServeError;
 use crate::emulate::EmulateError;
-use crate::processes::{LaunchError, MemoryError};
+use crate::processes::{LaunchError, MemoryFileError};
 use crate::record::OutputError;
 use crate::run::TreeTooDeep;
 use crate::signals::SignalError;
@@ -78,7 +78,7 @@ pub enum RunError {
     Thread(#[from] ThreadError),
     /// The system grants no file in memory.
     #[error(transparent)]
-    Memory(#[from] MemoryError),
+    Memory(#[from] MemoryFileError),
     /// A bus was lost.
     #[error(transparent)]
     Lost(BusError),

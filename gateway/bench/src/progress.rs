@@ -30,14 +30,14 @@ impl Progress {
         }
     }
 
-    /// Creates a progress display that shows only notes until [`Progress::bar`] is called.
+    /// Creates a progress display that shows only notes until [`Progress::start_bar`] is called.
     #[must_use]
     pub fn notes_only(quiet: bool) -> Self {
         Self { bar: ProgressBar::hidden(), quiet, due: Instant::now() }
     }
 
     /// Starts a bar of this length, or a spinner if the length is unknown. Only terminals show it.
-    pub fn bar(&mut self, length: Option<u64>) -> ProgressBar {
+    pub fn start_bar(&mut self, length: Option<u64>) -> ProgressBar {
         if !self.quiet {
             let (bar, style) = match length {
                 Some(length) => (ProgressBar::new(length), "{wide_bar} {percent}%  {msg} frames  {eta}"),
@@ -50,7 +50,7 @@ impl Progress {
 
     /// Shows the line if the interval since its last update is over. `text` gets the number of columns, or `None`
     /// without a terminal.
-    pub fn show(&mut self, text: impl FnOnce(Option<usize>) -> String) {
+    pub fn show_line(&mut self, text: impl FnOnce(Option<usize>) -> String) {
         let now = Instant::now();
         if self.quiet || now < self.due {
             return;
@@ -61,30 +61,30 @@ impl Progress {
             return eprint_line(&text(None));
         }
         self.due = now + here;
-        self.bar.set_message(printable(&text(columns())).into_owned());
+        self.bar.set_message(printable(&text(terminal_columns())).into_owned());
         self.bar.tick();
     }
 
     /// Writes a line above the progress line.
-    pub fn note(&self, text: &str) {
+    pub fn print_note(&self, text: &str) {
         if !self.quiet {
             self.bar.suspend(|| eprint_line(text));
         }
     }
 
     /// Writes an error above the line, even if quiet.
-    pub fn error(&self, text: &str) {
+    pub fn print_error(&self, text: &str) {
         self.bar.suspend(|| eprint_line(text));
     }
 
     /// Removes the line.
-    pub fn clear(&self) {
+    pub fn clear_line(&self) {
         self.bar.finish_and_clear();
     }
 }
 
 /// Columns of the terminal on standard error, or `None` if unknown.
-fn columns() -> Option<usize> {
+fn terminal_columns() -> Option<usize> {
     let size = tcgetwinsize(std::io::stderr()).ok()?;
     Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }

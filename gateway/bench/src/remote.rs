@@ -17,7 +17,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// Number of bytes read at once.
-const READ_BYTES: usize = 4_096;
+const READ_CHUNK_BYTES: usize = 4_096;
 /// Maximum length of a line in bytes. The state of 16 buses with one process per cell is shorter.
 const MAX_LINE_BYTES: usize = 1 << 20;
 
@@ -58,11 +58,11 @@ pub struct BenchState {
     /// Processes of cells that the run has started.
     pub processes: Vec<ProcessState>,
     /// Links that are down, in one direction or in both.
-    pub links_down: Vec<LinkDown>,
+    pub links_down: Vec<DownLink>,
     /// State of each bus.
     pub buses: Vec<BusStatus>,
     /// Lateness of the ticks.
-    pub lateness: Lateness,
+    pub lateness: TickLateness,
     /// Reason for the present halt, if the robot is halted.
     #[serde(default)]
     pub halted: Option<String>,
@@ -113,7 +113,7 @@ pub enum Phase {
 
 /// A link that is down.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
-pub struct LinkDown {
+pub struct DownLink {
     /// Bus of its two cells.
     pub bus: usize,
     /// Node ids of the cells, the smaller one first.
@@ -131,7 +131,7 @@ pub struct BusStatus {
 
 /// Lateness of ticks in µs.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
-pub struct Lateness {
+pub struct TickLateness {
     /// Ticks of the last full second.
     pub second: Quantiles,
     /// All ticks.
@@ -216,15 +216,15 @@ impl JsonPipe {
                 if let Ok(value) = serde_json::from_slice(&line) {
                     return Some(value);
                 }
-            } else if !self.read() {
+            } else if !self.read_available() {
                 return None;
             }
         }
     }
 
     /// Reads the bytes that have arrived. Returns true if there were any.
-    fn read(&mut self) -> bool {
-        let mut chunk = [0; READ_BYTES];
+    fn read_available(&mut self) -> bool {
+        let mut chunk = [0; READ_CHUNK_BYTES];
         if self.received.len() > MAX_LINE_BYTES {
             self.received.clear();
         }

@@ -12,8 +12,8 @@ use protocol::parameters::{Parameter, Sensing};
 use protocol::time::{Micros, Span};
 use thiserror::Error;
 
-use crate::answers::Answers;
-use crate::bus::listen::{self, Listener, send};
+use crate::answers::ReceivedAnswers;
+use crate::bus::listen::{self, Listener, send_message};
 
 /// Time to find the cells on a bus: two heartbeats and a margin.
 const DISCOVERY_TIME: Duration = Duration::from_millis(600);
@@ -22,15 +22,15 @@ const RETRY_INTERVAL: Span = Span::from_millis(250);
 /// Maximum time until all cells have answered.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Tag of the requests, by which their answers are told from answers to other senders.
-const REQUEST_TAG: u8 = 0x57;
+const SENSING_REQUEST_TAG: u8 = 0x57;
 
 /// Opens a bus whose cells are to be switched and whose packets have this format.
 ///
 /// # Errors
 /// Returns [`BusError`] if the bus cannot be opened.
-pub fn open(name: &str, kind: KindChoice, format: Format) -> Result<Bus, BusError> {
+pub fn open_bus(name: &str, kind: KindChoice, format: Format) -> Result<Bus, BusError> {
     let filters = [Kind::Network, Kind::Configured].map(Filter::for_kind).to_vec();
-    listen::open(name, kind, Some(format), BusOptions { filters, ..BusOptions::default() })
+    listen::open_bus(name, kind, Some(format), BusOptions { filters, ..BusOptions::default() })
 }
 
 /// An error that keeps cells from being switched.
@@ -74,7 +74,7 @@ pub enum SensingError {
     },
 }
 
-/// Switches the sensor frames of one cell, or of all cells that send, on a bus from [`open`]. Returns the names of the
+/// Switches the sensor frames of one cell, or of all cells that send, on a bus from [`open_bus`]. Returns the names of the
 /// switched cells.
 ///
 /// # Errors
@@ -85,20 +85,21 @@ pub fn switch_sensing(
     only: Option<CellId>,
     mode: Sensing,
 ) -> Result<String, SensingError> {
-    let mut answers = Answers::new(only, Some(REQUEST_TAG));
+    let mut answers = ReceivedAnswers::new(only, Some(SENSING_REQUEST_TAG));
     let mut listener = Listener::new(bus, Some(format));
     let request = |bus: &Bus, to| {
         let request = Request::Write { number: Parameter::Sensing.number(), words: mode.words() };
-        send(bus, &Message::Configure { to, tag: REQUEST_TAG, request }, format)
+        send_message(bus, &Message::Configure { to, tag: SENSING_REQUEST_TAG, request }, format)
     };
     request(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
     let began = Instant::now();
     let mut requests = RepeatedRequests::new(RETRY_INTERVAL);
-    requests.mark_all_sent(Micros::since_start(began.elapsed()));
-    while began.elapsed() < ANSWER_TIMEOUT && !are_complete(&answers, only, began.elapsed() >= DISCOVERY_TIME)
+    requests.mark_all_sent(Micros::from_elapsed(began.elapsed()));
+    while began.elapsed() < ANSWER_TIMEOUT
+        && !have_all_cells_answered(&answers, only, began.elapsed() >= DISCOVERY_TIME)
     {
         answers.receive(&mut listener)?;
-        for cell in requests.due_requests(Micros::since_start(began.elapsed()), answers.missing()) {
+        for cell in requests.due_requests(Micros::from_elapsed(began.elapsed()), answers.missing_cells()) {
             request(listener.bus(), Node::Cell(cell))?;
         }
     }
@@ -106,43 +107,44 @@ pub fn switch_sensing(
 }
 
 /// Returns true if all expected cells have answered. Before `listened` is true, further cells may appear.
-fn are_complete(answers: &Answers, only: Option<CellId>, listened: bool) -> bool {
-    answers.missing().is_empty() && (only.is_some() || (listened && !answers.present().is_empty()))
+fn have_all_cells_answered(answers: &ReceivedAnswers, only: Option<CellId>, listened: bool) -> bool {
+    answers.missing_cells().is_empty()
+        && (only.is_some() || (listened && !answers.present_cells().is_empty()))
 }
 
 /// Returns the switched cells as text, or an error if some were not switched.
 fn switch_result(
-    answers: &Answers,
+    answers: &ReceivedAnswers,
     only: Option<CellId>,
     bus: &str,
     format: Format,
 ) -> Result<String, SensingError> {
-    let (bus, missing) = (bus.to_owned(), answers.missing());
-    if answers.received().is_empty() {
+    let (bus, missing) = (bus.to_owned(), answers.missing_cells());
+    if answers.received_answers().is_empty() {
         let who = only.map_or_else(|| "no cell".to_owned(), |cell| format!("no cell {cell}"));
         return Err(SensingError::NoAnswer { who, bus, other: format.other_format().name() });
     }
     let (mut confirmed, mut refused) = (BTreeSet::new(), BTreeMap::new());
-    for &(cell, answer) in answers.received() {
+    for &(cell, answer) in answers.received_answers() {
         match answer {
             Answer::Value { .. } => _ = confirmed.insert(cell),
             Answer::Refused { reason, .. } => _ = refused.insert(cell, reason),
         }
     }
     if let Some((_, &reason)) = refused.first_key_value() {
-        return Err(SensingError::Refused { cells: names(refused.keys()), bus, reason });
+        return Err(SensingError::Refused { cells: cell_names(refused.keys()), bus, reason });
     }
     if !missing.is_empty() {
-        let (cells, done) = (names(missing.iter()), confirmed.len());
+        let (cells, done) = (cell_names(missing.iter()), confirmed.len());
         return Err(SensingError::Silent { cells, bus, done });
     }
     Ok(match confirmed.len() {
-        1 => names(confirmed.iter()),
+        1 => cell_names(confirmed.iter()),
         count => format!("{count} cells"),
     })
 }
 
-fn names<'a>(cells: impl Iterator<Item = &'a CellId>) -> String {
+fn cell_names<'a>(cells: impl Iterator<Item = &'a CellId>) -> String {
     let names: Vec<_> = cells.map(ToString::to_string).collect();
     match names.as_slice() {
         [one] => format!("cell {one}"),
@@ -158,7 +160,7 @@ mod tests {
     use protocol::packet::{Epoch, WORDS};
 
     /// Final verdict on an FD bus, as text.
-    fn says(answers: &Answers, only: Option<CellId>) -> Result<String, String> {
+    fn says(answers: &ReceivedAnswers, only: Option<CellId>) -> Result<String, String> {
         switch_result(answers, only, "vcan0", Format::Fd).map_err(|error| error.to_string())
     }
 
@@ -178,45 +180,47 @@ mod tests {
 
     #[test]
     fn all_cells_that_send_have_to_answer() {
-        let mut answers = Answers::new(None, Some(REQUEST_TAG));
-        assert!(!are_complete(&answers, None, true), "no cell is there yet");
+        let mut answers = ReceivedAnswers::new(None, Some(SENSING_REQUEST_TAG));
+        assert!(!have_all_cells_answered(&answers, None, true), "no cell is there yet");
         for message in [
             beat(1),
-            confirms(1, REQUEST_TAG),
-            confirms(2, REQUEST_TAG),
+            confirms(1, SENSING_REQUEST_TAG),
+            confirms(2, SENSING_REQUEST_TAG),
             beat(3),
-            confirms(3, REQUEST_TAG ^ 1),
+            confirms(3, SENSING_REQUEST_TAG ^ 1),
         ] {
-            answers.record(&message);
+            answers.record_message(&message);
         }
-        assert!(!are_complete(&answers, None, true));
-        assert_eq!(answers.missing(), [cell(3)].into(), "the answer to another sender does not count");
+        assert!(!have_all_cells_answered(&answers, None, true));
+        assert_eq!(answers.missing_cells(), [cell(3)].into(), "the answer to another sender does not count");
         let why =
             "cell 3 on vcan0 did not answer, but 2 did: switch the silent ones again when they are back";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
-        answers.record(&confirms(3, REQUEST_TAG));
-        assert!(!are_complete(&answers, None, false) && are_complete(&answers, None, true));
+        answers.record_message(&confirms(3, SENSING_REQUEST_TAG));
+        assert!(
+            !have_all_cells_answered(&answers, None, false) && have_all_cells_answered(&answers, None, true)
+        );
         assert_eq!(says(&answers, None), Ok("3 cells".to_owned()));
     }
 
     #[test]
     fn one_cell_is_requested_and_waited_for_alone() {
         let only = Some(cell(7));
-        let mut answers = Answers::new(only, Some(REQUEST_TAG));
-        answers.record(&confirms(1, REQUEST_TAG));
-        assert_eq!(answers.missing(), [cell(7)].into());
+        let mut answers = ReceivedAnswers::new(only, Some(SENSING_REQUEST_TAG));
+        answers.record_message(&confirms(1, SENSING_REQUEST_TAG));
+        assert_eq!(answers.missing_cells(), [cell(7)].into());
         let why = "no cell 7 answers on vcan0: start it, or give the bus's format with --format classic";
         assert_eq!(says(&answers, only), Err(why.to_owned()));
-        answers.record(&confirms(7, REQUEST_TAG));
-        assert!(are_complete(&answers, only, false));
+        answers.record_message(&confirms(7, SENSING_REQUEST_TAG));
+        assert!(have_all_cells_answered(&answers, only, false));
         assert_eq!(says(&answers, only), Ok("cell 7".to_owned()));
     }
 
     #[test]
     fn a_cell_that_refuses_is_named() {
-        let mut answers = Answers::new(None, Some(REQUEST_TAG));
-        let answer = Answer::Refused { number: 7, reason: Answer::UNKNOWN_PARAMETER };
-        answers.record(&Message::Configured { from: cell(9), tag: REQUEST_TAG, answer });
+        let mut answers = ReceivedAnswers::new(None, Some(SENSING_REQUEST_TAG));
+        let answer = Answer::Refused { number: 7, reason: Answer::REFUSED_UNKNOWN_PARAMETER };
+        answers.record_message(&Message::Configured { from: cell(9), tag: SENSING_REQUEST_TAG, answer });
         let why = "cell 9 on vcan0 refused with reason 18: docs/reference/protocol.md explains it";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
     }

@@ -29,7 +29,7 @@ impl Timeout {
 }
 
 /// Formats node ids and their place: `1, 2, 5 on vcan0`.
-pub(crate) fn names(cells: &[CellId], place: &str) -> String {
+pub(crate) fn format_cells(cells: &[CellId], place: &str) -> String {
     let numbers: Vec<_> = cells.iter().map(ToString::to_string).collect();
     match numbers.len() {
         count @ 13.. => {

@@ -12,9 +12,9 @@ use serde::Serialize;
 pub use self::cells::{CellSummary, RepliesSummary};
 pub use self::outcome::{CellError, ErrorCells, HaltSummary, Outcome, TickSummary, cells_in_error};
 pub(crate) use self::verdict::count_noun;
-pub use self::verdict::{CELL_ERROR_NM, Verdict};
+pub use self::verdict::{MAX_CELL_ERROR_NM, Verdict};
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, BusTable, CellStatus, Contributions, Event, SumCounts};
+use model::table::{BusTable, CellStatus, Contributions, FrameEvent, SumCounts, TorqueAccuracy};
 pub use trace::recording::account::{RecordingAccount, WrittenFile};
 
 mod cells;
@@ -56,7 +56,7 @@ pub struct Summary {
     #[serde(rename = "loop")]
     pub control: LoopSummary,
     /// Distributed torques compared with central ones.
-    pub accuracy: Accuracy,
+    pub accuracy: TorqueAccuracy,
     /// Number of packets that the kernel dropped before a socket because a processor's backlog was full, over the whole
     /// machine and all interfaces; `None` if the kernel does not report it.
     pub backlog_dropped: Option<u64>,
@@ -74,7 +74,7 @@ pub struct Summary {
 impl Summary {
     /// Creates an empty summary, for a run that has not started.
     #[must_use]
-    pub fn empty(skin: &Skin) -> Self {
+    pub fn for_unstarted_run(skin: &Skin) -> Self {
         Self {
             skin: skin.name.clone(),
             cells: skin.cells.iter().map(|cell| CellSummary::new(skin, cell, None)).collect(),
@@ -86,7 +86,7 @@ impl Summary {
     /// Creates the summary of a run that failed before any bus was opened.
     #[must_use]
     pub fn for_failed_start(skin: &Skin, why: String) -> Self {
-        Self::empty(skin).with_verdict(Some(why))
+        Self::for_unstarted_run(skin).with_verdict(Some(why))
     }
 
     /// Sets the outcome and the verdict according to the other figures. `failure` is the reason why the run ended
@@ -248,7 +248,7 @@ pub struct UplinkSummary {
 
 impl UplinkSummary {
     /// Attributes up to `at_most` of the unknown losses to links between hosts.
-    pub fn attribute_to_hosts(&mut self, at_most: u64) {
+    pub fn attribute_losses_to_hosts(&mut self, at_most: u64) {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
         self.hosts += explained;
@@ -256,7 +256,7 @@ impl UplinkSummary {
 
     /// Attributes up to `at_most` of the unknown losses to the kernel's backlog. Returns the number of packets
     /// attributed.
-    pub fn attribute_to_backlog(&mut self, at_most: u64) -> u64 {
+    pub fn attribute_losses_to_backlog(&mut self, at_most: u64) -> u64 {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
         self.backlog += explained;
@@ -418,7 +418,7 @@ impl BusSummary {
                 .filter(|(_, count)| *count > 0)
                 .collect()
         };
-        let events = Event::ALL.into_iter().map(|event| (event.name(), counters.events(event)));
+        let events = FrameEvent::ALL.into_iter().map(|event| (event.name(), counters.event_count(event)));
         Self {
             name: name.to_owned(),
             kind: kind.to_owned(),
@@ -434,13 +434,13 @@ impl BusSummary {
             sensors: sensors(table),
             epochs_due: counters.epochs_due,
             epochs_complete: counters.epochs_complete,
-            received: kinds(&|kind| counters.received(kind)),
-            sent: kinds(&|kind| counters.sent(kind)),
+            received: kinds(&|kind| counters.received_count(kind)),
+            sent: kinds(&|kind| counters.sent_count(kind)),
             events: events.filter(|(_, count)| *count > 0).collect(),
             dropped_by_bus: dropped,
-            last_reply_us: Quantiles::from_histogram(table.delays().last_replies(), 1.0),
-            reply_us: Quantiles::from_histogram(table.delays().replies(), 1.0),
-            joints_not_taken_us: Quantiles::from_histogram(table.delays().pending_joints(), 1.0),
+            last_reply_us: Quantiles::from_histogram(table.delays().last_reply_delays(), 1.0),
+            reply_us: Quantiles::from_histogram(table.delays().reply_delays(), 1.0),
+            joints_not_taken_us: Quantiles::from_histogram(table.delays().pending_joints_ages(), 1.0),
         }
     }
 }
@@ -482,13 +482,13 @@ fn uplink(table: &BusTable, dropped_by_bus: u64) -> UplinkSummary {
 }
 
 fn sums(table: &BusTable) -> Option<SumsSummary> {
-    let (counts, contributions) = table.sums()?;
+    let (counts, contributions) = table.sum_counts()?;
     let roots = table.cells().iter().filter(|cell| cell.root).count();
     Some(SumsSummary { roots, counts, contributions })
 }
 
 fn replies(table: &BusTable) -> RepliesSummary {
     let mut summary = RepliesSummary::default();
-    table.cells().iter().for_each(|cell| summary.add(cell));
+    table.cells().iter().for_each(|cell| summary.add_replies_of(cell));
     summary
 }

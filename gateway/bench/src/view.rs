@@ -5,7 +5,7 @@ use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 
 use model::network::check::ObservedCell;
-use model::table::{CellState, CellStatus, ResponseFlags, SWITCHES, Switch};
+use model::table::{CellState, CellStatus, ResponseFlags, SWITCH_COUNT, SwitchTarget};
 
 /// State of a bus's cells, updated every 20 ms.
 #[derive(Clone, Debug, Default)]
@@ -51,7 +51,7 @@ pub struct CellView {
     /// Ports whose links the cell holds down, by its last report; one bit per port.
     pub ports_down: u8,
     /// Switches that the cell has not confirmed.
-    pub unconfirmed_switches: [Option<Switch>; SWITCHES],
+    pub unconfirmed_switches: [Option<SwitchTarget>; SWITCH_COUNT],
     /// True if the cell computes with stimuli that this gateway may not have received.
     pub unclear: bool,
 }
@@ -78,7 +78,7 @@ impl CellView {
     pub fn new(cell: &CellState, status: CellStatus) -> Self {
         let state = cell.heartbeat().map(|heartbeat| heartbeat.state);
         let alive = !matches!(status, CellStatus::Dead | CellStatus::Unknown);
-        let settled = state.filter(|state| alive && !state.has(State::CLAIMING));
+        let settled = state.filter(|state| alive && !state.has(State::CLAIMING_NODE_ID));
         let ready = settled.is_some_and(|state| state.has(State::CONFIGURED));
         Self {
             node: cell.node,
@@ -92,7 +92,7 @@ impl CellView {
                 .heartbeat()
                 .is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
             last_joints: cell.last_joints,
-            responded: cell.responded(),
+            responded: cell.response_flags(),
             reply: cell.reply,
             ports_down: cell.ports_down,
             unconfirmed_switches: cell.unconfirmed_switches(),

@@ -6,9 +6,9 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 
 use crate::each::parallel_map;
-use crate::estimate::{AgeCovariance, Estimate, PoseGuess, estimate};
+use crate::estimate::{AgeCovariance, Estimate, PoseGuess, estimate_cell};
 use crate::help::{MotionAdvice, suggest_motion};
-use crate::lag::Lags;
+use crate::lag::StretchLags;
 use crate::neighbors::{LocatedCell, improve_positions};
 use crate::observe::{Observations, Reading};
 use crate::refusal::{GapSummary, Refusal};
@@ -16,7 +16,7 @@ use crate::result::{Calibration, CellResult, Diagnosis, Pose, SensorResult, Summ
 use crate::rounded::rounded;
 use crate::table::MotionTable;
 use crate::zero::zero_offsets;
-use model::accelerometer::sensor::{DataSheet, rotation};
+use model::accelerometer::sensor::{DataSheet, cell_rotation};
 
 pub use crate::settings::Settings;
 
@@ -25,19 +25,19 @@ const MIN_READING_SHARE: f64 = 0.5;
 /// The minimum number of readings for an estimate.
 const MIN_READINGS: usize = 200;
 /// The factor by which the residuals of a loose or damaged cell exceed those of most cells and those of the data sheet.
-const LOOSE_CELL_FACTOR: f64 = 1.5;
+const LOOSE_CELL_RESIDUAL_FACTOR: f64 = 1.5;
 /// The factor by which the residuals of most cells may exceed the data sheet; above it, the recording is refused.
 const MAX_SCATTER_FACTOR: f64 = 1.3;
 /// The relative difference above which the recorded broadcast rate does not match that of the skin.
-const RATE_TOLERANCE: f64 = 0.02;
+const BROADCAST_RATE_TOLERANCE: f64 = 0.02;
 /// The maximum difference between the lags of two stretches on a bus, as a fraction of the recording's duration.
-const MAX_SHIFTED_SHARE: f64 = 0.005;
+const MAX_LAG_DIFFERENCE_SHARE: f64 = 0.005;
 /// The number of rounds of estimates, each of which improves the shifts of stretches.
-const SHIFT_ROUNDS: usize = 5;
+const SHIFT_ESTIMATE_ROUNDS: usize = 5;
 /// The logarithm of the likelihood ratio above which the best joint is certain, against the next best one.
 const MIN_LOG_LIKELIHOOD_RATIO: f64 = 10.0;
 /// The factor by which a cell must be nearer to the described place of another cell than to its own, to be marked.
-const NEARER_PLACE_FACTOR: f64 = 2.0;
+const SWAPPED_CELL_DISTANCE_FACTOR: f64 = 2.0;
 
 /// Estimates the pose and the sensor errors of every cell of a skin from a recording.
 ///
@@ -54,15 +54,16 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Resul
         .zip(&seen.cells)
         .map(|((cell, estimate), readings)| {
             let table = tables.get(cell.bus).and_then(Option::as_ref);
-            let usable = table.map_or(0, |table| readings.iter().filter(|it| table.is_known(it)).count());
-            let share = as_f64(usable) / as_f64(table.map_or(0, MotionTable::known_count)).max(1.0);
+            let usable =
+                table.map_or(0, |table| readings.iter().filter(|it| table.is_motion_known(it)).count());
+            let share = as_f64(usable) / as_f64(table.map_or(0, MotionTable::known_motion_count)).max(1.0);
             cell_result(skin, cell, estimate.as_ref(), readings, share)
         })
         .collect();
     mark_scattering_cells(&mut cells, &estimates);
     let wires = improve_by_neighbors(skin, &mut cells, settings);
-    find_swaps(skin, &mut cells);
-    advise(skin, &estimates, &mut cells, settings);
+    find_swapped_cells(skin, &mut cells);
+    add_motion_advice(skin, &estimates, &mut cells, settings);
     for (result, cell) in cells.iter_mut().zip(&skin.cells) {
         result.store_pose(skin, cell, tables.get(cell.bus).and_then(Option::as_ref).map(|table| &table.arm));
     }
@@ -76,7 +77,7 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Resul
 struct CellEstimates {
     /// The motions of the links, by bus; `None` for a bus without a chain.
     tables: Vec<Option<MotionTable>>,
-    lags: Vec<Lags>,
+    lags: Vec<StretchLags>,
     /// The estimate of each cell.
     estimates: Vec<Option<Estimate>>,
 }
@@ -87,12 +88,12 @@ fn estimate_cells(
     seen: &Observations,
     settings: &Settings,
 ) -> Result<(CellEstimates, GapSummary), Refusal> {
-    check_joints(skin, seen)?;
-    let mut lags: Vec<_> = seen.buses.iter().map(Lags::zero_lags).collect();
+    check_joints_and_rate(skin, seen)?;
+    let mut lags: Vec<_> = seen.buses.iter().map(StretchLags::zero_lags).collect();
     let period = settings.sheet.period_s();
-    for round in 0..=SHIFT_ROUNDS {
+    for round in 0..=SHIFT_ESTIMATE_ROUNDS {
         let now = estimate_each_cell(skin, seen, settings, lags);
-        let disturbance = check_gaps(skin, seen, &now.tables)?;
+        let disturbance = check_recording_gaps(skin, seen, &now.tables)?;
         let more: Vec<_> = now
             .tables
             .iter()
@@ -103,17 +104,19 @@ fn estimate_cells(
                 let cells = cells.filter(|((cell, _), _)| cell.bus == bus);
                 let cells =
                     cells.filter_map(|((_, estimate), readings)| Some((estimate.as_ref()?, &readings[..])));
-                lags.refined(table.as_ref()?, cells, period)
+                lags.refined_by_residuals(table.as_ref()?, cells, period)
             })
             .collect();
-        let Some((bus, most)) =
-            more.iter().enumerate().find_map(|(bus, more)| Some((bus, more.as_ref()?.largest())))
+        let Some((bus, most)) = more
+            .iter()
+            .enumerate()
+            .find_map(|(bus, more)| Some((bus, more.as_ref()?.stretch_with_largest_lag())))
         else {
             check_scatter(&now.estimates, &settings.sheet, disturbance)?;
-            check_shifts(skin, seen, &now.lags, disturbance)?;
+            check_lag_differences(skin, seen, &now.lags, disturbance)?;
             return Ok((now, disturbance));
         };
-        if round == SHIFT_ROUNDS {
+        if round == SHIFT_ESTIMATE_ROUNDS {
             return Err(shift_refusal(skin, seen, (bus, most), disturbance));
         }
         lags = now.lags.into_iter().zip(more).map(|(before, more)| more.unwrap_or(before)).collect();
@@ -131,51 +134,53 @@ fn shift_refusal(
     let (from, from_s) = gap.map_or((0, 0.0), |gap| (gap.place, gap.at_s));
     let at_s = from_s + as_f64(place - from) / skin.timing.broadcast_hz();
     let (at_s, ms) = (rounded(at_s, 3), rounded(lag * 1e3, 1));
-    Refusal::Shifted { bus: name(skin, bus), at_s, ms, disturbance }
+    Refusal::Shifted { bus: bus_name(skin, bus), at_s, ms, disturbance }
 }
 
 /// Checks that the lags of a bus' stretches differ by at most [`MUCH_SHIFTED`] of the duration, because many large
 /// shifts cannot be estimated accurately.
-fn check_shifts(
+fn check_lag_differences(
     skin: &Skin,
     seen: &Observations,
-    lags: &[Lags],
+    lags: &[StretchLags],
     disturbance: GapSummary,
 ) -> Result<(), Refusal> {
     for (bus, (lags, observed)) in lags.iter().zip(&seen.buses).enumerate() {
         let length_s = as_f64(observed.joints.len()) / skin.timing.broadcast_hz();
-        if lags.range() > MAX_SHIFTED_SHARE * length_s {
-            return Err(shift_refusal(skin, seen, (bus, lags.largest()), disturbance));
+        if lags.lag_range_s() > MAX_LAG_DIFFERENCE_SHARE * length_s {
+            return Err(shift_refusal(skin, seen, (bus, lags.stretch_with_largest_lag()), disturbance));
         }
     }
     Ok(())
 }
 
-fn name(skin: &Skin, bus: usize) -> String {
+fn bus_name(skin: &Skin, bus: usize) -> String {
     skin.buses.get(bus).map_or_else(String::new, |bus| bus.name.clone())
 }
 
 /// Checks that the number of joints in a recording and their broadcast rate match the skin.
-fn check_joints(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
+fn check_joints_and_rate(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
     for (bus, observed) in
         seen.buses.iter().enumerate().filter(|(bus, _)| skin.cells_on_bus(*bus).next().is_some())
     {
         if let Some(got) = observed.other_joints {
             let joints = skin.chain(bus).joints.len();
-            return Err(Refusal::Joints { bus: name(skin, bus), got, joints });
+            return Err(Refusal::Joints { bus: bus_name(skin, bus), got, joints });
         }
         let hz = skin.timing.broadcast_hz();
-        if let Some(got) =
-            observed.period_s().map(f64::recip).filter(|got| (got / hz - 1.0).abs() > RATE_TOLERANCE)
+        if let Some(got) = observed
+            .period_s()
+            .map(f64::recip)
+            .filter(|got| (got / hz - 1.0).abs() > BROADCAST_RATE_TOLERANCE)
         {
-            return Err(Refusal::Rate { bus: name(skin, bus), got: rounded(got, 2), hz: rounded(hz, 2) });
+            return Err(Refusal::Rate { bus: bus_name(skin, bus), got: rounded(got, 2), hz: rounded(hz, 2) });
         }
     }
     Ok(())
 }
 
 /// Returns the gaps of a recording, or an error if the motion is known for too few of its broadcasts.
-fn check_gaps(
+fn check_recording_gaps(
     skin: &Skin,
     seen: &Observations,
     tables: &[Option<MotionTable>],
@@ -183,9 +188,9 @@ fn check_gaps(
     let mut all = GapSummary::default();
     for (bus, (observed, table)) in seen.buses.iter().zip(tables).enumerate() {
         let Some(table) = table else { continue };
-        let disturbance = GapSummary::from_bus(observed, table.known_count());
-        if table.known_count() < MIN_READINGS {
-            return Err(Refusal::Disturbed { bus: name(skin, bus), disturbance });
+        let disturbance = GapSummary::from_bus(observed, table.known_motion_count());
+        if table.known_motion_count() < MIN_READINGS {
+            return Err(Refusal::Disturbed { bus: bus_name(skin, bus), disturbance });
         }
         all = all.merged_with(disturbance);
     }
@@ -219,7 +224,7 @@ fn estimate_each_cell(
     skin: &Skin,
     seen: &Observations,
     settings: &Settings,
-    lags: Vec<Lags>,
+    lags: Vec<StretchLags>,
 ) -> CellEstimates {
     let buses: Vec<_> = (0..skin.buses.len()).collect();
     let tables: Vec<_> = parallel_map(buses.len(), settings.threads, |bus| {
@@ -242,10 +247,10 @@ fn estimate_each_cell(
             .transform_between(cell.row, skin.chain(cell.bus).row_of(cell.joint).unwrap_or_default());
         let guess = PoseGuess {
             joint: cell.joint,
-            rotation: own.rotation * rotation(cell.orientation, cell.normal),
+            rotation: own.rotation * cell_rotation(cell.orientation, cell.normal),
             position: own.transform_point(&cell.position.into()).coords,
         };
-        estimate(table, readings, &guess, &settings.sheet, &ages)
+        estimate_cell(table, readings, &guess, &settings.sheet, &ages)
     });
     CellEstimates { tables, lags, estimates }
 }
@@ -298,7 +303,7 @@ fn cell_result(
         position: estimate.model.position,
         rotation: estimate.model.rotation,
         position_covariance: estimate.position_covariance(),
-        turn_covariance: estimate.turn_covariance(),
+        turn_covariance: estimate.rotation_covariance(),
     });
     result
 }
@@ -313,7 +318,7 @@ fn mark_scattering_cells(cells: &mut [CellResult], estimates: &[Option<Estimate>
     let Some(&most) = all.get(all.len() / 2) else { return };
     for (cell, estimate) in cells.iter_mut().zip(estimates) {
         let Some(times) = times((cell, estimate)).map(|times| times / most.max(1.0)) else { continue };
-        if times > LOOSE_CELL_FACTOR {
+        if times > LOOSE_CELL_RESIDUAL_FACTOR {
             cell.troubles.push(Diagnosis::Loose { times: rounded(times, 1) });
         }
     }
@@ -361,7 +366,7 @@ fn improve_by_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settin
 }
 
 /// Marks cells that were found at the described place of another cell.
-fn find_swaps(skin: &Skin, cells: &mut [CellResult]) {
+fn find_swapped_cells(skin: &Skin, cells: &mut [CellResult]) {
     let found: Vec<_> =
         skin.cells.iter().zip(&*cells).map(|(cell, result)| other_cell_at(skin, cell, result)).collect();
     for (index, (result, place)) in cells.iter_mut().zip(&found).enumerate() {
@@ -393,12 +398,19 @@ fn other_cell_at(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize>
     let (nearest, index) = *distances.first()?;
     let next = distances.get(1).map_or(f64::INFINITY, |(next, _)| *next);
     let certain = 2.0 * pose.position_radius_95_m() + 0.002;
-    (nearest * NEARER_PLACE_FACTOR < own && nearest * NEARER_PLACE_FACTOR < next + 2e-3 && own > certain)
+    (nearest * SWAPPED_CELL_DISTANCE_FACTOR < own
+        && nearest * SWAPPED_CELL_DISTANCE_FACTOR < next + 2e-3
+        && own > certain)
         .then_some(index)
 }
 
 /// Adds to each cell without a determined pose the motion that would help to determine it.
-fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult], settings: &Settings) {
+fn add_motion_advice(
+    skin: &Skin,
+    estimates: &[Option<Estimate>],
+    cells: &mut [CellResult],
+    settings: &Settings,
+) {
     let mut known: Vec<((usize, u8), MotionAdvice)> = Vec::new();
     for ((cell, estimate), result) in skin.cells.iter().zip(estimates).zip(cells) {
         let (Some(estimate), Some(pose)) = (estimate, &result.pose) else { continue };

@@ -17,15 +17,15 @@ use model::accelerometer::kinematics::RowMotion;
 use model::accelerometer::sensor::DataSheet;
 
 /// The count of the numbers that describe the motion of a row: the force (3), and the gradient by columns (9).
-pub(crate) const ROW_NUMBERS: usize = 12;
+pub(crate) const NUMBERS_PER_ROW_MOTION: usize = 12;
 /// The number of ages of readings for which motions are computed.
-pub(crate) const AGE_COUNT: usize = 3;
+pub(crate) const READING_AGE_COUNT: usize = 3;
 /// The interval between two of the [`AGES`], in s.
-pub(crate) const AGE_STEP_S: f64 = 0.006;
+pub(crate) const READING_AGE_STEP_S: f64 = 0.006;
 /// The count of the numbers of a [`Moment`].
-pub(crate) const MODEL_INPUTS: usize = AGE_COUNT * ROW_NUMBERS + 1;
+pub(crate) const MODEL_INPUT_COUNT: usize = READING_AGE_COUNT * NUMBERS_PER_ROW_MOTION + 1;
 /// The number of unknowns of a cell.
-pub(crate) const UNKNOWNS: usize = 19;
+pub(crate) const CELL_UNKNOWN_COUNT: usize = 19;
 
 /// The unknowns of the orientation: a rotation vector, in the frame of the cell, from the present estimate.
 pub(crate) const ROTATION_UNKNOWNS: Range<usize> = 0..3;
@@ -35,17 +35,17 @@ pub(crate) const BIAS_UNKNOWNS: Range<usize> = 6..9;
 pub(crate) const GAIN_UNKNOWNS: Range<usize> = 9..12;
 /// The unknowns of the cross-sensitivity between axes.
 const CROSS_AXIS_UNKNOWNS: Range<usize> = 12..18;
-pub(crate) const AGE_UNKNOWN: usize = 18;
+pub(crate) const AGE_UNKNOWN_INDEX: usize = 18;
 
 /// Row and column of each element of [`CROSS`].
-const OFF_DIAGONAL: [(usize, usize); 6] = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)];
+const OFF_DIAGONAL_ENTRIES: [(usize, usize); 6] = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)];
 
 /// The input of the linear model at one moment: the motion of a row at all ages, and 1.
-pub(crate) type ModelInput = [f64; MODEL_INPUTS];
+pub(crate) type ModelInput = [f64; MODEL_INPUT_COUNT];
 /// The coefficients by which each axis of a sensor depends on the numbers of a [`Moment`].
-pub(crate) type Coefficients = SMatrix<f64, MODEL_INPUTS, 3>;
-pub(crate) type Unknowns = SVector<f64, UNKNOWNS>;
-pub(crate) type InformationMatrix = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
+pub(crate) type Coefficients = SMatrix<f64, MODEL_INPUT_COUNT, 3>;
+pub(crate) type Unknowns = SVector<f64, CELL_UNKNOWN_COUNT>;
+pub(crate) type InformationMatrix = SMatrix<f64, CELL_UNKNOWN_COUNT, CELL_UNKNOWN_COUNT>;
 
 /// The pose, the sensor errors and the age of readings that are assumed for a cell.
 #[derive(Clone, Debug, PartialEq)]
@@ -61,46 +61,49 @@ pub(crate) struct CellModel {
 
 impl CellModel {
     /// Creates a model with a perfect sensor.
-    pub(crate) fn ideal(rotation: UnitQuaternion<f64>, position: Vector3<f64>) -> Self {
+    pub(crate) fn with_ideal_sensor(rotation: UnitQuaternion<f64>, position: Vector3<f64>) -> Self {
         Self { rotation, position, bias: Vector3::zeros(), matrix: Matrix3::identity(), age: 0.0 }
     }
 
     /// Returns the coefficients by which each axis depends on the numbers of a moment.
     pub(crate) fn coefficients(&self) -> Coefficients {
         let rotation = self.rotation.to_rotation_matrix().matrix().to_owned();
-        let mut all = spread_over_ages(
+        let mut all = spread_coefficients_over_ages(
             &row_coefficients(&(self.matrix * rotation.transpose()), &self.position),
             &interpolation_weights(self.age),
         );
-        all.row_mut(MODEL_INPUTS - 1).copy_from(&self.bias.transpose());
+        all.row_mut(MODEL_INPUT_COUNT - 1).copy_from(&self.bias.transpose());
         all
     }
 
     /// Returns the derivatives of the coefficients with respect to each unknown.
-    pub(crate) fn derivatives(&self) -> [Coefficients; UNKNOWNS] {
+    pub(crate) fn derivatives(&self) -> [Coefficients; CELL_UNKNOWN_COUNT] {
         let turned = self.rotation.to_rotation_matrix().matrix().transpose();
         let axes = self.matrix * turned;
         let ages = interpolation_weights(self.age);
         let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
         core::array::from_fn(|unknown| {
-            if let Some(axis) = within(&ROTATION_UNKNOWNS, unknown) {
+            if let Some(axis) = index_in_range(&ROTATION_UNKNOWNS, unknown) {
                 let axes = -self.matrix * unit(axis).cross_matrix() * turned;
-                spread_over_ages(&row_coefficients(&axes, &self.position), &ages)
-            } else if let Some(axis) = within(&POSITION_UNKNOWNS, unknown) {
+                spread_coefficients_over_ages(&row_coefficients(&axes, &self.position), &ages)
+            } else if let Some(axis) = index_in_range(&POSITION_UNKNOWNS, unknown) {
                 let mut part = row_coefficients(&axes, &unit(axis));
                 part.fixed_rows_mut::<3>(0).fill(0.0);
-                spread_over_ages(&part, &ages)
-            } else if let Some(axis) = within(&BIAS_UNKNOWNS, unknown) {
+                spread_coefficients_over_ages(&part, &ages)
+            } else if let Some(axis) = index_in_range(&BIAS_UNKNOWNS, unknown) {
                 let mut all = Coefficients::zeros();
-                all.row_mut(MODEL_INPUTS - 1).copy_from(&unit(axis).transpose());
+                all.row_mut(MODEL_INPUT_COUNT - 1).copy_from(&unit(axis).transpose());
                 all
-            } else if unknown == AGE_UNKNOWN {
-                spread_over_ages(&row_coefficients(&axes, &self.position), &interpolation_slopes(self.age))
+            } else if unknown == AGE_UNKNOWN_INDEX {
+                spread_coefficients_over_ages(
+                    &row_coefficients(&axes, &self.position),
+                    &interpolation_slopes(self.age),
+                )
             } else {
                 let (to, from) = matrix_entry(unknown);
                 let mut one = Matrix3::zeros();
                 one.set_row(to, &turned.row(from));
-                spread_over_ages(&row_coefficients(&one, &self.position), &ages)
+                spread_coefficients_over_ages(&row_coefficients(&one, &self.position), &ages)
             }
         })
     }
@@ -117,19 +120,19 @@ impl CellModel {
             position: self.position + part(&POSITION_UNKNOWNS),
             bias: self.bias + part(&BIAS_UNKNOWNS),
             matrix,
-            age: self.age + step[AGE_UNKNOWN],
+            age: self.age + step[AGE_UNKNOWN_INDEX],
         }
     }
 
     /// Returns the deviations of the unknowns from the values that the data sheet expects.
     pub(crate) fn deviations_from_sheet(&self) -> Unknowns {
         Unknowns::from_fn(|unknown, _| {
-            if let Some(axis) = within(&BIAS_UNKNOWNS, unknown) {
+            if let Some(axis) = index_in_range(&BIAS_UNKNOWNS, unknown) {
                 self.bias[axis]
             } else if (GAIN_UNKNOWNS.start..CROSS_AXIS_UNKNOWNS.end).contains(&unknown) {
                 let (to, from) = matrix_entry(unknown);
                 self.matrix[(to, from)] - if to == from { 1.0 } else { 0.0 }
-            } else if unknown == AGE_UNKNOWN {
+            } else if unknown == AGE_UNKNOWN_INDEX {
                 self.age
             } else {
                 0.0
@@ -167,13 +170,13 @@ pub(crate) const PRIOR_ROTATION_SD_RAD: f64 = 1.0;
 pub(crate) const PRIOR_POSITION_SD_M: f64 = 0.5;
 
 /// Returns the 12 numbers of a row's motion: its force, and its gradient by columns.
-pub(crate) fn motion_numbers(motion: &RowMotion) -> [f64; ROW_NUMBERS] {
+pub(crate) fn motion_numbers(motion: &RowMotion) -> [f64; NUMBERS_PER_ROW_MOTION] {
     let mut all = motion.force.iter().chain(motion.gradient.iter());
     core::array::from_fn(|_| all.next().copied().unwrap_or_default())
 }
 
 /// Returns the coefficients by which the axes depend on a row's motion, for a sensor at a position on the row.
-fn row_coefficients(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64, ROW_NUMBERS, 3> {
+fn row_coefficients(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64, NUMBERS_PER_ROW_MOTION, 3> {
     SMatrix::from_fn(|number, axis| {
         let (block, part) = (number / 3, number % 3);
         let scale = if block == 0 { 1.0 } else { position[block - 1] };
@@ -181,12 +184,15 @@ fn row_coefficients(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64
     })
 }
 
-fn spread_over_ages(row: &SMatrix<f64, ROW_NUMBERS, 3>, ages: &[f64; AGE_COUNT]) -> Coefficients {
+fn spread_coefficients_over_ages(
+    row: &SMatrix<f64, NUMBERS_PER_ROW_MOTION, 3>,
+    ages: &[f64; READING_AGE_COUNT],
+) -> Coefficients {
     let mut all = Coefficients::zeros();
     for (at, age) in ages.iter().enumerate() {
         for axis in 0..3 {
-            for number in 0..ROW_NUMBERS {
-                all[(at * ROW_NUMBERS + number, axis)] = row[(number, axis)] * age;
+            for number in 0..NUMBERS_PER_ROW_MOTION {
+                all[(at * NUMBERS_PER_ROW_MOTION + number, axis)] = row[(number, axis)] * age;
             }
         }
     }
@@ -195,26 +201,31 @@ fn spread_over_ages(row: &SMatrix<f64, ROW_NUMBERS, 3>, ages: &[f64; AGE_COUNT])
 
 /// Returns the entry of the sensor's matrix that an unknown stands for.
 fn matrix_entry(unknown: usize) -> (usize, usize) {
-    within(&GAIN_UNKNOWNS, unknown).map_or_else(
-        || OFF_DIAGONAL.get(unknown.wrapping_sub(CROSS_AXIS_UNKNOWNS.start)).copied().unwrap_or((0, 0)),
+    index_in_range(&GAIN_UNKNOWNS, unknown).map_or_else(
+        || {
+            OFF_DIAGONAL_ENTRIES
+                .get(unknown.wrapping_sub(CROSS_AXIS_UNKNOWNS.start))
+                .copied()
+                .unwrap_or((0, 0))
+        },
         |axis| (axis, axis),
     )
 }
 
-fn within(range: &Range<usize>, unknown: usize) -> Option<usize> {
+fn index_in_range(range: &Range<usize>, unknown: usize) -> Option<usize> {
     range.contains(&unknown).then(|| unknown - range.start)
 }
 
 /// Returns the weights of the motions at the three ages that interpolate a motion at `age`.
-fn interpolation_weights(age: f64) -> [f64; AGE_COUNT] {
-    let x = age / AGE_STEP_S;
+fn interpolation_weights(age: f64) -> [f64; READING_AGE_COUNT] {
+    let x = age / READING_AGE_STEP_S;
     [x * (x - 1.0) / 2.0, 1.0 - x * x, x * (x + 1.0) / 2.0]
 }
 
 /// Returns the derivatives of the weights of [`parabola`] with respect to the age, in 1/s.
-fn interpolation_slopes(age: f64) -> [f64; AGE_COUNT] {
-    let x = age / AGE_STEP_S;
-    [(x - 0.5) / AGE_STEP_S, -2.0 * x / AGE_STEP_S, (x + 0.5) / AGE_STEP_S]
+fn interpolation_slopes(age: f64) -> [f64; READING_AGE_COUNT] {
+    let x = age / READING_AGE_STEP_S;
+    [(x - 0.5) / READING_AGE_STEP_S, -2.0 * x / READING_AGE_STEP_S, (x + 0.5) / READING_AGE_STEP_S]
 }
 
 #[cfg(test)]
@@ -249,18 +260,18 @@ mod tests {
 
     #[test]
     fn coefficients_and_numbers_make_the_reading() {
-        let model = CellModel { age: AGE_STEP_S, ..model() };
+        let model = CellModel { age: READING_AGE_STEP_S, ..model() };
         let motion = |seed: f64| RowMotion {
             force: Vector3::new(seed, 0.2, -1.0),
             gradient: Matrix3::from_fn(|row, column| seed + 0.3 * (row + 2 * column) as f64),
         };
         let motions = [0.1, 0.2, 0.3].map(motion);
-        let mut moment = [1.0; MODEL_INPUTS];
+        let mut moment = [1.0; MODEL_INPUT_COUNT];
         for (to, from) in moment.iter_mut().zip(motions.iter().flat_map(motion_numbers)) {
             *to = from;
         }
-        let shown = model.coefficients().transpose() * SVector::<f64, MODEL_INPUTS>::from(moment);
-        let force = model.rotation.inverse() * motions[2].force_at(&model.position);
+        let shown = model.coefficients().transpose() * SVector::<f64, MODEL_INPUT_COUNT>::from(moment);
+        let force = model.rotation.inverse() * motions[2].specific_force_at(&model.position);
         assert!((shown - (model.matrix * force + model.bias)).norm() < 1e-12);
     }
 }

@@ -7,9 +7,11 @@ use serde::Serialize;
 use crate::cell::{InformationMatrix, POSITION_UNKNOWNS, ROTATION_UNKNOWNS};
 use crate::estimate::Estimate;
 use crate::motion::MotionStep;
-use crate::plan::{ProbeCell, SWING_S, SwingAmplitudes, TARGET_DEVIATIONS, poses, step_information};
+use crate::plan::{
+    ProbeCell, SWING_DURATION_S, SwingAmplitudes, TARGET_DEVIATIONS, candidate_poses, step_information,
+};
 use crate::settings::Settings;
-use model::accelerometer::kinematics::Arm;
+use model::accelerometer::kinematics::ArmKinematics;
 
 /// The motion that would help to determine a pose.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -37,7 +39,7 @@ impl core::fmt::Display for MotionAdvice {
 }
 
 /// The fraction of the uncertainty that may remain after a motion that counts as a help.
-const HELPFUL_RATIO: f64 = 0.7;
+const HELPFUL_UNCERTAINTY_RATIO: f64 = 0.7;
 
 /// Finds the motion that would reduce the uncertainty of a cell's pose most.
 pub(crate) fn suggest_motion(
@@ -47,19 +49,19 @@ pub(crate) fn suggest_motion(
     settings: &Settings,
 ) -> MotionAdvice {
     let swings = SwingAmplitudes::new(skin, &settings.bounds);
-    let arms = [(bus, Arm::new(skin, bus, settings.gravity))];
+    let arms = [(bus, ArmKinematics::new(skin, bus, settings.gravity))];
     let row = usize::from(skin.chain(bus).row_of(estimate.joint).unwrap_or_default());
     let supposed = [ProbeCell { bus, row, model: estimate.model.clone() }];
     let Some(known) = estimate.covariance.try_inverse() else { return MotionAdvice::Nothing };
     let before = worst_uncertainty(&known);
-    let mut best = (HELPFUL_RATIO, MotionAdvice::Nothing);
-    for pose in poses(skin, &settings.bounds, &swings).iter().step_by(3) {
+    let mut best = (HELPFUL_UNCERTAINTY_RATIO, MotionAdvice::Nothing);
+    for pose in candidate_poses(skin, &settings.bounds, &swings).iter().step_by(3) {
         let steps = core::iter::once(MotionStep::Hold { at: pose.clone() }).chain(swings.swings_about(pose));
         for step in steps {
-            let informed = step_information(skin, &arms, &supposed, &step, SWING_S, &settings.sheet);
+            let informed = step_information(skin, &arms, &supposed, &step, SWING_DURATION_S, &settings.sheet);
             // As many repetitions as fit into a plan.
             let more = informed.first().copied().unwrap_or_else(InformationMatrix::zeros)
-                * (settings.bounds.length_s / SWING_S);
+                * (settings.bounds.length_s / SWING_DURATION_S);
             let left = worst_uncertainty(&(known + more)) / before;
             if left >= best.0 {
                 continue;

@@ -6,7 +6,7 @@ use model::accelerometer::RobotState;
 use serde::Serialize;
 
 /// The time in which a swing grows to its amplitude, and in which it dies down at its end, in s.
-const RAMP_S: f64 = 0.6;
+const SWING_RAMP_S: f64 = 0.6;
 
 /// A step of a motion.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -89,7 +89,7 @@ impl MotionPlan {
                 }
             }
             MotionStep::Swing { about, amplitude, rate_hz } => {
-                let envelope = envelope(time, *for_s);
+                let envelope = swing_envelope(time, *for_s);
                 let each = about.iter().zip(amplitude).zip(rate_hz);
                 for ([position, speed, acceleration], ((about, amplitude), rate)) in joints.zip(each) {
                     let [value, first, second] = enveloped_sine(envelope, TAU * rate, time);
@@ -123,8 +123,8 @@ pub(crate) const RISING_CURVE_PEAKS: [f64; 2] = [2.187_5, 7.513_2];
 
 /// Returns a curve that rises from 0 to 1 and falls to 0 within `length`: its value and its first two derivatives at
 /// `time`.
-fn envelope(time: f64, length: f64) -> [f64; 3] {
-    let ramp = RAMP_S.min(length / 2.0);
+fn swing_envelope(time: f64, length: f64) -> [f64; 3] {
+    let ramp = SWING_RAMP_S.min(length / 2.0);
     if time < length / 2.0 {
         rising_curve(time, ramp)
     } else {

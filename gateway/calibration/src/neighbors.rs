@@ -30,9 +30,9 @@ pub(crate) struct LocatedCell {
 
 /// The number of standard deviations by which the length of a wire may be off; longer ones are ignored, as they are
 /// cables or lead to mistaken cells.
-const MAX_LENGTH_DEVIATIONS: f64 = 4.0;
+const MAX_WIRE_LENGTH_DEVIATIONS: f64 = 4.0;
 /// The number of times that the positions are recomputed.
-const POSITION_ROUNDS: usize = 3;
+const POSITION_UPDATE_ROUNDS: usize = 3;
 
 /// Improves the positions of the cells on one link; `wires` has pairs of indices. Returns the number of wires used.
 pub(crate) fn improve_positions(
@@ -48,7 +48,7 @@ pub(crate) fn improve_positions(
             let along = way.try_normalize(1e-9).unwrap_or_else(Vector3::x);
             let variance = (along.transpose() * (one.covariance + other.covariance) * along).x;
             let deviation = (variance + spacing.deviation.powi(2)).sqrt();
-            (way.norm() - spacing.distance).abs() < MAX_LENGTH_DEVIATIONS * deviation
+            (way.norm() - spacing.distance).abs() < MAX_WIRE_LENGTH_DEVIATIONS * deviation
         })
     };
     let wires: Vec<_> = wires.iter().filter(fits).copied().collect();
@@ -58,7 +58,7 @@ pub(crate) fn improve_positions(
     let size = 3 * cells.len();
     let measured: Vec<_> = cells.iter().map(|cell| cell.position).collect();
     let mut covariance = None;
-    for _ in 0..POSITION_ROUNDS {
+    for _ in 0..POSITION_UPDATE_ROUNDS {
         let mut information = DMatrix::<f64>::zeros(size, size);
         let mut gradient = DVector::<f64>::zeros(size);
         for (index, (cell, measured)) in cells.iter().zip(&measured).enumerate() {

@@ -14,13 +14,13 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 
 /// The word from which on a reading counts as saturated.
-const SATURATED_WORD: i16 = i16::MAX - 8;
+const MIN_SATURATED_WORD: i16 = i16::MAX - 8;
 /// The allowed jitter of the receive time of a broadcast, in periods.
 const MAX_JITTER_PERIODS: f64 = 0.25;
 /// The number of consecutive broadcasts over which the period is measured.
-const PERIOD_SPAN: usize = 8;
+const PERIOD_MEASURING_BROADCASTS: usize = 8;
 /// The maximum number of later broadcasts before a reading arrives.
-const MAX_READING_DELAY: u32 = 100;
+const MAX_READING_DELAY_BROADCASTS: u32 = 100;
 
 /// The observations on all buses of a skin.
 #[derive(Clone, Debug)]
@@ -90,7 +90,7 @@ impl Observations {
                 joints: Vec::new(),
                 gaps: Vec::new(),
                 other_joints: None,
-                reference: CentralComputation::unquantised(&skin.with_cells_of_bus(bus)),
+                reference: CentralComputation::without_quantisation(&skin.with_cells_of_bus(bus)),
                 revolute: rows
                     .filter(|kind| *kind != RowKind::Fixed)
                     .map(|kind| kind == RowKind::Revolute)
@@ -119,9 +119,10 @@ impl Observations {
         } else if let Message::Sensors { from, epoch, page: SensorPage::Acceleration(words) } = message {
             let cell = bus.nodes.get(usize::from(from.get())).copied().flatten();
             let cell = cell.and_then(|cell| self.cells.get_mut(cell));
-            let full =
-                words.iter().any(|word| word.to_bits() > SATURATED_WORD || word.to_bits() < -SATURATED_WORD);
-            if let (Some(cell), Some(epoch), false) = (cell, bus.index_of(*epoch), full) {
+            let full = words
+                .iter()
+                .any(|word| word.to_bits() > MIN_SATURATED_WORD || word.to_bits() < -MIN_SATURATED_WORD);
+            if let (Some(cell), Some(epoch), false) = (cell, bus.broadcast_index(*epoch), full) {
                 // A page that repeats the reading for the same joints adds no information.
                 if cell.last().is_none_or(|last| last.epoch < epoch) {
                     cell.push(Reading { epoch, g: words.map(Q::to_f64) });
@@ -137,7 +138,7 @@ impl BusObservations {
             let periods = as_f64(at.0.saturating_sub(before.0)) / self.period_us;
             let steps = epoch.epochs_since(last);
             // Epoch numbers repeat after 256 broadcasts.
-            if steps < 1 && periods < f64::from(MAX_READING_DELAY) {
+            if steps < 1 && periods < f64::from(MAX_READING_DELAY_BROADCASTS) {
                 // A repeated or an old broadcast.
                 return;
             }
@@ -146,13 +147,13 @@ impl BusObservations {
                 self.joints.extend((1..steps).map(|_| None));
                 self.measure_period(at, steps == 1);
             } else {
-                let (at_s, took_ms) = (self.seconds(before), periods * self.period_us * 1e-3);
+                let (at_s, took_ms) = (self.seconds_since_first(before), periods * self.period_us * 1e-3);
                 self.gaps.push(BroadcastGap { at_s, took_ms, place: self.joints.len() });
                 self.joints.push(None);
                 self.measure_period(at, false);
             }
         }
-        let mut positions = self.reference.positions(words);
+        let mut positions = self.reference.joint_positions(words);
         // Words of angles wrap around at half a turn; joints do not.
         if let Some(before) = self.joints.iter().rev().find_map(Option::as_ref) {
             for ((position, before), revolute) in positions.iter_mut().zip(before).zip(&self.revolute) {
@@ -178,7 +179,11 @@ impl BusObservations {
             self.times.clear();
         }
         self.times.push(at);
-        let before = self.times.len().checked_sub(PERIOD_SPAN + 1).and_then(|index| self.times.get(index));
+        let before = self
+            .times
+            .len()
+            .checked_sub(PERIOD_MEASURING_BROADCASTS + 1)
+            .and_then(|index| self.times.get(index));
         self.spans.extend(before.map(|before| at.0.saturating_sub(before.0)));
     }
 
@@ -187,19 +192,19 @@ impl BusObservations {
         let mut spans = self.spans.clone();
         spans.sort_unstable();
         let middle = spans.get(spans.len() / 2)?;
-        Some(as_f64(*middle) * 1e-6 / f64::from(u8::try_from(PERIOD_SPAN).unwrap_or(1)))
+        Some(as_f64(*middle) * 1e-6 / f64::from(u8::try_from(PERIOD_MEASURING_BROADCASTS).unwrap_or(1)))
     }
 
     /// Returns the time since the first broadcast, in s.
-    fn seconds(&self, at: Micros) -> f64 {
+    fn seconds_since_first(&self, at: Micros) -> f64 {
         as_f64(at.0.saturating_sub(self.first.map_or(at.0, |first| first.0))) * 1e-6
     }
 
     /// Returns the newest broadcast with this epoch number.
-    fn index_of(&self, epoch: Epoch) -> Option<u32> {
+    fn broadcast_index(&self, epoch: Epoch) -> Option<u32> {
         let index = self.epochs.get(usize::from(epoch.0)).copied().flatten()?;
         let last = u32::try_from(self.joints.len()).ok()?;
-        (last - index <= MAX_READING_DELAY).then_some(index)
+        (last - index <= MAX_READING_DELAY_BROADCASTS).then_some(index)
     }
 }
 

@@ -14,17 +14,17 @@ use rand_pcg::Pcg64Mcg;
 use thiserror::Error;
 
 use crate::cell::{
-    AGE_STEP_S, CellModel, InformationMatrix, MODEL_INPUTS, POSITION_UNKNOWNS, ROTATION_UNKNOWNS,
-    motion_numbers, prior_inverse_variances,
+    CellModel, InformationMatrix, MODEL_INPUT_COUNT, POSITION_UNKNOWNS, READING_AGE_STEP_S,
+    ROTATION_UNKNOWNS, motion_numbers, prior_inverse_variances,
 };
 use crate::motion::{MotionPlan, MotionStep, RISING_CURVE_PEAKS};
 use crate::sums::ReadingSums;
-use model::accelerometer::kinematics::{Arm, STANDARD_GRAVITY};
+use model::accelerometer::kinematics::{ArmKinematics, STANDARD_GRAVITY};
 use model::accelerometer::sensor::DataSheet;
 
 /// The limits of a plan.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Bounds {
+pub struct PlanBounds {
     /// The pose about which the robot moves, by joint in rad or m; the motion begins and ends at this pose.
     pub center: Vec<f64>,
     /// The maximum distance of each joint from the center, in rad or m.
@@ -75,11 +75,11 @@ pub enum PlanError {
 /// The number of candidate poses.
 const CANDIDATE_POSES: usize = 24;
 /// The time that the robot stands at a pose, in s.
-const HOLD_S: f64 = 0.6;
+const POSE_HOLD_S: f64 = 0.6;
 /// The duration of a swing, in s.
-pub(crate) const SWING_S: f64 = 3.2;
+pub(crate) const SWING_DURATION_S: f64 = 3.2;
 /// The assumed duration of a move to another pose, in s.
-const MOVE_S: f64 = 1.6;
+const ASSUMED_MOVE_DURATION_S: f64 = 1.6;
 /// The frequency of a joint that swings alone.
 const SINGLE_SWING_HZ: f64 = 1.1;
 /// The frequencies of joints that swing together; they differ, so that the joints can be separated.
@@ -89,7 +89,7 @@ const SAMPLE_INTERVAL_S: f64 = 1.0 / 15.0;
 /// The standard deviations at which an estimate counts as good: of the position in m, and of the orientation in rad.
 pub(crate) const TARGET_DEVIATIONS: [f64; 2] = [0.5e-3, 0.2 * TAU / 360.0];
 
-impl Bounds {
+impl PlanBounds {
     /// Returns limits about the middle of each joint's range, or about 0 if it turns by more than half a turn each way.
     #[must_use]
     pub fn from_skin(skin: &Skin) -> Self {
@@ -148,23 +148,23 @@ pub(crate) struct ProbeCell {
 ///
 /// # Errors
 /// Returns [`PlanError`] if the bounds do not fit the robot.
-pub fn plan(
+pub fn plan_motion(
     skin: &Skin,
-    bounds: &Bounds,
+    bounds: &PlanBounds,
     sheet: &DataSheet,
     gravity: [f64; 3],
 ) -> Result<MotionPlan, PlanError> {
     bounds.check(skin)?;
     let swings = SwingAmplitudes::new(skin, bounds);
-    let poses = poses(skin, bounds, &swings);
+    let poses = candidate_poses(skin, bounds, &swings);
     let buses = (0..skin.buses.len()).filter(|&bus| skin.cells_on_bus(bus).next().is_some());
-    let arms: Vec<_> = buses.map(|bus| (bus, Arm::new(skin, bus, gravity))).collect();
+    let arms: Vec<_> = buses.map(|bus| (bus, ArmKinematics::new(skin, bus, gravity))).collect();
     let supposed = probe_cells(skin, &arms);
     let mut candidates = Vec::new();
     for (pose, at) in poses.iter().enumerate() {
-        let hold = (HOLD_S, MotionStep::Hold { at: at.clone() });
+        let hold = (POSE_HOLD_S, MotionStep::Hold { at: at.clone() });
         for (seconds, step) in
-            core::iter::once(hold).chain(swings.swings_about(at).map(|step| (SWING_S, step)))
+            core::iter::once(hold).chain(swings.swings_about(at).map(|step| (SWING_DURATION_S, step)))
         {
             let information = step_information(skin, &arms, &supposed, &step, seconds, sheet);
             candidates.push(CandidateStep { pose, step, seconds, information });
@@ -180,7 +180,7 @@ pub(crate) struct SwingAmplitudes {
 }
 
 impl SwingAmplitudes {
-    pub(crate) fn new(skin: &Skin, bounds: &Bounds) -> Self {
+    pub(crate) fn new(skin: &Skin, bounds: &PlanBounds) -> Self {
         let rate = TAU * SINGLE_SWING_HZ;
         let joints = skin.robot.joints.iter().zip(&skin.controller.max_speed).enumerate();
         let amplitudes = joints.map(|(index, (joint, max_speed))| {
@@ -228,7 +228,7 @@ fn reach_m(skin: &Skin, joint: usize) -> f64 {
 }
 
 /// Returns the center and random poses, all of which leave room for every swing within the limits.
-pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &SwingAmplitudes) -> Vec<Vec<f64>> {
+pub(crate) fn candidate_poses(skin: &Skin, bounds: &PlanBounds, swings: &SwingAmplitudes) -> Vec<Vec<f64>> {
     let mut dice = Pcg64Mcg::seed_from_u64(bounds.seed);
     let ranges = skin.robot.joints.iter().zip(&bounds.center).zip(&swings.amplitudes);
     let ranges: Vec<_> = ranges
@@ -249,7 +249,7 @@ pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &SwingAmplitudes) -> V
 }
 
 /// Returns assumed cells on each link: near its joint, in its middle, and at its end.
-fn probe_cells(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<ProbeCell> {
+fn probe_cells(skin: &Skin, arms: &[(usize, ArmKinematics)]) -> Vec<ProbeCell> {
     let mut all = Vec::new();
     for &(bus, _) in arms {
         let chain = skin.chain(bus);
@@ -260,7 +260,7 @@ fn probe_cells(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<ProbeCell> {
             for (share, turn) in [(0.2, 0.5), (0.8, 2.1)] {
                 let position = Vector3::new(-length * share, 0.06, 0.04 * share);
                 let rotation = UnitQuaternion::from_euler_angles(turn, 0.3 * turn, 0.7 - turn);
-                all.push(ProbeCell { bus, row, model: CellModel::ideal(rotation, position) });
+                all.push(ProbeCell { bus, row, model: CellModel::with_ideal_sensor(rotation, position) });
             }
         }
     }
@@ -270,7 +270,7 @@ fn probe_cells(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<ProbeCell> {
 /// Returns the information that a step adds on each assumed cell.
 pub(crate) fn step_information(
     skin: &Skin,
-    arms: &[(usize, Arm)],
+    arms: &[(usize, ArmKinematics)],
     supposed: &[ProbeCell],
     step: &MotionStep,
     seconds: f64,
@@ -283,9 +283,9 @@ pub(crate) fn step_information(
     while time < seconds {
         for (bus, arm) in arms {
             let joints = &skin.chain(*bus).joints;
-            let ages = [-AGE_STEP_S, 0.0, AGE_STEP_S];
+            let ages = [-READING_AGE_STEP_S, 0.0, READING_AGE_STEP_S];
             let motions =
-                ages.map(|age| arm.rows(&motion.state_at((time - age).max(0.0)).chain_state(joints)));
+                ages.map(|age| arm.row_motions(&motion.state_at((time - age).max(0.0)).chain_state(joints)));
             // The cells of one link see the same motion: they share the sums of the first one.
             let mut seen = usize::MAX;
             for (one, sum) in supposed.iter().zip(&mut sums) {
@@ -293,11 +293,11 @@ pub(crate) fn step_information(
                     continue;
                 }
                 seen = one.row;
-                let mut moment = [1.0; MODEL_INPUTS];
+                let mut moment = [1.0; MODEL_INPUT_COUNT];
                 let all =
                     motions.iter().flat_map(|rows| rows.get(one.row).map(motion_numbers).unwrap_or_default());
                 moment.iter_mut().zip(all).for_each(|(to, from)| *to = from);
-                sum.get_or_insert_with(ReadingSums::default).add(&moment, &[0.0; 3], look);
+                sum.get_or_insert_with(ReadingSums::default).add_reading(&moment, &[0.0; 3], look);
             }
         }
         time += SAMPLE_INTERVAL_S;
@@ -306,7 +306,9 @@ pub(crate) fn step_information(
     let mut last = None;
     let each = supposed.iter().zip(&sums).map(|(one, sum)| {
         last = sum.as_ref().or(last);
-        last.map_or_else(InformationMatrix::zeros, |sum| sum.information(&one.model).0 / variance)
+        last.map_or_else(InformationMatrix::zeros, |sum| {
+            sum.information_and_gradient(&one.model).0 / variance
+        })
     });
     each.collect()
 }
@@ -315,26 +317,28 @@ pub(crate) fn step_information(
 fn choose_candidates(
     candidates: &[CandidateStep],
     supposed: &[ProbeCell],
-    bounds: &Bounds,
+    bounds: &PlanBounds,
     sheet: &DataSheet,
 ) -> Vec<usize> {
     let prior = InformationMatrix::from_diagonal(&prior_inverse_variances(sheet));
     let mut known = vec![prior; supposed.len()];
-    let mut scores: Vec<_> = known.iter().map(score).collect();
+    let mut scores: Vec<_> = known.iter().map(uncertainty_score).collect();
     let mut chosen: Vec<usize> = Vec::new();
     // The moves from the center and back.
-    let mut left = bounds.length_s - 2.0 * MOVE_S;
+    let mut left = bounds.length_s - 2.0 * ASSUMED_MOVE_DURATION_S;
     loop {
         let visited =
             |pose: usize| chosen.iter().any(|&it| candidates.get(it).is_some_and(|it| it.pose == pose));
         let rate = |(index, candidate): (usize, &CandidateStep)| {
-            let seconds = candidate.seconds + if visited(candidate.pose) { 0.0 } else { MOVE_S + HOLD_S };
+            let seconds = candidate.seconds
+                + if visited(candidate.pose) { 0.0 } else { ASSUMED_MOVE_DURATION_S + POSE_HOLD_S };
             // Repeating a step adds the same information only.
             if seconds > left || chosen.contains(&index) {
                 return None;
             }
             let each = known.iter().zip(&scores).zip(&candidate.information);
-            let gained: f64 = each.map(|((known, before), more)| before - score(&(known + more))).sum();
+            let gained: f64 =
+                each.map(|((known, before), more)| before - uncertainty_score(&(known + more))).sum();
             Some((gained / seconds, index, seconds))
         };
         let best =
@@ -343,7 +347,7 @@ fn choose_candidates(
         if let Some(candidate) = candidates.get(index) {
             for ((known, score_of), more) in known.iter_mut().zip(&mut scores).zip(&candidate.information) {
                 *known += more;
-                *score_of = score(known);
+                *score_of = uncertainty_score(known);
             }
         }
         chosen.push(index);
@@ -352,7 +356,7 @@ fn choose_candidates(
 }
 
 /// Returns a measure of the uncertainty that remains with this information: 0 for a cell that is known exactly.
-fn score(information: &InformationMatrix) -> f64 {
+fn uncertainty_score(information: &InformationMatrix) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return 1e3 };
     let part = |start: usize, aim: f64| {
         let part: Matrix3<f64> = covariance.fixed_view::<3, 3>(start, start).into_owned();
@@ -364,7 +368,7 @@ fn score(information: &InformationMatrix) -> f64 {
 /// Returns the motion of the chosen steps, pose by pose; each next pose is the nearest one to the previous pose.
 fn order_steps(
     skin: &Skin,
-    bounds: &Bounds,
+    bounds: &PlanBounds,
     poses: &[Vec<f64>],
     candidates: &[CandidateStep],
     chosen: &[usize],
@@ -373,7 +377,7 @@ fn order_steps(
     left.retain(|pose| chosen.iter().any(|&it| candidates.get(it).is_some_and(|it| it.pose == *pose)));
     let mut motion = MotionPlan::default();
     let mut at = bounds.center.clone();
-    motion.push_step(HOLD_S, MotionStep::Hold { at: at.clone() });
+    motion.push_step(POSE_HOLD_S, MotionStep::Hold { at: at.clone() });
     let distance = |from: &[f64], pose: usize| {
         poses.get(pose).map_or(f64::INFINITY, |to| move_duration_s(skin, bounds, from, to))
     };
@@ -385,7 +389,7 @@ fn order_steps(
         left.remove(place);
         let Some(to) = poses.get(pose) else { continue };
         push_move(skin, bounds, &mut motion, &mut at, to);
-        motion.push_step(HOLD_S, MotionStep::Hold { at: to.clone() });
+        motion.push_step(POSE_HOLD_S, MotionStep::Hold { at: to.clone() });
         let swings = chosen.iter().filter_map(|&it| candidates.get(it)).filter(|it| it.pose == pose);
         for CandidateStep { step, seconds, .. } in swings {
             if matches!(step, MotionStep::Swing { .. }) {
@@ -394,11 +398,11 @@ fn order_steps(
         }
     }
     push_move(skin, bounds, &mut motion, &mut at, &bounds.center);
-    motion.push_step(HOLD_S, MotionStep::Hold { at });
+    motion.push_step(POSE_HOLD_S, MotionStep::Hold { at });
     motion
 }
 
-fn push_move(skin: &Skin, bounds: &Bounds, motion: &mut MotionPlan, at: &mut Vec<f64>, to: &[f64]) {
+fn push_move(skin: &Skin, bounds: &PlanBounds, motion: &mut MotionPlan, at: &mut Vec<f64>, to: &[f64]) {
     let seconds = move_duration_s(skin, bounds, at, to);
     if seconds > 0.0 {
         motion.push_step(seconds, MotionStep::Move { from: at.clone(), to: to.to_vec() });
@@ -407,7 +411,7 @@ fn push_move(skin: &Skin, bounds: &Bounds, motion: &mut MotionPlan, at: &mut Vec
 }
 
 /// Returns the duration of a move, in s.
-fn move_duration_s(skin: &Skin, bounds: &Bounds, from: &[f64], to: &[f64]) -> f64 {
+fn move_duration_s(skin: &Skin, bounds: &PlanBounds, from: &[f64], to: &[f64]) -> f64 {
     let [speed_peak, acceleration_peak] = RISING_CURVE_PEAKS;
     let joints = from.iter().zip(to).zip(&skin.controller.max_speed);
     let longest = joints.map(|((from, to), max_speed)| {
@@ -425,9 +429,10 @@ mod tests {
 
     #[test]
     fn a_plan_stays_within_limits_speeds_and_its_time() {
-        for skin in [testing::ur5(), testing::panda()] {
-            let bounds = Bounds::from_skin(&skin);
-            let motion = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap();
+        for skin in [testing::ur5_skin(), testing::panda_skin()] {
+            let bounds = PlanBounds::from_skin(&skin);
+            let motion =
+                plan_motion(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap();
             assert!(motion.length_s() < 180.0 && motion.length_s() > 100.0, "{}", motion.length_s());
             let mut time = 0.0;
             while time < motion.length_s() {
@@ -445,16 +450,18 @@ mod tests {
 
     #[test]
     fn a_pose_outside_of_limits_is_refused() {
-        let skin = testing::panda();
-        let mut bounds = Bounds::from_skin(&skin);
+        let skin = testing::panda_skin();
+        let mut bounds = PlanBounds::from_skin(&skin);
         bounds.center[3] = 0.5;
-        let error = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap_err();
+        let error =
+            plan_motion(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap_err();
         assert_eq!(
             error.to_string(),
             "joint joint4 at 0.5: its limits are -3.0718 to -0.0698; choose a position between them"
         );
         bounds.center.pop();
-        let error = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap_err();
+        let error =
+            plan_motion(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -STANDARD_GRAVITY]).unwrap_err();
         assert_eq!(error.to_string(), "the pose has 6 positions; the robot has 7 joints: give one for each");
     }
 }

@@ -8,10 +8,10 @@ use crate::help::MotionAdvice;
 use crate::refusal::GapSummary;
 use crate::rounded::rounded;
 use crate::zero::ZeroOffset;
-use model::accelerometer::kinematics::Arm;
+use model::accelerometer::kinematics::ArmKinematics;
 
 /// The limits of the 95 % uncertainty of a determined pose: of the position in m, and of the orientation in rad.
-const MAX_UNCERTAINTY: [f64; 2] = [0.02, 0.09];
+const MAX_POSE_UNCERTAINTIES_95: [f64; 2] = [0.02, 0.09];
 
 /// The results of the calibration of a skin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -61,7 +61,7 @@ pub struct CellResult {
     pub troubles: Vec<Diagnosis>,
     /// The place of the cell, as it is written to a skin file.
     #[serde(flatten)]
-    pub found: Option<FoundPlace>,
+    pub found: Option<EstimatedCellPlace>,
     /// The errors of the cell's accelerometer.
     #[serde(flatten)]
     pub sensor: SensorResult,
@@ -85,7 +85,7 @@ pub struct SensorResult {
 
 /// The place of a cell, in the terms of a skin file.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct FoundPlace {
+pub struct EstimatedCellPlace {
     /// The joint that moves the cell.
     pub joint: u8,
     /// The row in whose frame position and orientation are given.
@@ -231,7 +231,7 @@ impl CellResult {
 
     /// Stores the pose in the terms of a skin file: in the frame of the row that carries the cell in the skin, if that
     /// row belongs to the same joint.
-    pub(crate) fn store_pose(&mut self, skin: &Skin, cell: &Cell, arm: Option<&Arm>) {
+    pub(crate) fn store_pose(&mut self, skin: &Skin, cell: &Cell, arm: Option<&ArmKinematics>) {
         let sensor = &mut self.sensor;
         sensor.bias_g = sensor.bias_g.map(|bias| bias.map(|it| rounded(it, 5)));
         sensor.gain = sensor.gain.map(|gain| gain.map(|it| rounded(it, 5)));
@@ -245,13 +245,13 @@ impl CellResult {
         let own = skin.chain(cell.bus).row_of(pose.joint).unwrap_or_default();
         let row = if cell.joint == pose.joint { cell.row } else { own };
         let change = arm.transform_between(own, row);
-        let placed = pose.transformed_by((&change.rotation, &change.translation.vector));
+        let placed = pose.in_other_frame((&change.rotation, &change.translation.vector));
         let quaternion = placed.rotation.quaternion();
         let sign = if quaternion.w < 0.0 { -1.0 } else { 1.0 };
         let same_link = cell.joint == pose.joint;
         let way = (placed.position - Vector3::from(cell.position)).norm();
         let turn = (placed.rotation * Vector3::z()).angle(&Vector3::from(cell.normal));
-        self.found = Some(FoundPlace {
+        self.found = Some(EstimatedCellPlace {
             joint: pose.joint,
             row,
             position: placed.position.map(|part| rounded(part, 5)).into(),
@@ -269,24 +269,24 @@ impl Pose {
     /// Returns the 95 % radius of the position, in m.
     #[must_use]
     pub fn position_radius_95_m(&self) -> f64 {
-        radius_95(&self.position_covariance)
+        covariance_radius_95(&self.position_covariance)
     }
 
     /// Returns the 95 % angle of the orientation, in rad.
     #[must_use]
     pub fn rotation_angle_95_rad(&self) -> f64 {
-        radius_95(&self.turn_covariance)
+        covariance_radius_95(&self.turn_covariance)
     }
 
     /// Returns true if the pose is certain enough to be used.
     #[must_use]
     pub fn is_determined(&self) -> bool {
-        let [position, turn] = MAX_UNCERTAINTY;
+        let [position, turn] = MAX_POSE_UNCERTAINTIES_95;
         self.position_radius_95_m() < position && self.rotation_angle_95_rad() < turn
     }
 
     /// Returns the same pose, seen from another frame of the same link.
-    pub(crate) fn transformed_by(&self, (turn, shift): (&UnitQuaternion<f64>, &Vector3<f64>)) -> Self {
+    pub(crate) fn in_other_frame(&self, (turn, shift): (&UnitQuaternion<f64>, &Vector3<f64>)) -> Self {
         let matrix: Matrix3<f64> = turn.to_rotation_matrix().matrix().to_owned();
         Self {
             position: turn * self.position + shift,
@@ -299,7 +299,7 @@ impl Pose {
 
 /// Returns the 95 % radius of a normally distributed vector. The sum of squares is approximated by a scaled chi-squared
 /// distribution with the same mean and variance (Welch and Satterthwaite), whose quantile follows Wilson and Hilferty.
-fn radius_95(covariance: &Matrix3<f64>) -> f64 {
+fn covariance_radius_95(covariance: &Matrix3<f64>) -> f64 {
     let variances = SymmetricEigen::new(*covariance).eigenvalues.map(|it| it.max(0.0));
     let (mean, half) = (variances.sum(), variances.norm_squared());
     if half <= 0.0 {
@@ -337,7 +337,8 @@ mod tests {
 
     #[test]
     fn the_radius_is_that_of_chi_squared_where_it_is_known() {
-        let of = |variances: [f64; 3]| radius_95(&Matrix3::from_diagonal(&Vector3::from(variances)));
+        let of =
+            |variances: [f64; 3]| covariance_radius_95(&Matrix3::from_diagonal(&Vector3::from(variances)));
         assert!((of([1.0, 1.0, 1.0]) - 7.815_f64.sqrt()).abs() < 0.01);
         assert!((of([1.0, 1.0, 0.0]) - 5.991_f64.sqrt()).abs() < 0.02);
         assert!((of([4.0, 0.0, 0.0]) - 2.0 * 1.96).abs() < 0.06);

@@ -3,7 +3,7 @@
 use protocol::skin::Skin;
 
 use crate::neighbors::Spacing;
-use crate::plan::Bounds;
+use crate::plan::PlanBounds;
 use model::accelerometer::kinematics::STANDARD_GRAVITY;
 use model::accelerometer::sensor::DataSheet;
 
@@ -21,7 +21,7 @@ pub struct Settings {
     /// The number of threads that estimate cells.
     pub threads: usize,
     /// The limits of the robot's motion, which are used only for advice on further motions.
-    pub bounds: Bounds,
+    pub bounds: PlanBounds,
 }
 
 impl Settings {
@@ -34,7 +34,7 @@ impl Settings {
             spacing: None,
             zero_offsets: false,
             threads: 1,
-            bounds: Bounds::from_skin(skin),
+            bounds: PlanBounds::from_skin(skin),
         }
     }
 }

@@ -1,22 +1,24 @@
 //! The estimate of the shifts of a bus' stretches, from the readings of all of its cells.
 
-use crate::cell::AGE_UNKNOWN;
-use crate::estimate::{Estimate, reading_derivative, readings_with_motion, residual, weight};
-use crate::lag::Lags;
+use crate::cell::AGE_UNKNOWN_INDEX;
+use crate::estimate::{
+    Estimate, huber_weight, reading_age_derivative, reading_residual, readings_with_motion,
+};
+use crate::lag::StretchLags;
 use crate::observe::Reading;
 use crate::table::MotionTable;
 
 /// The lag from which on a stretch counts as shifted, in s.
 const MIN_SHIFT_S: f64 = 1e-3;
 /// The number of standard deviations from which on a shift counts as certain.
-const MIN_SIGNIFICANCE: f64 = 5.0;
+const MIN_SHIFT_DEVIATIONS: f64 = 5.0;
 /// The residual beyond which a reading gets a lower weight, in g.
-const RESIDUAL_LIMIT: f64 = 0.05;
+const RESIDUAL_LIMIT_G: f64 = 0.05;
 
-impl Lags {
+impl StretchLags {
     /// Returns these lags plus the shifts that remain in the residuals, or `None` if no shift is certain; `period` is
     /// the interval of the sensors' samples, in s.
-    pub(crate) fn refined<'a>(
+    pub(crate) fn refined_by_residuals<'a>(
         &self,
         table: &MotionTable,
         cells: impl Iterator<Item = (&'a Estimate, &'a [Reading])>,
@@ -31,13 +33,13 @@ impl Lags {
             (ages, count) = (ages + estimate.model.age, count + 1.0);
             let (coefficients, derivatives) = (estimate.model.coefficients(), estimate.model.derivatives());
             let mut own = vec![StretchSums::default(); all.len()];
-            for (moment, reading) in readings_with_motion(table.link(estimate.joint), readings) {
+            for (moment, reading) in readings_with_motion(table.link_motions(estimate.joint), readings) {
                 let index = usize::try_from(reading.epoch).unwrap_or_default();
                 let Some(sum) = own.get_mut(self.stretch_index(index)) else { continue };
-                let change = reading_derivative(&derivatives[AGE_UNKNOWN], moment);
-                let off = residual(&coefficients, moment, &reading.g);
+                let change = reading_age_derivative(&derivatives[AGE_UNKNOWN_INDEX], moment);
+                let off = reading_residual(&coefficients, moment, &reading.g);
                 // Large shifts cause large residuals.
-                let weight = weight(&off, RESIDUAL_LIMIT * RESIDUAL_LIMIT);
+                let weight = huber_weight(&off, RESIDUAL_LIMIT_G * RESIDUAL_LIMIT_G);
                 sum.weight += weight * change.iter().map(|it| it * it).sum::<f64>();
                 sum.product += weight * change.iter().zip(off).map(|(one, other)| one * other).sum::<f64>();
             }
@@ -63,7 +65,7 @@ impl Lags {
             // Each cell's own age varies over a whole period.
             let deviation = (period * period / 12.0 * sum.squares + sum.noise).sqrt() / sum.weight;
             *own = deviation;
-            is_certain |= off.abs() > MIN_SHIFT_S.max(MIN_SIGNIFICANCE * deviation);
+            is_certain |= off.abs() > MIN_SHIFT_S.max(MIN_SHIFT_DEVIATIONS * deviation);
             before + off
         });
         let by_stretch = by_stretch.collect();

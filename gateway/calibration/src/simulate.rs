@@ -14,7 +14,7 @@ use crate::observe::Observations;
 
 /// The deviation of a cell from the skin's description.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub enum Defect {
+pub enum CellDefect {
     /// The cell works as the skin describes it.
     #[default]
     None,
@@ -31,11 +31,11 @@ pub enum Defect {
 /// Moves a simulated skin through a motion, and returns the observations of its bus; values are rounded to words as in
 /// frames.
 #[must_use]
-pub fn observe(
+pub fn simulate_observations(
     skin: &Skin,
     motion: &MotionPlan,
     sensors: &Accelerometers,
-    defects: &[Defect],
+    defects: &[CellDefect],
 ) -> Observations {
     let mut seen = Observations::new(skin);
     let period = 1.0 / skin.timing.broadcast_hz();
@@ -62,7 +62,7 @@ pub fn observe(
         }
         let tilt = |cell: usize, force: &Vector3<f64>| match defects.get(cell) {
             // The cell rests on one side or the other, as gravity pulls it.
-            Some(Defect::Loose(angle)) => {
+            Some(CellDefect::Loose(angle)) => {
                 let turn = Vector3::new(angle * force.x.signum(), angle * force.y.signum(), 0.0);
                 nalgebra::Rotation3::new(turn) * force
             }
@@ -71,9 +71,9 @@ pub fn observe(
         let shown: Vec<_> = sensors.readings(skin, |time| motion.state_at(time), now, tilt).collect();
         for ((number, cell), shown) in skin.cells.iter().enumerate().zip(shown) {
             let shown = match defects.get(number) {
-                Some(Defect::Dead) => continue,
-                Some(Defect::Silent(part)) if (index * 0.618_034).fract() >= *part => continue,
-                Some(Defect::Stuck) => Vector3::new(0.0, 0.0, 1.0),
+                Some(CellDefect::Dead) => continue,
+                Some(CellDefect::Silent(part)) if (index * 0.618_034).fract() >= *part => continue,
+                Some(CellDefect::Stuck) => Vector3::new(0.0, 0.0, 1.0),
                 _ => shown,
             };
             let words: [f64; 3] = shown.into();

@@ -11,7 +11,7 @@ use model::accelerometer::kinematics::JointState;
 
 /// The number of broadcasts in a window on each side of the middle one.
 pub(crate) const HALF_WINDOW: usize = 10;
-const WINDOW: usize = 2 * HALF_WINDOW + 1;
+const WINDOW_LENGTH: usize = 2 * HALF_WINDOW + 1;
 /// The number of coefficients of the polynomial.
 const POLYNOMIAL_TERMS: usize = 7;
 
@@ -21,16 +21,16 @@ pub(crate) const POSITION_STEP_RAD: f64 = core::f64::consts::TAU / 65_536.0;
 pub(crate) const POSITION_STEP_M: f64 = 1.0 / 16_384.0;
 
 /// The positions of the joints of a chain at one broadcast.
-pub(crate) type Positions = [f64; MAX_JOINTS];
+pub(crate) type JointPositions = [f64; MAX_JOINTS];
 
 /// A least-squares fit of polynomials to windows of consecutive positions.
 #[derive(Clone, Debug)]
 pub(crate) struct Smoother {
     /// The matrix that maps the positions in a window to the polynomial's coefficients, with time in units of [`HALF`]
     /// periods.
-    fit: SMatrix<f64, POLYNOMIAL_TERMS, WINDOW>,
+    fit: SMatrix<f64, POLYNOMIAL_TERMS, WINDOW_LENGTH>,
     /// The matrix that maps the positions in a window to the residuals of the polynomial.
-    left: SMatrix<f64, WINDOW, WINDOW>,
+    left: SMatrix<f64, WINDOW_LENGTH, WINDOW_LENGTH>,
     /// The duration of half a window, in s.
     half_s: f64,
 }
@@ -39,7 +39,7 @@ impl Smoother {
     /// Creates the fit for positions at intervals of `period_s`.
     #[must_use]
     pub(crate) fn new(period_s: f64) -> Self {
-        let powers = SMatrix::<f64, WINDOW, POLYNOMIAL_TERMS>::from_fn(|at, power| {
+        let powers = SMatrix::<f64, WINDOW_LENGTH, POLYNOMIAL_TERMS>::from_fn(|at, power| {
             let x = (as_f64(at) - as_f64(HALF_WINDOW)) / as_f64(HALF_WINDOW);
             x.powi(i32::try_from(power).unwrap_or_default())
         });
@@ -53,16 +53,20 @@ impl Smoother {
     /// Returns the root mean square distance of each of the first `joints` in a window from a smooth motion, or `None`
     /// if the window is incomplete.
     #[must_use]
-    pub(crate) fn roughness(&self, window: &[Option<Positions>], joints: usize) -> Option<Positions> {
-        let middle = window.get(HALF_WINDOW)?.as_ref().filter(|_| window.len() == WINDOW)?;
+    pub(crate) fn roughness(
+        &self,
+        window: &[Option<JointPositions>],
+        joints: usize,
+    ) -> Option<JointPositions> {
+        let middle = window.get(HALF_WINDOW)?.as_ref().filter(|_| window.len() == WINDOW_LENGTH)?;
         let mut roughness = [0.0; MAX_JOINTS];
         for (joint, (rough, middle)) in roughness.iter_mut().zip(middle).take(joints).enumerate() {
-            let mut series = SVector::<f64, WINDOW>::zeros();
+            let mut series = SVector::<f64, WINDOW_LENGTH>::zeros();
             for (value, positions) in series.iter_mut().zip(window) {
                 *value = positions.as_ref()?.get(joint)? - middle;
             }
             if series.amax() > 0.0 {
-                *rough = (self.left * series).norm() / as_f64(WINDOW).sqrt();
+                *rough = (self.left * series).norm() / as_f64(WINDOW_LENGTH).sqrt();
             }
         }
         Some(roughness)
@@ -73,15 +77,15 @@ impl Smoother {
     #[must_use]
     pub(crate) fn joint_state(
         &self,
-        window: &[Option<Positions>],
+        window: &[Option<JointPositions>],
         joints: usize,
         earlier_s: f64,
     ) -> Option<JointState> {
-        if window.len() != WINDOW {
+        if window.len() != WINDOW_LENGTH {
             return None;
         }
         let x = -earlier_s / self.half_s;
-        let mut weights = [SVector::<f64, WINDOW>::zeros(); 3];
+        let mut weights = [SVector::<f64, WINDOW_LENGTH>::zeros(); 3];
         let powers = |order: usize| {
             SVector::<f64, POLYNOMIAL_TERMS>::from_fn(|power, _| {
                 let factor: f64 = (0..order).map(|less| as_f64(power) - as_f64(less)).product();
@@ -169,7 +173,7 @@ mod tests {
 
     #[test]
     fn a_window_with_a_gap_has_no_state() {
-        let mut window = vec![Some([0.5; MAX_JOINTS]); WINDOW];
+        let mut window = vec![Some([0.5; MAX_JOINTS]); WINDOW_LENGTH];
         let smoother = Smoother::new(0.016);
         let state = smoother.joint_state(&window, 2, 0.0).unwrap();
         assert!((state.position[1] - 0.5).abs() < 1e-9 && state.speed[1].abs() < 1e-9);
@@ -186,12 +190,12 @@ mod tests {
         let position = |at: usize| 0.12 * (TAU * 0.016 * at as f64).sin();
         let words: Vec<_> =
             (0..400).map(|at| Some([(position(at) / step).round() * step; MAX_JOINTS])).collect();
-        for window in words.windows(WINDOW) {
+        for window in words.windows(WINDOW_LENGTH) {
             assert!(smoother.roughness(window, 1).unwrap()[0] < step / 2.0);
         }
-        let mut late = words[100..100 + WINDOW].to_vec();
+        let mut late = words[100..100 + WINDOW_LENGTH].to_vec();
         // Polynomials with this number of terms follow the first and the last position.
-        for place in 1..WINDOW - 1 {
+        for place in 1..WINDOW_LENGTH - 1 {
             let before = late[place];
             late[place].as_mut().unwrap()[0] -= 10.0 * step;
             assert!(smoother.roughness(&late, 1).unwrap()[0] > 1.2 * step, "{place}");

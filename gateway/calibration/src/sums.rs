@@ -5,17 +5,18 @@
 use nalgebra::{Cholesky, SMatrix};
 
 use crate::cell::{
-    CellModel, Coefficients, InformationMatrix, MODEL_INPUTS, ModelInput, ROW_NUMBERS, UNKNOWNS, Unknowns,
+    CELL_UNKNOWN_COUNT, CellModel, Coefficients, InformationMatrix, MODEL_INPUT_COUNT, ModelInput,
+    NUMBERS_PER_ROW_MOTION, Unknowns,
 };
 
 /// The maximum number of least-squares steps.
-const MAX_STEPS: usize = 60;
+const MAX_LEAST_SQUARES_STEPS: usize = 60;
 
 /// Weighted sums over the readings of a cell, from which least squares compute residuals and derivatives.
 #[derive(Clone, Debug)]
 pub(crate) struct ReadingSums {
     /// The sums of products of two numbers of a moment.
-    moments: SMatrix<f64, MODEL_INPUTS, MODEL_INPUTS>,
+    moments: SMatrix<f64, MODEL_INPUT_COUNT, MODEL_INPUT_COUNT>,
     /// The sums of products of a number of a moment and the reading of each axis.
     shown: Coefficients,
     /// The sum of the squares of the readings.
@@ -25,17 +26,17 @@ pub(crate) struct ReadingSums {
 }
 
 /// The coefficients of the 12 numbers of a motion at the middle age, and of 1, without the constraints of a model.
-pub(crate) type FreeCoefficients = SMatrix<f64, 13, 3>;
+pub(crate) type UnconstrainedCoefficients = SMatrix<f64, 13, 3>;
 
 /// Converts an index into [`Free`] to the index among all numbers of a moment.
 const fn model_input_index(number: usize) -> usize {
-    if number < ROW_NUMBERS { ROW_NUMBERS + number } else { MODEL_INPUTS - 1 }
+    if number < NUMBERS_PER_ROW_MOTION { NUMBERS_PER_ROW_MOTION + number } else { MODEL_INPUT_COUNT - 1 }
 }
 
 /// Converts coefficients for the middle age to coefficients for all ages, with zeros for the others.
-pub(crate) fn expand_middle_age(free: &FreeCoefficients) -> Coefficients {
+pub(crate) fn expand_middle_age(free: &UnconstrainedCoefficients) -> Coefficients {
     let mut all = Coefficients::zeros();
-    for number in 0..=ROW_NUMBERS {
+    for number in 0..=NUMBERS_PER_ROW_MOTION {
         all.row_mut(model_input_index(number)).copy_from(&free.row(number));
     }
     all
@@ -43,7 +44,7 @@ pub(crate) fn expand_middle_age(free: &FreeCoefficients) -> Coefficients {
 
 /// The result of least squares.
 #[derive(Clone, Debug)]
-pub(crate) struct Fit {
+pub(crate) struct FitResult {
     pub(crate) model: CellModel,
     /// The sum of the squared residuals in units of the noise, plus that of the squared deviations from the data sheet.
     pub(crate) cost: f64,
@@ -57,13 +58,13 @@ impl Default for ReadingSums {
 
 impl ReadingSums {
     /// Adds a reading at a moment, with a weight.
-    pub(crate) fn add(&mut self, moment: &ModelInput, shown: &[f64; 3], weight: f64) {
+    pub(crate) fn add_reading(&mut self, moment: &ModelInput, shown: &[f64; 3], weight: f64) {
         // Columns of static matrices are contiguous: both loops become vector instructions.
-        for (column, number) in self.moments.as_mut_slice().chunks_exact_mut(MODEL_INPUTS).zip(moment) {
+        for (column, number) in self.moments.as_mut_slice().chunks_exact_mut(MODEL_INPUT_COUNT).zip(moment) {
             let scale = weight * number;
             column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += scale * number);
         }
-        for (column, value) in self.shown.as_mut_slice().chunks_exact_mut(MODEL_INPUTS).zip(shown) {
+        for (column, value) in self.shown.as_mut_slice().chunks_exact_mut(MODEL_INPUT_COUNT).zip(shown) {
             let scale = weight * value;
             column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += scale * number);
             self.squares += scale * value;
@@ -72,7 +73,7 @@ impl ReadingSums {
     }
 
     /// Returns the weighted sum of squared differences between the readings and a model with these coefficients.
-    pub(crate) fn residual(&self, coefficients: &Coefficients) -> f64 {
+    pub(crate) fn squared_residual_sum(&self, coefficients: &Coefficients) -> f64 {
         let mut sum = self.squares;
         for (mine, shown) in coefficients.column_iter().zip(self.shown.column_iter()) {
             sum += mine.dot(&(self.moments * mine)) - 2.0 * mine.dot(&shown);
@@ -82,7 +83,7 @@ impl ReadingSums {
 
     /// Returns the information of the readings on the unknowns, for noise of variance 1, and the gradient of half of
     /// [`Self::residual`].
-    pub(crate) fn information(&self, model: &CellModel) -> (InformationMatrix, Unknowns) {
+    pub(crate) fn information_and_gradient(&self, model: &CellModel) -> (InformationMatrix, Unknowns) {
         let derivatives = model.derivatives();
         let coefficients = model.coefficients();
         let mut information = InformationMatrix::zeros();
@@ -103,20 +104,20 @@ impl ReadingSums {
     }
 
     /// Finds the most likely model, by the method of Levenberg and Marquardt.
-    pub(crate) fn fit(&self, start: CellModel, expected: &Unknowns, variance: f64) -> Fit {
+    pub(crate) fn fit_model(&self, start: CellModel, expected: &Unknowns, variance: f64) -> FitResult {
         let cost = |model: &CellModel| {
             let unexpected = model.deviations_from_sheet();
-            self.residual(&model.coefficients()) / variance
+            self.squared_residual_sum(&model.coefficients()) / variance
                 + unexpected.component_mul(expected).dot(&unexpected)
         };
-        let mut best = Fit { cost: cost(&start), model: start };
+        let mut best = FitResult { cost: cost(&start), model: start };
         let mut damping = 1e-3;
-        for _ in 0..MAX_STEPS {
-            let (mut information, mut gradient) = self.information(&best.model);
+        for _ in 0..MAX_LEAST_SQUARES_STEPS {
+            let (mut information, mut gradient) = self.information_and_gradient(&best.model);
             information /= variance;
             gradient /= variance;
             gradient += expected.component_mul(&best.model.deviations_from_sheet());
-            for unknown in 0..UNKNOWNS {
+            for unknown in 0..CELL_UNKNOWN_COUNT {
                 information[(unknown, unknown)] += expected[unknown];
                 information[(unknown, unknown)] *= 1.0 + damping;
             }
@@ -125,7 +126,7 @@ impl ReadingSums {
             let now = cost(&model);
             if now < best.cost {
                 let gained = best.cost - now;
-                best = Fit { model, cost: now };
+                best = FitResult { model, cost: now };
                 damping = (damping * 0.2).max(1e-12);
                 if gained < 1e-7 * (1.0 + best.cost) {
                     break;
@@ -142,7 +143,7 @@ impl ReadingSums {
 
     /// Returns the coefficients at the middle age that fit the readings best without constraints, as a start for least
     /// squares. `ridge` regularises the coefficients on which the readings have no information.
-    pub(crate) fn fit_unconstrained(&self, ridge: f64) -> Option<FreeCoefficients> {
+    pub(crate) fn fit_unconstrained(&self, ridge: f64) -> Option<UnconstrainedCoefficients> {
         let mut moments = SMatrix::<f64, 13, 13>::from_fn(|row, column| {
             self.moments[(model_input_index(row), model_input_index(column))]
         });

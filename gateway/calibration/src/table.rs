@@ -3,19 +3,19 @@
 use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::{Chain, Skin};
 
-use crate::cell::{AGE_COUNT, AGE_STEP_S, MODEL_INPUTS, ModelInput, motion_numbers};
-use crate::lag::Lags;
+use crate::cell::{MODEL_INPUT_COUNT, ModelInput, READING_AGE_COUNT, READING_AGE_STEP_S, motion_numbers};
+use crate::lag::StretchLags;
 use crate::observe::{BusObservations, Observations, Reading};
-use crate::smooth::{HALF_WINDOW, POSITION_STEP_M, POSITION_STEP_RAD, Positions, Smoother};
-use model::accelerometer::kinematics::Arm;
+use crate::smooth::{HALF_WINDOW, JointPositions, POSITION_STEP_M, POSITION_STEP_RAD, Smoother};
+use model::accelerometer::kinematics::ArmKinematics;
 use model::accelerometer::sensor::DataSheet;
 
 /// The motion of the links of one bus' chain.
 #[derive(Debug)]
 pub(crate) struct MotionTable {
-    pub(crate) arm: Arm,
+    pub(crate) arm: ArmKinematics,
     /// The ages of readings relative to their joints.
-    pub(crate) lags: Lags,
+    pub(crate) lags: StretchLags,
     /// The motion by joint (0 is the base), then by broadcast; `None` where positions around the broadcast are missing.
     links: Vec<Vec<Option<ModelInput>>>,
 }
@@ -30,7 +30,7 @@ const MAX_MEDIAN_ROUGHNESS_FACTOR: f64 = 4.0;
 const PERIOD_TOLERANCE: f64 = 5e-4;
 
 /// Returns the roughness up to which a window counts as a smooth motion, by joint in rad or m.
-fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
+fn roughness_limits(chain: &Chain, roughness: &[Option<JointPositions>]) -> JointPositions {
     let mut limits = [f64::INFINITY; MAX_JOINTS];
     let kinds = chain.rows.iter().map(|row| row.kind).filter(|kind| *kind != RowKind::Fixed);
     for (joint, (limit, kind)) in limits.iter_mut().zip(kinds).enumerate() {
@@ -53,9 +53,9 @@ impl MotionTable {
         sheet: &DataSheet,
         gravity: [f64; 3],
         offsets: &[f64; MAX_JOINTS],
-        lags: &Lags,
+        lags: &StretchLags,
     ) -> Self {
-        let arm = Arm::new(skin, bus, gravity);
+        let arm = ArmKinematics::new(skin, bus, gravity);
         let chain = skin.chain(bus);
         let observed = seen.buses.get(bus);
         let nominal = 1.0 / skin.timing.broadcast_hz();
@@ -72,9 +72,9 @@ impl MotionTable {
         let mut links = vec![vec![None; series.len()]; rows.len()];
         let roughness: Vec<_> =
             series.windows(2 * HALF_WINDOW + 1).map(|window| smoother.roughness(window, joints)).collect();
-        let limits = limits(chain, &roughness);
+        let limits = roughness_limits(chain, &roughness);
         let is_smooth =
-            |roughness: &Positions| !roughness.iter().zip(&limits).any(|(rough, limit)| rough > limit);
+            |roughness: &JointPositions| !roughness.iter().zip(&limits).any(|(rough, limit)| rough > limit);
         for index in 0..series.len() {
             // The window around the time of the reading, which may lie at other joints than the preceding ones.
             let lag = lags.lag_at(index);
@@ -87,15 +87,15 @@ impl MotionTable {
             let known = roughness.get(first).copied().flatten().is_some_and(|it| is_smooth(&it));
             let (Some(window), true) = (series.get(first..=first + 2 * HALF_WINDOW), known) else { continue };
             let middle = middle + lag - periods * period;
-            let mut moments = vec![[1.0; MODEL_INPUTS]; rows.len()];
+            let mut moments = vec![[1.0; MODEL_INPUT_COUNT]; rows.len()];
             let mut complete = true;
-            for (at, age) in [-AGE_STEP_S, 0.0, AGE_STEP_S].into_iter().enumerate() {
+            for (at, age) in [-READING_AGE_STEP_S, 0.0, READING_AGE_STEP_S].into_iter().enumerate() {
                 let Some(mut state) = smoother.joint_state(window, joints, middle + age) else {
                     complete = false;
                     break;
                 };
                 state.position.iter_mut().zip(offsets).for_each(|(position, offset)| *position += offset);
-                let motions = arm.rows(&state);
+                let motions = arm.row_motions(&state);
                 for (moment, &row) in moments.iter_mut().zip(&rows) {
                     let numbers = motions.get(row).map(motion_numbers).unwrap_or_default();
                     let places = moment.chunks_exact_mut(numbers.len()).nth(at);
@@ -110,29 +110,29 @@ impl MotionTable {
                 }
             }
         }
-        debug_assert_eq!(AGE_COUNT, 3, "as many as the loop above has");
+        debug_assert_eq!(READING_AGE_COUNT, 3, "as many as the loop above has");
         Self { arm, lags: lags.clone(), links }
     }
 
     /// Returns true if the motion at a reading's broadcast is known.
-    pub(crate) fn is_known(&self, reading: &Reading) -> bool {
+    pub(crate) fn is_motion_known(&self, reading: &Reading) -> bool {
         let index = usize::try_from(reading.epoch).unwrap_or(usize::MAX);
-        self.link(0).get(index).is_some_and(Option::is_some)
+        self.link_motions(0).get(index).is_some_and(Option::is_some)
     }
 
     /// Returns the number of joints of the chain.
-    pub(crate) fn joints(&self) -> u8 {
+    pub(crate) fn joint_count(&self) -> u8 {
         u8::try_from(self.links.len()).unwrap_or_default().saturating_sub(1)
     }
 
     /// Returns the motion of the link behind a joint, at each broadcast.
-    pub(crate) fn link(&self, joint: u8) -> &[Option<ModelInput>] {
+    pub(crate) fn link_motions(&self, joint: u8) -> &[Option<ModelInput>] {
         self.links.get(usize::from(joint)).map_or(&[], Vec::as_slice)
     }
 
     /// Returns the number of broadcasts with a known motion.
-    pub(crate) fn known_count(&self) -> usize {
-        self.link(0).iter().flatten().count()
+    pub(crate) fn known_motion_count(&self) -> usize {
+        self.link_motions(0).iter().flatten().count()
     }
 }
 

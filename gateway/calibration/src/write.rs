@@ -4,7 +4,7 @@ use protocol::skin::Skin;
 use protocol::skin::file::{SkinEdit, Value};
 use thiserror::Error;
 
-use crate::result::{Calibration, FoundPlace};
+use crate::result::{Calibration, EstimatedCellPlace};
 
 /// The error for a skin whose text cannot be changed.
 #[derive(Debug, Error)]
@@ -23,7 +23,7 @@ pub fn calibrated_text(skin: &Skin, text: &str, calibration: &Calibration) -> Re
     let mut edit = SkinEdit::new(skin, text).map_err(|error| WriteError::Text(error.to_string()))?;
     for (index, (cell, result)) in skin.cells.iter().zip(&calibration.cells).enumerate() {
         let Some(found) = result.found.filter(|_| result.is_pose_written()) else { continue };
-        let FoundPlace { joint, row, position, orientation, .. } = found;
+        let EstimatedCellPlace { joint, row, position, orientation, .. } = found;
         if joint != cell.joint {
             set_or_insert(&mut edit, index, "joint", Value::Integer(i64::from(joint)), "node");
         }
@@ -31,21 +31,21 @@ pub fn calibrated_text(skin: &Skin, text: &str, calibration: &Calibration) -> Re
         edit.set(index, "position", Value::Numbers(&position));
         // A cell has one of the two keys: the orientation replaces the normal.
         let orientation = Value::Numbers(&orientation);
-        if edit.has(index, "normal") {
-            edit.replace(index, "normal", "orientation", orientation);
+        if edit.has_key(index, "normal") {
+            edit.replace_key(index, "normal", "orientation", orientation);
         } else {
             set_or_insert(&mut edit, index, "orientation", orientation, "position");
         }
     }
-    Ok(edit.text())
+    Ok(edit.edited_text())
 }
 
 /// Sets the value of a cell's key. Inserts the key after another one if the cell does not have it.
 fn set_or_insert(edit: &mut SkinEdit<'_>, cell: usize, key: &str, value: Value<'_>, after: &str) {
-    if edit.has(cell, key) {
+    if edit.has_key(cell, key) {
         edit.set(cell, key, value);
     } else {
-        edit.insert(cell, key, value, after);
+        edit.insert_key_after(cell, key, value, after);
     }
 }
 
@@ -75,7 +75,7 @@ orientation = [0.0, 0.0, 0.0, 1.0]
     #[test]
     fn poses_change_and_nothing_else() {
         let skin = Skin::parse("skin.toml", SKIN).unwrap();
-        let found = FoundPlace {
+        let found = EstimatedCellPlace {
             joint: 2,
             row: 2,
             position: [0.01, -0.02, 0.3],

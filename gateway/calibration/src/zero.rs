@@ -11,26 +11,28 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{JointKind, Skin};
 use serde::Serialize;
 
-use crate::cell::{InformationMatrix, MODEL_INPUTS, UNKNOWNS, Unknowns, prior_inverse_variances};
+use crate::cell::{
+    CELL_UNKNOWN_COUNT, InformationMatrix, MODEL_INPUT_COUNT, Unknowns, prior_inverse_variances,
+};
 use crate::each::parallel_map;
-use crate::estimate::{Estimate, readings_with_motion, residual};
-use crate::lag::Lags;
+use crate::estimate::{Estimate, reading_residual, readings_with_motion};
+use crate::lag::StretchLags;
 use crate::observe::{Observations, Reading};
 use crate::rounded::rounded;
 use crate::settings::Settings;
 use crate::table::MotionTable;
 
 /// The prior standard deviation of offsets, in rad or m.
-const PRIOR_DEVIATION: f64 = 0.1;
+const PRIOR_OFFSET_DEVIATION: f64 = 0.1;
 /// An offset with a larger standard deviation than this is not observable: 1 degree, or 2 cm.
-const MAX_DEVIATION: f64 = 0.0175;
+const MAX_OFFSET_DEVIATION: f64 = 0.0175;
 /// The step of numerical derivatives.
 const DERIVATIVE_STEP: f64 = 1e-5;
 /// The interval of the readings that are used: one of this many.
 const READING_STRIDE: usize = 4;
 /// The fraction of an independent reading that each reading counts as, because errors of readings close in time are
 /// correlated.
-const READING_WEIGHT: f64 = 0.5;
+const CORRELATED_READING_WEIGHT: f64 = 0.5;
 
 /// The zero offset of a joint.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -70,11 +72,12 @@ pub(crate) fn zero_offsets(
     skin: &Skin,
     seen: &Observations,
     settings: &Settings,
-    (tables, lags): (&[Option<MotionTable>], &[Lags]),
+    (tables, lags): (&[Option<MotionTable>], &[StretchLags]),
     estimates: &[Option<Estimate>],
 ) -> Vec<ZeroOffset> {
     let size = skin.robot.joints.len();
-    let mut information = DMatrix::<f64>::identity(size, size) / (PRIOR_DEVIATION * PRIOR_DEVIATION);
+    let mut information =
+        DMatrix::<f64>::identity(size, size) / (PRIOR_OFFSET_DEVIATION * PRIOR_OFFSET_DEVIATION);
     let mut gradient = DVector::<f64>::zeros(size);
     for (bus, table) in tables.iter().enumerate() {
         let (Some(table), Some(lags)) = (table, lags.get(bus)) else { continue };
@@ -90,7 +93,7 @@ pub(crate) fn zero_offsets(
             let (cell, estimate) = (skin.cells.get(index)?, estimates.get(index)?.as_ref()?);
             let readings = seen.cells.get(index)?;
             (cell.bus == bus && estimate.joint > 0)
-                .then(|| cell_remainder(table, &moved, estimate, readings, settings))?
+                .then(|| cell_offset_information(table, &moved, estimate, readings, settings))?
         });
         for left in left.into_iter().flatten() {
             for (row, &to) in joints.iter().enumerate() {
@@ -109,7 +112,7 @@ pub(crate) fn zero_offsets(
         ZeroOffset {
             joint: joint.name.clone(),
             unit: if joint.kind == JointKind::Revolute { "rad" } else { "m" },
-            offset: (deviation < MAX_DEVIATION).then(|| rounded(offsets[index], 5)),
+            offset: (deviation < MAX_OFFSET_DEVIATION).then(|| rounded(offsets[index], 5)),
             deviation: rounded(deviation, 5),
         }
     });
@@ -117,7 +120,7 @@ pub(crate) fn zero_offsets(
 }
 
 /// Returns the information of a cell's readings on the offsets that the cell's own unknowns cannot explain.
-fn cell_remainder(
+fn cell_offset_information(
     table: &MotionTable,
     moved: &[MotionTable],
     estimate: &Estimate,
@@ -129,22 +132,22 @@ fn cell_remainder(
     let (coefficients, derivatives) = (model.coefficients(), model.derivatives());
     let size = moved.len();
     let mut own = InformationMatrix::from_diagonal(&prior_inverse_variances(&settings.sheet));
-    let mut shared = DMatrix::<f64>::zeros(UNKNOWNS, size);
+    let mut shared = DMatrix::<f64>::zeros(CELL_UNKNOWN_COUNT, size);
     let mut information = DMatrix::<f64>::zeros(size, size);
     let (mut of_own, mut gradient) = (Unknowns::zeros(), DVector::<f64>::zeros(size));
-    let weight = READING_WEIGHT * f64::from(u8::try_from(READING_STRIDE).unwrap_or(1))
+    let weight = CORRELATED_READING_WEIGHT * f64::from(u8::try_from(READING_STRIDE).unwrap_or(1))
         / estimate.noise_g.powi(2).max(1e-10);
-    let links: Vec<_> = moved.iter().map(|table| table.link(estimate.joint)).collect();
-    for (moment, reading) in readings_with_motion(table.link(estimate.joint), &few) {
+    let links: Vec<_> = moved.iter().map(|table| table.link_motions(estimate.joint)).collect();
+    for (moment, reading) in readings_with_motion(table.link_motions(estimate.joint), &few) {
         let at = usize::try_from(reading.epoch).ok()?;
-        let off = residual(&coefficients, moment, &reading.g);
+        let off = reading_residual(&coefficients, moment, &reading.g);
         let mut changes = Vec::with_capacity(size);
         for link in &links {
             let Some(Some(other)) = link.get(at) else { return None };
             let numbers = other.iter().zip(moment).map(|(other, one)| (other - one) / DERIVATIVE_STEP);
-            changes.push(coefficients.tr_mul(&SVector::<f64, MODEL_INPUTS>::from_iterator(numbers)));
+            changes.push(coefficients.tr_mul(&SVector::<f64, MODEL_INPUT_COUNT>::from_iterator(numbers)));
         }
-        let now = SVector::<f64, MODEL_INPUTS>::from(*moment);
+        let now = SVector::<f64, MODEL_INPUT_COUNT>::from(*moment);
         for (axis, off) in off.into_iter().enumerate() {
             let mine = Unknowns::from_fn(|unknown, _| {
                 derivatives.get(unknown).map_or(0.0, |derivative| derivative.column(axis).dot(&now))

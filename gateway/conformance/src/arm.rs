@@ -21,7 +21,7 @@ impl TestRandom {
     }
 
     /// Returns a random word, from the whole range.
-    pub(crate) fn word(&mut self) -> i16 {
+    pub(crate) fn random_word(&mut self) -> i16 {
         self.0.random()
     }
 
@@ -32,7 +32,7 @@ impl TestRandom {
 
     /// Returns a random number in [-1, 1).
     fn random_signed_unit(&mut self) -> f64 {
-        f64::from(self.word()) / 32_768.0
+        f64::from(self.random_word()) / 32_768.0
     }
 
     /// Returns a random element of a slice.
@@ -46,7 +46,7 @@ impl TestRandom {
 const PERIOD_US: u16 = 60_000;
 
 /// Gain 1, no proximity, no thresholds: the force is the sum of the three contact words.
-pub(crate) const PLAIN_CONTACT: Contact = Contact {
+pub(crate) const UNIT_GAIN_CONTACT: Contact = Contact {
     alpha_c: Q3_12::from_bits(4096),
     alpha_p: Q5_10::ZERO,
     contact_threshold: Q5_10::ZERO,
@@ -54,7 +54,7 @@ pub(crate) const PLAIN_CONTACT: Contact = Contact {
     force_threshold: Q5_10::ZERO,
 };
 
-fn row(a: i16, d: i16, alpha: i16, theta_offset: i16) -> Row {
+fn revolute_row(a: i16, d: i16, alpha: i16, theta_offset: i16) -> Row {
     let [a, d, alpha, theta_offset] = [a, d, alpha, theta_offset].map(Q1_14::from_bits);
     Row { kind: RowKind::Revolute, a, d, alpha, theta_offset }
 }
@@ -63,12 +63,12 @@ fn row(a: i16, d: i16, alpha: i16, theta_offset: i16) -> Row {
 pub(crate) fn example_parameters(joint: u8) -> Parameters {
     let mut rows = [Row::default(); MAX_ROWS];
     let ur5 = [
-        row(0, 0x05B5, 0x4000, 0),
-        row(-0x1B32, 0, 0, 0),
-        row(-0x191B, 0, 0, 0),
-        row(0, 0x06FC, 0x4000, 0),
-        row(0, 0x060F, -0x4000, 0),
-        row(0, 0x0544, 0, 0),
+        revolute_row(0, 0x05B5, 0x4000, 0),
+        revolute_row(-0x1B32, 0, 0, 0),
+        revolute_row(-0x191B, 0, 0, 0),
+        revolute_row(0, 0x06FC, 0x4000, 0),
+        revolute_row(0, 0x060F, -0x4000, 0),
+        revolute_row(0, 0x0544, 0, 0),
     ];
     for (row, ur5) in rows.iter_mut().zip(ur5) {
         *row = ur5;
@@ -83,14 +83,14 @@ pub(crate) fn example_parameters(joint: u8) -> Parameters {
             position: [0x0666, 0x0333, 0x03D7].map(Q1_14::from_bits),
             normal: [0, 0x3333, 0x2666].map(Q1_14::from_bits),
         },
-        contact: PLAIN_CONTACT,
+        contact: UNIT_GAIN_CONTACT,
         period_us: PERIOD_US,
         rows,
     }
 }
 
 /// Returns the configuration of [`document`] with a period of 16 ms (62.5 joints a second), for checks of times.
-pub(crate) fn fast_parameters(joint: u8) -> Parameters {
+pub(crate) fn fast_example_parameters(joint: u8) -> Parameters {
     Parameters { period_us: 16_000, ..example_parameters(joint) }
 }
 
@@ -141,7 +141,7 @@ pub(crate) fn distinct_parameters(abilities: Abilities) -> Parameters {
 }
 
 /// Returns the gains and thresholds of the document's example.
-pub(crate) fn document_contact() -> Contact {
+pub(crate) fn example_contact() -> Contact {
     let [alpha_c, threshold] = [4096, 0x67];
     Contact {
         alpha_c: Q3_12::from_bits(alpha_c),
@@ -179,7 +179,7 @@ pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Par
         } else {
             left.0 -= 1
         }
-        let twist = [0x4000, -0x4000, 0, dice.word(), dice.word()];
+        let twist = [0x4000, -0x4000, 0, dice.random_word(), dice.random_word()];
         *row = Row {
             kind,
             a: Q1_14::nearest(dice.random_signed_unit() * share),
@@ -187,7 +187,7 @@ pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Par
                 dice.random_signed_unit() * share / if kind == RowKind::Prismatic { 2.0 } else { 1.0 },
             ),
             alpha: Q1_14::from_bits(dice.choose(&twist)),
-            theta_offset: Q1_14::from_bits(dice.word()),
+            theta_offset: Q1_14::from_bits(dice.random_word()),
         };
     }
     let plain = rows.iter().take(shape.rows).all(|row| row.kind == RowKind::Revolute);
@@ -207,7 +207,7 @@ pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Par
         table_rows,
         torque_format: TorqueFormat::Q3_12,
         pose: Pose { position, normal: random_unit_vector(dice) },
-        contact: PLAIN_CONTACT,
+        contact: UNIT_GAIN_CONTACT,
         period_us: PERIOD_US,
         rows,
     }
@@ -225,22 +225,22 @@ fn random_unit_vector(dice: &mut TestRandom) -> [Q1_14; 3] {
 }
 
 /// Returns joint positions for a chain; prismatic joints stay near 0.
-pub(crate) fn positions(dice: &mut TestRandom, parameters: &Parameters) -> [i16; MAX_JOINTS] {
+pub(crate) fn random_positions(dice: &mut TestRandom, parameters: &Parameters) -> [i16; MAX_JOINTS] {
     let moving: Vec<_> =
         parameters.all_rows().iter().filter(|row| row.has_joint()).map(|row| row.kind).collect();
     let share = 16_384 / i16::try_from(parameters.all_rows().len().max(1) * 3).unwrap_or(i16::MAX);
     core::array::from_fn(|index| match moving.get(index) {
         None => 0,
-        Some(RowKind::Prismatic) => dice.word() % share,
+        Some(RowKind::Prismatic) => dice.random_word() % share,
         Some(RowKind::Revolute | RowKind::Fixed) => match dice.random_below(8) {
             0 => dice.choose(&[0, 0x4000, -0x4000, i16::MIN, i16::MAX]),
-            _ => dice.word(),
+            _ => dice.random_word(),
         },
     })
 }
 
 /// Computes F_z in steps of 2^-16 N, by Algorithm 1 of the document.
-pub(crate) fn force(contact: &Contact, skin: &SkinSensors) -> i64 {
+pub(crate) fn expected_force(contact: &Contact, skin: &SkinSensors) -> i64 {
     let bits = |word: i16| i64::from(word);
     let f_c: i64 = skin.contact.iter().map(|word| bits(word.to_bits())).sum();
     let f_c = if f_c < bits(contact.contact_threshold.to_bits()) { 0 } else { f_c };
@@ -299,16 +299,16 @@ pub(crate) fn exact_jacobian(
     positions: &[i16; MAX_JOINTS],
 ) -> [f64; MAX_JOINTS] {
     let words = positions.map(Q1_14::from_bits);
-    central.torque(0, &central.frames(&words), 1.0)
+    central.cell_torque(0, &central.link_frames(&words), 1.0)
 }
 
 /// Returns the distance of a word of J from the nearest word to the exact value, in steps.
-pub(crate) fn steps_from_exact(j: i16, exact: f64) -> u32 {
+pub(crate) fn rounding_error_steps(j: i16, exact: f64) -> u32 {
     let nearest = Q::<14>::nearest(exact).to_bits();
     i32::from(j).abs_diff(nearest.into())
 }
 
 /// Returns the distance from the exact value that J-3 allows, in steps: 8, and one more for each row after the sixth.
-pub(crate) fn tolerance(parameters: &Parameters) -> u32 {
-    8 + u32::try_from(parameters.chain().len().saturating_sub(6)).unwrap_or(0)
+pub(crate) fn jacobian_tolerance_steps(parameters: &Parameters) -> u32 {
+    8 + u32::try_from(parameters.rows_to_cell().len().saturating_sub(6)).unwrap_or(0)
 }

@@ -37,10 +37,10 @@ pub trait TestBus {
 
     /// Returns the maximum lateness of the bench itself since the last call, so that it does not count against the
     /// cell.
-    fn lateness(&mut self) -> Span;
+    fn bench_lateness(&mut self) -> Span;
 
     /// Ignores signals from now on, so that the cell can be restored.
-    fn finish(&mut self);
+    fn ignore_signals(&mut self);
 
     /// Returns true if the cell can be switched off and on.
     fn can_restart(&self) -> bool;

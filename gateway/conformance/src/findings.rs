@@ -59,7 +59,7 @@ pub struct Finding {
 }
 
 #[derive(Clone, Debug, Default)]
-struct Tally {
+struct RequirementTally {
     passed: usize,
     failed: usize,
     failure: Option<(String, Vec<String>)>,
@@ -69,21 +69,26 @@ struct Tally {
 
 /// The results of all checks.
 #[derive(Clone, Debug, Default)]
-pub struct Findings(BTreeMap<&'static str, Tally>);
+pub struct Findings(BTreeMap<&'static str, RequirementTally>);
 
 impl Findings {
-    fn tally(&mut self, id: &'static str) -> &mut Tally {
+    fn tally(&mut self, id: &'static str) -> &mut RequirementTally {
         debug_assert!(REQUIREMENTS.iter().any(|it| it.id == id), "{id} is not a requirement");
         self.0.entry(id).or_default()
     }
 
     /// Counts a passed check.
-    pub(crate) fn pass(&mut self, id: &'static str) {
+    pub(crate) fn count_passed(&mut self, id: &'static str) {
         self.tally(id).passed += 1;
     }
 
     /// Counts a failed check; the first failure of a requirement is kept.
-    pub(crate) fn fail(&mut self, id: &'static str, what: String, frames: impl FnOnce() -> Vec<String>) {
+    pub(crate) fn count_failed(
+        &mut self,
+        id: &'static str,
+        what: String,
+        frames: impl FnOnce() -> Vec<String>,
+    ) {
         let tally = self.tally(id);
         tally.failed += 1;
         tally.failure.get_or_insert_with(|| {
@@ -94,18 +99,18 @@ impl Findings {
     }
 
     /// Notes that the requirement does not apply to the cell.
-    pub(crate) fn not_applicable(&mut self, id: &'static str, why: impl Into<String>) {
+    pub(crate) fn mark_not_applicable(&mut self, id: &'static str, why: impl Into<String>) {
         self.tally(id).not_applicable.get_or_insert_with(|| why.into());
     }
 
     /// Notes that the requirement, or a part of it, could not be tested.
-    pub(crate) fn not_tested(&mut self, id: &'static str, why: impl Into<String>) {
+    pub(crate) fn mark_not_tested(&mut self, id: &'static str, why: impl Into<String>) {
         self.tally(id).not_tested.get_or_insert_with(|| why.into());
     }
 
     /// Returns the ids of the requirements that failed.
     #[must_use]
-    pub fn failed(&self) -> Vec<&'static str> {
+    pub fn failed_requirements(&self) -> Vec<&'static str> {
         self.0.iter().filter(|(_, tally)| tally.failed > 0).map(|(id, _)| *id).collect()
     }
 
@@ -116,8 +121,8 @@ impl Findings {
     }
 
     /// Retracts the failures of a requirement since `before`.
-    pub(crate) fn retract(&mut self, id: &'static str, before: &Self) {
-        let Tally { failed, failure, .. } = before.0.get(id).cloned().unwrap_or_default();
+    pub(crate) fn retract_failures(&mut self, id: &'static str, before: &Self) {
+        let RequirementTally { failed, failure, .. } = before.0.get(id).cloned().unwrap_or_default();
         let tally = self.tally(id);
         (tally.failed, tally.failure) = (failed, failure);
     }
@@ -140,9 +145,9 @@ impl Findings {
     /// Returns all requested requirements with their verdicts, in the order of the documents. `stopped` is the reason
     /// why the test ended early, if it did.
     #[must_use]
-    pub fn list(&self, only: &RequirementFilter, stopped: Option<&StopReason>) -> Vec<Finding> {
+    pub fn requested_findings(&self, only: &RequirementFilter, stopped: Option<&StopReason>) -> Vec<Finding> {
         let why = stopped.map_or_else(|| "there is no check for it".to_owned(), ToString::to_string);
-        let asked = REQUIREMENTS.iter().filter(|it| only.has(it.id));
+        let asked = REQUIREMENTS.iter().filter(|it| only.is_selected(it.id));
         asked
             .map(|requirement| Finding { requirement, verdict: self.verdict(requirement.id, &why) })
             .collect()
@@ -161,7 +166,7 @@ impl RequirementFilter {
     pub fn new(words: &[String]) -> Result<Self, String> {
         let words: Vec<_> = words.iter().map(|word| word.to_uppercase()).collect();
         let one = |word: &String| Self(vec![word.clone()]);
-        match words.iter().find(|word| !REQUIREMENTS.iter().any(|it| one(word).has(it.id))) {
+        match words.iter().find(|word| !REQUIREMENTS.iter().any(|it| one(word).is_selected(it.id))) {
             Some(word) => Err(word.clone()),
             None => Ok(Self(words)),
         }
@@ -169,7 +174,7 @@ impl RequirementFilter {
 
     /// Returns true if this requirement is selected.
     #[must_use]
-    pub fn has(&self, id: &str) -> bool {
+    pub fn is_selected(&self, id: &str) -> bool {
         let is = |word: &String| id == word || id.split_once('-').is_some_and(|(kind, _)| kind == word);
         self.0.is_empty() || self.0.iter().any(is)
     }

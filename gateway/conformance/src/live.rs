@@ -50,7 +50,7 @@ impl SocketBus {
     ) -> Result<Self, BusError> {
         let receive_buffer = GATEWAY_RECEIVE_BUFFER_BYTES as usize;
         let options = BusOptions { own_frames: true, receive_buffer, ..BusOptions::default() };
-        let socket = listen::open(name, kind, None, options)?;
+        let socket = listen::open_bus(name, kind, None, options)?;
         let (inbox, waiting, late) = (Inbox::new(), VecDeque::new(), Span(0));
         let probe = socket.is_virtual().unwrap_or(false).then(LatenessProbe::new).transpose();
         let probe = probe.map_err(|source| BusError::Io {
@@ -61,7 +61,7 @@ impl SocketBus {
         Ok(Self { socket, inbox, waiting, stopped, obeys_signals: true, late, probe, command, child: None })
     }
 
-    fn interrupted(&self) -> bool {
+    fn is_interrupted(&self) -> bool {
         self.obeys_signals && self.stopped.load(Ordering::Relaxed)
     }
 }
@@ -86,7 +86,7 @@ impl TestBus for SocketBus {
 
     fn receive(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason> {
         loop {
-            if self.interrupted() {
+            if self.is_interrupted() {
                 return Err(StopReason::Interrupted);
             }
             if let Some(seen) = self.waiting.pop_front() {
@@ -97,7 +97,7 @@ impl TestBus for SocketBus {
             let wait_time = Duration::from_micros(wait.0);
             let count = receive_batch(&self.socket, &mut self.inbox, wait_time).map_err(bus_failure)?;
             let now = self.now();
-            if self.inbox.dropped() > 0 {
+            if self.inbox.dropped_count() > 0 {
                 let name = self.socket.name();
                 return Err(StopReason::Bus(format!(
                     "{name}: frames were lost because they came faster than they were read"
@@ -118,12 +118,12 @@ impl TestBus for SocketBus {
         }
     }
 
-    fn lateness(&mut self) -> Span {
+    fn bench_lateness(&mut self) -> Span {
         let probed = self.probe.as_ref().map_or(Span(0), LatenessProbe::lateness);
         core::mem::take(&mut self.late).max(probed)
     }
 
-    fn finish(&mut self) {
+    fn ignore_signals(&mut self) {
         self.obeys_signals = false;
     }
 

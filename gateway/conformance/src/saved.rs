@@ -14,9 +14,9 @@ use crate::session::{Reply, Session};
 /// The time limit for restoring the state.
 const RESTORE_TIMEOUT: Span = Span::from_millis(8_000);
 /// The time after which no more answers to requests of the test come.
-const SETTLE_TIME: Span = Span::from_millis(60);
+const ANSWER_SETTLE_TIME: Span = Span::from_millis(60);
 /// The number of attempts to restore a value.
-const ATTEMPTS: usize = 3;
+const RESTORE_ATTEMPTS: usize = 3;
 
 /// The volatile parameters, which are saved and restored.
 const VOLATILE_PARAMETERS: [Parameter; 6] = [
@@ -52,7 +52,7 @@ impl Session<'_> {
     /// # Errors
     /// Returns [`StopReason`] if the bus fails, or if the test is interrupted.
     pub fn save(&mut self) -> Result<Result<SavedCell, String>, StopReason> {
-        let Reply::Value(identity) = self.read(Parameter::Identity.number())? else {
+        let Reply::Value(identity) = self.read_parameter(Parameter::Identity.number())? else {
             return Ok(Err("it does not answer a read of parameter 0 (identity)".to_owned()));
         };
         let [low, high, _, hash, state, abilities] = identity.map(i16::cast_unsigned);
@@ -62,10 +62,10 @@ impl Session<'_> {
         let all = Parameter::stored_for_rows(abilities.max_rows()).chain(VOLATILE_PARAMETERS);
         for parameter in all.collect::<Vec<_>>() {
             let number = parameter.number();
-            match self.read(number)? {
+            match self.read_parameter(number)? {
                 Reply::Value(words) => _ = parameters.insert(number, words),
                 // A cell that implements the protocol without baselines.
-                Reply::Refused(Answer::UNKNOWN_PARAMETER) if parameter == Parameter::Baseline => {}
+                Reply::Refused(Answer::REFUSED_UNKNOWN_PARAMETER) if parameter == Parameter::Baseline => {}
                 Reply::Refused(_) | Reply::Nothing => {
                     return Ok(Err(format!("it does not answer a read of parameter {number}")));
                 }
@@ -84,14 +84,14 @@ impl Session<'_> {
     /// Returns [`StopReason`] if the bus fails.
     pub fn restore(&mut self, saved: &SavedCell) -> Result<Vec<String>, StopReason> {
         let mut left = Vec::new();
-        self.extend(RESTORE_TIMEOUT);
+        self.set_remaining_time(RESTORE_TIMEOUT);
         // Lets late answers to the test pass, so that they do not count as answers to this.
-        self.idle(SETTLE_TIME)?;
+        self.receive_for(ANSWER_SETTLE_TIME)?;
         self.begin_expected_exchange();
         self.send_messages(&[Message::Resume])?;
         if saved.hash == 0 {
             left.push("its configuration: it had none, and the one of the test cannot be erased".to_owned());
-        } else if !self.put_back_stored(saved)? {
+        } else if !self.restore_stored_parameters(saved)? {
             left.push(format!("its configuration {:04X}", saved.hash));
         }
         for parameter in VOLATILE_PARAMETERS {
@@ -101,8 +101,8 @@ impl Session<'_> {
                 continue;
             }
             let mut is_back = false;
-            for _ in 0..ATTEMPTS {
-                is_back = self.write(parameter.number(), *words)? == Reply::Value(*words);
+            for _ in 0..RESTORE_ATTEMPTS {
+                is_back = self.write_parameter(parameter.number(), *words)? == Reply::Value(*words);
                 if is_back {
                     break;
                 }
@@ -115,16 +115,16 @@ impl Session<'_> {
         Ok(left)
     }
 
-    fn put_back_stored(&mut self, saved: &SavedCell) -> Result<bool, StopReason> {
-        for _ in 0..ATTEMPTS {
+    fn restore_stored_parameters(&mut self, saved: &SavedCell) -> Result<bool, StopReason> {
+        for _ in 0..RESTORE_ATTEMPTS {
             let mut is_well = true;
             for (&number, &words) in &saved.parameters {
                 if Parameter::from_number(number).is_some_and(Parameter::is_stored) {
-                    is_well &= self.write(number, words)? == Reply::Value(words);
+                    is_well &= self.write_parameter(number, words)? == Reply::Value(words);
                 }
             }
             let hash = padded_words([saved.hash.cast_signed()]);
-            is_well &= self.write(Parameter::Commit.number(), hash)? == Reply::Value(hash);
+            is_well &= self.write_parameter(Parameter::Commit.number(), hash)? == Reply::Value(hash);
             if is_well {
                 return Ok(true);
             }

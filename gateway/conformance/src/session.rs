@@ -24,14 +24,14 @@ use crate::timings::Timings;
 
 pub(crate) use exchange::Exchange;
 pub(crate) use joints::JointsResult;
-pub(crate) use known::{CellAbilities, TrackedState};
+pub(crate) use known::{CellAbilities, KnownCellState};
 use life::CellLife;
 pub(crate) use request::Reply;
 
 /// The time limit for the answer to a request or a sync.
 pub(crate) const ANSWER_TIMEOUT: Span = Span::from_millis(300);
 /// The additional wait for answers after the heartbeat that answers a sync.
-pub(crate) const SYNC_GRACE: Span = Span::from_millis(5);
+pub(crate) const SYNC_ANSWER_GRACE: Span = Span::from_millis(5);
 /// The time within which a sent frame appears on the bus, even on a busy computer.
 const SEND_TIMEOUT: Span = Span::from_millis(1_200);
 /// The time without packets after which the cell counts as silent, which ends the test.
@@ -47,7 +47,7 @@ pub(crate) struct CellPacket {
 
 impl CellPacket {
     /// Returns the heartbeat and its epoch byte, if the packet is one.
-    pub(crate) const fn beat(&self) -> Option<(&Heartbeat, Epoch)> {
+    pub(crate) const fn heartbeat_and_epoch(&self) -> Option<(&Heartbeat, Epoch)> {
         if let Message::Network { page: NetworkPage::Heartbeat(beat), epoch, .. } = &self.message {
             Some((beat, *epoch))
         } else {
@@ -90,7 +90,7 @@ struct Clock {
 
 /// The log of the frames that the cell and the bench sent.
 #[derive(Debug, Default)]
-struct Log {
+struct FrameLog {
     frames: Vec<ObservedFrame>,
     /// The index of the first frame of the present exchange.
     since: usize,
@@ -98,9 +98,9 @@ struct Log {
     ended: usize,
 }
 
-impl Log {
+impl FrameLog {
     /// Returns the frames of the present exchange.
-    fn present(&self) -> &[ObservedFrame] {
+    fn present_frames(&self) -> &[ObservedFrame] {
         self.frames.get(self.since..).unwrap_or_default()
     }
 }
@@ -111,7 +111,7 @@ pub struct Session<'a> {
     name: String,
     pub(crate) cell: CellId,
     pub(crate) format: Format,
-    log: Log,
+    log: FrameLog,
     /// The packets that the cell sent.
     pub(crate) packets: Vec<CellPacket>,
     /// The index in `heard` at which the present exchange begins.
@@ -126,7 +126,7 @@ pub struct Session<'a> {
     held: Option<Vec<(ObservedFrame, Id)>>,
     /// The results.
     pub findings: Findings,
-    pub(crate) known: TrackedState,
+    pub(crate) known: KnownCellState,
     pub(crate) about: CellAbilities,
     tag: u8,
     pub(crate) timings: Timings,
@@ -151,7 +151,7 @@ impl<'a> Session<'a> {
             name: name.to_owned(),
             cell,
             format,
-            log: Log::default(),
+            log: FrameLog::default(),
             packets: Vec::new(),
             from: 0,
             consumed: 0,
@@ -159,7 +159,7 @@ impl<'a> Session<'a> {
             life: CellLife::default(),
             held: None,
             findings: Findings::default(),
-            known: TrackedState::default(),
+            known: KnownCellState::default(),
             about: CellAbilities::default(),
             tag: 0x50,
             timings: Timings::default(),
@@ -187,8 +187,8 @@ impl<'a> Session<'a> {
     }
 
     /// Sets the remaining time, and ignores signals from now on.
-    pub(crate) fn extend(&mut self, span: Span) {
-        self.bus.finish();
+    pub(crate) fn set_remaining_time(&mut self, span: Span) {
+        self.bus.ignore_signals();
         self.clock.finishing = true;
         self.clock.end = self.bus.now() + span;
         self.clock.last = self.bus.now();
@@ -200,7 +200,7 @@ impl<'a> Session<'a> {
     }
 
     /// Notes that the cell was allowed to be silent until now.
-    pub(crate) fn excuse_silence(&mut self) {
+    pub(crate) fn excuse_silence_until_now(&mut self) {
         self.clock.last = self.bus.now();
     }
 
@@ -215,11 +215,12 @@ impl<'a> Session<'a> {
     /// Records the result of a check of requirement `id`; `what` describes a failure. Returns `is_so`.
     pub(crate) fn check(&mut self, id: &'static str, is_so: bool, what: impl FnOnce() -> String) -> bool {
         if is_so {
-            self.findings.pass(id);
+            self.findings.count_passed(id);
         } else if !self.clock.skipped {
             let (log, name) = (&self.log, &self.name);
-            self.findings
-                .fail(id, what(), || log.present().iter().map(|seen| frame_line(name, seen)).collect());
+            self.findings.count_failed(id, what(), || {
+                log.present_frames().iter().map(|seen| frame_line(name, seen)).collect()
+            });
         }
         is_so
     }
@@ -244,12 +245,12 @@ impl<'a> Session<'a> {
         self.clock.skipped = false;
         self.log.since = self.log.ended;
         (self.from, self.consumed) = (self.packets.len(), self.packets.len());
-        self.lateness();
+        self.bench_lateness();
         self.clock.late = Span(0);
     }
 
     /// Marks the packets since the exchange began as expected.
-    pub(crate) fn mark_expected(&mut self) {
+    pub(crate) fn mark_packets_expected(&mut self) {
         self.consumed = self.packets.len();
         self.log.ended = self.log.frames.len();
     }
@@ -265,12 +266,12 @@ impl<'a> Session<'a> {
     }
 
     /// Discards the known state of the cell, except its last epoch and its number of joints.
-    pub(crate) fn forget_state(&mut self) {
-        self.known = TrackedState {
+    pub(crate) fn forget_cell_state(&mut self) {
+        self.known = KnownCellState {
             last_epoch: self.known.last_epoch,
             joints: self.known.joints,
             hash: None,
-            ..TrackedState::default()
+            ..KnownCellState::default()
         };
     }
 
@@ -323,7 +324,7 @@ impl<'a> Session<'a> {
 
     /// Receives until a time, or until a condition on the packets since the exchange began is met. Returns true if it
     /// was met.
-    pub(crate) fn wait(
+    pub(crate) fn wait_for_packets(
         &mut self,
         until: Micros,
         mut done: impl FnMut(&[CellPacket]) -> bool,
@@ -340,39 +341,39 @@ impl<'a> Session<'a> {
     }
 
     /// Receives packets for this time.
-    pub(crate) fn idle(&mut self, span: Span) -> Result<(), StopReason> {
+    pub(crate) fn receive_for(&mut self, span: Span) -> Result<(), StopReason> {
         let until = self.bus.now() + span;
-        self.wait(until, |_| false).map(|_| ())
+        self.wait_for_packets(until, |_| false).map(|_| ())
     }
 
     /// Waits 15 ms for late packets of the cell, and begins a new exchange.
-    pub(crate) fn settle(&mut self) -> Result<(), StopReason> {
-        self.idle(Span::from_millis(15))?;
+    pub(crate) fn wait_for_late_packets(&mut self) -> Result<(), StopReason> {
+        self.receive_for(Span::from_millis(15))?;
         self.begin_exchange();
         Ok(())
     }
 
     /// Returns the maximum lateness of the bench since the exchange began.
-    pub(crate) fn lateness(&mut self) -> Span {
-        self.clock.late = self.clock.late.max(self.bus.lateness());
+    pub(crate) fn bench_lateness(&mut self) -> Span {
+        self.clock.late = self.clock.late.max(self.bus.bench_lateness());
         self.clock.worst = self.clock.worst.max(self.clock.late);
         self.clock.longest = self.clock.longest.max(self.clock.late);
         self.clock.late
     }
 
     /// Returns the maximum lateness of the bench since the last call, over all exchanges.
-    pub(crate) fn worst_lateness(&mut self) -> Span {
-        self.lateness();
+    pub(crate) fn worst_bench_lateness(&mut self) -> Span {
+        self.bench_lateness();
         core::mem::take(&mut self.clock.worst)
     }
 
     /// Checks that the segments of packets followed each other in time; a busy processor may delay them in a few
     /// packets.
-    pub(crate) fn check_segments(&mut self) -> Result<(), StopReason> {
+    pub(crate) fn check_segment_times(&mut self) -> Result<(), StopReason> {
         const MAX_TORN_PACKETS: usize = 3;
         if self.format == Format::Classic {
-            if self.life.is_waiting() {
-                self.idle(Span(ANSWER_TIMEOUT.0 + 10_000))?;
+            if self.life.has_waiting_segment() {
+                self.receive_for(Span(ANSWER_TIMEOUT.0 + 10_000))?;
             }
             let torn = self.clock.torn;
             self.check("SEND-1", torn <= MAX_TORN_PACKETS, || {
@@ -384,38 +385,43 @@ impl<'a> Session<'a> {
 
     /// Measures the mean time from a request to its answer.
     pub(crate) fn measure_round_trip(&mut self) -> Result<(), StopReason> {
-        const MEASURED_READS: u64 = 8;
+        const MEASURED_READ_COUNT: u64 = 8;
         let began = self.now();
-        for _ in 0..MEASURED_READS {
-            self.read(0)?;
+        for _ in 0..MEASURED_READ_COUNT {
+            self.read_parameter(0)?;
         }
-        self.clock.round_trip = Span(self.now().elapsed_since(began).0 / MEASURED_READS);
+        self.clock.round_trip = Span(self.now().elapsed_since(began).0 / MEASURED_READ_COUNT);
         Ok(())
     }
 
     /// Returns true if answers are so slow that checks have to be reduced.
-    pub(crate) fn is_slow(&self) -> bool {
+    pub(crate) fn are_answers_slow(&self) -> bool {
         self.clock.round_trip > Span::from_millis(4)
     }
 
     /// Returns the number of attempts of a check: `many`, or a quarter of it if answers are slow.
     pub(crate) fn reduced_attempts(&self, many: usize) -> usize {
-        if self.is_slow() { many.div_ceil(4) } else { many }
+        if self.are_answers_slow() { many.div_ceil(4) } else { many }
     }
 
     /// Records the time from a request to its answer, with the lateness of the bench meanwhile.
-    pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
-        let late = self.lateness();
-        self.timings.record(what, answered.elapsed_since(asked), late);
+    pub(crate) fn record_answer_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
+        let late = self.bench_lateness();
+        self.timings.record_answer(what, answered.elapsed_since(asked), late);
     }
 
     /// Returns a joints message for the chain in use.
-    pub(crate) fn joints(&self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Message {
-        self.joints_of(epoch, positions, self.known.joints)
+    pub(crate) fn joints_message(&self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Message {
+        self.joints_message_for_chain(epoch, positions, self.known.joints)
     }
 
     /// Returns a joints message for a chain of `in_use` joints; further words are 0.
-    pub(crate) fn joints_of(&self, epoch: u8, positions: &[i16; MAX_JOINTS], in_use: u8) -> Message {
+    pub(crate) fn joints_message_for_chain(
+        &self,
+        epoch: u8,
+        positions: &[i16; MAX_JOINTS],
+        in_use: u8,
+    ) -> Message {
         let mut words = *positions;
         words.iter_mut().skip(in_use.into()).for_each(|word| *word = 0);
         let positions = words.map(protocol::fixed::Q1_14::from_bits);

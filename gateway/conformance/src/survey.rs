@@ -56,7 +56,7 @@ impl Survey {
         let mut survey = Self::default();
         while bus.now() < until {
             let Some(seen) = bus.receive(until)? else { continue };
-            let Ok(id) = packet::data_id(&seen.frame) else { continue };
+            let Ok(id) = packet::data_frame_id(&seen.frame) else { continue };
             let message = match decoder.decode(seen.at, name, &seen.frame) {
                 Decoded::Message(message) => message,
                 // Frames before the first packet may belong to other devices.
@@ -105,7 +105,7 @@ impl Survey {
     ///
     /// # Errors
     /// Returns the reason, in one line, why the cell cannot be tested.
-    pub fn check(
+    pub fn check_cell(
         &self,
         cell: CellId,
         name: &str,

@@ -19,7 +19,7 @@ pub(crate) const ANSWER_LIMITS_MS: [(&str, u64); 6] = [
 
 /// The numbers of timely and late answers of one kind.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct AnswerTimes {
+pub(crate) struct AnswerTimeCounts {
     pub(crate) in_time: usize,
     pub(crate) late: usize,
     /// The number of late answers while the bench was late too.
@@ -29,11 +29,11 @@ pub(crate) struct AnswerTimes {
 
 /// The times of answers, by kind.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Timings(pub(crate) BTreeMap<&'static str, AnswerTimes>);
+pub(crate) struct Timings(pub(crate) BTreeMap<&'static str, AnswerTimeCounts>);
 
 impl Timings {
     /// Records the time of an answer, with the lateness of the bench meanwhile.
-    pub(crate) fn record(&mut self, what: &'static str, took: Span, bench: Span) {
+    pub(crate) fn record_answer(&mut self, what: &'static str, took: Span, bench: Span) {
         let times = self.0.entry(what).or_default();
         let limit = ANSWER_LIMITS_MS.iter().find(|(name, _)| *name == what);
         let is_late = limit.is_some_and(|(_, limit)| took > Span::from_millis(*limit));
@@ -48,7 +48,7 @@ impl Timings {
     }
 }
 
-impl AnswerTimes {
+impl AnswerTimeCounts {
     /// Returns true if at most one in 50 answers was late.
     pub(crate) const fn are_in_time(self) -> bool {
         self.late * 50 <= self.in_time + self.late || self.late == 1 && self.in_time > 0

@@ -8,7 +8,7 @@
 //! [`KinestheticController`] moves the arm with the torque of a push. [`PlannedController`] follows a motion that is known in advance and
 //! ignores torques. [`crate::external::ExternalController`] asks another program for each command.
 
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::skin::{ControllerKind, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::Micros;
 use thiserror::Error;
@@ -74,7 +74,7 @@ pub trait Controller: Send {
     fn step(&mut self, input: &ControllerInput) -> ControllerOutput;
 
     /// Returns the controller's counters, each with its name. To be called at the end of a run, not in a tick.
-    fn counts(&self) -> Vec<(String, u64)> {
+    fn named_counters(&self) -> Vec<(String, u64)> {
         Vec::new()
     }
 
@@ -96,12 +96,12 @@ pub trait Controller: Send {
 /// tick: `v' = tau/D + (v - tau/D) e^(-D/M T)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KinestheticController {
-    joints: [Admittance; MAX_ROBOT_JOINTS],
+    joints: [JointAdmittance; MAX_ROBOT_JOINTS],
 }
 
 /// Constants of the admittance of one joint.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Admittance {
+struct JointAdmittance {
     /// Mobility 1/D in rad/s per Nm.
     mobility: f64,
     /// Fraction of the velocity that remains after one tick without torque: `e^(-D/M T)`.
@@ -123,10 +123,10 @@ impl KinestheticController {
 
     pub(crate) fn from_parameters(skin: &Skin, inertia: &[f64], damping: &[f64]) -> Self {
         let tick = 1.0 / skin.timing.control_hz;
-        let mut joints = [Admittance::default(); MAX_ROBOT_JOINTS];
+        let mut joints = [JointAdmittance::default(); MAX_ROBOT_JOINTS];
         let given = inertia.iter().zip(damping).zip(&skin.controller.max_speed);
         for (joint, ((inertia, damping), &max_speed)) in joints.iter_mut().zip(given) {
-            *joint = Admittance {
+            *joint = JointAdmittance {
                 mobility: damping.recip(),
                 remaining: (-damping / inertia * tick).exp(),
                 max_speed,
@@ -190,7 +190,7 @@ pub(crate) struct SpeedLimits {
 
 impl SpeedLimits {
     pub(crate) fn from_skin(skin: &Skin) -> Self {
-        Self { tick: 1.0 / skin.timing.control_hz, max_speed: padded(&skin.controller.max_speed) }
+        Self { tick: 1.0 / skin.timing.control_hz, max_speed: pad_with_defaults(&skin.controller.max_speed) }
     }
 
     /// Returns the joint velocities that bring the robot to `goal` by the next tick, as far as the speed limits allow;
@@ -230,13 +230,13 @@ fn seconds(time: Micros) -> f64 {
 mod tests {
     use super::*;
     use crate::robot::{Robot, SimulatedArm};
-    use model::testing::skin;
+    use model::testing::one_cell_skin;
     use proptest::prelude::*;
 
     const TICK: f64 = 0.002;
 
     fn kinesthetic() -> KinestheticController {
-        KinestheticController::new(&skin()).unwrap()
+        KinestheticController::new(&one_cell_skin()).unwrap()
     }
 
     fn moved(step: ControllerOutput) -> [f64; MAX_ROBOT_JOINTS] {
@@ -252,11 +252,16 @@ mod tests {
 
     /// Runs the controller on a simulated arm for `ticks` ticks with a constant torque. Returns the arm.
     fn run(controller: &mut impl Controller, start: [f64; 6], ticks: u64, torque: [f64; 6]) -> SimulatedArm {
-        let mut arm = SimulatedArm::new(&skin(), padded(&start));
+        let mut arm = SimulatedArm::new(&one_cell_skin(), pad_with_defaults(&start));
         for tick in 0..ticks {
             let (q, qdot) = (arm.positions(), arm.velocities());
-            let input =
-                ControllerInput { tick, time: Micros(tick * 2_000), q, qdot, ..pushed(padded(&torque)) };
+            let input = ControllerInput {
+                tick,
+                time: Micros(tick * 2_000),
+                q,
+                qdot,
+                ..pushed(pad_with_defaults(&torque))
+            };
             arm.step(&moved(controller.step(&input)), TICK);
         }
         arm
@@ -278,7 +283,8 @@ mod tests {
     #[test]
     fn without_torque_the_arm_comes_to_rest() {
         let mut controller = kinesthetic();
-        let input = ControllerInput { qdot: padded(&[1.0; 6]), ..pushed(padded(&[0.0; 6])) };
+        let input =
+            ControllerInput { qdot: pad_with_defaults(&[1.0; 6]), ..pushed(pad_with_defaults(&[0.0; 6])) };
         for velocity in moved(controller.step(&input)).into_iter().take(6) {
             assert!(velocity > 0.99 && velocity < 1.0);
         }
@@ -288,17 +294,24 @@ mod tests {
     fn a_torque_that_must_not_be_used_is_a_bad_cycle() {
         let mut controller = kinesthetic();
         assert_eq!(controller.step(&ControllerInput::default()), ControllerOutput::Bad(BadCycle::Torque));
-        assert_eq!(controller.step(&pushed(padded(&[f64::NAN; 6]))), ControllerOutput::Bad(BadCycle::Torque));
-        let halted = ControllerInput { halted: true, qdot: padded(&[1.0; 6]), ..pushed(padded(&[5.0; 6])) };
-        assert_eq!(controller.step(&halted), ControllerOutput::Move(padded(&[0.0; 6])));
+        assert_eq!(
+            controller.step(&pushed(pad_with_defaults(&[f64::NAN; 6]))),
+            ControllerOutput::Bad(BadCycle::Torque)
+        );
+        let halted = ControllerInput {
+            halted: true,
+            qdot: pad_with_defaults(&[1.0; 6]),
+            ..pushed(pad_with_defaults(&[5.0; 6]))
+        };
+        assert_eq!(controller.step(&halted), ControllerOutput::Move(pad_with_defaults(&[0.0; 6])));
     }
 
     #[test]
     fn a_robot_that_holds_returns_no_quicker_than_it_may() {
         let at = [0.1, -0.2, 0.3, 0.0, 0.0, 0.0];
-        let mut hold = PlannedController::new(&skin(), |_| padded(&at));
+        let mut hold = PlannedController::new(&one_cell_skin(), |_| pad_with_defaults(&at));
         assert_eq!(
-            moved(hold.step(&ControllerInput { q: padded(&at), ..ControllerInput::default() })),
+            moved(hold.step(&ControllerInput { q: pad_with_defaults(&at), ..ControllerInput::default() })),
             [0.0; MAX_ROBOT_JOINTS]
         );
         assert_eq!(moved(hold.step(&ControllerInput::default()))[..3], [2.0, -2.0, 2.0]);
@@ -311,8 +324,9 @@ mod tests {
     #[test]
     fn a_planned_motion_is_where_it_should_be_at_every_tick() {
         let start = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
-        let swings = |seconds: f64| padded(&start.map(|start| start + 0.2 * (1.5 * seconds).sin()));
-        let mut planned = PlannedController::new(&skin(), swings);
+        let swings =
+            |seconds: f64| pad_with_defaults(&start.map(|start| start + 0.2 * (1.5 * seconds).sin()));
+        let mut planned = PlannedController::new(&one_cell_skin(), swings);
         for ticks in [1_u32, 7, 500, 4_321] {
             let arm = run(&mut planned, start, ticks.into(), [0.0; 6]);
             let target = swings(f64::from(ticks) * TICK);
@@ -328,7 +342,7 @@ mod tests {
             torque in any::<[f64; 6]>(), qdot in proptest::array::uniform6(-5.0..5.0),
         ) {
             let mut controller = kinesthetic();
-            let input = ControllerInput { qdot: padded(&qdot), ..pushed(padded(&torque)) };
+            let input = ControllerInput { qdot: pad_with_defaults(&qdot), ..pushed(pad_with_defaults(&torque)) };
             match controller.step(&input) {
                 ControllerOutput::Bad(why) => {
                     prop_assert_eq!(why, BadCycle::Torque);

@@ -11,7 +11,7 @@
 //! ([`carried`]), and the loop continues with the other buses.
 //!
 //! A tick does not allocate, lock or log. Its cost does not grow with the number of cells, unless torques are also
-//! computed centrally ([`Cycle::central_torque`]).
+//! computed centrally ([`ControlCycle::central_torque`]).
 
 pub mod carried;
 mod chain;
@@ -27,7 +27,7 @@ use protocol::time::Micros;
 use crate::controller::{BadCycle, Controller, ControllerInput, ControllerOutput};
 use crate::external::ControllerAbsence;
 use crate::robot::{Robot, StepResult};
-use carried::{BusInput, CarriedBroadcasts, bit};
+use carried::{BusInput, CarriedBroadcasts, bus_bit};
 use chain::Chain;
 use model::central::CentralComputation;
 use model::table::Snapshot;
@@ -100,7 +100,7 @@ pub struct CentralTorque {
 /// The result of a tick: messages to send, and the record.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TickOutcome {
-    /// Epoch of the new joints to send on all buses ([`Cycle::joints`]); `None` if none are due.
+    /// Epoch of the new joints to send on all buses ([`ControlCycle::broadcast_joints`]); `None` if none are due.
     pub broadcast: Option<Epoch>,
     /// Number of earlier broadcasts that were skipped because their ticks were skipped.
     pub broadcasts_skipped: u64,
@@ -112,7 +112,7 @@ pub struct TickOutcome {
 }
 
 /// The state of the control loop.
-pub struct Cycle {
+pub struct ControlCycle {
     controller: Box<dyn Controller>,
     robot: Box<dyn Robot + Send>,
     central: Vec<CentralComputation>,
@@ -138,7 +138,7 @@ pub struct Cycle {
     resumes: u32,
 }
 
-impl core::fmt::Debug for Cycle {
+impl core::fmt::Debug for ControlCycle {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         f.debug_struct("Cycle")
             .field("epoch", &self.epoch)
@@ -147,7 +147,7 @@ impl core::fmt::Debug for Cycle {
     }
 }
 
-impl Cycle {
+impl ControlCycle {
     /// Creates a loop before its first tick. The first epoch is 0.
     #[must_use]
     pub fn new(skin: &Skin, controller: Box<dyn Controller>, robot: Box<dyn Robot + Send>) -> Self {
@@ -188,7 +188,7 @@ impl Cycle {
 
     /// Sets the epoch after which the loop starts. Cells that were already running would take joints with an epoch that
     /// they know for repeated ones.
-    pub const fn start_after(&mut self, epoch: Epoch) {
+    pub const fn start_after_epoch(&mut self, epoch: Epoch) {
         self.epoch = epoch;
     }
 
@@ -200,8 +200,8 @@ impl Cycle {
 
     /// Returns the controller's counters, each with its name.
     #[must_use]
-    pub fn counts(&self) -> Vec<(String, u64)> {
-        self.controller.counts()
+    pub fn named_counters(&self) -> Vec<(String, u64)> {
+        self.controller.named_counters()
     }
 
     /// Returns the reason for which the controller counts as absent; `None` if it does not. The robot of an absent
@@ -243,15 +243,15 @@ impl Cycle {
         for (index, (BusInput { sums: bus, works }, (carried, chain))) in
             buses.into_iter().zip(chains).enumerate()
         {
-            let unanswered = carried.unanswered(bus.read_back, self.epoch, self.broadcasts);
-            if works && !carried::is_lost(unanswered, &self.safety) {
+            let unanswered = carried.unanswered_broadcasts(bus.read_back, self.epoch, self.broadcasts);
+            if works && !carried::is_bus_lost(unanswered, &self.safety) {
                 some_bus_works = true;
             } else {
-                input.missing |= bit(index);
+                input.missing |= bus_bit(index);
             }
-            let part = carried::remaining_fraction(unanswered, &self.safety);
+            let part = carried::remaining_torque_fraction(unanswered, &self.safety);
             if part > 0.0 {
-                chain.add(part, &bus.torque, &mut input.torque);
+                chain.add_torque_share(part, &bus.torque, &mut input.torque);
                 input.contributing += bus.contributing;
                 stale += bus.stale;
                 if bus.contributing > 0 {
@@ -274,7 +274,7 @@ impl Cycle {
             ControllerOutput::Move(_) => None,
             ControllerOutput::Bad(why) => Some(why),
         };
-        let command = if self.count_cycle(bad, tick.time) { Some(Command::Halt) } else { heard };
+        let command = if self.count_bad_cycles(bad, tick.time) { Some(Command::Halt) } else { heard };
         let velocity = match step {
             ControllerOutput::Move(velocity) if self.halted.is_none() => velocity,
             // Without an answer, the robot first keeps its velocity for some cycles; then it stands, halted or not.
@@ -318,8 +318,8 @@ impl Cycle {
         let chains = self.chain_of.iter().filter_map(|&chain| self.chains.get(chain));
         for ((central, chain), bus) in self.central.iter().zip(chains).zip(buses) {
             let part =
-                central.total_torque(&central.frames(&chain.broadcast_joints().positions), &bus.sensors);
-            chain.add(1.0, &part.torque, &mut reference.torque);
+                central.total_torque(&central.link_frames(&chain.broadcast_joints().positions), &bus.sensors);
+            chain.add_torque_share(1.0, &part.torque, &mut reference.torque);
             reference.active += part.active;
         }
         reference
@@ -327,13 +327,13 @@ impl Cycle {
 
     /// Returns the index of a bus's chain. Buses with the same index have the same joints.
     #[must_use]
-    pub fn chain_of(&self, bus: usize) -> usize {
+    pub fn chain_index(&self, bus: usize) -> usize {
         self.chain_of.get(bus).copied().unwrap_or(usize::MAX)
     }
 
     /// Returns the joints of a chain as in the last broadcast.
     #[must_use]
-    pub fn joints(&self, chain: usize) -> Joints {
+    pub fn broadcast_joints(&self, chain: usize) -> Joints {
         self.chains.get(chain).map_or_else(Joints::default, Chain::broadcast_joints)
     }
 
@@ -362,7 +362,7 @@ impl Cycle {
     }
 
     /// Counts consecutive bad cycles. Returns true if this cycle halts the robot.
-    fn count_cycle(&mut self, bad: Option<BadCycle>, now: Micros) -> bool {
+    fn count_bad_cycles(&mut self, bad: Option<BadCycle>, now: Micros) -> bool {
         let Some(why) = bad else {
             self.bad_in_a_row = 0;
             self.good_in_a_row = self.good_in_a_row.saturating_add(1);

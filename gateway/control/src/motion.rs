@@ -12,7 +12,7 @@ use model::scenario::{Motion, MotionKind};
 ///
 /// # Errors
 /// Returns [`SocketError`] if the skin's controller is an external program and the gateway cannot listen on its socket.
-pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
+pub fn controller_for_motion(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
     let motion = *motion;
     Ok(match (motion.kind, &skin.controller.kind) {
         (MotionKind::Hold | MotionKind::Sine { .. }, _) => {
@@ -34,21 +34,21 @@ pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>
 mod tests {
     use super::*;
     use crate::controller::{ControllerInput, ControllerOutput};
-    use model::testing::skin;
-    use protocol::packet::padded;
+    use model::testing::one_cell_skin;
+    use protocol::packet::pad_with_defaults;
 
     #[test]
     fn the_scenario_selects_the_controller() {
-        let mut motion = Motion { start: padded(&[0.25; 6]), kind: MotionKind::Hold };
+        let mut motion = Motion { start: pad_with_defaults(&[0.25; 6]), kind: MotionKind::Hold };
         let mut step = |kind, torque| {
             motion.kind = kind;
             let input = ControllerInput {
-                q: padded(&[0.25; 6]),
-                torque: padded(&[torque; 6]),
+                q: pad_with_defaults(&[0.25; 6]),
+                torque: pad_with_defaults(&[torque; 6]),
                 valid: true,
                 ..ControllerInput::default()
             };
-            match controller_of(&skin(), &motion).unwrap().step(&input) {
+            match controller_for_motion(&one_cell_skin(), &motion).unwrap().step(&input) {
                 ControllerOutput::Move(velocities) => velocities[0],
                 ControllerOutput::Bad(why) => panic!("{why}"),
             }
@@ -56,6 +56,6 @@ mod tests {
         assert_eq!(step(MotionKind::Hold, 1.0), 0.0);
         assert_eq!(step(MotionKind::Kinesthetic, 0.0), 0.0);
         assert!(step(MotionKind::Kinesthetic, 1.0) > 0.0, "moves with the torque");
-        assert!(step(MotionKind::Sine { amplitude: padded(&[0.1; 6]), period_s: 4.0 }, 0.0) > 0.0);
+        assert!(step(MotionKind::Sine { amplitude: pad_with_defaults(&[0.1; 6]), period_s: 4.0 }, 0.0) > 0.0);
     }
 }

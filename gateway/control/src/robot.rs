@@ -79,15 +79,18 @@ impl Robot for SimulatedArm {
 #[expect(clippy::float_cmp, reason = "what is held at a limit is exactly there")]
 mod tests {
     use super::*;
-    use model::testing::skin;
+    use model::testing::one_cell_skin;
     use proptest::prelude::*;
-    use protocol::packet::padded;
+    use protocol::packet::pad_with_defaults;
 
     #[test]
     fn positions_follow_velocities_beyond_half_a_turn() {
-        let mut arm = SimulatedArm::new(&skin(), padded(&[0.5; 6]));
+        let mut arm = SimulatedArm::new(&one_cell_skin(), pad_with_defaults(&[0.5; 6]));
         for _ in 0..2_000 {
-            assert_eq!(arm.step(&padded(&[1.0, -1.0, 0.0, 0.0, 0.0, 0.0]), 0.002), StepResult::default());
+            assert_eq!(
+                arm.step(&pad_with_defaults(&[1.0, -1.0, 0.0, 0.0, 0.0, 0.0]), 0.002),
+                StepResult::default()
+            );
         }
         let [q1, q2, q3, ..] = arm.positions();
         assert!((q1 - 4.5).abs() < 1e-9 && (q2 + 3.5).abs() < 1e-9 && q3 == 0.5);
@@ -96,30 +99,33 @@ mod tests {
 
     #[test]
     fn the_arm_stops_at_a_limit_reports_it_and_comes_back() {
-        let mut skin = skin();
+        let mut skin = one_cell_skin();
         skin.robot.joints[2].limits = [-1.0, 0.5];
-        let mut arm = SimulatedArm::new(&skin, padded(&[0.0, 0.0, 0.499, 0.0, 0.0, 0.0]));
-        let moved = arm.step(&padded(&[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), 0.002);
+        let mut arm = SimulatedArm::new(&skin, pad_with_defaults(&[0.0, 0.0, 0.499, 0.0, 0.0, 0.0]));
+        let moved = arm.step(&pad_with_defaults(&[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), 0.002);
         assert_eq!(moved, StepResult { at_limit: 0b100, refused: false });
         assert_eq!((arm.positions()[2], arm.velocities()[2]), (0.5, 0.0));
-        assert_eq!(arm.step(&padded(&[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]), 0.002), StepResult::default());
+        assert_eq!(
+            arm.step(&pad_with_defaults(&[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]), 0.002),
+            StepResult::default()
+        );
         assert!(arm.positions()[2] < 0.5);
     }
 
     #[test]
     fn a_velocity_that_is_no_number_moves_nothing() {
-        let mut arm = SimulatedArm::new(&skin(), padded(&[0.25; 6]));
-        assert!(arm.step(&padded(&[f64::NAN, f64::INFINITY, 0.0, 0.0, 0.0, 0.0]), 0.002).refused);
+        let mut arm = SimulatedArm::new(&one_cell_skin(), pad_with_defaults(&[0.25; 6]));
+        assert!(arm.step(&pad_with_defaults(&[f64::NAN, f64::INFINITY, 0.0, 0.0, 0.0, 0.0]), 0.002).refused);
         assert_eq!(arm.positions()[..6], [0.25; 6]);
     }
 
     proptest! {
         #[test]
         fn no_joint_ever_leaves_its_limits(steps in proptest::collection::vec(any::<[f64; 6]>(), 1..50)) {
-            let skin = skin();
-            let mut arm = SimulatedArm::new(&skin, padded(&[0.0; 6]));
+            let skin = one_cell_skin();
+            let mut arm = SimulatedArm::new(&skin, pad_with_defaults(&[0.0; 6]));
             for step in steps {
-                arm.step(&padded(&step), 0.002);
+                arm.step(&pad_with_defaults(&step), 0.002);
                 for (position, joint) in arm.positions().iter().zip(&skin.robot.joints) {
                     let [min, max] = &joint.limits;
                     prop_assert!(min <= position && position <= max);

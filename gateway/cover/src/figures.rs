@@ -1,7 +1,7 @@
 //! Measures how well the cells cover a link.
 
-use crate::grid::Grid;
-use crate::place::{CellPosition, spacing};
+use crate::grid::PointGrid;
+use crate::place::{CellPosition, median_spacing};
 use crate::surface::{Sample, Surface, count_to_f64};
 use crate::{LinkFigures, RobotLink};
 
@@ -12,9 +12,9 @@ pub(crate) fn coverage_figures(
     spots: &[CellPosition],
     pitch: f64,
 ) -> LinkFigures {
-    let grid = Grid::with_points(pitch, spots.iter().map(|spot| &spot.point));
+    let grid = PointGrid::with_points(pitch, spots.iter().map(|spot| &spot.point));
     let covered = |sample: &&Sample| {
-        let mut near = grid.points_around(grid.cube(&sample.point)).filter_map(|index| spots.get(index));
+        let mut near = grid.points_around(grid.cube_at(&sample.point)).filter_map(|index| spots.get(index));
         near.any(|spot| {
             // A cell covers only samples whose faces point to the same side, so not the other side of a thin wall.
             spot.normal.dot(&sample.face) > -0.5 && (spot.point - sample.point).norm() <= pitch
@@ -30,7 +30,7 @@ pub(crate) fn coverage_figures(
             surface.samples.iter().filter(|sample| surface.is_in_keep_out_box(&sample.point)).count(),
         ),
         covered: share(surface.samples.iter().filter(covered).count()),
-        spacing: spacing(spots, pitch),
+        spacing: median_spacing(spots, pitch),
         tilt: spots.iter().map(|spot| spot.tilt).fold(0.0, f64::max),
     }
 }

@@ -6,12 +6,12 @@ use nalgebra::Point3;
 
 /// Indices of points, by the cube that contains the point.
 #[derive(Clone, Debug)]
-pub(crate) struct Grid {
+pub(crate) struct PointGrid {
     edge: f64,
     cubes: BTreeMap<[i64; 3], Vec<usize>>,
 }
 
-impl Grid {
+impl PointGrid {
     /// Creates an empty grid whose cubes have this edge length, in m.
     pub(crate) const fn new(edge: f64) -> Self {
         Self { edge, cubes: BTreeMap::new() }
@@ -27,17 +27,17 @@ impl Grid {
     }
 
     pub(crate) fn insert(&mut self, point: &Point3<f64>, index: usize) {
-        self.cubes.entry(self.cube(point)).or_default().push(index);
+        self.cubes.entry(self.cube_at(point)).or_default().push(index);
     }
 
     /// Returns the coordinates of the cube that contains a point.
     #[expect(clippy::cast_possible_truncation, reason = "saturates far away, where nothing is near")]
-    pub(crate) fn cube(&self, point: &Point3<f64>) -> [i64; 3] {
+    pub(crate) fn cube_at(&self, point: &Point3<f64>) -> [i64; 3] {
         [point.x, point.y, point.z].map(|coordinate| (coordinate / self.edge).floor() as i64)
     }
 
     /// Returns all cubes that contain points, each with the indices of its points.
-    pub(crate) fn cubes(&self) -> impl Iterator<Item = ([i64; 3], &[usize])> {
+    pub(crate) fn filled_cubes(&self) -> impl Iterator<Item = ([i64; 3], &[usize])> {
         self.cubes.iter().map(|(&cube, points)| (cube, points.as_slice()))
     }
 
@@ -64,10 +64,10 @@ mod tests {
             points in proptest::collection::vec(proptest::array::uniform3(-2.0..2.0_f64), 1..80),
         ) {
             let points: Vec<_> = points.into_iter().map(Point3::from).collect();
-            let grid = Grid::with_points(0.7, &points);
-            prop_assert_eq!(grid.cubes().map(|(_, points)| points.len()).sum::<usize>(), points.len());
+            let grid = PointGrid::with_points(0.7, &points);
+            prop_assert_eq!(grid.filled_cubes().map(|(_, points)| points.len()).sum::<usize>(), points.len());
             for point in &points {
-                let found: Vec<_> = grid.points_around(grid.cube(point)).collect();
+                let found: Vec<_> = grid.points_around(grid.cube_at(point)).collect();
                 for (index, other) in points.iter().enumerate() {
                     prop_assert!((point - other).norm() > 0.7 || found.contains(&index));
                 }

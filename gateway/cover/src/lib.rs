@@ -35,7 +35,7 @@ use thiserror::Error;
 
 use mesh::{Mesh, Triangle};
 use surface::Surface;
-pub use wire::{MAX_NODES, PORTS};
+pub use wire::{MAX_CELLS_PER_BUS, PORTS_PER_CELL};
 
 /// The smallest distance between neighbouring cells, in m.
 pub const MIN_PITCH: f64 = 1e-3;
@@ -106,7 +106,7 @@ pub struct CoverOptions {
     pub seed: u64,
     /// Boxes in which no cells are placed.
     pub keep_out: Vec<KeepOut>,
-    /// The maximum number of cells per bus, 1 to [`MAX_NODES`].
+    /// The maximum number of cells per bus, 1 to [`MAX_CELLS_PER_BUS`].
     pub nodes_per_bus: usize,
     /// The minimum distance from the center of a cell to other links, in m.
     pub clearance: f64,
@@ -114,7 +114,13 @@ pub struct CoverOptions {
 
 impl Default for CoverOptions {
     fn default() -> Self {
-        Self { pitch: 0.028, seed: 1, keep_out: Vec::new(), nodes_per_bus: MAX_NODES, clearance: 0.005 }
+        Self {
+            pitch: 0.028,
+            seed: 1,
+            keep_out: Vec::new(),
+            nodes_per_bus: MAX_CELLS_PER_BUS,
+            clearance: 0.005,
+        }
     }
 }
 
@@ -134,7 +140,7 @@ pub struct CoverCell {
     pub node: u8,
     /// For each port, the node id of the cell that the port is wired to, on the same bus and link. The ports are a
     /// quarter turn apart, counterclockwise as seen from outside. Each wire is at the port nearest to its direction.
-    pub neighbors: [Option<u8>; PORTS],
+    pub neighbors: [Option<u8>; PORTS_PER_CELL],
     /// True if the cell is wired to the gateway. This holds for one cell of each group of wired cells.
     pub root: bool,
 }
@@ -182,7 +188,7 @@ pub enum CoverError {
     #[error("clearance {0} m: it is 0 to {MAX_PITCH} m; correct it")]
     Clearance(f64),
     /// The number of nodes per bus is out of range.
-    #[error("{0} nodes per bus: it is 1 to {MAX_NODES}; correct it")]
+    #[error("{0} nodes per bus: it is 1 to {MAX_CELLS_PER_BUS}; correct it")]
     Nodes(usize),
     /// There are more links than [`MAX_LINKS`].
     #[error("{0} links, at most {MAX_LINKS}: add those far from the skin to --leave-out")]
@@ -268,7 +274,7 @@ fn check(links: &[RobotLink], others: &[RobotLink], options: &CoverOptions) -> R
     if !(0.0..=MAX_PITCH).contains(&options.clearance) {
         return Err(CoverError::Clearance(options.clearance));
     }
-    if !(1..=MAX_NODES).contains(&options.nodes_per_bus) {
+    if !(1..=MAX_CELLS_PER_BUS).contains(&options.nodes_per_bus) {
         return Err(CoverError::Nodes(options.nodes_per_bus));
     }
     if links.len() + others.len() > MAX_LINKS {

@@ -8,8 +8,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::CoverOptions;
-use crate::grid::Grid;
-use crate::relax::{SampleField, Site};
+use crate::grid::PointGrid;
+use crate::relax::{CellSite, SampleField};
 use crate::surface::{Sample, Surface, cell_area, count_to_f64};
 
 /// The maximum angle between the normal of a cell and that of the mesh at its center, in rad: 9 degrees.
@@ -28,7 +28,7 @@ const SPACING_TOLERANCE: f64 = 0.015;
 /// The cost of tilting a cell, relative to that of moving it: 1 minus the cosine of the angle, times this factor, is
 /// compared with the square of the distance in pitches. A tilt of 9 degrees costs as much as moving the cell by a fifth
 /// of a pitch.
-const TILT_COST: f64 = 3.0;
+const TILT_COST_FACTOR: f64 = 3.0;
 
 /// The minimum distance between two cells on the same side, in pitches. Relaxation leaves a few cells closer together
 /// where a surface is folded or narrow.
@@ -61,9 +61,9 @@ pub(crate) fn place_cells(surface: &Surface<'_>, options: &CoverOptions, link: u
     let mut best: Option<(f64, Vec<CellPosition>)> = None;
     for _ in 0..MAX_ATTEMPTS {
         let mut sites = field.grow_honeycomb(&order, apart, dice.random_range(0.0..FRAC_PI_3));
-        field.relax(&mut sites, apart);
+        field.relax_sites(&mut sites, apart);
         let spots = remove_close_cells(cell_positions(surface, &field, &sites, pitch), pitch);
-        let Some(spacing) = spacing(&spots, pitch) else {
+        let Some(spacing) = median_spacing(&spots, pitch) else {
             return spots;
         };
         let off = (spacing / pitch - 1.0).abs();
@@ -81,14 +81,14 @@ pub(crate) fn place_cells(surface: &Surface<'_>, options: &CoverOptions, link: u
 /// Removes places that are closer than [`CLOSEST`] to an earlier place on the same side.
 fn remove_close_cells(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition> {
     let apart = MIN_SPACING_PITCHES * pitch;
-    let mut grid = Grid::new(apart);
+    let mut grid = PointGrid::new(apart);
     let mut kept: Vec<CellPosition> = Vec::new();
     for spot in spots {
         let near = |other: &CellPosition| {
             other.normal.dot(&spot.normal) > MIN_SAME_SIDE_COSINE && (other.point - spot.point).norm() < apart
         };
         let is_crowded =
-            grid.points_around(grid.cube(&spot.point)).filter_map(|index| kept.get(index)).any(near);
+            grid.points_around(grid.cube_at(&spot.point)).filter_map(|index| kept.get(index)).any(near);
         if !is_crowded {
             grid.insert(&spot.point, kept.len());
             kept.push(spot);
@@ -98,7 +98,7 @@ fn remove_close_cells(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition>
 }
 
 /// Returns the median distance from a place to the nearest other place on the same side, in m.
-pub(crate) fn spacing(spots: &[CellPosition], pitch: f64) -> Option<f64> {
+pub(crate) fn median_spacing(spots: &[CellPosition], pitch: f64) -> Option<f64> {
     let nearest = |spot: &CellPosition| {
         let same = spots.iter().filter(|other| *other != spot && other.normal.dot(&spot.normal) > 0.0);
         same.map(|other| (other.point - spot.point).norm()).min_by(f64::total_cmp)
@@ -122,7 +122,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
 fn cell_positions(
     surface: &Surface<'_>,
     field: &SampleField<'_>,
-    sites: &[Site],
+    sites: &[CellSite],
     pitch: f64,
 ) -> Vec<CellPosition> {
     let mut best: Vec<Option<(f64, &Sample)>> = vec![None; sites.len()];
@@ -132,14 +132,14 @@ fn cell_positions(
             continue;
         };
         let tilt = 1.0 - sample.face.dot(&sample.smooth);
-        let cost = (site.point - sample.point).norm_squared() + TILT_COST * pitch * pitch * tilt;
+        let cost = (site.point - sample.point).norm_squared() + TILT_COST_FACTOR * pitch * pitch * tilt;
         if best.is_none_or(|(min, _)| cost < min) {
             *best = Some((cost, *sample));
         }
     }
-    let spot = |(site, best): (&Site, Option<(f64, &Sample)>)| {
+    let spot = |(site, best): (&CellSite, Option<(f64, &Sample)>)| {
         let (_, sample) = best?;
-        let projected = surface.project(&site.point, sample);
+        let projected = surface.project_to_mesh(&site.point, sample);
         let straight = projected.filter(|(_, face)| face.angle(&sample.smooth) < MAX_TILT_RAD);
         let (point, face) = straight.unwrap_or((sample.point, sample.face));
         let normal = limit_tilt(&face, &sample.smooth);

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 
 use nalgebra::{Point3, Rotation3, Unit, Vector3};
 
-use crate::grid::Grid;
+use crate::grid::PointGrid;
 use crate::surface::{Sample, tangents};
 
 /// The cosine of the largest angle between the normals of a site and of a sample that may belong to it. It separates
@@ -25,12 +25,12 @@ const ROUNDS_PER_ADDITION: usize = 15;
 
 /// A point that is the center of the samples nearest to it. A cell is placed there at the end.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Site {
+pub(crate) struct CellSite {
     pub(crate) point: Point3<f64>,
     pub(crate) normal: Vector3<f64>,
 }
 
-impl Site {
+impl CellSite {
     /// Returns the squared distance to a sample in m²; `None` if the sample faces another way.
     pub(crate) fn squared_distance(&self, sample: &Sample) -> Option<f64> {
         (self.normal.dot(&sample.smooth) > MIN_NORMAL_COSINE)
@@ -42,45 +42,45 @@ impl Site {
 #[derive(Debug)]
 pub(crate) struct SampleField<'a> {
     pub(crate) samples: Vec<&'a Sample>,
-    grid: Grid,
+    grid: PointGrid,
     reach: f64,
 }
 
 impl<'a> SampleField<'a> {
     pub(crate) fn new(samples: Vec<&'a Sample>, reach: f64) -> Self {
-        let grid = Grid::with_points(reach, samples.iter().map(|sample| &sample.point));
+        let grid = PointGrid::with_points(reach, samples.iter().map(|sample| &sample.point));
         Self { samples, grid, reach }
     }
 
     /// Adds a site at each sample, in the given order, that is farther than `apart` (in m) from all sites.
-    pub(crate) fn add_sites(&self, order: &[usize], apart: f64, sites: &mut Vec<Site>) {
-        let mut grid = Grid::with_points(apart, sites.iter().map(|site| &site.point));
+    pub(crate) fn add_sites(&self, order: &[usize], apart: f64, sites: &mut Vec<CellSite>) {
+        let mut grid = PointGrid::with_points(apart, sites.iter().map(|site| &site.point));
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
-            let near = grid.points_around(grid.cube(&sample.point)).filter_map(|index| sites.get(index));
+            let near = grid.points_around(grid.cube_at(&sample.point)).filter_map(|index| sites.get(index));
             let free = !near
                 .filter_map(|site| site.squared_distance(sample))
                 .any(|distance| distance < apart * apart);
             if free {
                 grid.insert(&sample.point, sites.len());
-                sites.push(Site { point: sample.point, normal: sample.smooth });
+                sites.push(CellSite { point: sample.point, normal: sample.smooth });
             }
         }
     }
 
     /// Grows a honeycomb of sites whose distance is `step`, in m. Growth begins at those samples, in the given order,
     /// that have no site nearby. `turn` is the direction of the first row, in rad.
-    pub(crate) fn grow_honeycomb(&self, order: &[usize], step: f64, turn: f64) -> Vec<Site> {
-        let mut sites: Vec<Site> = Vec::new();
-        let mut grid = Grid::new(step);
-        let free = |site: &Site, apart: f64, sites: &[Site], grid: &Grid| {
-            let mut near = grid.points_around(grid.cube(&site.point)).filter_map(|index| sites.get(index));
+    pub(crate) fn grow_honeycomb(&self, order: &[usize], step: f64, turn: f64) -> Vec<CellSite> {
+        let mut sites: Vec<CellSite> = Vec::new();
+        let mut grid = PointGrid::new(step);
+        let free = |site: &CellSite, apart: f64, sites: &[CellSite], grid: &PointGrid| {
+            let mut near = grid.points_around(grid.cube_at(&site.point)).filter_map(|index| sites.get(index));
             near.all(|other| {
                 other.normal.dot(&site.normal) <= MIN_NORMAL_COSINE
                     || (other.point - site.point).norm() >= apart
             })
         };
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
-            let first = Site { point: sample.point, normal: sample.smooth };
+            let first = CellSite { point: sample.point, normal: sample.smooth };
             if !free(&first, step, &sites, &grid) {
                 continue;
             }
@@ -98,7 +98,7 @@ impl<'a> SampleField<'a> {
                         f64::from(sixth) * FRAC_PI_3,
                     );
                     let direction = turn * row;
-                    let next = Site { point: site.point + direction * step, normal: site.normal };
+                    let next = CellSite { point: site.point + direction * step, normal: site.normal };
                     let Some(next) = self.snap_to_surface(&next, 0.4 * step) else { continue };
                     let flat = Unit::try_new(direction - next.normal * direction.dot(&next.normal), 0.0);
                     open.extend(flat.map(|flat| (next, flat.into_inner())));
@@ -109,21 +109,23 @@ impl<'a> SampleField<'a> {
     }
 
     /// Moves a site onto the surface at the nearest sample; `None` if no sample is within `within`, in m.
-    fn snap_to_surface(&self, site: &Site, within: f64) -> Option<Site> {
-        let near =
-            self.grid.points_around(self.grid.cube(&site.point)).filter_map(|index| self.samples.get(index));
+    fn snap_to_surface(&self, site: &CellSite, within: f64) -> Option<CellSite> {
+        let near = self
+            .grid
+            .points_around(self.grid.cube_at(&site.point))
+            .filter_map(|index| self.samples.get(index));
         let near = near.filter_map(|sample| Some((site.squared_distance(sample)?, sample)));
         let (distance, sample) = near.min_by(|a, b| a.0.total_cmp(&b.0))?;
         let height = (site.point - sample.point).dot(&sample.smooth);
         let point = site.point - sample.smooth * height;
-        (distance <= within * within).then_some(Site { point, normal: sample.smooth })
+        (distance <= within * within).then_some(CellSite { point, normal: sample.smooth })
     }
 
     /// Returns the index of the nearest site for each sample; `None` if no site is near enough.
-    pub(crate) fn nearest_sites(&self, sites: &[Site]) -> Vec<Option<usize>> {
+    pub(crate) fn nearest_sites(&self, sites: &[CellSite]) -> Vec<Option<usize>> {
         let mut owners = vec![None; self.samples.len()];
-        let grid = Grid::with_points(self.reach, sites.iter().map(|site| &site.point));
-        for (cube, members) in self.grid.cubes() {
+        let grid = PointGrid::with_points(self.reach, sites.iter().map(|site| &site.point));
+        for (cube, members) in self.grid.filled_cubes() {
             let near: Vec<_> =
                 grid.points_around(cube).filter_map(|index| Some((index, sites.get(index)?))).collect();
             for &member in members {
@@ -148,7 +150,7 @@ impl<'a> SampleField<'a> {
 
     /// Moves the sites until they are distributed evenly. Removes those that have no samples. New sites are at least
     /// `apart` (in m) from others.
-    pub(crate) fn relax(&self, sites: &mut Vec<Site>, apart: f64) {
+    pub(crate) fn relax_sites(&self, sites: &mut Vec<CellSite>, apart: f64) {
         for round in 1..=RELAXATION_ROUNDS {
             let owners = self.nearest_sites(sites);
             let mut sums = vec![(0.0, Vector3::zeros(), Vector3::zeros()); sites.len()];
@@ -168,7 +170,7 @@ impl<'a> SampleField<'a> {
                 .filter(|&(count, ..)| count > 0.0)
                 .filter_map(|(count, points, normals)| {
                     let normal = Unit::try_new(normals, 0.0)?.into_inner();
-                    Some(Site { point: Point3::from(points / count), normal })
+                    Some(CellSite { point: Point3::from(points / count), normal })
                 })
                 .collect();
             if round % ROUNDS_PER_ADDITION == 0 && round < RELAXATION_ROUNDS {

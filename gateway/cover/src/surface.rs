@@ -4,7 +4,7 @@ use core::f64::consts::{PI, TAU};
 
 use nalgebra::{Isometry3, Matrix3, Point3, Unit, Vector3};
 
-use crate::grid::Grid;
+use crate::grid::PointGrid;
 use crate::mesh::{Affine, MAX_TRIANGLES, Triangle};
 use crate::tree::{Ray, TriangleTree};
 use crate::{CoverError, CoverOptions, KeepOut, RobotLink};
@@ -37,10 +37,10 @@ const MIN_REACHED_RAY_SHARE: f64 = 0.05;
 const REACH_TEST_RAYS: u32 = 128;
 
 /// The height above the surface from which rays start, in pitches.
-const RAY_START_HEIGHT: f64 = 1e-3;
+const RAY_START_HEIGHT_PITCHES: f64 = 1e-3;
 
 /// The distance up to which other links hide a surface from rays, in pitches.
-const HIDING_DISTANCE_PITCHES: f64 = 2.0;
+const LINK_HIDING_DISTANCE_PITCHES: f64 = 2.0;
 
 /// The minimum share of the disc below a cell that must be surface of a similar direction. The share is about a half at
 /// a straight edge, and near zero on the rim of a sheet.
@@ -89,14 +89,14 @@ impl<'a> Surface<'a> {
         let frame = links.get(index).map_or_else(Isometry3::identity, |link| link.pose.inverse());
         for (other, link) in links.iter().chain(others).enumerate() {
             if other == index {
-                collect(link, &Isometry3::identity(), &mut own)?;
+                collect_link_triangles(link, &Isometry3::identity(), &mut own)?;
             } else {
-                collect(link, &(frame * link.pose), &mut obstacles)?;
+                collect_link_triangles(link, &(frame * link.pose), &mut obstacles)?;
             }
         }
         remove_duplicates(&mut own);
         let pitch = options.pitch;
-        let area: f64 = own.iter().map(area).sum();
+        let area: f64 = own.iter().map(triangle_area).sum();
         let cells = area / cell_area(pitch);
         if cells.is_nan() || cells > count_to_f64(MAX_CELLS) {
             let link = links.get(index).map_or_else(String::new, |link| link.name.clone());
@@ -126,9 +126,9 @@ impl<'a> Surface<'a> {
         let mut due = -0.5;
         let mut taken = 0;
         for &triangle in self.own.triangles() {
-            due += self::area(&triangle) / self.share;
+            due += triangle_area(&triangle) / self.share;
             let [a, b, c] = triangle;
-            let Some(face) = normal(&triangle) else { continue };
+            let Some(face) = triangle_normal(&triangle) else { continue };
             while due > 0.0 {
                 due -= 1.0;
                 taken += 1;
@@ -138,7 +138,7 @@ impl<'a> Surface<'a> {
                 }
                 let point = a + (b - a) * u + (c - a) * v;
                 if let Some(face) = self.outward_normal(&point, &face) {
-                    let free = self.is_allowed(&point);
+                    let free = self.allows_cell_at(&point);
                     self.samples.push(Sample { point, face, smooth: face, free });
                 }
             }
@@ -154,23 +154,23 @@ impl<'a> Surface<'a> {
         let back = if front < 0.95 { self.escaping_ray_share(point, &-face) } else { 0.0 };
         let (side, share) = if back > front { (-face, back) } else { (*face, front) };
         let is_outer = share >= MIN_ESCAPING_RAY_SHARE
-            && !self.is_inside_other_link(&(point + side * (RAY_START_HEIGHT * self.pitch)))
-            && self.is_reached(point, &side);
+            && !self.is_inside_other_link(&(point + side * (RAY_START_HEIGHT_PITCHES * self.pitch)))
+            && self.is_touchable(point, &side);
         is_outer.then_some(side)
     }
 
     /// Returns the share of rays that leave the link from just above a point. Rays are weighted by the cosine of the
     /// angle to the normal.
     fn escaping_ray_share(&self, point: &Point3<f64>, side: &Vector3<f64>) -> f64 {
-        let rays = self.rays(point, side);
-        share_of_rays(|ray| self.escapes(&rays(*ray), HIDING_DISTANCE_PITCHES * self.pitch))
+        let rays = self.ray_generator(point, side);
+        share_of_rays(|ray| self.ray_escapes(&rays(*ray), LINK_HIDING_DISTANCE_PITCHES * self.pitch))
     }
 
     /// Returns true if something could touch the point from this side, because enough rays leave the robot.
-    fn is_reached(&self, point: &Point3<f64>, side: &Vector3<f64>) -> bool {
-        let rays = self.rays(point, side);
-        let leaves = |ray: &u32| self.escapes(&rays(*ray), f64::INFINITY);
-        let few = count((0..MIN_RAYS_PER_TEST).filter(leaves));
+    fn is_touchable(&self, point: &Point3<f64>, side: &Vector3<f64>) -> bool {
+        let rays = self.ray_generator(point, side);
+        let leaves = |ray: &u32| self.ray_escapes(&rays(*ray), f64::INFINITY);
+        let few = count_rays((0..MIN_RAYS_PER_TEST).filter(leaves));
         if 2 * few >= MIN_RAYS_PER_TEST {
             return true;
         }
@@ -184,8 +184,8 @@ impl<'a> Surface<'a> {
 
     /// Returns a function that creates a ray from its number. The rays start just above a point; their density is
     /// proportional to the cosine of the angle to the normal.
-    fn rays(&self, point: &Point3<f64>, side: &Vector3<f64>) -> impl Fn(u32) -> Ray {
-        let origin = point + side * (RAY_START_HEIGHT * self.pitch);
+    fn ray_generator(&self, point: &Point3<f64>, side: &Vector3<f64>) -> impl Fn(u32) -> Ray {
+        let origin = point + side * (RAY_START_HEIGHT_PITCHES * self.pitch);
         let ((s, t), side) = (tangents(side), *side);
         move |ray| {
             let (u, v) = quasirandom_point(ray);
@@ -195,8 +195,8 @@ impl<'a> Surface<'a> {
     }
 
     /// Returns true if a ray hits neither the link itself nor, within the distance `until` in m, another link.
-    fn escapes(&self, ray: &Ray, until: f64) -> bool {
-        !self.own.blocks(ray, f64::INFINITY) && !self.others.blocks(ray, until)
+    fn ray_escapes(&self, ray: &Ray, until: f64) -> bool {
+        !self.own.blocks_ray(ray, f64::INFINITY) && !self.others.blocks_ray(ray, until)
     }
 
     fn is_inside_other_link(&self, point: &Point3<f64>) -> bool {
@@ -206,7 +206,7 @@ impl<'a> Surface<'a> {
             let (height, (sin, cos)) = (2.0 * u - 1.0, (TAU * v).sin_cos());
             let radius = (1.0 - height * height).sqrt();
             let ray = Ray::new(*point, Vector3::new(radius * cos, radius * sin, height));
-            if !self.others.blocks(&ray, f64::INFINITY) {
+            if !self.others.blocks_ray(&ray, f64::INFINITY) {
                 leaking += 1;
             }
             if f64::from(leaking) > MAX_LEAKING_RAY_SHARE * f64::from(RAYS_PER_TEST) {
@@ -217,7 +217,7 @@ impl<'a> Surface<'a> {
     }
 
     /// Returns true if cells are allowed at a point, because it is in no keep-out box and far enough from other links.
-    fn is_allowed(&self, point: &Point3<f64>) -> bool {
+    fn allows_cell_at(&self, point: &Point3<f64>) -> bool {
         !self.is_in_keep_out_box(point) && !self.others.is_near(point, self.clearance)
     }
 
@@ -233,10 +233,10 @@ impl<'a> Surface<'a> {
     /// Computes the mean normal around each sample, and checks that a cell there would have enough surface below it.
     fn smooth_normals(&mut self) {
         let radius = self.pitch / 2.0;
-        let grid = Grid::with_points(radius, self.samples.iter().map(|sample| &sample.point));
+        let grid = PointGrid::with_points(radius, self.samples.iter().map(|sample| &sample.point));
         let min = MIN_SUPPORT_SHARE * PI * radius * radius / self.share;
         let mut smoothed = Vec::new();
-        for (cube, members) in grid.cubes() {
+        for (cube, members) in grid.filled_cubes() {
             let near: Vec<_> = grid.points_around(cube).filter_map(|index| self.samples.get(index)).collect();
             for &member in members {
                 let Some(sample) = self.samples.get(member) else { continue };
@@ -262,7 +262,7 @@ impl<'a> Surface<'a> {
 
     /// Returns the point of the mesh directly above or below `point`, and the outward normal of the mesh there. Returns
     /// `None` if no cell may be placed there.
-    pub(crate) fn project(
+    pub(crate) fn project_to_mesh(
         &self,
         point: &Point3<f64>,
         sample: &Sample,
@@ -272,22 +272,23 @@ impl<'a> Surface<'a> {
         let origin = point + up * ((sample.point - point).dot(&up) + reach);
         let (at, triangle) = self.own.first_hit(&Ray::new(origin, -up), 2.0 * reach)?;
         let point = origin - up * at;
-        let face = self.outward_normal(&point, &normal(self.own.triangle(triangle)?)?)?;
-        (face.dot(&up) > 0.0 && self.is_allowed(&point)).then_some((point, face))
+        let face = self.outward_normal(&point, &triangle_normal(self.own.triangle(triangle)?)?)?;
+        (face.dot(&up) > 0.0 && self.allows_cell_at(&point)).then_some((point, face))
     }
 }
 
 /// Returns the share of rays for which `escapes` is true. Only the first [`FEW`] rays are cast if they all agree.
 fn share_of_rays(escapes: impl Fn(&u32) -> bool) -> f64 {
-    let few = count((0..MIN_RAYS_PER_TEST).filter(&escapes));
+    let few = count_rays((0..MIN_RAYS_PER_TEST).filter(&escapes));
     if few == 0 || few == MIN_RAYS_PER_TEST {
         return f64::from(few) / f64::from(MIN_RAYS_PER_TEST);
     }
-    f64::from(few + count((MIN_RAYS_PER_TEST..RAYS_PER_TEST).filter(&escapes))) / f64::from(RAYS_PER_TEST)
+    f64::from(few + count_rays((MIN_RAYS_PER_TEST..RAYS_PER_TEST).filter(&escapes)))
+        / f64::from(RAYS_PER_TEST)
 }
 
 /// Counts the rays of an iterator.
-fn count(rays: impl Iterator<Item = u32>) -> u32 {
+fn count_rays(rays: impl Iterator<Item = u32>) -> u32 {
     rays.fold(0, |count, _| count + 1)
 }
 
@@ -309,17 +310,21 @@ pub(crate) fn tangents(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
 }
 
 /// Returns the area of a triangle, in m².
-pub(crate) fn area([a, b, c]: &Triangle) -> f64 {
+pub(crate) fn triangle_area([a, b, c]: &Triangle) -> f64 {
     (b - a).cross(&(c - a)).norm() / 2.0
 }
 
 /// Returns the unit normal of a triangle; `None` for a triangle without an area.
-pub(crate) fn normal([a, b, c]: &Triangle) -> Option<Vector3<f64>> {
+pub(crate) fn triangle_normal([a, b, c]: &Triangle) -> Option<Vector3<f64>> {
     Unit::try_new((b - a).cross(&(c - a)), 0.0).map(Unit::into_inner)
 }
 
 /// Adds the triangles of a link, in a frame in which the link has the pose `pose`.
-fn collect(link: &RobotLink, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle>) -> Result<(), CoverError> {
+fn collect_link_triangles(
+    link: &RobotLink,
+    pose: &Isometry3<f64>,
+    triangles: &mut Vec<Triangle>,
+) -> Result<(), CoverError> {
     let count = link.parts.iter().map(|part| part.mesh.triangles().len()).sum();
     if count > MAX_TRIANGLES {
         return Err(CoverError::Triangles { link: link.name.clone(), count });

@@ -246,7 +246,7 @@ fn enclosed(links: &[RobotLink], skin: &Cover) -> usize {
     let blocked = |cell: &&CoverCell| {
         let (position, normal) = vectors(cell);
         let from = links[0].pose * Point3::from(position + normal * 1e-4);
-        directions.iter().all(|direction| tree.blocks(&tree::Ray::new(from, *direction), f64::INFINITY))
+        directions.iter().all(|direction| tree.blocks_ray(&tree::Ray::new(from, *direction), f64::INFINITY))
     };
     skin.cells.iter().filter(|cell| cell.link == 0).filter(blocked).count()
 }
@@ -399,7 +399,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(16))]
 
     #[test]
-    fn any_triangles_are_covered_or_refused(soup in soup(), seed in any::<u64>(), nodes in 1..=MAX_NODES) {
+    fn any_triangles_are_covered_or_refused(soup in soup(), seed in any::<u64>(), nodes in 1..=MAX_CELLS_PER_BUS) {
         let options = CoverOptions { seed, nodes_per_bus: nodes, pitch: 0.08, ..CoverOptions::default() };
         let (first, second) = soup.split_at(soup.len() / 2);
         let link = |triangles: &[Triangle]| Mesh::new("soup", triangles.to_vec()).map(single).unwrap_or_default();

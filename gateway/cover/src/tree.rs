@@ -12,12 +12,12 @@ const MAX_LEAF_TRIANGLES: usize = 4;
 
 /// A bounding box.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Bounds {
+pub(crate) struct BoundingBox {
     pub(crate) min: Point3<f64>,
     pub(crate) max: Point3<f64>,
 }
 
-impl Bounds {
+impl BoundingBox {
     fn enclosing<'a>(points: impl Iterator<Item = &'a Point3<f64>>) -> Self {
         let empty = Self {
             min: Point3::from(Vector3::repeat(f64::INFINITY)),
@@ -87,7 +87,7 @@ enum NodeKind {
 #[derive(Clone, Debug)]
 pub(crate) struct TriangleTree {
     /// The nodes; the root comes first.
-    nodes: Vec<(Bounds, NodeKind)>,
+    nodes: Vec<(BoundingBox, NodeKind)>,
     /// The triangles in the order of the leaves.
     triangles: Vec<Triangle>,
 }
@@ -100,7 +100,7 @@ impl TriangleTree {
         let mut open = vec![(0, count, None)];
         while let Some((from, to, place)) = open.pop() {
             let Some(part) = triangles.get_mut(from..to).filter(|part| !part.is_empty()) else { continue };
-            let bounds = Bounds::enclosing(part.iter().flatten());
+            let bounds = BoundingBox::enclosing(part.iter().flatten());
             let node = nodes.len();
             nodes.push((bounds, NodeKind::Leaf(from, to)));
             // The parent stores the index of its second child; the first one follows the parent directly.
@@ -135,12 +135,12 @@ impl TriangleTree {
         self.triangles.get(index)
     }
 
-    fn leaf(&self, from: usize, to: usize) -> impl Iterator<Item = (usize, &Triangle)> {
+    fn leaf_triangles(&self, from: usize, to: usize) -> impl Iterator<Item = (usize, &Triangle)> {
         (from..to).zip(self.triangles.get(from..to).unwrap_or_default())
     }
 
     /// Returns true if a ray meets a triangle within `until`.
-    pub(crate) fn blocks(&self, ray: &Ray, until: f64) -> bool {
+    pub(crate) fn blocks_ray(&self, ray: &Ray, until: f64) -> bool {
         self.find_hit(ray, until, true).is_some()
     }
 
@@ -162,7 +162,7 @@ impl TriangleTree {
             match *kind {
                 NodeKind::Fork(first, second) => open.extend([second, first]),
                 NodeKind::Leaf(from, to) => {
-                    for (index, triangle) in self.leaf(from, to) {
+                    for (index, triangle) in self.leaf_triangles(from, to) {
                         if let Some(at) = ray.intersect_triangle(triangle).filter(|&at| at <= until) {
                             until = at;
                             best = Some((at, index));
@@ -188,7 +188,10 @@ impl TriangleTree {
             match *kind {
                 NodeKind::Fork(first, second) => open.extend([first, second]),
                 NodeKind::Leaf(from, to) => {
-                    if self.leaf(from, to).any(|(_, triangle)| distance(point, triangle) < within) {
+                    if self
+                        .leaf_triangles(from, to)
+                        .any(|(_, triangle)| distance_to_triangle(point, triangle) < within)
+                    {
                         return true;
                     }
                 }
@@ -199,7 +202,7 @@ impl TriangleTree {
 }
 
 /// Returns the distance of a point from a triangle, in m.
-pub(crate) fn distance(point: &Point3<f64>, &[a, b, c]: &Triangle) -> f64 {
+pub(crate) fn distance_to_triangle(point: &Point3<f64>, &[a, b, c]: &Triangle) -> f64 {
     let edge = |from: Point3<f64>, to: Point3<f64>| {
         let along = to - from;
         let share = (point - from).dot(&along) / along.norm_squared();
@@ -244,8 +247,8 @@ mod tests {
             let hits = triangles.iter().filter_map(|triangle| ray.intersect_triangle(triangle));
             let first = hits.filter(|&at| at <= until).min_by(f64::total_cmp);
             prop_assert_eq!(tree.first_hit(&ray, until).map(|(at, _)| at), first);
-            prop_assert_eq!(tree.blocks(&ray, until), first.is_some());
-            let nearest = triangles.iter().map(|triangle| distance(&from, triangle)).min_by(f64::total_cmp);
+            prop_assert_eq!(tree.blocks_ray(&ray, until), first.is_some());
+            let nearest = triangles.iter().map(|triangle| distance_to_triangle(&from, triangle)).min_by(f64::total_cmp);
             prop_assert_eq!(tree.is_near(&from, until), nearest.is_some_and(|nearest| nearest < until));
         }
 
@@ -255,8 +258,8 @@ mod tests {
         ) {
             let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
             let on = a + (b - a) * u + (c - a) * v;
-            prop_assert!(distance(&from, &[a, b, c]) <= (from - on).norm() + 1e-12);
-            prop_assert!(distance(&on, &[a, b, c]) < 1e-9);
+            prop_assert!(distance_to_triangle(&from, &[a, b, c]) <= (from - on).norm() + 1e-12);
+            prop_assert!(distance_to_triangle(&on, &[a, b, c]) < 1e-9);
         }
     }
 
@@ -264,7 +267,7 @@ mod tests {
     fn triangles_without_an_area_stop_no_ray() {
         let point = Point3::new(0.0, 0.0, 1.0);
         let tree = TriangleTree::new(vec![[point; 3]; 10]);
-        assert!(!tree.blocks(&Ray::new(Point3::origin(), Vector3::z()), 9.0));
+        assert!(!tree.blocks_ray(&Ray::new(Point3::origin(), Vector3::z()), 9.0));
         assert!(tree.is_near(&Point3::origin(), 1.5));
         assert!(!tree.is_near(&Point3::origin(), 0.5));
     }

@@ -5,13 +5,13 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 /// Path of the release build's program, one directory above the examples.
-pub(crate) fn gateway() -> PathBuf {
+pub(crate) fn gateway_program() -> PathBuf {
     let program = std::env::current_exe().expect("this program has a path");
     program.parent().and_then(Path::parent).expect("it lies in a folder of the build").join("skinbus")
 }
 
 /// Runs a command. Returns its duration in s, and the peak memory of its process in MB.
-pub(crate) fn run(command: &mut Command) -> (f64, f64) {
+pub(crate) fn run_measured(command: &mut Command) -> (f64, f64) {
     let begun = Instant::now();
     let mut child = command.spawn().expect("the release build's gateway: cargo build --release -p gateway");
     let status = Path::new("/proc").join(child.id().to_string()).join("status");

@@ -22,7 +22,7 @@ use protocol::id::{CellId, Node};
 use protocol::message::{
     Answer, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart,
 };
-use protocol::packet::{self, Epoch, WORDS, padded};
+use protocol::packet::{self, Epoch, WORDS, pad_with_defaults};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use protocol::time::Micros;
@@ -37,7 +37,7 @@ const FIRST_EPOCH_NANOS: u64 = 1_700_000_000_000_000_000;
 const EPOCH_NANOS: u64 = 16_000_000;
 
 /// The frames of one epoch, by its number.
-type Frames = fn(u8, Format) -> Vec<LatchedFrame>;
+type EpochFramesFn = fn(u8, Format) -> Vec<LatchedFrame>;
 
 fn skin(format: Format) -> Skin {
     let text = generate(&SkinRequest { cells: CELLS, ..SkinRequest::default() }).expect("a UR5 has room");
@@ -47,12 +47,12 @@ fn skin(format: Format) -> Skin {
 }
 
 /// Returns a value that is never dropped, so that no count includes its drop.
-fn leaked<T>(value: T) -> &'static mut T {
+fn leak_value<T>(value: T) -> &'static mut T {
     Box::leak(Box::new(value))
 }
 
 /// Returns the frames of messages in an epoch, 22 us apart: first those of the gateway, then those of cells.
-fn frames(
+fn message_frames(
     number: u8,
     format: Format,
     from_gateway: &[Message],
@@ -79,23 +79,23 @@ fn cells() -> impl Iterator<Item = CellId> {
 /// Returns the joints and the torques of an epoch.
 fn torques(number: u8, format: Format) -> Vec<LatchedFrame> {
     let epoch = Epoch(number);
-    let positions = padded(&[0.3, -1.2, 1.0, -1.4, -0.6, 0.2_f64].map(Q1_14::nearest));
+    let positions = pad_with_defaults(&[0.3, -1.2, 1.0, -1.4, -0.6, 0.2_f64].map(Q1_14::nearest));
     let joints = Message::Joints { epoch, joints: Joints { positions, in_use: 6 } };
     let words: [i16; WORDS] = [0.1, -0.2, 0.3, 0.05, 0.01, 0.0].map(|nm| Q3_12::nearest(nm).to_bits());
     let torque = |from| Message::Torque { from, epoch, torque: words.into() };
-    frames(number, format, &[joints], cells().map(torque))
+    message_frames(number, format, &[joints], cells().map(torque))
 }
 
 /// Returns a heartbeat of each cell.
 fn heartbeats(number: u8, format: Format) -> Vec<LatchedFrame> {
-    let state = State::CONFIGURED.with(State::TEST_MODE, true).with(State::ACTIVE, true);
+    let state = State::CONFIGURED.with_flags(State::TEST_MODE, true).with_flags(State::ACTIVE, true);
     let heartbeat = |cell: CellId| {
         let serial = u32::from(cell.get());
         let heartbeat = Heartbeat { serial, sent: number.into(), state, ..Heartbeat::default() };
         let page = NetworkPage::Heartbeat(heartbeat);
         Message::Network { from: Node::Cell(cell), epoch: Epoch(number), page }
     };
-    frames(number, format, &[], cells().map(heartbeat))
+    message_frames(number, format, &[], cells().map(heartbeat))
 }
 
 /// Returns the stimulus that presses all cells, after the write of the mode that each of them confirms.
@@ -109,12 +109,12 @@ fn presses(number: u8, format: Format) -> Vec<LatchedFrame> {
     let skin = SkinSensors { contact, proximity: Q1_14::nearest(0.9), ..SkinSensors::default() };
     let page = SensorPage::Skin(skin);
     let press = Message::Stimulus { to: Node::Everyone, from: StimulusStart::Next, page };
-    let press = frames(number, format, &[press], std::iter::empty());
-    [frames(number, format, &[write], confirmed), press].concat()
+    let press = message_frames(number, format, &[press], std::iter::empty());
+    [message_frames(number, format, &[write], confirmed), press].concat()
 }
 
 /// Returns an epoch of pressed cells.
-fn epoch_before(format: Format) -> Vec<LatchedFrame> {
+fn pressed_epoch_frames(format: Format) -> Vec<LatchedFrame> {
     [heartbeats(0, format), presses(1, format), torques(2, format)].concat()
 }
 
@@ -125,11 +125,11 @@ struct Receiver {
 }
 
 impl Receiver {
-    fn new(format: Format, comparing: bool, next: Frames) -> &'static mut Self {
+    fn new(format: Format, comparing: bool, next: EpochFramesFn) -> &'static mut Self {
         let mut table = BusTable::new(&skin(format), 0);
-        table.set_comparing(comparing);
-        receive(&mut table, &epoch_before(format));
-        leaked(Self { table, next: next(3, format) })
+        table.set_torque_comparison(comparing);
+        receive(&mut table, &pressed_epoch_frames(format));
+        leak_value(Self { table, next: next(3, format) })
     }
 
     /// Receives the next frames, and returns the number of cells that contribute to the sum.
@@ -163,10 +163,10 @@ struct Latching {
 }
 
 impl Latching {
-    fn new(format: Format, next: Frames) -> &'static mut Self {
+    fn new(format: Format, next: EpochFramesFn) -> &'static mut Self {
         let mut latched = LatchedPackets::default();
-        epoch_before(format).iter().for_each(|&frame| latched.receive(frame));
-        leaked(Self { latched, next: next(3, format) })
+        pressed_epoch_frames(format).iter().for_each(|&frame| latched.receive(frame));
+        leak_value(Self { latched, next: next(3, format) })
     }
 
     /// Latches the next frames, and returns true if the last of them is not the end of a packet.

@@ -9,7 +9,7 @@
 //! ```
 //!
 //! [`CentralComputation::new`] computes with the quantised parameters, as the cells do, so that a difference is the error of the
-//! cells' arithmetic. [`CentralComputation::unquantised`] computes with the numbers of the file: the difference then includes the
+//! cells' arithmetic. [`CentralComputation::without_quantisation`] computes with the numbers of the file: the difference then includes the
 //! rounding of poses, lengths and angles to words.
 //!
 //! A contact pushes against the outward normal: force = -F_z * normal.
@@ -88,7 +88,7 @@ impl CentralComputation {
     /// Builds the reference from the unrounded numbers of the skin's file. All cells must sit on one chain, as in
     /// [`Self::new`].
     #[must_use]
-    pub fn unquantised(skin: &Skin) -> Self {
+    pub fn without_quantisation(skin: &Skin) -> Self {
         let rows = |chain: &Chain| {
             let link = |row: &protocol::skin::ChainRow| {
                 let table = row.table;
@@ -108,14 +108,14 @@ impl CentralComputation {
         let Parameters { pose, contact, .. } = *parameters;
         let position = pose.position.map(Q::to_f64).into();
         let normal = pose.normal.map(Q::to_f64).into();
-        let place = CellGeometry { row: parameters.chain().len(), position, normal, contact };
+        let place = CellGeometry { row: parameters.rows_to_cell().len(), position, normal, contact };
         let links = parameters.all_rows().iter().map(ChainLink::from_row).collect();
         Self { base: IsometryMatrix3::identity(), links, cells: vec![place] }
     }
 
     /// Returns the poses of all links for these joint words. Bounded work, no allocation.
     #[must_use]
-    pub fn frames(&self, joints: &[Q1_14]) -> LinkFrames {
+    pub fn link_frames(&self, joints: &[Q1_14]) -> LinkFrames {
         self.chain_frames(joints, |link, word| match (link.kind, word) {
             (RowKind::Revolute, Some(word)) => (word.wrapping_add(link.offset_word).to_radians(), 0.0),
             (RowKind::Prismatic, Some(word)) => (link.offset_word.to_radians(), word.to_f64()),
@@ -135,7 +135,7 @@ impl CentralComputation {
 
     /// Converts joint words to joint positions, in rad or m.
     #[must_use]
-    pub fn positions(&self, joints: &[Q1_14]) -> [f64; MAX_JOINTS] {
+    pub fn joint_positions(&self, joints: &[Q1_14]) -> [f64; MAX_JOINTS] {
         let mut positions = [0.0; MAX_JOINTS];
         let moving = self.links.iter().filter(|link| link.kind != RowKind::Fixed);
         for ((position, link), word) in positions.iter_mut().zip(moving).zip(joints) {
@@ -170,13 +170,13 @@ impl CentralComputation {
     /// Returns the force F_z in N that a cell computes from its sensor words, exactly by Algorithm 1. Returns zero
     /// without contact and for an unknown cell.
     #[must_use]
-    pub fn force(&self, cell: usize, sensors: &SkinSensors) -> f64 {
-        self.cells.get(cell).map_or(0.0, |place| force(&place.contact, sensors))
+    pub fn cell_force(&self, cell: usize, sensors: &SkinSensors) -> f64 {
+        self.cells.get(cell).map_or(0.0, |place| contact_force(&place.contact, sensors))
     }
 
     /// Returns the position of a cell in the base frame, in m; zero for an unknown cell.
     #[must_use]
-    pub fn position(&self, cell: usize, frames: &LinkFrames) -> [f64; 3] {
+    pub fn cell_position(&self, cell: usize, frames: &LinkFrames) -> [f64; 3] {
         let place =
             self.cells.get(cell).and_then(|place| Some(frames.frames.get(place.row)? * place.position));
         place.map_or([0.0; 3], |position| position.coords.into())
@@ -185,7 +185,7 @@ impl CentralComputation {
     /// Returns the joint torques in Nm (forces in N for prismatic joints) of one cell with the force `f_z` on it
     /// (paper, Eq. 8). Joints that do not move the cell get zero, as does an unknown cell. Bounded work, no allocation.
     #[must_use]
-    pub fn torque(&self, cell: usize, frames: &LinkFrames, f_z: f64) -> [f64; MAX_JOINTS] {
+    pub fn cell_torque(&self, cell: usize, frames: &LinkFrames, f_z: f64) -> [f64; MAX_JOINTS] {
         let mut torque = [0.0; MAX_JOINTS];
         if let Some(place) = self.cells.get(cell) {
             frames.add_torque(place, f_z, &mut torque);
@@ -200,7 +200,7 @@ impl CentralComputation {
     pub fn total_torque(&self, frames: &LinkFrames, sensors: &[SkinSensors]) -> ReferenceTorque {
         let mut reference_torque = ReferenceTorque::default();
         for (place, sensors) in self.cells.iter().zip(sensors) {
-            let f_z = force(&place.contact, sensors);
+            let f_z = contact_force(&place.contact, sensors);
             if f_z > 0.0 {
                 frames.add_torque(place, f_z, &mut reference_torque.torque);
                 reference_torque.active += 1;
@@ -213,14 +213,14 @@ impl CentralComputation {
 /// Returns the pose of frame 0 of the cells' chain in the robot's base frame.
 fn base_pose(skin: &Skin) -> IsometryMatrix3<f64> {
     let base = skin.cells.first().map_or_else(ChainBase::default, |cell| skin.chain(cell.bus).base);
-    let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();
+    let turn = Matrix4::from(base.transform_matrix()).fixed_view::<3, 3>(0, 0).into_owned();
     Translation3::from(base.position) * Rotation3::from_matrix_unchecked(turn)
 }
 
 impl LinkFrames {
     /// Returns the frame of a row, counted from 1, in the robot's base frame; row 0 is frame 0 of the chain.
     #[must_use]
-    pub fn row(&self, row: usize) -> Option<&IsometryMatrix3<f64>> {
+    pub fn row_frame(&self, row: usize) -> Option<&IsometryMatrix3<f64>> {
         self.frames.get(row)
     }
 
@@ -263,7 +263,7 @@ impl CellGeometry {
 }
 
 /// Returns the force F_z in N by Algorithm 1 of the paper. Every word, sum and product is exact in `f64`.
-pub(crate) fn force(contact: &Contact, sensors: &SkinSensors) -> f64 {
+pub(crate) fn contact_force(contact: &Contact, sensors: &SkinSensors) -> f64 {
     let above = |value: f64, threshold: f64| if value < threshold { 0.0 } else { value };
     let touch = sensors.contact.iter().map(|word| word.to_f64()).sum();
     let touch = above(touch, contact.contact_threshold.to_f64());

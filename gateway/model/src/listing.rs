@@ -10,7 +10,7 @@ use crate::tracker::{AddressClaim, HeartbeatKind};
 
 /// Formats sorted node ids as text. Three or more consecutive ids become a range: `1-3`, `5`.
 #[must_use]
-pub fn ranges(nodes: &[u8]) -> Vec<String> {
+pub fn node_id_ranges(nodes: &[u8]) -> Vec<String> {
     let in_a_row = nodes.chunk_by(|one, next| one.checked_add(1) == Some(*next));
     let text = |row: &[u8]| match row {
         [first, _, .., last] => vec![format!("{first}-{last}")],
@@ -36,12 +36,12 @@ pub struct ListedCell {
 impl ListedCell {
     /// Returns the time since the last packet of the cell.
     #[must_use]
-    pub const fn age(&self, now: Micros) -> Span {
+    pub const fn time_since_last_packet(&self, now: Micros) -> Span {
         now.elapsed_since(self.last_packet)
     }
 
     fn record_page(&mut self, now: Micros, page: &NetworkPage) {
-        self.pages.record(page);
+        self.pages.record_page(page);
         if let NetworkPage::Heartbeat(heartbeat) = page {
             let before = self.claim.serial();
             if matches!(self.claim.receive(now, heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider)
@@ -128,8 +128,8 @@ mod tests {
 
     #[test]
     fn node_ids_in_a_row_are_folded() {
-        assert_eq!(ranges(&[1, 2, 4, 5, 6, 253, 254, 255]), ["1", "2", "4-6", "253-255"]);
-        assert_eq!(ranges(&[]), [""; 0]);
+        assert_eq!(node_id_ranges(&[1, 2, 4, 5, 6, 253, 254, 255]), ["1", "2", "4-6", "253-255"]);
+        assert_eq!(node_id_ranges(&[]), [""; 0]);
     }
 
     #[test]
@@ -147,7 +147,7 @@ mod tests {
         assert_eq!((third.heartbeat, third.pages.rejected, third.pages.tree), (Some(heartbeat), None, None));
         assert_eq!((fourth.heartbeat, fourth.pages.rejected), (None, Some(RejectedCounts::default())));
         assert_eq!(
-            (third.age(Micros(110)), listing.node_id(7), listing.node_id(8)),
+            (third.time_since_last_packet(Micros(110)), listing.node_id(7), listing.node_id(8)),
             (Span(100), Some(3), None)
         );
         assert_eq!((listing.format(), listing.has_gateway()), (Some(Format::Classic), false));
@@ -171,6 +171,6 @@ mod tests {
         listing.receive(Micros(10), Format::Fd, &says(3, beat(7)));
         listing.receive(Micros(900_000), Format::Fd, &says(3, beat(8)));
         let (_, cell) = listing.cells().next().unwrap();
-        assert_eq!((cell.age(Micros(900_400)), cell.other_serial), (Span(400), Some(7)));
+        assert_eq!((cell.time_since_last_packet(Micros(900_400)), cell.other_serial), (Span(400), Some(7)));
     }
 }

@@ -12,7 +12,9 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id};
 use protocol::message::{Message, MessageError};
-use protocol::packet::{Length, Lengths, Packet, PacketError, PacketRef, Reassembler, Reassembly, data_id};
+use protocol::packet::{
+    Length, Lengths, Packet, PacketError, PacketRef, Reassembler, Reassembly, data_frame_id,
+};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
@@ -34,14 +36,14 @@ pub struct FrameWithPacket<'f> {
     /// The frame.
     pub frame: &'f Frame,
     /// The packet, with its message unless this version cannot decode it.
-    pub packet: Result<(Packet, Result<Message, MessageError>), NoPacket>,
+    pub packet: Result<(Packet, Result<Message, MessageError>), NoPacketReason>,
     /// Pending segments with the identifier of the frame.
     pub pending: PendingSegments,
 }
 
 /// The reason why a frame neither is nor completes a packet.
 #[derive(Clone, Copy, Debug)]
-pub enum NoPacket {
+pub enum NoPacketReason {
     /// A remote or error frame, or a 29-bit identifier: not a packet of this protocol.
     NotData,
     /// A segment of a packet in classic frames; the packet needs more segments.
@@ -130,7 +132,7 @@ impl PacketReader {
 
     /// Reads the next frame, which arrived `at`. Never panics.
     pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> FrameWithPacket<'f> {
-        let (packet, pending) = self.packet(at, frame);
+        let (packet, pending) = self.read_packet(at, frame);
         let packet = packet.map(|packet| (packet, self.decode(&packet)));
         FrameWithPacket { frame, packet, pending }
     }
@@ -139,12 +141,14 @@ impl PacketReader {
     /// [`decode`](Self::decode).
     // Inlined, as `reassemble`: the receiver of a bus calls them for every frame, and copies each packet once less.
     #[inline(always)]
-    pub(crate) fn packet(
+    pub(crate) fn read_packet(
         &mut self,
         at: Micros,
         frame: &Frame,
-    ) -> (Result<Packet, NoPacket>, PendingSegments) {
-        let Ok(id) = data_id(frame) else { return (Err(NoPacket::NotData), PendingSegments::default()) };
+    ) -> (Result<Packet, NoPacketReason>, PendingSegments) {
+        let Ok(id) = data_frame_id(frame) else {
+            return (Err(NoPacketReason::NotData), PendingSegments::default());
+        };
         let error = match self.format.unwrap_or_else(|| frame.format()) {
             Format::Fd => match PacketRef::from_fd(frame).and_then(|packet| self.check_length(packet)) {
                 Ok(packet) => return (Ok(packet.to_packet()), PendingSegments::default()),
@@ -155,7 +159,7 @@ impl PacketReader {
             }
             Format::Classic => return self.reassemble(at, id, frame),
         };
-        (Err(NoPacket::Damaged(id, error)), PendingSegments::default())
+        (Err(NoPacketReason::Damaged(id, error)), PendingSegments::default())
     }
 
     /// Does the second half of [`read`](Self::read): decodes a packet.
@@ -188,23 +192,23 @@ impl PacketReader {
         at: Micros,
         id: Id,
         frame: &Frame,
-    ) -> (Result<Packet, NoPacket>, PendingSegments) {
+    ) -> (Result<Packet, NoPacketReason>, PendingSegments) {
         let lengths = match self.length {
             ChainLength::Described(length) => Lengths::only(length),
             // Joints packets contain their own length.
             ChainLength::FromJoints(_) if id == Id::command(Command::Joints) => Lengths::ALL,
-            ChainLength::FromJoints(length) => Lengths::for_chain(length),
+            ChainLength::FromJoints(length) => Lengths::from_chain_length(length),
         };
         let segments = self.segments.entry(id);
-        let before = segments.waiting();
+        let before = segments.waiting_segment_count();
         let packet = match segments.push_borrowed(at, id, lengths, frame.data()) {
             Ok(Reassembly::Complete(packet)) => Ok(packet.to_packet()),
-            Ok(Reassembly::Waiting) => Err(NoPacket::Segment(id)),
-            Ok(Reassembly::Incomplete) => Err(NoPacket::AfterLost(id)),
-            Ok(Reassembly::Ambiguous) => Err(NoPacket::Damaged(id, PacketError::Ambiguous)),
-            Err(error) => Err(NoPacket::Damaged(id, error)),
+            Ok(Reassembly::Waiting) => Err(NoPacketReason::Segment(id)),
+            Ok(Reassembly::Incomplete) => Err(NoPacketReason::AfterLost(id)),
+            Ok(Reassembly::Ambiguous) => Err(NoPacketReason::Damaged(id, PacketError::Ambiguous)),
+            Err(error) => Err(NoPacketReason::Damaged(id, error)),
         };
-        (packet, PendingSegments { before, after: segments.waiting() })
+        (packet, PendingSegments { before, after: segments.waiting_segment_count() })
     }
 
     /// Drops the pending segments with this identifier.

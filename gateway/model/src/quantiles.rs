@@ -39,7 +39,7 @@ impl TimeHistogram {
 
     /// Returns the longest time in ns; 0 if empty.
     #[must_use]
-    pub const fn longest(&self) -> u64 {
+    pub const fn longest_ns(&self) -> u64 {
         self.longest
     }
 }

@@ -19,7 +19,7 @@ pub struct RetryLimits {
 
 /// The retry state of one request that has not been answered yet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Attempt {
+pub struct RetryState {
     limits: RetryLimits,
     transmissions: u8,
     due: Micros,
@@ -36,7 +36,7 @@ pub enum RetryAction {
     GiveUp,
 }
 
-impl Attempt {
+impl RetryState {
     /// Starts the timeout of a request whose first transmission is at `now`.
     #[must_use]
     pub fn new(now: Micros, limits: RetryLimits) -> Self {
@@ -49,9 +49,9 @@ impl Attempt {
         self.transmissions
     }
 
-    /// Returns the time at which the timeout expires and [`Attempt::handle_timeout`] must be called.
+    /// Returns the time at which the timeout expires and [`RetryState::handle_timeout`] must be called.
     #[must_use]
-    pub const fn due(&self) -> Micros {
+    pub const fn next_timeout(&self) -> Micros {
         self.due
     }
 
@@ -107,7 +107,7 @@ impl<K: Copy + Ord> RepeatedRequests<K> {
     }
 
     /// Lets a changed request be sent without waiting for its interval.
-    pub fn make_due(&mut self, key: K) {
+    pub fn make_request_due(&mut self, key: K) {
         self.sent.remove(&key);
     }
 }
@@ -121,15 +121,15 @@ mod tests {
 
     #[test]
     fn an_attempt_waits_twice_as_long_each_time_up_to_a_limit_and_then_gives_up() {
-        let mut attempt = Attempt::new(Micros(0), LIMITS);
+        let mut attempt = RetryState::new(Micros(0), LIMITS);
         for due in [100, 300, 600] {
             assert_eq!(
-                (attempt.due(), attempt.handle_timeout(Micros(due - 1))),
+                (attempt.next_timeout(), attempt.handle_timeout(Micros(due - 1))),
                 (Micros(due), RetryAction::Wait)
             );
             assert_eq!(attempt.handle_timeout(Micros(due)), RetryAction::Resend);
         }
-        assert_eq!((attempt.transmissions(), attempt.due()), (4, Micros(900)));
+        assert_eq!((attempt.transmissions(), attempt.next_timeout()), (4, Micros(900)));
         attempt.extend_timeout(Micros(800));
         assert_eq!(
             (attempt.handle_timeout(Micros(1_099)), attempt.handle_timeout(Micros(1_100))),
@@ -146,7 +146,7 @@ mod tests {
         repeats.mark_all_sent(Micros(200));
         assert!(repeats.due_requests(Micros(299), [1, 2, 3, 4]).is_empty());
         assert_eq!(repeats.due_requests(Micros(300), [1, 4]), [1, 4]);
-        repeats.make_due(4);
+        repeats.make_request_due(4);
         assert_eq!(repeats.due_requests(Micros(301), [1, 4]), [4], "it has changed");
     }
 }

@@ -32,7 +32,7 @@ impl Cylinder {
             return None;
         }
         let count = cells.len() as f64;
-        let cells: Vec<_> = cells.iter().map(vectors).collect();
+        let cells: Vec<_> = cells.iter().map(position_and_normal).collect();
         let spread: Matrix3<f64> = cells.iter().map(|(_, normal)| normal * normal.transpose()).sum();
         let eigen = (spread / count).symmetric_eigen();
         let mut values: Vec<_> = eigen.eigenvalues.iter().copied().zip(0..).collect();
@@ -94,20 +94,20 @@ pub fn lay_flat(cells: &[SurfaceCell], tip: [f64; 3]) -> FlatMap {
         let front = perpendicular(&axis);
         let right = front.cross(&axis);
         let places = cells.iter().map(|cell| {
-            let position = vectors(cell).0;
+            let position = position_and_normal(cell).0;
             let out = position - Vector3::from(cylinder.middle);
             let angle = out.dot(&right).atan2(out.dot(&front));
             [angle * cylinder.radius, axis.dot(&position)]
         });
         return FlatMap { places: places.collect(), radius: Some(cylinder.radius) };
     }
-    let mean = cells.iter().fold(Vector3::zeros(), |sum, cell| sum + vectors(cell).1);
+    let mean = cells.iter().fold(Vector3::zeros(), |sum, cell| sum + position_and_normal(cell).1);
     let normal = (mean / cells.len().max(1) as f64).try_normalize(1e-6).unwrap_or_else(Vector3::z);
     let down =
         (tip - normal * normal.dot(&tip)).try_normalize(1e-6).unwrap_or_else(|| perpendicular(&normal));
     let right = normal.cross(&down);
     let places = cells.iter().map(|cell| {
-        let position = vectors(cell).0;
+        let position = position_and_normal(cell).0;
         [right.dot(&position), down.dot(&position)]
     });
     FlatMap { places: places.collect(), radius: None }
@@ -120,7 +120,7 @@ fn perpendicular(axis: &Vector3<f64>) -> Vector3<f64> {
     (chosen - axis * axis.dot(&chosen)).normalize()
 }
 
-fn vectors((position, normal): &SurfaceCell) -> (Vector3<f64>, Vector3<f64>) {
+fn position_and_normal((position, normal): &SurfaceCell) -> (Vector3<f64>, Vector3<f64>) {
     (Vector3::from(*position), Vector3::from(*normal))
 }
 

@@ -3,7 +3,7 @@
 use protocol::skin::Skin;
 
 /// A UR5 with one cell on joint 3.
-pub const SKIN: &str = r#"version = 1
+pub const ONE_CELL_SKIN_TOML: &str = r#"version = 1
 name = "bare"
 
 [robot]
@@ -48,57 +48,60 @@ orientation = [0.7071068, 0.0, 0.0, 0.7071068]
 "#;
 
 /// The skin of the demo: 253 cells on two links of a UR5.
-pub const UR5: &str = include_str!("../../examples/ur5-253.toml");
+pub const UR5_SKIN_TOML: &str = include_str!("../../examples/ur5-253.toml");
 /// 126 cells on all links of an arm with seven joints, imported from its URDF.
-const PANDA: &str = include_str!("../tests/data/panda.toml");
+const PANDA_SKIN_TOML: &str = include_str!("../tests/data/panda.toml");
 /// A cell on an arm on a lift.
-const LIFT: &str = include_str!("../tests/data/lift.toml");
+const LIFT_SKIN_TOML: &str = include_str!("../tests/data/lift.toml");
 
-/// Returns the skin [`UR5`].
+/// Returns the skin [`UR5_SKIN_TOML`].
 ///
 /// # Panics
 /// Never: the skin is valid.
 #[must_use]
-pub fn ur5() -> Skin {
-    Skin::parse("ur5-253.toml", UR5).expect("the tests' skin is valid")
+pub fn ur5_skin() -> Skin {
+    Skin::parse("ur5-253.toml", UR5_SKIN_TOML).expect("the tests' skin is valid")
 }
 
 /// Returns a skin with cells on all links of an arm with seven joints.
 ///
 /// # Panics
-/// See [`ur5`].
+/// See [`ur5_skin`].
 #[must_use]
-pub fn panda() -> Skin {
-    Skin::parse("panda.toml", PANDA).expect("the tests' skin is valid")
+pub fn panda_skin() -> Skin {
+    Skin::parse("panda.toml", PANDA_SKIN_TOML).expect("the tests' skin is valid")
 }
 
 /// Returns a skin with one cell on an arm on a lift.
 ///
 /// # Panics
-/// See [`ur5`].
+/// See [`ur5_skin`].
 #[must_use]
-pub fn lift() -> Skin {
-    Skin::parse("lift.toml", LIFT).expect("the tests' skin is valid")
+pub fn lift_skin() -> Skin {
+    Skin::parse("lift.toml", LIFT_SKIN_TOML).expect("the tests' skin is valid")
 }
 
-/// Returns [`SKIN`] with a second bus like the first one.
+/// Returns [`ONE_CELL_SKIN_TOML`] with a second bus like the first one.
 ///
 /// # Panics
 /// Never: the skin is valid.
 #[must_use]
-pub fn two_buses() -> Skin {
-    let bus = SKIN.find("[[bus]]").zip(SKIN.find("[controller]")).and_then(|(from, to)| SKIN.get(from..to));
-    let cell = SKIN.find("[[cell]]").and_then(|from| SKIN.get(from..));
+pub fn two_bus_skin() -> Skin {
+    let bus = ONE_CELL_SKIN_TOML
+        .find("[[bus]]")
+        .zip(ONE_CELL_SKIN_TOML.find("[controller]"))
+        .and_then(|(from, to)| ONE_CELL_SKIN_TOML.get(from..to));
+    let cell = ONE_CELL_SKIN_TOML.find("[[cell]]").and_then(|from| ONE_CELL_SKIN_TOML.get(from..));
     let more = bus.into_iter().chain(cell).map(|part| format!("\n{}", part.replace("vcan0", "vcan1")));
-    let text = SKIN.to_owned() + &more.collect::<String>();
+    let text = ONE_CELL_SKIN_TOML.to_owned() + &more.collect::<String>();
     Skin::parse("skin.toml", &text).expect("the tests' skin is valid")
 }
 
-/// Returns [`SKIN`], parsed and checked.
+/// Returns [`ONE_CELL_SKIN_TOML`], parsed and checked.
 ///
 /// # Panics
 /// Never: the skin is valid.
 #[must_use]
-pub fn skin() -> Skin {
-    Skin::parse("skin.toml", SKIN).expect("the tests' skin is valid")
+pub fn one_cell_skin() -> Skin {
+    Skin::parse("skin.toml", ONE_CELL_SKIN_TOML).expect("the tests' skin is valid")
 }

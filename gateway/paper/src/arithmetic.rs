@@ -5,17 +5,17 @@ use cell_node::kernel::oracle::{CountingWord, Projection};
 use cell_node::kernel::{Kernel, Operations, Wrench};
 use cell_node::sine::{paper_sine, sine};
 use protocol::fixed::Q1_14;
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::skin::Skin;
 
 use super::line::count_to_f64;
-use super::ticks::POSE;
+use super::ticks::ARM_POSE_RAD;
 use analysis::paper;
-use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table};
+use analysis::report::figure::{Axis, Figure, Finding, Section, SeriesShape, Table};
 
 /// The number of angles between two that are drawn.
-const DRAWN_INTERVAL: usize = 16;
+const ANGLES_BETWEEN_DRAWN: usize = 16;
 /// The number of angles in each part of the circle for which a maximum error is drawn.
 const ANGLES_PER_PART: usize = 256;
 
@@ -43,7 +43,7 @@ impl SineError {
             let error = function(angle).to_f64() - angle.to_radians().sin();
             sum += error.abs();
             max = max.max(error.abs());
-            if place % DRAWN_INTERVAL == 0 {
+            if place % ANGLES_BETWEEN_DRAWN == 0 {
                 points.push((angle.to_f64(), error));
             }
             if let Some((middle, max)) = parts.get_mut(place / ANGLES_PER_PART) {
@@ -72,23 +72,23 @@ pub fn sine_section() -> Section {
     };
     let max = |what: &str, error: &SineError, bar: f64| Finding::new_unrated(what, error.max).at_most(bar);
     Section::new("sine", "The sine in 16 bits")
-        .text(
+        .with_paragraph(
             "The difference to the sine in double precision, over all 65 536 angles of a word. Of the \
              polynomial of fifth order the paper gives a mean error; the one of seventh order is what cells compute with, and \
              costs one multiplication more. Below it is what rounding to Q1.14 alone costs.",
         )
-        .figures([
-            figure("sine-fifth", "Fifth order, the paper's (Eq. 17)", "error").draw(
+        .with_figures([
+            figure("sine-fifth", "Fifth order, the paper's (Eq. 17)", "error").draw_series(
                 "fifth order",
-                Shape::Line,
+                SeriesShape::Line,
                 fifth.points.clone(),
             ),
             figure("sine-max", "The maximum errors in 256 parts of the circle", "maximum error")
-                .draw("fifth order", Shape::Steps, fifth.parts.clone())
-                .draw("seventh order, the cells'", Shape::Steps, seventh.parts.clone())
-                .draw("rounding alone", Shape::Steps, rounded.parts.clone()),
+                .draw_series("fifth order", SeriesShape::Steps, fifth.parts.clone())
+                .draw_series("seventh order, the cells'", SeriesShape::Steps, seventh.parts.clone())
+                .draw_series("rounding alone", SeriesShape::Steps, rounded.parts.clone()),
         ])
-        .findings([
+        .with_findings([
             mean("sine of fifth order, mean error", &fifth, 1.9e-4),
             max("sine of fifth order, maximum error", &fifth, 4.6e-4),
             mean("sine of seventh order, mean error", &seventh, 2e-5),
@@ -117,7 +117,7 @@ impl JacobianCosts {
             Parameters { joint, row: 0, table_rows: 0, ..cell }
         };
         let words: [Q1_14; MAX_JOINTS] =
-            padded(&POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default()));
+            pad_with_defaults(&ARM_POSE_RAD.map(|angle| Q1_14::from_radians(angle).unwrap_or_default()));
         Self {
             wrench: (1..=joints)
                 .map(|joint| count_jacobian_operations::<Wrench<CountingWord>>(&on(joint), &words))
@@ -135,7 +135,7 @@ fn count_jacobian_operations<K: Kernel<CountingWord>>(
     words: &[Q1_14; MAX_JOINTS],
 ) -> Operations {
     let kernel = K::new(cell);
-    Operations::count(|| kernel.jacobian(words)).1
+    Operations::count_operations(|| kernel.jacobian(words)).1
 }
 
 /// Returns the counts of operations with their names, in the order of the paper.
@@ -177,16 +177,16 @@ pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
         })
     });
     Section::new("kernels", "Operations of one cell's Jacobian")
-        .text(format!(
+        .with_paragraph(format!(
             "Counted by running the cells' code with numbers that count their operations, on a {robot}. The wrench kernel \
              transforms the contact's force and moment down to the base; the paper transforms frames up to the cell.",
         ))
-        .figures([figure
-            .draw("wrench", Shape::Line, products(&costs.wrench))
-            .draw("the paper's projections", Shape::Line, products(&costs.projection))])
-        .findings(wrench.map(|(counts, bar)| finding(counts, "the wrench kernel").at_most(bar.into())))
-        .findings(projection.map(|counts| finding(counts, "the paper's projections")))
-        .tables([Table::new("Operations", ["kernel", "link", "mul", "add", "sin", "cos"], rows)])
+        .with_figures([figure
+            .draw_series("wrench", SeriesShape::Line, products(&costs.wrench))
+            .draw_series("the paper's projections", SeriesShape::Line, products(&costs.projection))])
+        .with_findings(wrench.map(|(counts, bar)| finding(counts, "the wrench kernel").at_most(bar.into())))
+        .with_findings(projection.map(|counts| finding(counts, "the paper's projections")))
+        .with_tables([Table::new("Operations", ["kernel", "link", "mul", "add", "sin", "cos"], rows)])
 }
 
 #[cfg(test)]
@@ -204,7 +204,7 @@ mod tests {
         );
         let drawn =
             section.figures.iter().flat_map(|figure| &figure.series).map(|series| series.points.len());
-        assert_eq!(drawn.collect::<Vec<_>>(), [65_536 / DRAWN_INTERVAL, 256, 256, 256]);
+        assert_eq!(drawn.collect::<Vec<_>>(), [65_536 / ANGLES_BETWEEN_DRAWN, 256, 256, 256]);
         let error = SineError::of_function(sine);
         let max = error.parts.iter().map(|(_, error)| *error).fold(0.0, f64::max);
         assert!((max - error.max).abs() < 1e-15 && (error.parts[128].0 - 0.0078).abs() < 1e-4);
@@ -215,7 +215,7 @@ mod tests {
 
     #[test]
     fn the_kernels_cost_what_they_may_and_more_on_farther_links() {
-        let costs = JacobianCosts::for_skin(&ticks::skin(1, 1).unwrap());
+        let costs = JacobianCosts::for_skin(&ticks::generated_skin(1, 1).unwrap());
         let section = kernels_section("UR5", &costs);
         assert!(
             section.findings.iter().all(|finding| finding.verdict == FindingVerdict::Better

@@ -5,19 +5,19 @@ use protocol::skin::Skin;
 use super::Effort;
 use model::generate::{SkinRequest, generate};
 
-pub use model::generate::Reply;
+pub use model::generate::ReplyMode;
 
 /// Returns the name, without extension, of the files of a run in which cells reply in this way.
 #[must_use]
-pub const fn run_name(reply: Reply) -> &'static str {
+pub const fn run_file_name(reply: ReplyMode) -> &'static str {
     match reply {
-        Reply::Torque => "single",
-        Reply::Sum => "sum",
+        ReplyMode::Torque => "single",
+        ReplyMode::Sum => "sum",
     }
 }
 
 /// The number of cells on the arm in the paper.
-const CELLS: usize = 253;
+const PAPER_CELLS: usize = 253;
 /// The number of cells on the arm in a quick run.
 const QUICK_CELLS: usize = 24;
 /// A scenario with strokes, palms, a grip and a poke. The central computation is switched off at 5.7 s.
@@ -53,10 +53,10 @@ profile = \"half-sine\"
 /// # Panics
 /// Never panics in practice, because this number of cells fits on the arm.
 #[must_use]
-pub fn skin_toml(reply: Reply, effort: Effort) -> String {
+pub fn skin_toml(reply: ReplyMode, effort: Effort) -> String {
     let cells = match effort {
         Effort::Quick => QUICK_CELLS,
-        Effort::Full => CELLS,
+        Effort::Full => PAPER_CELLS,
     };
     generate(&SkinRequest { cells, reply, ..SkinRequest::default() }).expect("so many cells fit on the arm")
 }
@@ -67,7 +67,7 @@ pub fn skin_toml(reply: Reply, effort: Effort) -> String {
 /// Never panics in practice, because a generated skin is valid.
 #[must_use]
 pub fn paper_skin() -> Skin {
-    Skin::parse("skin.toml", &skin_toml(Reply::Torque, Effort::Full)).expect("it has been generated")
+    Skin::parse("skin.toml", &skin_toml(ReplyMode::Torque, Effort::Full)).expect("it has been generated")
 }
 
 /// Returns the text of the arm's `scenario.toml`.
@@ -87,13 +87,13 @@ mod tests {
 
     #[test]
     fn the_arm_is_that_of_the_demonstration_and_its_scenarios_fit_it() {
-        let text = skin_toml(Reply::Torque, Effort::Full);
+        let text = skin_toml(ReplyMode::Torque, Effort::Full);
         assert_eq!(text, include_str!("../../examples/ur5-253.toml"));
         for (reply, effort) in [
-            (Reply::Torque, Effort::Full),
-            (Reply::Sum, Effort::Full),
-            (Reply::Torque, Effort::Quick),
-            (Reply::Sum, Effort::Quick),
+            (ReplyMode::Torque, Effort::Full),
+            (ReplyMode::Sum, Effort::Full),
+            (ReplyMode::Torque, Effort::Quick),
+            (ReplyMode::Sum, Effort::Quick),
         ] {
             let skin = Skin::parse("skin.toml", &skin_toml(reply, effort)).unwrap();
             let scenario = Scenario::parse("scenario.toml", scenario_toml(effort), &skin).unwrap();

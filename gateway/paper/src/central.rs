@@ -1,6 +1,6 @@
 //! Fig. 9 and 10: the time of the central computation, as a function of the number of cells and of active cells.
 //!
-//! The functions [`CentralComputation::frames`] and [`CentralComputation::total_torque`] are timed. In a bench, a tick that compares runs them for
+//! The functions [`CentralComputation::link_frames`] and [`CentralComputation::total_torque`] are timed. In a bench, a tick that compares runs them for
 //! each bus; here they run for one list of cells. Each measurement covers several computations in a row, so that the
 //! time for reading the clock is negligible and code and data are mostly in the caches.
 
@@ -14,9 +14,9 @@ use rand_pcg::Pcg64Mcg;
 
 use super::line::{LinearFit, WeightedPoint, count_to_f64, quantile};
 use super::samples;
-use super::ticks::{POSE, nanos, touch};
+use super::ticks::{ARM_POSE_RAD, nanos_to_float, touched_sensors};
 use analysis::paper;
-use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Shape, Table, number};
+use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, SeriesShape, Table, format_number};
 use model::central::CentralComputation;
 
 /// The number of computations between two readings of the clock.
@@ -26,7 +26,7 @@ const MEASUREMENTS_PER_TOUCH: usize = 5;
 
 /// The number of measurements for Fig. 9 and 10.
 #[derive(Clone, Copy, Debug)]
-pub struct CentralExtent {
+pub struct CentralMeasurementPlan {
     /// The difference between successive numbers of cells.
     pub step: usize,
     /// The number of measurements for each number of cells.
@@ -37,7 +37,7 @@ pub struct CentralExtent {
 
 /// The time T_skin of the central computation for different numbers of cells, none of which is active.
 #[derive(Clone, Debug)]
-pub struct TimesOverCells {
+pub struct CentralTimesByCells {
     /// For each number of cells: that number, and the median, the 25th and the 75th percentile of T_skin in ns.
     pub points: Vec<[f64; 4]>,
     /// The line fitted to T_skin in ns as a function of the number of cells.
@@ -46,7 +46,7 @@ pub struct TimesOverCells {
 
 /// The time T_skin of the central computation for different numbers of active cells on one skin.
 #[derive(Clone, Debug)]
-pub struct TimesOverActive {
+pub struct CentralTimesByActiveCells {
     /// The number of cells of the skin.
     pub cells: usize,
     /// For each number of active cells: that number, the median of T_skin in ns, and as weight the number of touches.
@@ -58,13 +58,13 @@ pub struct TimesOverActive {
 
 /// Returns the time of one computation in ns, as the mean over several in a row.
 fn computation_time_ns(central: &CentralComputation, sensors: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
-    let joints = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
+    let joints = ARM_POSE_RAD.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
     let began = now();
     for _ in 0..COMPUTATIONS_PER_SAMPLE {
-        let frames = central.frames(black_box(&joints));
+        let frames = central.link_frames(black_box(&joints));
         black_box(central.total_torque(&frames, black_box(sensors)));
     }
-    nanos(now().saturating_sub(began)) / f64::from(COMPUTATIONS_PER_SAMPLE)
+    nanos_to_float(now().saturating_sub(began)) / f64::from(COMPUTATIONS_PER_SAMPLE)
 }
 
 /// Measures T_skin for parts of a skin with 0 to all cells, none of which is active. Returns `None` for fewer than
@@ -72,9 +72,9 @@ fn computation_time_ns(central: &CentralComputation, sensors: &[SkinSensors], no
 #[must_use]
 pub fn measure_over_cells(
     skin: &Skin,
-    extent: CentralExtent,
+    extent: CentralMeasurementPlan,
     now: impl Fn() -> u64,
-) -> Option<TimesOverCells> {
+) -> Option<CentralTimesByCells> {
     let central = CentralComputation::new(skin);
     let sensors = vec![SkinSensors::default(); skin.cells.len()];
     let cells: Vec<usize> = (0..=skin.cells.len()).step_by(extent.step.max(1)).collect();
@@ -88,7 +88,7 @@ pub fn measure_over_cells(
     });
     let points: Vec<_> = points.collect();
     let line = LinearFit::fit_unweighted(&points.iter().map(|[x, y, ..]| (*x, *y)).collect::<Vec<_>>())?;
-    Some(TimesOverCells { points, line })
+    Some(CentralTimesByCells { points, line })
 }
 
 /// Measures T_skin for different numbers of active cells on a skin. A touch is of consecutive cells in the order of the
@@ -96,9 +96,9 @@ pub fn measure_over_cells(
 #[must_use]
 pub fn measure_over_active(
     skin: &Skin,
-    extent: CentralExtent,
+    extent: CentralMeasurementPlan,
     now: impl Fn() -> u64,
-) -> Option<TimesOverActive> {
+) -> Option<CentralTimesByActiveCells> {
     let central = CentralComputation::new(skin);
     let cells = skin.cells.len();
     let mut dice = Pcg64Mcg::seed_from_u64(10);
@@ -106,7 +106,7 @@ pub fn measure_over_active(
     for _ in 0..extent.touches {
         let (active, first) = (dice.random_range(0..=cells), dice.random_range(0..cells.max(1)));
         let mut sensors = vec![SkinSensors::default(); cells];
-        sensors.iter_mut().take(active).for_each(|reference_torque| *reference_torque = touch());
+        sensors.iter_mut().take(active).for_each(|reference_torque| *reference_torque = touched_sensors());
         sensors.rotate_right(first);
         let min = (0..MEASUREMENTS_PER_TOUCH)
             .map(|_| computation_time_ns(&central, &sensors, &now))
@@ -118,19 +118,19 @@ pub fn measure_over_active(
     let points = by_active.iter_mut().enumerate().filter(|(_, values)| !values.is_empty());
     let points: Vec<_> =
         points.map(|(active, values)| WeightedPoint::median(count_to_f64(active), values)).collect();
-    Some(TimesOverActive { cells, line: LinearFit::fit(&points)?, points })
+    Some(CentralTimesByActiveCells { cells, line: LinearFit::fit(&points)?, points })
 }
 
 /// The minimum R² at which a fitted line counts as a good description.
-const MIN_QUALITY: f64 = 0.99;
+const MIN_R_SQUARED: f64 = 0.99;
 
-fn quality(line: &LinearFit, paper: f64) -> Finding {
+fn fit_quality_finding(line: &LinearFit, paper: f64) -> Finding {
     let finding = Finding::more_is_better("quality of the fit, R²", paper, line.quality);
-    finding.with_requirement(format!("at least {MIN_QUALITY}"), line.quality >= MIN_QUALITY)
+    finding.with_requirement(format!("at least {MIN_R_SQUARED}"), line.quality >= MIN_R_SQUARED)
 }
 
 /// Compares a slope or an intercept in ns with that of the paper in s: both values, and their ratio.
-fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
+fn coefficient_findings(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     let ours = ours.into();
     let ratio = ours.value / (paper_s * 1e9);
     [
@@ -140,13 +140,13 @@ fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
 }
 
 /// Compares the maximum number of cells for which one cycle is long enough with that in the paper.
-fn limit(active: &str, paper: f64, ours: f64) -> Finding {
+fn cell_limit_finding(active: &str, paper: f64, ours: f64) -> Finding {
     let what = format!("most cells at 500 Hz, {active} active, with 0.2 ms for the rest of a cycle");
     Finding::more_is_better(what, paper, (ours, "cells"))
 }
 
 /// Returns an empty figure for T_skin over the quantity `x`.
-fn figure(name: &str, title: impl Into<String>, x: &str) -> Figure {
+fn empty_time_figure(name: &str, title: impl Into<String>, x: &str) -> Figure {
     Figure::new(name, title, Axis::new(x, ""), Axis::new("T_skin", "µs"))
 }
 
@@ -161,117 +161,123 @@ fn logarithmic_figure(
 ) -> Figure {
     let law = (0..=100).map(|step| most * f64::from(step) / 100.0).map(|x| (x, law(x) * 1e6));
     let title = format!("The same, compared with the paper's law ({equation})");
-    let y = Axis::new("T_skin", "µs").log().with_ends(0.1, 10_000.0);
+    let y = Axis::new("T_skin", "µs").with_log_scale().with_ends(0.1, 10_000.0);
     Figure::new(format!("{}-paper", figure.name), title, figure.x.clone(), y)
-        .draw("measured", Shape::Points, measured)
-        .draw("the paper's law", Shape::Dashed, law.collect())
+        .draw_series("measured", SeriesShape::Points, measured)
+        .draw_series("the paper's law", SeriesShape::Dashed, law.collect())
 }
 
 /// Returns two points that draw a line, from 0 to `most`. The line is in ns and the points are in µs.
-fn line_points(line: &LinearFit, most: f64) -> Vec<(f64, f64)> {
+fn line_end_points(line: &LinearFit, most: f64) -> Vec<(f64, f64)> {
     [0.0, most].map(|x| (x, line.value_at(x) * 1e-3)).into()
 }
 
 /// Writes the section on Fig. 9, with the line of Eq. 29.
 #[must_use]
-pub fn fig9(over: &TimesOverCells) -> Section {
-    let TimesOverCells { points, line } = over;
+pub fn fig9_section(over: &CentralTimesByCells) -> Section {
+    let CentralTimesByCells { points, line } = over;
     let most = points.last().map_or(0.0, |point| point[0]);
     let micros = |place: fn(&[f64; 4]) -> f64| {
         points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
     };
     let band = micros(|point| point[2]).into_iter().chain(micros(|point| point[3]).into_iter().rev());
     let median = micros(|point| point[1]);
-    let fig9 = figure("fig9", "T_skin over cells, none active", "cells, none active")
-        .draw("middle half", Shape::Band, band.collect())
-        .draw("median", Shape::Points, median.clone())
-        .draw("linear fit", Shape::Line, line_points(line, most));
+    let fig9 = empty_time_figure("fig9", "T_skin over cells, none active", "cells, none active")
+        .draw_series("middle half", SeriesShape::Band, band.collect())
+        .draw_series("median", SeriesShape::Points, median.clone())
+        .draw_series("linear fit", SeriesShape::Line, line_end_points(line, most));
     let papers = logarithmic_figure(&fig9, "Eq. 29", median, most, |cells| {
-        paper::CENTRAL_PER_CELL_S * cells + paper::CENTRAL_FIXED_S
+        paper::CENTRAL_TIME_PER_CELL_S * cells + paper::CENTRAL_FIXED_TIME_S
     });
     let cells = paper::max_cells(line.slope * 1e-9, line.intercept * 1e-9, 0.0, 0.0);
     Section::new("fig9", "Fig. 9: central computation over the number of cells")
-        .text(
+        .with_paragraph(
             "A loop that computes the skin's torques has to look at every cell in every cycle, also when none is \
              touched. Timed is the gateway's own central computation, the code that a comparing tick runs; the medians of \
              many rounds in random order, with the middle half of the measurements as a band.",
         )
-        .text(format!(
+        .with_paragraph(format!(
             "T_skin(N) = {} ns · N + {} ns, R² = {:.4}. The paper's law is 827 ns · N + 10730 ns, on another \
              computer with another program: the claim is that the line is straight; its slope depends on the speed of \
              the computer and of the loop.",
-            number(line.slope),
-            number(line.intercept),
+            format_number(line.slope),
+            format_number(line.intercept),
             line.quality
         ))
-        .text(format!(
+        .with_paragraph(format!(
             "By the paper's reasoning, (2 ms - 0.2 ms - start) / slope, this computer could handle {cells} cells; the paper's law \
              gives 2163, which the paper rounds to 2160.",
         ))
-        .figures([fig9, papers])
-        .findings(cost("T_skin for each cell (slope of Eq. 29)", line.slope_in("ns"), paper::CENTRAL_PER_CELL_S))
-        .findings(cost("T_skin without a cell", (line.intercept, "ns"), paper::CENTRAL_FIXED_S))
-        .findings([quality(line, paper::CENTRAL_CELLS_R_SQUARED), limit("none", paper::MAX_CELLS, cells)])
+        .with_figures([fig9, papers])
+        .with_findings(coefficient_findings("T_skin for each cell (slope of Eq. 29)", line.slope_in("ns"), paper::CENTRAL_TIME_PER_CELL_S))
+        .with_findings(coefficient_findings("T_skin without a cell", (line.intercept, "ns"), paper::CENTRAL_FIXED_TIME_S))
+        .with_findings([fit_quality_finding(line, paper::CELLS_FIT_R_SQUARED), cell_limit_finding("none", paper::MAX_CELLS_NONE_ACTIVE, cells)])
 }
 
 /// Writes the section on Fig. 10, with the lines of Eq. 30 and 31, and the number of cells at which each line reaches
 /// one cycle.
 #[must_use]
-pub fn fig10(over: &TimesOverActive, cells: &TimesOverCells) -> Section {
-    let TimesOverActive { points, line, cells: of } = over;
+pub fn fig10_section(over: &CentralTimesByActiveCells, cells: &CentralTimesByCells) -> Section {
+    let CentralTimesByActiveCells { points, line, cells: of } = over;
     let most = count_to_f64(*of);
     let of_cells = cells.line;
-    let limits = [(0.0, paper::MAX_CELLS), (paper::LIMIT_ACTIVE_CELLS, paper::MAX_CELLS_WITH_ACTIVE)].map(
-        |(active, paper)| {
-            let [cell, fixed, each] = [of_cells.slope, of_cells.intercept, line.slope].map(|ns| ns * 1e-9);
-            limit(&active.to_string(), paper, paper::max_cells(cell, fixed, each, active))
-        },
-    );
+    let limits =
+        [(0.0, paper::MAX_CELLS_NONE_ACTIVE), (paper::ACTIVE_CELLS_AT_LIMIT, paper::MAX_CELLS_WITH_ACTIVE)]
+            .map(|(active, paper)| {
+                let [cell, fixed, each] =
+                    [of_cells.slope, of_cells.intercept, line.slope].map(|ns| ns * 1e-9);
+                cell_limit_finding(&active.to_string(), paper, paper::max_cells(cell, fixed, each, active))
+            });
     let micros: Vec<_> = points.iter().map(|point| (point.x, point.y * 1e-3)).collect();
-    let fig10 = figure("fig10", format!("T_skin over the number of active cells, of {of}"), "active cells")
-        .draw("median of touches", Shape::Points, micros.clone())
-        .draw("linear fit", Shape::Line, line_points(line, most));
+    let fig10 = empty_time_figure(
+        "fig10",
+        format!("T_skin over the number of active cells, of {of}"),
+        "active cells",
+    )
+    .draw_series("median of touches", SeriesShape::Points, micros.clone())
+    .draw_series("linear fit", SeriesShape::Line, line_end_points(line, most));
     let papers = logarithmic_figure(&fig10, "Eq. 30", micros, most, |active| {
-        paper::CENTRAL_PER_ACTIVE_CELL_S * active + paper::CENTRAL_NONE_ACTIVE_S
+        paper::CENTRAL_TIME_PER_ACTIVE_CELL_S * active + paper::CENTRAL_TIME_NONE_ACTIVE_S
     });
     let all = Finding::new_unrated(
         format!("T_skin of {of} cells, all active (Eq. 31)"),
         ((of_cells.value_at(most) + line.slope * most) * 1e-3, "µs"),
     );
-    let all_papers =
-        (paper::CENTRAL_PER_CELL_S * most + paper::CENTRAL_FIXED_S + paper::CENTRAL_PER_ACTIVE_CELL_S * most)
-            * 1e6;
+    let all_papers = (paper::CENTRAL_TIME_PER_CELL_S * most
+        + paper::CENTRAL_FIXED_TIME_S
+        + paper::CENTRAL_TIME_PER_ACTIVE_CELL_S * most)
+        * 1e6;
     let touches: f64 = points.iter().map(|point| point.weight).sum();
     let laws = [
-        ("cells (Eq. 29)", of_cells, paper::CENTRAL_PER_CELL_S),
-        ("active cells (Eq. 30)", *line, paper::CENTRAL_PER_ACTIVE_CELL_S),
+        ("cells (Eq. 29)", of_cells, paper::CENTRAL_TIME_PER_CELL_S),
+        ("active cells (Eq. 30)", *line, paper::CENTRAL_TIME_PER_ACTIVE_CELL_S),
     ];
     let laws = laws.map(|(name, line, paper)| {
         let quality = format!("{:.4}", line.quality);
-        let [slope, start, papers] = [line.slope, line.intercept, paper * 1e9].map(number);
+        let [slope, start, papers] = [line.slope, line.intercept, paper * 1e9].map(format_number);
         [name.to_owned(), slope, start, quality, papers]
     });
     Section::new("fig10", "Fig. 10: central computation over the number of active cells")
-        .text(format!(
+        .with_paragraph(format!(
             "{of} cells, {touches} touches, each on a patch of cells of random size at a random place; the line is \
              weighted by the number of touches, as the paper's is by the number of samples."
         ))
-        .text(format!(
+        .with_paragraph(format!(
             "T_skin(N_act, N) = {} ns · N_act + {} ns · N + {} ns (Eq. 31; the paper: 798, 827 and 10730 ns).",
-            number(line.slope),
-            number(of_cells.slope),
-            number(of_cells.intercept)
+            format_number(line.slope),
+            format_number(of_cells.slope),
+            format_number(of_cells.intercept)
         ))
-        .figures([fig10, papers])
-        .findings(cost("T_skin for each active cell (slope of Eq. 30)", line.slope_in("ns"), paper::CENTRAL_PER_ACTIVE_CELL_S))
-        .findings(cost(
+        .with_figures([fig10, papers])
+        .with_findings(coefficient_findings("T_skin for each active cell (slope of Eq. 30)", line.slope_in("ns"), paper::CENTRAL_TIME_PER_ACTIVE_CELL_S))
+        .with_findings(coefficient_findings(
             &format!("T_skin of {of} cells, none active"),
             (line.intercept, "ns"),
-            paper::CENTRAL_NONE_ACTIVE_S,
+            paper::CENTRAL_TIME_NONE_ACTIVE_S,
         ))
-        .findings([quality(line, paper::CENTRAL_ACTIVE_R_SQUARED), all.with_paper_value(all_papers)])
-        .findings(limits)
-        .tables([Table::new("Laws", ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"], laws)])
+        .with_findings([fit_quality_finding(line, paper::ACTIVE_CELLS_FIT_R_SQUARED), all.with_paper_value(all_papers)])
+        .with_findings(limits)
+        .with_tables([Table::new("Laws", ["law", "each, ns", "start, ns", "R²", "the paper's each, ns"], laws)])
 }
 
 #[cfg(test)]
@@ -287,14 +293,14 @@ mod tests {
     /// The findings that result from the lines of the paper, converted to ns.
     #[test]
     fn the_papers_own_laws_lead_to_its_limits_and_to_no_verdict_but_the_same() {
-        let law = line(paper::CENTRAL_PER_CELL_S * 1e9, paper::CENTRAL_FIXED_S * 1e9);
+        let law = line(paper::CENTRAL_TIME_PER_CELL_S * 1e9, paper::CENTRAL_FIXED_TIME_S * 1e9);
         let points = [0.0, 1500.0, 3000.0]
             .map(|cells| [cells, law.value_at(cells), law.value_at(cells), law.value_at(cells)]);
-        let cells = TimesOverCells { points: points.to_vec(), line: law };
-        let over = line(paper::CENTRAL_PER_ACTIVE_CELL_S * 1e9, paper::CENTRAL_NONE_ACTIVE_S * 1e9);
+        let cells = CentralTimesByCells { points: points.to_vec(), line: law };
+        let over = line(paper::CENTRAL_TIME_PER_ACTIVE_CELL_S * 1e9, paper::CENTRAL_TIME_NONE_ACTIVE_S * 1e9);
         let points = [0.0, 100.0, 253.0].map(|x| WeightedPoint { x, y: over.value_at(x), weight: 3.0 });
-        let active = TimesOverActive { cells: 253, points: points.to_vec(), line: over };
-        let (nine, ten) = (fig9(&cells), fig10(&active, &cells));
+        let active = CentralTimesByActiveCells { cells: 253, points: points.to_vec(), line: over };
+        let (nine, ten) = (fig9_section(&cells), fig10_section(&active, &cells));
         let all = || nine.findings.iter().chain(&ten.findings);
         for finding in all().filter(|finding| finding.what.ends_with("ratio of ours to the paper's")) {
             assert!((finding.ours.value - 1.0).abs() < 1e-9, "{finding:?}");
@@ -308,22 +314,25 @@ mod tests {
         let of = |what: &str| all().find(|finding| finding.what.starts_with(what)).unwrap();
         assert_eq!(of("T_skin for each cell").verdict, FindingVerdict::Same);
         assert_eq!(of("quality").verdict, FindingVerdict::Better, "above the bar");
-        let steep = TimesOverCells { line: LinearFit { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
-        let worse =
-            fig9(&steep).findings.iter().filter(|finding| finding.verdict == FindingVerdict::Worse).count();
+        let steep = CentralTimesByCells { line: LinearFit { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
+        let worse = fig9_section(&steep)
+            .findings
+            .iter()
+            .filter(|finding| finding.verdict == FindingVerdict::Worse)
+            .count();
         assert_eq!(worse, 3, "slope, quality and limit");
     }
 
     /// The clock advances by 16 ns per reading, so each of the 16 computations between two readings takes 1 ns.
     #[test]
     fn every_number_of_cells_and_of_active_cells_is_measured() {
-        let skin = ticks::skin(40, 1).unwrap();
+        let skin = ticks::generated_skin(40, 1).unwrap();
         let clock = std::cell::Cell::new(0);
         let now = || {
             clock.set(clock.get() + 16);
             clock.get()
         };
-        let extent = CentralExtent { step: 10, rounds: 3, touches: 200 };
+        let extent = CentralMeasurementPlan { step: 10, rounds: 3, touches: 200 };
         let cells = measure_over_cells(&skin, extent, now).unwrap();
         assert_eq!(
             cells.points.iter().map(|point| point[0].to_string()).collect::<Vec<_>>(),
@@ -334,7 +343,7 @@ mod tests {
         assert!((active.points.iter().map(|point| point.weight).sum::<f64>() - 200.0).abs() < 1e-9);
         assert!(active.points.iter().all(|point| (point.y - 1.0).abs() < 1e-9 && point.x <= 40.0));
         assert!(
-            measure_over_cells(&skin, CentralExtent { step: 40, ..extent }, now).is_none(),
+            measure_over_cells(&skin, CentralMeasurementPlan { step: 40, ..extent }, now).is_none(),
             "two numbers make no law"
         );
     }

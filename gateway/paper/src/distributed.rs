@@ -16,14 +16,14 @@ use protocol::time::Micros;
 
 use super::line::{LinearFit, count_to_f64};
 use super::samples;
-use super::ticks::{BUSES, TickBench, nanos, skin_with_fewer_cells};
-use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, number};
+use super::ticks::{BUSES, TickBench, nanos_to_float, skin_with_fewer_cells};
+use analysis::report::figure::{Axis, Figure, Finding, Section, SeriesShape, format_number};
 use model::scenario::TorqueSource;
 use model::table::BusTable;
 
 /// The number of measurements.
 #[derive(Clone, Copy, Debug)]
-pub struct DistributedExtent {
+pub struct DistributedMeasurementPlan {
     /// The number of different numbers of cells besides one cell per bus, and of active cells besides 0.
     pub steps: usize,
     /// The number of measurements for each of these numbers.
@@ -53,7 +53,7 @@ impl TickTimes {
 
 /// All measurements of the experiment.
 #[derive(Clone, Debug)]
-pub struct DistributedTimes {
+pub struct DistributedMeasurements {
     /// Times for different numbers of cells, none of which is active.
     pub cells: TickTimes,
     /// Times for different numbers of active cells on the whole skin.
@@ -68,11 +68,11 @@ pub struct DistributedTimes {
 
 /// Measures times on parts of a skin. Returns `None` if `extent` has fewer than two steps.
 #[must_use]
-pub fn measure(
+pub fn measure_distributed(
     skin: &Skin,
-    extent: DistributedExtent,
+    extent: DistributedMeasurementPlan,
     now: impl Fn() -> u64 + Copy,
-) -> Option<DistributedTimes> {
+) -> Option<DistributedMeasurements> {
     let most = skin.cells.len();
     let step = |step| most * step / extent.steps.max(1);
     // Each bus has at least one cell, because a bus without cells has no chain to be computed.
@@ -83,21 +83,21 @@ pub fn measure(
     let of_part = |place: usize, mode| TickBench::new(parts.get(place).unwrap_or(skin), 0, mode);
     let of_touch = |place: usize, mode| TickBench::new(skin, active.get(place).copied().unwrap_or(0), mode);
     let (cells, active) = (
-        tick_times(&cells, extent.rounds, 11, of_part, now)?,
-        tick_times(&active, extent.rounds, 12, of_touch, now)?,
+        measure_tick_times(&cells, extent.rounds, 11, of_part, now)?,
+        measure_tick_times(&active, extent.rounds, 12, of_touch, now)?,
     );
-    Some(DistributedTimes {
+    Some(DistributedMeasurements {
         cells,
         active,
         buses: measure_over_buses(skin, extent, now)?,
         of: most,
-        receiving: receiving_time_ns(&skin.with_cells_of_bus(0), extent.rounds, now),
+        receiving: torque_receiving_time_ns(&skin.with_cells_of_bus(0), extent.rounds, now),
     })
 }
 
 /// Measures ticks with and without the central computation for each of some numbers. `ticks` creates the loop for the
 /// number with this index and for a mode.
-pub(super) fn tick_times(
+pub(super) fn measure_tick_times(
     numbers: &[usize],
     rounds: usize,
     seed: u64,
@@ -127,7 +127,7 @@ pub(super) fn tick_times(
 /// Measures distributed ticks of a skin without cells, for different numbers of buses.
 fn measure_over_buses(
     skin: &Skin,
-    extent: DistributedExtent,
+    extent: DistributedMeasurementPlan,
     now: impl Fn() -> u64 + Copy,
 ) -> Option<LinearFit> {
     let bare = |buses: usize| Skin {
@@ -151,7 +151,7 @@ fn measure_over_buses(
 
 /// Measures the time for handling a torque, in ns: its packet is checked and decoded, and the torque replaces the
 /// previous one of the cell in the sum. Every cell of a bus replies in every epoch, each time with a different torque.
-fn receiving_time_ns(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
+fn torque_receiving_time_ns(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
     let mut table = BusTable::new(skin, 0);
     let mut epoch = Epoch(0);
     let mut took = Vec::with_capacity(rounds);
@@ -171,7 +171,7 @@ fn receiving_time_ns(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
         for frame in &replies {
             table.handle_frame(at, false, black_box(frame), &mut |_| None);
         }
-        took.push(nanos(now().saturating_sub(began)) / count_to_f64(replies.len()));
+        took.push(nanos_to_float(now().saturating_sub(began)) / count_to_f64(replies.len()));
         debug_assert_eq!(
             table.snapshot().sums.contributing as usize,
             skin.cells.len(),
@@ -203,8 +203,8 @@ pub(super) fn slope_findings(what: &str, over: &TickTimes) -> [Finding; 3] {
 
 /// Writes the section on the times of the distributed computation.
 #[must_use]
-pub fn section(measured: &DistributedTimes) -> Section {
-    let DistributedTimes { cells, active, buses, of, receiving } = measured;
+pub fn distributed_section(measured: &DistributedMeasurements) -> Section {
+    let DistributedMeasurements { cells, active, buses, of, receiving } = measured;
     let figure = |name: &str, title: String, what: &str, over: &TickTimes| {
         let micros = |place: fn(&[f64; 3]) -> f64| {
             over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
@@ -212,10 +212,10 @@ pub fn section(measured: &DistributedTimes) -> Section {
         let most = over.points.last().map_or(0.0, |point| point[0]);
         let law = |line: &LinearFit| [0.0, most].map(|x| (x, line.value_at(x) * 1e-3)).to_vec();
         Figure::new(name, title, Axis::new(what, ""), Axis::new("time in a tick", "µs"))
-            .draw("central T_skin", Shape::Points, micros(|point| point[2]))
-            .draw("distributed: the whole tick", Shape::Points, micros(|point| point[1]))
-            .draw("", Shape::Line, law(&over.central))
-            .draw("", Shape::Line, law(&over.distributed))
+            .draw_series("central T_skin", SeriesShape::Points, micros(|point| point[2]))
+            .draw_series("distributed: the whole tick", SeriesShape::Points, micros(|point| point[1]))
+            .draw_series("", SeriesShape::Line, law(&over.central))
+            .draw_series("", SeriesShape::Line, law(&over.distributed))
     };
     let findings = [
         Finding::new_unrated("distributed tick for each further bus", buses.slope_in("ns")),
@@ -233,26 +233,26 @@ pub fn section(measured: &DistributedTimes) -> Section {
         ),
     ];
     Section::new("distributed", "The distributed way over cells and active cells")
-        .text(format!(
+        .with_paragraph(format!(
             "Up to {of} cells on {BUSES} buses. For the distributed way the whole tick is timed: sums of all buses, controller, \
              robot, joints; for the central way only T_skin, the part that computes torques. Both are timed in the same run, \
              in random order. The robot does not move.",
         ))
-        .text(format!(
+        .with_paragraph(format!(
             "A tick of the distributed way receives one sum per bus and no data of single cells, so only more buses make it \
              longer: {} ns each, with or without cells. More cells mean more work for the receivers, which run in \
              threads of their own: {} ns per received torque, once per epoch, and only for cells in contact. The time that the \
              kernel needs to deliver a frame to the receiver is not included.",
-            number(buses.slope),
-            number(*receiving)
+            format_number(buses.slope),
+            format_number(*receiving)
         ))
-        .figures([
+        .with_figures([
             figure("distributed-cells", "Over cells, none active".to_owned(), "cells", cells),
             figure("distributed-active", format!("Over the number of active cells, of {of}"), "active cells", active),
         ])
-        .findings(slope_findings("cell", cells))
-        .findings(slope_findings("active cell", active))
-        .findings(findings)
+        .with_findings(slope_findings("cell", cells))
+        .with_findings(slope_findings("active cell", active))
+        .with_findings(findings)
 }
 
 #[cfg(test)]
@@ -263,13 +263,14 @@ mod tests {
     /// The clock advances by 1 ns per reading. A distributed tick reads it twice, whatever the number of cells.
     #[test]
     fn both_ways_are_measured_over_both_numbers() {
-        let skin = ticks::skin(48, BUSES).unwrap();
+        let skin = ticks::generated_skin(48, BUSES).unwrap();
         let clock = std::cell::Cell::new(0);
         let now = || {
             clock.set(clock.get() + 1);
             clock.get()
         };
-        let measured = measure(&skin, DistributedExtent { steps: 4, rounds: 3 }, now).unwrap();
+        let measured =
+            measure_distributed(&skin, DistributedMeasurementPlan { steps: 4, rounds: 3 }, now).unwrap();
         for (over, target) in [
             (&measured.cells, ["12", "12", "24", "36", "48"]),
             (&measured.active, ["0", "12", "24", "36", "48"]),
@@ -283,8 +284,10 @@ mod tests {
             );
         }
         assert!((measured.receiving - 0.25).abs() < 1e-9, "four cells between two looks");
-        let section = section(&measured);
+        let section = distributed_section(&measured);
         assert_eq!(section.figures.len(), 2);
-        assert!(measure(&skin, DistributedExtent { steps: 1, rounds: 3 }, now).is_none());
+        assert!(
+            measure_distributed(&skin, DistributedMeasurementPlan { steps: 1, rounds: 3 }, now).is_none()
+        );
     }
 }

@@ -5,7 +5,7 @@ use std::fmt::Write;
 
 use serde_json::{Value, json};
 
-use analysis::report::figure::{Axis, Figure, Page, Series, Shape};
+use analysis::report::figure::{Axis, Figure, Page, Series, SeriesShape};
 
 /// Returns the data of a figure as CSV: a column for x and one for each series, with units in the header. A band has
 /// two columns. A value is empty where a series has no point. If a series has several values at one x, they are in
@@ -48,7 +48,7 @@ pub fn csv(figure: &Figure) -> String {
 
 /// Returns the columns of a series: a single one, or the lower and the upper edge of a band.
 fn columns(series: &Series) -> Vec<(String, &[(f64, f64)])> {
-    if series.shape != Shape::Band {
+    if series.shape != SeriesShape::Band {
         return vec![(series.caption.clone(), &series.points)];
     }
     let (lower, upper) = series.points.split_at(series.points.len().div_ceil(2));
@@ -75,7 +75,7 @@ fn csv_quoted(text: &str) -> String {
 
 /// Returns the findings on a page as JSON, by experiment, with facts about the run such as the machine.
 #[must_use]
-pub fn results(page: &Page) -> Value {
+pub fn findings_json(page: &Page) -> Value {
     let facts: BTreeMap<_, _> = page.facts.iter().map(|(name, value)| (name, value)).collect();
     let experiments: Vec<Value> = page
         .sections
@@ -96,9 +96,13 @@ mod tests {
             x: Axis::new("time", "s"),
             y: Axis::new("torque", "Nm"),
             series: vec![
-                Series::new("central, f64", Shape::Line, vec![(-1.0, 1.0), (0.5, f64::NAN), (2.0, 3.0)]),
-                Series::new("", Shape::Points, vec![(0.5, 7.0), (0.5, 8.0)]),
-                Series::new("half", Shape::Band, vec![(0.5, 1.0), (2.0, 2.0), (2.0, 4.0), (0.5, 3.0)]),
+                Series::new(
+                    "central, f64",
+                    SeriesShape::Line,
+                    vec![(-1.0, 1.0), (0.5, f64::NAN), (2.0, 3.0)],
+                ),
+                Series::new("", SeriesShape::Points, vec![(0.5, 7.0), (0.5, 8.0)]),
+                Series::new("half", SeriesShape::Band, vec![(0.5, 1.0), (2.0, 2.0), (2.0, 4.0), (0.5, 3.0)]),
             ],
             ..Figure::default()
         };
@@ -127,7 +131,7 @@ mod tests {
             sections: vec![section],
             ..Page::default()
         };
-        let value = results(&page);
+        let value = findings_json(&page);
         let finding = &value["experiments"][0]["findings"][0];
         assert_eq!(
             (finding["ours"]["value"].as_f64(), finding["paper"]["unit"].as_str()),

@@ -6,7 +6,7 @@
 //!   Effort (how much) ────────────┘                          └─> report::page, report::svg, files::csv, files::results
 //! ```
 //!
-//! All computations here are pure, except that they read a clock. The implementation of [`Lab`] runs benches of
+//! All computations here are pure, except that they read a clock. The implementation of [`ExperimentLab`] runs benches of
 //! processes. Each verdict is computed from the measurements of its run.
 //!
 //! This crate and `reference` use the code of the cells: it counts the operations of that code, and computes sums along
@@ -35,7 +35,7 @@ use protocol::skin::Skin;
 use serde_json::Value;
 
 use analysis::report::figure::Section;
-use arm::Reply;
+use arm::ReplyMode;
 use moving::BenchRun;
 
 /// An experiment that can be performed.
@@ -83,7 +83,7 @@ impl Experiment {
 
     /// Returns the name and the description of the experiment, and its approximate duration in s for a quick and for a
     /// full measurement.
-    const fn metadata(self) -> (&'static str, &'static str, [u64; 2]) {
+    const fn name_description_seconds(self) -> (&'static str, &'static str, [u64; 2]) {
         match self {
             Self::Fig6 => (
                 "fig6",
@@ -124,20 +124,20 @@ impl Experiment {
     /// Returns the name of the experiment, as used on the command line and in file names.
     #[must_use]
     pub const fn name(self) -> &'static str {
-        self.metadata().0
+        self.name_description_seconds().0
     }
 
     /// Returns a description of the experiment, in one line.
     #[must_use]
     pub const fn description(self) -> &'static str {
-        self.metadata().1
+        self.name_description_seconds().1
     }
 
     /// Returns the approximate duration in s, without the time for measurements that it shares with earlier
     /// experiments.
     #[must_use]
     pub const fn seconds(self, effort: Effort) -> u64 {
-        let [quick, full] = self.metadata().2;
+        let [quick, full] = self.name_description_seconds().2;
         match effort {
             Effort::Quick => quick,
             Effort::Full => full,
@@ -173,18 +173,18 @@ pub enum Effort {
 }
 
 /// The environment of experiments: a clock, and a way to run benches.
-pub trait Lab {
+pub trait ExperimentLab {
     /// The error of a bench that failed.
     type Error;
 
     /// Returns the time of a monotonic clock, in ns.
-    fn now(&self) -> u64;
+    fn now_ns(&self) -> u64;
 
     /// Runs a bench with the arm, and reads its recording.
     ///
     /// # Errors
     /// Returns an error if the bench failed, or if its recording is incomplete.
-    fn run_bench(&mut self, reply: Reply, effort: Effort) -> Result<BenchRun, Self::Error>;
+    fn run_bench(&mut self, reply: ReplyMode, effort: Effort) -> Result<BenchRun, Self::Error>;
 
     /// Runs a bench with the given numbers of cells and buses. Returns its summary as JSON, even if the run failed.
     ///
@@ -204,7 +204,7 @@ pub trait Lab {
 pub struct Session {
     effort: Effort,
     single: Option<BenchRun>,
-    over_cells: Option<central::TimesOverCells>,
+    over_cells: Option<central::CentralTimesByCells>,
     large: Option<Skin>,
 }
 
@@ -222,90 +222,99 @@ impl Session {
     ///
     /// # Panics
     /// Never panics in practice: generated skins are valid, and all lines are fitted to enough points.
-    pub fn perform<L: Lab>(&mut self, experiment: Experiment, lab: &mut L) -> Result<Section, L::Error> {
+    pub fn perform<L: ExperimentLab>(
+        &mut self,
+        experiment: Experiment,
+        lab: &mut L,
+    ) -> Result<Section, L::Error> {
         lab.check_stopped()?;
         Ok(match experiment {
             Experiment::Fig6 => {
-                let single = self.single_run(lab)?.clone();
+                let single = self.torque_reply_run(lab)?.clone();
                 lab.check_stopped()?;
-                moving::fig6(&single, &lab.run_bench(Reply::Sum, self.effort)?)
+                moving::fig6_section(&single, &lab.run_bench(ReplyMode::Sum, self.effort)?)
             }
-            Experiment::Fig7 => moving::fig7(self.single_run(lab)?),
-            Experiment::Fig8 => moving::fig8(self.single_run(lab)?),
-            Experiment::Fig9 => central::fig9(self.over_cells(lab)),
+            Experiment::Fig7 => moving::fig7_section(self.torque_reply_run(lab)?),
+            Experiment::Fig8 => moving::fig8_section(self.torque_reply_run(lab)?),
+            Experiment::Fig9 => central::fig9_section(self.central_times_over_cells(lab)),
             Experiment::Fig10 => {
-                let cells = self.over_cells(lab).clone();
+                let cells = self.central_times_over_cells(lab).clone();
                 lab.check_stopped()?;
-                let (cells_of_arm, extent) = (self.arm(), self.extent());
-                let active = central::measure_over_active(&cells_of_arm, extent, || lab.now());
-                central::fig10(&active.expect("more than two numbers of active cells"), &cells)
+                let (cells_of_arm, extent) = (self.arm_skin(), self.central_measurement_plan());
+                let active = central::measure_over_active(&cells_of_arm, extent, || lab.now_ns());
+                central::fig10_section(&active.expect("more than two numbers of active cells"), &cells)
             }
             Experiment::Distributed => {
-                let (steps, rounds) = self.by_effort((4, 10), (30, 200));
-                let extent = distributed::DistributedExtent { steps, rounds };
-                let now = || lab.now();
-                let measured = distributed::measure(self.large_skin(), extent, now);
-                distributed::section(&measured.expect("more than two numbers of cells"))
+                let (steps, rounds) = self.choose_by_effort((4, 10), (30, 200));
+                let extent = distributed::DistributedMeasurementPlan { steps, rounds };
+                let now = || lab.now_ns();
+                let measured = distributed::measure_distributed(self.large_skin(), extent, now);
+                distributed::distributed_section(&measured.expect("more than two numbers of cells"))
             }
             Experiment::Sums => {
-                let (touches, epochs) = self.by_effort((2, 5), (20, 50));
-                let arm = self.arm();
+                let (touches, epochs) = self.choose_by_effort((2, 5), (20, 50));
+                let arm = self.arm_skin();
                 let mut errors = Vec::new();
                 for active in sums::active_cell_counts(&arm) {
                     lab.check_stopped()?;
-                    errors.push(sums::errors(&arm, active, sums::SumsExtent { touches, epochs }));
+                    errors.push(sums::measure_sum_errors(
+                        &arm,
+                        active,
+                        sums::SumMeasurementPlan { touches, epochs },
+                    ));
                 }
-                sums::section(&arm, &errors)
+                sums::sums_section(&arm, &errors)
             }
             Experiment::Sine => arithmetic::sine_section(),
             Experiment::Kernels => {
-                let arm = self.arm();
+                let arm = self.arm_skin();
                 arithmetic::kernels_section(&arm.robot.name, &arithmetic::JacobianCosts::for_skin(&arm))
             }
-            Experiment::Load => load::section(),
-            Experiment::Scale => scale::section(&scale::measure(lab, self.effort)?),
+            Experiment::Load => load::load_section(),
+            Experiment::Scale => scale::scale_section(&scale::measure_scale(lab, self.effort)?),
         })
     }
 
-    fn by_effort<T>(&self, quick: T, full: T) -> T {
+    fn choose_by_effort<T>(&self, quick: T, full: T) -> T {
         match self.effort {
             Effort::Quick => quick,
             Effort::Full => full,
         }
     }
 
-    fn extent(&self) -> central::CentralExtent {
-        self.by_effort(
-            central::CentralExtent { step: 24, rounds: 20, touches: 100 },
-            central::CentralExtent { step: 100, rounds: 1_000, touches: 8_000 },
+    fn central_measurement_plan(&self) -> central::CentralMeasurementPlan {
+        self.choose_by_effort(
+            central::CentralMeasurementPlan { step: 24, rounds: 20, touches: 100 },
+            central::CentralMeasurementPlan { step: 100, rounds: 1_000, touches: 8_000 },
         )
     }
 
     /// Returns the skin of the paper's arm, or of a smaller one for a quick measurement.
-    fn arm(&self) -> Skin {
-        ticks::skin(self.by_effort(24, 253), 1).expect("so many cells fit on the arm")
+    fn arm_skin(&self) -> Skin {
+        ticks::generated_skin(self.choose_by_effort(24, 253), 1).expect("so many cells fit on the arm")
     }
 
     /// Returns a skin with the maximum number of cells in Fig. 9, or fewer for a quick measurement.
     fn large_skin(&mut self) -> &Skin {
-        let cells = self.by_effort(240, ticks::MAX_CELLS);
+        let cells = self.choose_by_effort(240, ticks::MAX_CELLS);
         self.large.get_or_insert_with(|| {
-            ticks::skin(cells, ticks::BUSES).expect("so many cells fit on the arm and on so many buses")
+            ticks::generated_skin(cells, ticks::BUSES)
+                .expect("so many cells fit on the arm and on so many buses")
         })
     }
 
-    fn over_cells<L: Lab>(&mut self, lab: &L) -> &central::TimesOverCells {
-        let extent = self.extent();
+    fn central_times_over_cells<L: ExperimentLab>(&mut self, lab: &L) -> &central::CentralTimesByCells {
+        let extent = self.central_measurement_plan();
         if self.over_cells.is_none() {
-            self.over_cells = central::measure_over_cells(self.large_skin(), extent, || lab.now());
+            self.over_cells = central::measure_over_cells(self.large_skin(), extent, || lab.now_ns());
         }
         self.over_cells.as_ref().expect("more than two numbers of cells")
     }
 
-    fn single_run<L: Lab>(&mut self, lab: &mut L) -> Result<&BenchRun, L::Error> {
+    fn torque_reply_run<L: ExperimentLab>(&mut self, lab: &mut L) -> Result<&BenchRun, L::Error> {
         Ok(match &mut self.single {
             Some(run) => run,
-            none => none.insert(lab.run_bench(Reply::Torque, self.effort)?),
+            none => none.insert(lab.run_bench(ReplyMode::Torque, self.effort)?),
         })
     }
 }

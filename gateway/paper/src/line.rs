@@ -91,7 +91,7 @@ impl LinearFit {
     /// Returns the slope with its 95 % confidence interval as a quantity in `unit`, without conversion.
     #[must_use]
     pub fn slope_in(&self, unit: &str) -> Quantity {
-        Quantity::new(self.slope, unit).plus_minus(self.slope_half)
+        Quantity::new(self.slope, unit).with_half_interval(self.slope_half)
     }
 
     /// Returns the upper end of the slope's 95 % confidence interval.
@@ -102,7 +102,7 @@ impl LinearFit {
 
     /// Returns the x at which a rising line reaches `y`; NaN for a line that does not rise.
     #[must_use]
-    pub fn x_reaching(&self, y: f64) -> f64 {
+    pub fn x_at_value(&self, y: f64) -> f64 {
         if self.slope > 0.0 { (y - self.intercept) / self.slope } else { f64::NAN }
     }
 }
@@ -150,7 +150,7 @@ mod tests {
         let line = LinearFit::fit_unweighted(&points).unwrap();
         assert!((line.slope - 3.0).abs() < 1e-12 && (line.intercept + 2.0).abs() < 1e-12);
         assert!((line.quality - 1.0).abs() < 1e-12 && line.slope_half < 1e-6);
-        assert!((line.x_reaching(25.0) - 9.0).abs() < 1e-12 && (line.value_at(9.0) - 25.0).abs() < 1e-12);
+        assert!((line.x_at_value(25.0) - 9.0).abs() < 1e-12 && (line.value_at(9.0) - 25.0).abs() < 1e-12);
     }
 
     /// A common example in textbooks: x is 1 to 5 and y is 2, 4, 5, 4, 5. Slope 0.6, intercept 2.2, R² 0.6, standard
@@ -191,7 +191,7 @@ mod tests {
         assert_eq!(LinearFit::fit_unweighted(&[(0.0, 1.0), (1.0, 2.0)]), None);
         assert_eq!(LinearFit::fit_unweighted(&[(1.0, 1.0), (1.0, 2.0), (1.0, 3.0)]), None);
         let level = LinearFit::fit_unweighted(&[(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]).unwrap();
-        assert!(level.x_reaching(5.0).is_nan(), "a line that does not rise has no limit");
+        assert!(level.x_at_value(5.0).is_nan(), "a line that does not rise has no limit");
     }
 
     #[test]

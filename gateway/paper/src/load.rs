@@ -3,25 +3,25 @@
 
 use super::arm;
 use super::line::count_to_f64;
-use analysis::fit::limits::MAX_NODES;
+use analysis::fit::limits::MAX_NODES_PER_BUS;
 use analysis::fit::verdict::FitSummary;
-use analysis::fit::{self, COMPUTATION_NS, RatesRow};
-use analysis::report::figure::{Axis, Figure, Finding, MarkLine, Section, Series, Shape, Table};
+use analysis::fit::{self, PAPER_COMPUTATION_NS, RatesRow};
+use analysis::report::figure::{Axis, Figure, Finding, MarkLine, Section, Series, SeriesShape, Table};
 
 /// The maximum number of cells in the figure.
 const MAX_CELLS: u32 = 300;
 
 /// Writes the section on the load of a bus over the number of cells.
 #[must_use]
-pub fn section() -> Section {
+pub fn load_section() -> Section {
     let skin = arm::paper_skin();
-    let rows = fit::table(&skin, None, COMPUTATION_NS);
+    let rows = fit::rates_table(&skin, None, PAPER_COMPUTATION_NS);
     let cells = skin.cells.len();
     let series = |row: &RatesRow| {
         let rated = &row.fullest.rated;
         let load = |cells| (f64::from(cells), 100.0 * rated.case.with_cells(cells).load().total());
         let points = (0..=MAX_CELLS).step_by(10).map(load).collect();
-        Series::new(FitSummary::worst_case(rated).rates, Shape::Line, points)
+        Series::new(FitSummary::worst_case(rated).rates, SeriesShape::Line, points)
     };
     // The bit rates are defaults that no user has chosen, so the findings get no verdict.
     let finding = |row: &RatesRow| {
@@ -37,32 +37,32 @@ pub fn section() -> Section {
     );
     let marks = [
         MarkLine::at_y(100.0, "full"),
-        MarkLine::at_x(f64::from(MAX_NODES - 1), "nodes electrically"),
+        MarkLine::at_x(f64::from(MAX_NODES_PER_BUS - 1), "nodes electrically"),
         MarkLine::at_x(count_to_f64(cells), "the paper's arm"),
     ];
     Section::new("load", "Bus load over the number of cells")
-        .text(
+        .with_paragraph(
             "What joints, replies and heartbeats need of a bus when every cell is in contact: 62.5 epochs and 4 heartbeats of \
              each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
              100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
              numbers of skinbus fit, which shows more about one skin.",
         )
-        .text(format!(
-            "The paper considers time only. Transceivers can drive about {MAX_NODES} nodes, one of which is the gateway: so the table has \
+        .with_paragraph(format!(
+            "The paper considers time only. Transceivers can drive about {MAX_NODES_PER_BUS} nodes, one of which is the gateway: so the table has \
              the number of buses that {cells} cells need for time alone, and the number for all limits, with the limit that decides."
         ))
-        .figures([figure.series(rows.iter().map(series)).marks(marks)])
-        .findings(rows.iter().map(finding))
-        .tables([table(&rows, cells)])
+        .with_figures([figure.with_series(rows.iter().map(series)).with_marks(marks)])
+        .with_findings(rows.iter().map(finding))
+        .with_tables([load_table(&rows, cells)])
 }
 
-fn table(rows: &[RatesRow], cells: usize) -> Table {
+fn load_table(rows: &[RatesRow], cells: usize) -> Table {
     let row = |row: &RatesRow| {
         let rated = &row.fullest.rated;
         let FitSummary { load, rates, .. } = FitSummary::worst_case(rated);
         [
             rates,
-            format!("{:.1}", rated.case.packet_ns() as f64 / 1e3),
+            format!("{:.1}", rated.case.longest_packet_ns() as f64 / 1e3),
             format!("{:.1}", 100.0 * (load - rated.load.heartbeats)),
             format!("{:.1}", 100.0 * load),
             row.fullest.most.max_cells_in_time().to_string(),
@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn bus_counts_match_fit_and_default_rates_are_not_rated() {
-        let section = section();
+        let section = load_section();
         let column = |at: usize| section.tables[0].rows.iter().map(move |row| row[at].as_str());
         let named: Vec<_> = column(0).zip(column(5)).zip(column(6)).collect();
         assert_eq!(

@@ -6,7 +6,7 @@ use super::line::{LinearFit, WeightedPoint, count_to_f64, quantile};
 use super::recorded::TickRow;
 use analysis::paper;
 use analysis::report::figure::{
-    Axis, Figure, Finding, MarkLine, Quantity, Section, Series, Shape, Table, number,
+    Axis, Figure, Finding, MarkLine, Quantity, Section, Series, SeriesShape, Table, format_number,
 };
 
 /// The recording of a bench: its ticks, and its summary (`bench::summary::Summary` as JSON).
@@ -49,14 +49,14 @@ impl BenchRun {
 
     /// Returns an empty figure whose x axis is the time of this run.
     fn time_figure(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
-        Figure::new(name, title, Axis::new("time", "s"), y).marks(self.switch_off_marks())
+        Figure::new(name, title, Axis::new("time", "s"), y).with_marks(self.switch_off_marks())
     }
 
     fn switch_off_marks(&self) -> Vec<MarkLine> {
         self.switch_off_time_s().map(|at| MarkLine::at_x(at, "central computation off")).into_iter().collect()
     }
 
-    fn replies(&self) -> Finding {
+    fn replies_finding(&self) -> Finding {
         let due = self.summary_number(&["buses", "0", "replies", "due"]);
         let in_time = self.summary_number(&["buses", "0", "replies", "in_time"]);
         Finding::new_unrated(format!("replies in time, of {due} due"), in_time)
@@ -66,17 +66,17 @@ impl BenchRun {
 /// Writes the section on Fig. 6: the central and the distributed torques of a run in which each cell sends its own
 /// torque, the errors of that run, and the errors of a run in which cells send sums.
 #[must_use]
-pub fn fig6(single: &BenchRun, summed: &BenchRun) -> Section {
+pub fn fig6_section(single: &BenchRun, summed: &BenchRun) -> Section {
     let joint = |joint: usize| {
         let central = |row: &TickRow| row.central.map_or(f64::NAN, |torque| joint_value(&torque, joint));
         let (name, title) = (format!("fig6-joint{}", joint + 1), format!("Joint {}", joint + 1));
         single
             .time_figure(name, title, Axis::new("torque", "Nm"))
-            .half_width()
-            .draw("central", Shape::Line, single.points_over_time(central))
-            .draw(
+            .with_half_width()
+            .draw_series("central", SeriesShape::Line, single.points_over_time(central))
+            .draw_series(
                 "distributed",
-                Shape::Dashed,
+                SeriesShape::Dashed,
                 single.points_over_time(|row| joint_value(&row.distributed, joint)),
             )
     };
@@ -85,7 +85,8 @@ pub fn fig6(single: &BenchRun, summed: &BenchRun) -> Section {
     let [summed_due, summed_in] =
         ["due", "in_time"].map(|key| summed.summary_number(&["buses", "0", "sums", "contributions", key]));
     let row = |name: &str, run: &BenchRun, kind: &str| {
-        let [mean, max, torques] = ["mean_nm", "max_nm", "count"].map(|key| number(error(run, kind, key)));
+        let [mean, max, torques] =
+            ["mean_nm", "max_nm", "count"].map(|key| format_number(error(run, kind, key)));
         [name.to_owned(), mean, max, torques]
     };
     let title = "Fig. 6: torques of the moving arm, computed in the loop and on the cells";
@@ -106,27 +107,27 @@ pub fn fig6(single: &BenchRun, summed: &BenchRun) -> Section {
         row("the whole skin, sums along the tree in Q7.8", summed, "sums"),
     ];
     Section::new("fig6", title)
-        .text(format!(
+        .with_paragraph(format!(
             "{} cells, each a process on a bus, answer joints at 62.5 Hz while the arm yields to touches; until {:.1} s \
              the loop also computes the torques itself.",
             single.cells(),
             single.switch_off_time_s().unwrap_or(f64::NAN)
         ))
-        .text(
+        .with_paragraph(
             "Errors compare each answer with the central computation on the same joints and touches, over the joints that \
              the cell loads, so they hold nothing of what was on its way; the curves are what the loop had at each tick. \
              The run with sums is a second one, with the same touches; only epochs whose sums were complete in time are \
              compared.",
         )
-        .text(joints_without_torque(single))
-        .figures((0..single.joints).map(joint))
-        .findings([
+        .with_paragraph(joints_without_torque(single))
+        .with_figures((0..single.joints).map(joint))
+        .with_findings([
             cell.with_requirement("at most 1.2e-4 Nm", mean_single <= 1.2e-4),
             sum,
-            single.replies(),
+            single.replies_finding(),
             Finding::new_unrated(format!("cells' torques that arrived in sums in time, of {summed_due} due"), summed_in),
         ])
-        .tables([Table::new(
+        .with_tables([Table::new(
             "Errors against the central computation, Nm",
             ["what", "mean", "max", "torques"],
             rows,
@@ -151,10 +152,10 @@ fn joint_value(values: &[f64], joint: usize) -> f64 {
 
 /// Writes the section on Fig. 7: joint velocities and active cells of a run.
 #[must_use]
-pub fn fig7(run: &BenchRun) -> Section {
+pub fn fig7_section(run: &BenchRun) -> Section {
     let velocity = |joint: usize| {
         let caption = format!("joint {}", joint + 1);
-        Series::new(caption, Shape::Line, run.points_over_time(|row| joint_value(&row.velocity, joint)))
+        Series::new(caption, SeriesShape::Line, run.points_over_time(|row| joint_value(&row.velocity, joint)))
     };
     let active = run.rows.iter().map(|row| row.contributing).max().unwrap_or(0);
     let fastest = run.rows.iter().flat_map(|row| row.velocity).map(f64::abs).fold(0.0, f64::max);
@@ -162,12 +163,12 @@ pub fn fig7(run: &BenchRun) -> Section {
     let cells = run.time_figure("fig7-active", "Active cells", Axis::new("cells in the torque", ""));
     let contributing = run.points_over_time(|row| f64::from(row.contributing));
     Section::new("fig7", "Fig. 7: joint velocities and active cells")
-        .text("The same run. The cells' torques move the arm: the loop uses only theirs.")
-        .figures([
-            velocities.series((0..run.joints).map(velocity)),
-            cells.draw("active cells", Shape::Steps, contributing),
+        .with_paragraph("The same run. The cells' torques move the arm: the loop uses only theirs.")
+        .with_figures([
+            velocities.with_series((0..run.joints).map(velocity)),
+            cells.draw_series("active cells", SeriesShape::Steps, contributing),
         ])
-        .findings([
+        .with_findings([
             Finding::new_unrated("most cells active at once", (f64::from(active), "cells")),
             Finding::new_unrated("maximum joint velocity", (fastest, "rad/s")),
         ])
@@ -177,13 +178,13 @@ pub fn fig7(run: &BenchRun) -> Section {
 const CYCLES_PER_MEDIAN: usize = 25;
 
 /// Returns the median of a time of some ticks, in µs.
-fn median<'a>(rows: impl Iterator<Item = &'a TickRow>, time: impl Fn(&TickRow) -> f64) -> f64 {
+fn median_time<'a>(rows: impl Iterator<Item = &'a TickRow>, time: impl Fn(&TickRow) -> f64) -> f64 {
     quantile(&mut rows.map(time).collect::<Vec<_>>(), 0.5)
 }
 
 /// Writes the section on Fig. 8: the times of cycles, and of the central computation until it is switched off.
 #[must_use]
-pub fn fig8(run: &BenchRun) -> Section {
+pub fn fig8_section(run: &BenchRun) -> Section {
     let cells = run.cells();
     let before = || run.rows.iter().filter(|row| row.central.is_some());
     let after = || run.rows.iter().filter(|row| row.central.is_none());
@@ -192,7 +193,7 @@ pub fn fig8(run: &BenchRun) -> Section {
             before().filter(|row| row.contributing == 0).map(|row| row.central_us).collect();
         times.iter().sum::<f64>() / count_to_f64(times.len())
     };
-    let total = [median(before(), |row| row.took_us), median(after(), |row| row.took_us)];
+    let total = [median_time(before(), |row| row.took_us), median_time(after(), |row| row.took_us)];
     let off = after().map(|row| row.central_us).fold(0.0, f64::max);
     let slope = fit_over_active(after());
     let top = {
@@ -200,14 +201,14 @@ pub fn fig8(run: &BenchRun) -> Section {
         2.0 * quantile(&mut times, 0.99)
     };
     let beyond = run.rows.iter().filter(|row| row.took_us > top).count();
-    let over = run.rows.iter().filter(|row| row.took_us > paper::CYCLE_S * 1e6).count();
+    let over = run.rows.iter().filter(|row| row.took_us > paper::CYCLE_TIME_S * 1e6).count();
     let us = |value| (value, "µs");
     let figure = |name: &str, title: &str, top| {
         run.time_figure(name, title, Axis::new("time in a cycle", "µs").with_ends(0.0, top))
     };
     let medians = |time: &dyn Fn(&TickRow) -> f64| {
         let pieces = run.rows.chunks(CYCLES_PER_MEDIAN).filter_map(|rows| Some((rows.first()?.time_s, rows)));
-        pieces.map(|(at, rows)| (at, median(rows.iter(), time))).collect::<Vec<_>>()
+        pieces.map(|(at, rows)| (at, median_time(rows.iter(), time))).collect::<Vec<_>>()
     };
     let per_frame = {
         let frames = run.summary_number(&["buses", "0", "uplink", "delivered"]);
@@ -215,43 +216,46 @@ pub fn fig8(run: &BenchRun) -> Section {
     };
     let none = Finding::less_is_better(
         format!("mean T_skin while none of {cells} cells is active"),
-        (paper::CENTRAL_PER_CELL_S * cells + paper::CENTRAL_FIXED_S) * 1e6,
+        (paper::CENTRAL_TIME_PER_CELL_S * cells + paper::CENTRAL_FIXED_TIME_S) * 1e6,
         us(none_active),
     );
-    let after_switch =
-        Finding::less_is_better("T_total after the switch, median", paper::OTHER_WORK_S * 1e6, us(total[1]));
+    let after_switch = Finding::less_is_better(
+        "T_total after the switch, median",
+        paper::NON_CENTRAL_WORK_S * 1e6,
+        us(total[1]),
+    );
     let of_active = slope.map(|line| {
-        let slope = Quantity::new(line.slope * 1e3, "ns").plus_minus(line.slope_half * 1e3);
+        let slope = Quantity::new(line.slope * 1e3, "ns").with_half_interval(line.slope_half * 1e3);
         Finding::new_unrated("T_total after the switch for each active cell", slope)
     });
     let took = |row: &TickRow| row.took_us;
     let central = |row: &TickRow| row.central_us;
     Section::new("fig8", format!("Fig. 8: cycle times, {cells} cells"))
-        .text(
+        .with_paragraph(
             "T_total is how long a tick took from reading the sums to handing on its record, T_skin the central computation in \
              it. Unlike the paper's, T_total does not hold the robot's own driver: the robot is simulated.",
         )
-        .text(format!(
+        .with_paragraph(format!(
             "The axis ends at twice the 99th percentile; {beyond} of {} ticks, in which the machine was busy otherwise, lie \
              beyond it, but are in the data.",
             run.rows.len()
         ))
-        .figures([
+        .with_figures([
             figure("fig8", "Cycle times", top)
-                .draw("T_total", Shape::Line, run.points_over_time(took))
-                .draw("T_skin", Shape::Line, run.points_over_time(central)),
+                .draw_series("T_total", SeriesShape::Line, run.points_over_time(took))
+                .draw_series("T_skin", SeriesShape::Line, run.points_over_time(central)),
             figure("fig8-medians", "The same, medians of 25 cycles", top / 2.0)
-                .draw("T_total", Shape::Steps, medians(&took))
-                .draw("T_skin", Shape::Steps, medians(&central)),
+                .draw_series("T_total", SeriesShape::Steps, medians(&took))
+                .draw_series("T_skin", SeriesShape::Steps, medians(&central)),
         ])
-        .findings([
+        .with_findings([
             none,
             Finding::new_unrated("T_skin after the switch, maximum", us(off)).with_paper_value(0.0).with_requirement("0", off <= 0.0),
             Finding::new_unrated("T_total before the switch, median", us(total[0])),
             after_switch.with_requirement("less than before", total[1] < total[0]),
         ])
-        .findings(of_active)
-        .findings([
+        .with_findings(of_active)
+        .with_findings([
             Finding::new_unrated("ticks above 2 ms", count_to_f64(over)),
             Finding::new_unrated(
                 "all of the gateway's processor time by frames that came: socket, loop, recorder",
@@ -274,7 +278,7 @@ fn fit_over_active<'a>(rows: impl Iterator<Item = &'a TickRow>) -> Option<Linear
 mod tests {
     use super::*;
     use analysis::report::figure::FindingVerdict;
-    use protocol::packet::padded;
+    use protocol::packet::pad_with_defaults;
     use serde_json::json;
 
     /// Returns a run of one second in which the central computation takes 3 µs and is switched off at 0.5 s.
@@ -284,9 +288,9 @@ mod tests {
             let central_us = if central.is_some() { 3.0 } else { 0.0 };
             TickRow {
                 time_s: f64::from(tick) * 0.002,
-                velocity: padded(&[0.1, -0.4, 0.0, 0.0, 0.0, 0.0]),
-                distributed: padded(&[1.001; 6]),
-                central: central.map(|central: [f64; 6]| padded(&central)),
+                velocity: pad_with_defaults(&[0.1, -0.4, 0.0, 0.0, 0.0, 0.0]),
+                distributed: pad_with_defaults(&[1.001; 6]),
+                central: central.map(|central: [f64; 6]| pad_with_defaults(&central)),
                 contributing: u32::from(tick % 20),
                 took_us: 1.0 + central_us,
                 central_us,
@@ -307,7 +311,7 @@ mod tests {
     fn the_switch_is_found_and_what_came_before_it_and_after() {
         let run = run();
         assert_eq!(run.switch_off_time_s(), Some(0.5));
-        let section = fig8(&run);
+        let section = fig8_section(&run);
         let of = |what: &str| section.findings.iter().find(|finding| finding.what.starts_with(what)).unwrap();
         assert!((of("mean T_skin").ours.value - 3.0).abs() < 1e-9);
         assert!((of("T_total before").ours.value - 4.0).abs() < 1e-9);
@@ -316,19 +320,21 @@ mod tests {
         assert!((of("all of the gateway's").ours.value - 10.0).abs() < 1e-9);
         let mut never_off = run;
         never_off.rows.iter_mut().for_each(|row| row.central_us = 3.0);
-        assert!(fig8(&never_off).findings.iter().any(|finding| finding.verdict == FindingVerdict::Worse));
+        assert!(
+            fig8_section(&never_off).findings.iter().any(|finding| finding.verdict == FindingVerdict::Worse)
+        );
     }
 
     #[test]
     fn every_joint_has_its_figure_and_errors_stand_beside_the_papers() {
         let run = run();
-        let section = fig6(&run, &run);
+        let section = fig6_section(&run, &run);
         assert_eq!(section.figures.len(), 6);
         let central = &section.figures[0].series[0].points;
         assert!(central[249].1.is_finite() && central[250].1.is_nan(), "a gap from the switch on");
         assert!((section.findings[0].ours.value - 6e-5).abs() < 1e-12);
         assert!((section.findings[1].ours.value - 0.004).abs() < 1e-12);
-        let section = fig7(&run);
+        let section = fig7_section(&run);
         assert_eq!((section.figures[0].series.len(), section.findings[0].ours.value), (6, 19.0));
     }
 }

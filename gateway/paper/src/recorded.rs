@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::skin::MAX_ROBOT_JOINTS;
 
 use trace::capture::{CaptureError, Reader, RecordingItem};
@@ -46,11 +46,14 @@ pub fn read(path: &Path) -> Result<Vec<TickRow>, CaptureError> {
         }
     }
     let first = rows.keys().next().copied().unwrap_or(0);
-    Ok(rows.into_iter().map(|(nanos, row)| TickRow { time_s: seconds(nanos - first), ..row }).collect())
+    Ok(rows
+        .into_iter()
+        .map(|(nanos, row)| TickRow { time_s: nanos_to_seconds(nanos - first), ..row })
+        .collect())
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a run's length, far below 2^53 ns")]
-fn seconds(nanos: u64) -> f64 {
+fn nanos_to_seconds(nanos: u64) -> f64 {
     nanos as f64 * 1e-9
 }
 
@@ -64,15 +67,15 @@ fn store_message(
 ) -> Result<(), CdrError> {
     let is_states = schema == JointState::TYPE && topic.ends_with("/joint_states");
     if is_states {
-        let joints = read::joints(message)?;
+        let joints = read::decode_joints(message)?;
         rows.entry(nanos).or_default().velocity = padded_to_joints(&joints.velocity);
     } else if schema == Torques::TYPE {
-        let torques = read::torques(message)?;
+        let torques = read::decode_torques(message)?;
         let row = rows.entry(nanos).or_default();
         row.distributed = padded_to_joints(&torques.distributed);
         row.central = (!torques.central.is_empty()).then(|| padded_to_joints(&torques.central));
     } else if schema == LoopTiming::TYPE {
-        let timing = read::timing(message)?;
+        let timing = read::decode_loop_timing(message)?;
         let row = rows.entry(nanos).or_default();
         (row.took_us, row.central_us, row.contributing) =
             (timing.took_us, timing.central_us, timing.contributing);
@@ -82,7 +85,7 @@ fn store_message(
 
 /// Returns an array with the number for each joint, filled with 0.
 fn padded_to_joints(numbers: &[f64]) -> [f64; MAX_ROBOT_JOINTS] {
-    padded(numbers)
+    pad_with_defaults(numbers)
 }
 
 #[cfg(test)]

@@ -12,14 +12,14 @@ use std::fmt::Write;
 use protocol::id::CellId;
 use serde_json::Value;
 
-use super::distributed::{TickTimes, tick_times};
+use super::distributed::{TickTimes, measure_tick_times};
 use super::line::count_to_f64;
 use super::ticks::{self, TickBench, skin_with_fewer_cells};
-use super::{Effort, Lab};
+use super::{Effort, ExperimentLab};
 use model::generate::{SkinRequest, generate};
 use model::scenario::TorqueSource;
 
-pub use section::section;
+pub use section::scale_section;
 
 /// The share of cells that are touched, 0 to 1.
 pub const ACTIVE_SHARE: f64 = 0.05;
@@ -58,7 +58,7 @@ impl ScaleBench {
     /// # Panics
     /// Never panics in practice, because the buses have enough node ids.
     #[must_use]
-    pub fn skin(&self) -> String {
+    pub fn skin_toml(&self) -> String {
         let Self { cells, buses, hz, .. } = *self;
         let target = SkinRequest { cells, buses, broadcast_hz: hz, ..SkinRequest::default() };
         generate(&target).expect("so many cells fit on the arm")
@@ -67,7 +67,7 @@ impl ScaleBench {
     /// Returns the text of the bench's `scenario.toml`. The first cells of each bus are touched; their number differs
     /// by at most one between buses.
     #[must_use]
-    pub fn scenario(&self) -> String {
+    pub fn scenario_toml(&self) -> String {
         let mut text = format!(
             "duration_s = {:?}\n\n[motion]\nkind = \"kinesthetic\"\n\n[[mode]]\nat_s = 0.0\nkind = \"distributed\"\n",
             self.seconds
@@ -145,13 +145,13 @@ impl BenchFigures {
 
     /// Returns the share of the replies due that arrived in time, 0 to 1.
     #[must_use]
-    pub fn share(&self) -> f64 {
+    pub fn in_time_share(&self) -> f64 {
         if self.due > 0.0 { self.in_time / self.due } else { f64::NAN }
     }
 
     /// Returns true if the bench holds its rate.
     fn holds_rate(&self) -> bool {
-        self.done && self.share() >= MIN_IN_TIME_SHARE && self.unknown <= 0.0
+        self.done && self.in_time_share() >= MIN_IN_TIME_SHARE && self.unknown <= 0.0
     }
 }
 
@@ -191,7 +191,7 @@ pub struct ScaleMeasurements {
 
 /// The numbers of cells and rates to be measured.
 #[derive(Clone, Copy, Debug)]
-struct ScaleExtent {
+struct ScaleMeasurementPlan {
     /// The numbers of cells, in ascending order.
     cells: &'static [usize],
     /// The rates in Hz, in descending order.
@@ -204,7 +204,7 @@ struct ScaleExtent {
     rounds: usize,
 }
 
-const FULL: ScaleExtent = ScaleExtent {
+const FULL_PLAN: ScaleMeasurementPlan = ScaleMeasurementPlan {
     cells: &[PAPER_CELLS, 2 * PAPER_CELLS, 4 * PAPER_CELLS, 10 * PAPER_CELLS, 20 * PAPER_CELLS, 10_000],
     rates: &[62.5, 31.25, 15.625],
     seconds: 5.0,
@@ -212,8 +212,8 @@ const FULL: ScaleExtent = ScaleExtent {
     rounds: 100,
 };
 
-const QUICK: ScaleExtent =
-    ScaleExtent { cells: &[24, 300], rates: &[62.5], seconds: 1.0, steps: 4, rounds: 5 };
+const QUICK_PLAN: ScaleMeasurementPlan =
+    ScaleMeasurementPlan { cells: &[24, 300], rates: &[62.5], seconds: 1.0, steps: 4, rounds: 5 };
 
 /// Runs all benches and measures all ticks.
 ///
@@ -222,23 +222,27 @@ const QUICK: ScaleExtent =
 ///
 /// # Panics
 /// Never panics in practice: generated skins are valid, and all lines are fitted to enough points.
-pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<ScaleMeasurements, L::Error> {
+pub fn measure_scale<L: ExperimentLab>(lab: &mut L, effort: Effort) -> Result<ScaleMeasurements, L::Error> {
     let extent = match effort {
-        Effort::Quick => QUICK,
-        Effort::Full => FULL,
+        Effort::Quick => QUICK_PLAN,
+        Effort::Full => FULL_PLAN,
     };
     let mut sizes = Vec::new();
     for &cells in extent.cells {
-        sizes.push(measure_size(lab, cells, extent)?);
+        sizes.push(measure_bench_size(lab, cells, extent)?);
     }
     lab.check_stopped()?;
     let (fewest, most) = (extent.cells.first().copied(), extent.cells.last().copied());
-    let (ticks, beside) = measure_loops(fewest.unwrap_or(1), most.unwrap_or(1), extent, || lab.now());
+    let (ticks, beside) = measure_ticks(fewest.unwrap_or(1), most.unwrap_or(1), extent, || lab.now_ns());
     Ok(ScaleMeasurements { sizes, ticks, beside })
 }
 
 /// Finds the highest rate that a bench with this many cells holds, and measures at this rate.
-fn measure_size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Result<SizeFigures, L::Error> {
+fn measure_bench_size<L: ExperimentLab>(
+    lab: &mut L,
+    cells: usize,
+    extent: ScaleMeasurementPlan,
+) -> Result<SizeFigures, L::Error> {
     let buses = cells.div_ceil(CellId::COUNT);
     let of = |hz, active| ScaleBench { cells, buses, hz, active, seconds: extent.seconds };
     let (mut hz, mut active) = (f64::NAN, BenchFigures::default());
@@ -256,13 +260,13 @@ fn measure_size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Resul
 }
 
 /// Measures ticks without threads: for different numbers of cells, and three for comparison.
-fn measure_loops(
+fn measure_ticks(
     fewest: usize,
     most: usize,
-    extent: ScaleExtent,
+    extent: ScaleMeasurementPlan,
     now: impl Fn() -> u64 + Copy,
 ) -> (TickTimes, ComparedTicks) {
-    let skin = |cells, buses| ticks::skin(cells, buses).expect("so many cells fit on the arm");
+    let skin = |cells, buses| ticks::generated_skin(cells, buses).expect("so many cells fit on the arm");
     let buses = most.div_ceil(CellId::COUNT);
     let large = skin(most, buses);
     // Each bus has at least one cell, because a bus without cells has no chain to be computed.
@@ -273,8 +277,8 @@ fn measure_loops(
         let part = parts.get(place).unwrap_or(&large);
         TickBench::new(part, part.cells.len(), mode)
     };
-    let over =
-        tick_times(&numbers, extent.rounds, 14, all_active, now).expect("more than two numbers of cells");
+    let over = measure_tick_times(&numbers, extent.rounds, 14, all_active, now)
+        .expect("more than two numbers of cells");
     let few = skin(fewest, fewest.div_ceil(CellId::COUNT));
     let skins = [&few, &skin_with_fewer_cells(&large, fewest.max(buses)), &large];
     let mut loops = skins.map(|skin| TickBench::new(skin, skin.cells.len(), TorqueSource::Distributed));
@@ -288,7 +292,7 @@ fn measure_loops(
 }
 
 /// Returns the number of cells as the x of a figure.
-fn cells_of(size: &SizeFigures) -> f64 {
+fn cell_count_as_float(size: &SizeFigures) -> f64 {
     count_to_f64(size.cells)
 }
 

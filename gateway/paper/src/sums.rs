@@ -11,14 +11,14 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::line::count_to_f64;
-use super::tree::{EpochResult, SumTree};
+use super::tree::{EpochSums, SumTree};
 use analysis::paper;
-use analysis::report::figure::{Axis, Figure, Finding, Section, Series, Shape, Table, number};
+use analysis::report::figure::{Axis, Figure, Finding, Section, Series, SeriesShape, Table, format_number};
 
 /// The numbers of active cells that are measured. About twenty were active on the arm in the paper.
 const ACTIVE_CELL_COUNTS: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
 /// The number of active cells at which the findings are stated.
-const FINDINGS_AT: usize = 20;
+const FINDINGS_ACTIVE_CELLS: usize = 20;
 /// The number of epochs over which the sum of a constant touch is averaged.
 const AVERAGED_EPOCHS: u32 = 32;
 /// The maximum torque in Nm. Touches that cause a larger torque are left out, because Q7.8 cannot hold it.
@@ -26,7 +26,7 @@ const MAX_TORQUE_NM: f64 = 127.0;
 
 /// The number of measurements.
 #[derive(Clone, Copy, Debug)]
-pub struct SumsExtent {
+pub struct SumMeasurementPlan {
     /// The number of touches for each number of active cells.
     pub touches: usize,
     /// The number of epochs for which each touch lasts while the arm moves.
@@ -63,14 +63,14 @@ fn random_touches(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usiz
 
 /// A mean of absolute errors.
 #[derive(Clone, Copy, Debug, Default)]
-struct Mean {
+struct MeanError {
     sum: f64,
     count: u32,
 }
 
-impl Mean {
+impl MeanError {
     /// Adds the absolute errors of the first `loaded` joints.
-    fn add(&mut self, loaded: usize, got: &[f64; MAX_JOINTS], target: &[f64; MAX_JOINTS]) {
+    fn add_absolute_errors(&mut self, loaded: usize, got: &[f64; MAX_JOINTS], target: &[f64; MAX_JOINTS]) {
         for (got, target) in
             got.iter().zip(target).take(loaded).filter(|(_, target)| target.abs() < MAX_TORQUE_NM)
         {
@@ -92,27 +92,27 @@ pub fn active_cell_counts(skin: &Skin) -> impl Iterator<Item = usize> + use<> {
 
 /// Measures the errors for a number of active cells. Equal arguments give equal results.
 #[must_use]
-pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
+pub fn measure_sum_errors(skin: &Skin, active: usize, extent: SumMeasurementPlan) -> SumErrors {
     let mut dice = Pcg64Mcg::seed_from_u64(active as u64);
     let (mut rounding, mut carrying) = (SumTree::new(skin, false), SumTree::new(skin, true));
-    let [mut truncated, mut rounded, mut carried] = [Mean::default(); 3];
-    let [mut rounded_average, mut carried_average] = [Mean::default(); 2];
+    let [mut truncated, mut rounded, mut carried] = [MeanError::default(); 3];
+    let [mut rounded_average, mut carried_average] = [MeanError::default(); 2];
     for _ in 0..extent.touches {
         let touch = random_touches(&mut dice, skin.cells.len(), active);
         let phase: [f64; MAX_JOINTS] = core::array::from_fn(|_| dice.random_range(0.0..6.0));
         for epoch in 0..extent.epochs {
             let q = phase.map(|phase| (phase + f64::from(epoch) * 0.016).sin());
             let (round, carry) = (rounding.run_epoch(&q, &touch), carrying.run_epoch(&q, &touch));
-            truncated.add(round.loaded, &round.truncated, &round.central);
-            rounded.add(round.loaded, &round.sum, &round.central);
-            carried.add(carry.loaded, &carry.sum, &carry.central);
+            truncated.add_absolute_errors(round.loaded, &round.truncated, &round.central);
+            rounded.add_absolute_errors(round.loaded, &round.sum, &round.central);
+            carried.add_absolute_errors(carry.loaded, &carry.sum, &carry.central);
         }
         let q = phase.map(|phase| 1.5 * phase.sin());
         // Cells that carry begin each touch without a rounding error from the one before.
         let mut fresh = SumTree::new(skin, true);
         for (tree, average) in [(&mut rounding, &mut rounded_average), (&mut fresh, &mut carried_average)] {
             let (mean, last) = average_sum(tree, &q, &touch);
-            average.add(last.loaded, &mean, &last.central);
+            average.add_absolute_errors(last.loaded, &mean, &last.central);
         }
     }
     SumErrors {
@@ -130,8 +130,8 @@ fn average_sum(
     tree: &mut SumTree,
     q: &[f64; MAX_JOINTS],
     touch: &[(usize, SkinSensors)],
-) -> ([f64; MAX_JOINTS], EpochResult) {
-    let (mut mean, mut last) = ([0.0; MAX_JOINTS], EpochResult::default());
+) -> ([f64; MAX_JOINTS], EpochSums) {
+    let (mut mean, mut last) = ([0.0; MAX_JOINTS], EpochSums::default());
     for _ in 0..AVERAGED_EPOCHS {
         last = tree.run_epoch(q, touch);
         for (mean, sum) in mean.iter_mut().zip(last.sum) {
@@ -155,47 +155,47 @@ const SUM_METHODS: [SumMethod; 5] = [
 
 /// Writes the section on the error of sums over the number of active cells.
 #[must_use]
-pub fn section(skin: &Skin, errors: &[SumErrors]) -> Section {
+pub fn sums_section(skin: &Skin, errors: &[SumErrors]) -> Section {
     let of = skin.cells.len();
     let figure = Figure::new(
         "sums",
         format!(
             "Mean error of the summed torque over the number of active cells, of {of}, Q7.8, loaded joints"
         ),
-        Axis::new("active cells", "").log().with_ends(0.9, 300.0),
-        Axis::new("mean absolute error", "Nm").log().with_ends(1e-5, 1.0),
+        Axis::new("active cells", "").with_log_scale().with_ends(0.9, 300.0),
+        Axis::new("mean absolute error", "Nm").with_log_scale().with_ends(1e-5, 1.0),
     );
     let series = SUM_METHODS.map(|(caption, _, error)| {
         let points = errors.iter().map(|errors| (count_to_f64(errors.active), error(errors))).collect();
-        Series::new(caption, Shape::Line, points)
+        Series::new(caption, SeriesShape::Line, points)
     });
-    let at = errors.iter().filter(|errors| errors.active == FINDINGS_AT).take(1);
+    let at = errors.iter().filter(|errors| errors.active == FINDINGS_ACTIVE_CELLS).take(1);
     let findings = at.flat_map(|at| {
         SUM_METHODS.map(|(caption, what, error)| {
-            let what = format!("sum of {FINDINGS_AT} active cells of {of}, {what}");
+            let what = format!("sum of {FINDINGS_ACTIVE_CELLS} active cells of {of}, {what}");
             let found = Finding::less_is_better(what, paper::SUMMED_ERROR_NM, (error(at), "Nm"));
             if caption == "rounded" { found.at_most(0.005) } else { found }
         })
     });
     let rows = errors.iter().map(|at| {
-        let errors = SUM_METHODS.map(|(_, _, error)| number(error(at)));
+        let errors = SUM_METHODS.map(|(_, _, error)| format_number(error(at)));
         core::iter::once(at.active.to_string()).chain(errors).collect::<Vec<_>>()
     });
     let [a, b, c, d, e] = SUM_METHODS.map(|(caption, ..)| caption);
     Section::new("sums", "Sums along the tree: cutting off, rounding, carrying")
-        .text(
+        .with_paragraph(
             "Random cells measure 0.6 to 6 N while the arm moves; every cell computes and adds with the code of its \
              microcontroller. A cell that cuts off what Q7.8 has no room for errs by half a step of 0.0039 Nm to the same \
              side as all others, so errors add up with the number of cells; rounded ones grow with its root. A cell that \
              carries what rounding took away into its next value errs more in one epoch and not at all in the long run.",
         )
-        .text(format!(
+        .with_paragraph(format!(
             "The paper's {} Nm is the error that cutting off causes with about twenty active cells.",
-            number(paper::SUMMED_ERROR_NM)
+            format_number(paper::SUMMED_ERROR_NM)
         ))
-        .figures([figure.series(series)])
-        .findings(findings)
-        .tables([Table::new("Mean absolute error in Nm", ["active cells", a, b, c, d, e], rows)])
+        .with_figures([figure.with_series(series)])
+        .with_findings(findings)
+        .with_tables([Table::new("Mean absolute error in Nm", ["active cells", a, b, c, d, e], rows)])
 }
 
 #[cfg(test)]
@@ -205,10 +205,10 @@ mod tests {
 
     #[test]
     fn truncated_sums_drift_with_the_cells_rounded_ones_do_not_and_carried_ones_are_right_on_average() {
-        let skin = ticks::skin(64, 1).unwrap();
+        let skin = ticks::generated_skin(64, 1).unwrap();
         let measure = || -> Vec<_> {
             active_cell_counts(&skin)
-                .map(|active| errors(&skin, active, SumsExtent { touches: 6, epochs: 4 }))
+                .map(|active| measure_sum_errors(&skin, active, SumMeasurementPlan { touches: 6, epochs: 4 }))
                 .collect()
         };
         let errors = measure();
@@ -223,7 +223,7 @@ mod tests {
         // root of the number of cells.
         assert!(forty.rounded < 0.012 && forty.truncated > 4.0 * forty.rounded, "{errors:?}");
         assert!(forty.carried_average < forty.rounded_average / 2.0, "{errors:?}");
-        let section = section(&skin, &errors);
+        let section = sums_section(&skin, &errors);
         assert_eq!(section.findings.len(), 5);
         assert!(section.figures[0].series.iter().all(|series| series.points.len() == 6));
         assert_eq!(measure(), errors, "the same again");

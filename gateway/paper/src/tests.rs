@@ -1,7 +1,7 @@
 //! Tests that perform every experiment that needs no bench, with few measurements.
 
 use super::*;
-use analysis::report::figure::{Figure, FindingVerdict, Shape};
+use analysis::report::figure::{Figure, FindingVerdict, SeriesShape};
 use std::sync::LazyLock;
 use std::time::Instant;
 
@@ -10,14 +10,14 @@ static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
 /// A lab that has a clock but cannot run benches.
 struct Bare;
 
-impl Lab for Bare {
+impl ExperimentLab for Bare {
     type Error = &'static str;
 
-    fn now(&self) -> u64 {
+    fn now_ns(&self) -> u64 {
         u64::try_from(BEGAN.elapsed().as_nanos()).unwrap()
     }
 
-    fn run_bench(&mut self, _: Reply, _: Effort) -> Result<BenchRun, &'static str> {
+    fn run_bench(&mut self, _: ReplyMode, _: Effort) -> Result<BenchRun, &'static str> {
         Err("there is no bench here")
     }
 
@@ -42,7 +42,7 @@ fn is_drawable(figure: &Figure) {
         assert!(series.points.len() >= 2 && finite, "{}: {series:?}", figure.name);
         let rises = series.points.windows(2).all(|pair| pair[0].0 <= pair[1].0);
         assert!(
-            rises || matches!(series.shape, Shape::Band | Shape::Points),
+            rises || matches!(series.shape, SeriesShape::Band | SeriesShape::Points),
             "{}: {}",
             figure.name,
             series.caption

@@ -5,14 +5,14 @@ use std::sync::Arc;
 
 use protocol::can::{Format, Frame};
 use protocol::message::{Joints, Message, SkinSensors};
-use protocol::packet::{Epoch, WORDS, padded};
+use protocol::packet::{Epoch, WORDS, pad_with_defaults};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 use protocol::time::{Micros, Span};
 
 use control::controller::{Controller, ControllerInput, ControllerOutput, KinestheticController};
 use control::cycle::turn::{BusPort, SharedRunState, TickDriver, TimedRecord};
-use control::cycle::{Cycle, Tick};
+use control::cycle::{ControlCycle, Tick};
 use control::robot::SimulatedArm;
 use model::generate::{GenerateError, SkinRequest, generate};
 use model::scenario::{ModeChange, Scenario, TorqueSource, contact_words};
@@ -23,7 +23,7 @@ pub const MAX_CELLS: usize = 3_000;
 /// The number of buses for [`MAX_CELLS`] cells.
 pub const BUSES: usize = 12;
 /// The joint positions of the arm while times are measured, in rad.
-pub const POSE: [f64; WORDS] = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
+pub const ARM_POSE_RAD: [f64; WORDS] = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
 /// The force on an active cell, in N.
 const TOUCH_N: f64 = 1.5;
 /// The number of ticks in an epoch, with 500 ticks and 62.5 epochs per second.
@@ -35,7 +35,7 @@ const QUEUE_CAPACITY: usize = 64;
 ///
 /// # Errors
 /// Returns [`GenerateError`] if the cells do not fit on the buses.
-pub fn skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
+pub fn generated_skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
     let text = generate(&SkinRequest { cells, buses, ..SkinRequest::default() })?;
     Ok(Skin::parse("generated skin", &text)?)
 }
@@ -52,13 +52,13 @@ pub fn skin_with_fewer_cells(skin: &Skin, cells: usize) -> Skin {
 
 /// Returns the sensor values of a cell that is touched.
 #[must_use]
-pub fn touch() -> SkinSensors {
+pub fn touched_sensors() -> SkinSensors {
     SkinSensors { contact: contact_words(TOUCH_N), ..SkinSensors::default() }
 }
 
 /// Returns the sensor values of all cells if the first `active` cells, in the order of `spread`, are touched.
-fn sensors(cells: usize, active: usize) -> Vec<SkinSensors> {
-    (0..cells).map(|cell| if cell < active { touch() } else { SkinSensors::default() }).collect()
+fn sensors_with_active_cells(cells: usize, active: usize) -> Vec<SkinSensors> {
+    (0..cells).map(|cell| if cell < active { touched_sensors() } else { SkinSensors::default() }).collect()
 }
 
 /// Returns the snapshot that a bus receiver passes to the loop after the first `active` cells have replied. It is
@@ -77,7 +77,7 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
         // The time of a tick does not depend on the value of the torque.
         hear(false, Message::Torque { from: cell.node, epoch, torque: [409; WORDS].into() });
     }
-    Snapshot { sums: table.snapshot().sums, sensors: sensors(cells.len(), active) }
+    Snapshot { sums: table.snapshot().sums, sensors: sensors_with_active_cells(cells.len(), active) }
 }
 
 /// A controller that computes what the kinesthetic controller computes, but does not move the arm. Otherwise the robot
@@ -115,7 +115,7 @@ struct ReceiverEnds {
 
 /// The mean times of the ticks in an epoch, in ns.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct TickCost {
+pub struct MeanTickTimes {
     /// The time of a tick without that of the central computation.
     pub tick: f64,
     /// The time of the central computation in a tick; 0 if there is none.
@@ -150,7 +150,11 @@ impl TickBench {
         let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
         let controller =
             HoldingController(KinestheticController::new(skin).expect("a generated skin moves by itself"));
-        let cycle = Cycle::new(skin, Box::new(controller), Box::new(SimulatedArm::new(skin, padded(&POSE))));
+        let cycle = ControlCycle::new(
+            skin,
+            Box::new(controller),
+            Box::new(SimulatedArm::new(skin, pad_with_defaults(&ARM_POSE_RAD))),
+        );
         let turn = TickDriver::new(
             cycle,
             lines,
@@ -162,7 +166,7 @@ impl TickBench {
     }
 
     /// Runs the ticks of one epoch, each with a new snapshot. Returns their mean times.
-    pub fn run_epoch(&mut self, now: impl Fn() -> u64 + Copy) -> TickCost {
+    pub fn run_epoch(&mut self, now: impl Fn() -> u64 + Copy) -> MeanTickTimes {
         for _ in 0..TICKS_PER_EPOCH {
             for ReceiverEnds { snapshot, to_loop, positions } in &mut self.buses {
                 // The epoch that was read back is that of the previous broadcast, as on a bus that works.
@@ -177,11 +181,11 @@ impl TickBench {
             self.turn.run_tick(tick, 0, 0, now, take);
             self.number += 1;
         }
-        let mut took = TickCost::default();
+        let mut took = MeanTickTimes::default();
         while let Ok(TimedRecord { took_ns, central, .. }) = self.records.pop() {
             let central = central.map_or(0, |(nanos, _)| nanos);
-            took.tick += nanos(took_ns.saturating_sub(central)) / 8.0;
-            took.central += nanos(central) / 8.0;
+            took.tick += nanos_to_float(took_ns.saturating_sub(central)) / 8.0;
+            took.central += nanos_to_float(central) / 8.0;
         }
         took
     }
@@ -201,7 +205,7 @@ impl TickBench {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
-pub(super) fn nanos(nanos: u64) -> f64 {
+pub(super) fn nanos_to_float(nanos: u64) -> f64 {
     nanos as f64
 }
 
@@ -211,7 +215,7 @@ mod tests {
 
     #[test]
     fn a_skin_is_spread_evenly_and_its_ticks_know_who_is_touched() {
-        let whole = skin(240, BUSES).unwrap();
+        let whole = generated_skin(240, BUSES).unwrap();
         for (cells, active) in [(0, 0), (30, 0), (30, 7), (240, 240)] {
             let part = skin_with_fewer_cells(&whole, cells);
             assert_eq!(part.cells.len(), cells);
@@ -234,14 +238,14 @@ mod tests {
     /// and at its end.
     #[test]
     fn a_tick_is_told_without_its_central_computation() {
-        let part = skin_with_fewer_cells(&skin(BUSES, BUSES).unwrap(), BUSES);
+        let part = skin_with_fewer_cells(&generated_skin(BUSES, BUSES).unwrap(), BUSES);
         let clock = std::cell::Cell::new(0);
         let now = || {
             clock.set(clock.get() + 1);
             clock.get()
         };
         let took = |mode| TickBench::new(&part, 0, mode).run_epoch(now);
-        assert_eq!(took(TorqueSource::Compare), TickCost { tick: 2.0, central: 1.0 });
-        assert_eq!(took(TorqueSource::Distributed), TickCost { tick: 1.0, central: 0.0 });
+        assert_eq!(took(TorqueSource::Compare), MeanTickTimes { tick: 2.0, central: 1.0 });
+        assert_eq!(took(TorqueSource::Distributed), MeanTickTimes { tick: 1.0, central: 0.0 });
     }
 }

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
-use cell_node::sum::{EpochStart, Sum};
+use cell_node::sum::{EpochStart, SubtreeSum};
 use protocol::fixed::{Accumulator, Q1_14};
 use protocol::id::CellId;
 use protocol::message::SkinSensors;
@@ -18,7 +18,7 @@ use protocol::time::{Micros, Span};
 use model::central::CentralComputation;
 
 /// The number of fraction bits of a cell's exact torque that Q7.8 does not have.
-const DROPPED_BITS: u32 = 30 - 8;
+const DROPPED_FRACTION_BITS: u32 = 30 - 8;
 /// The interval between joint broadcasts, in µs.
 const JOINTS_INTERVAL_US: u64 = 16_000;
 
@@ -35,7 +35,7 @@ struct Branch {
 pub struct SumTree {
     skin: Skin,
     central: CentralComputation,
-    sums: Vec<Sum>,
+    sums: Vec<SubtreeSum>,
     /// The cells, sorted so that each comes after its children.
     order: Vec<Branch>,
     kernels: Vec<Wrench>,
@@ -44,7 +44,7 @@ pub struct SumTree {
 
 /// The sums of one epoch and the torques to compare them with, in Nm.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct EpochResult {
+pub struct EpochSums {
     /// The torque that the central computation yields in double precision.
     pub central: [f64; MAX_JOINTS],
     /// The sum that arrives at the roots, in Q7.8.
@@ -86,9 +86,9 @@ impl SumTree {
         }
         order.reverse();
         let deepest = order.first().map_or(0, |branch| branch.depth);
-        let mut sums = vec![Sum::default(); skin.cells.len()];
+        let mut sums = vec![SubtreeSum::default(); skin.cells.len()];
         for sum in &mut sums {
-            sum.set_slots(Some(SumSchedule { slot_us: 600, deepest, carry }));
+            sum.set_schedule(Some(SumSchedule { slot_us: 600, deepest, carry }));
         }
         let kernels = skin.cells.iter().map(|cell| Wrench::new(&skin.parameters(cell))).collect();
         Self {
@@ -109,20 +109,20 @@ impl SumTree {
 
     /// Runs one epoch with the joint positions `q` in rad. `touch` are the cells in contact, by index, with their
     /// sensor values.
-    pub fn run_epoch(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochResult {
+    pub fn run_epoch(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochSums {
         let words = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
-        let frames = self.central.frames(&words);
-        let mut came = EpochResult::default();
+        let frames = self.central.link_frames(&words);
+        let mut came = EpochSums::default();
         let mut own = vec![None; self.sums.len()];
         for (place, sensors) in touch {
             let (Some(cell), Some(kernel)) = (self.skin.cells.get(*place), self.kernels.get(*place)) else {
                 continue;
             };
-            let force = self.central.force(*place, sensors);
-            add(&mut came.central, self.central.torque(*place, &frames, force));
+            let force = self.central.cell_force(*place, sensors);
+            add_torque(&mut came.central, self.central.cell_torque(*place, &frames, force));
             let force = Force::fuse(sensors.contact, sensors.proximity, &self.skin.parameters(cell).contact);
             let exact = Torque::new(&kernel.jacobian(&words), force).exact_torques();
-            add(&mut came.truncated, exact.map(truncated));
+            add_torque(&mut came.truncated, exact.map(truncate_to_q7_8_nm));
             came.loaded = came.loaded.max(cell.joint.into());
             if let Some(own) = own.get_mut(*place) {
                 *own = Some(exact);
@@ -140,18 +140,18 @@ impl SumTree {
                 may_send: true,
                 children: children.iter().map(|(port, _)| 1 << port).sum(),
             };
-            sum.begin(&begin, own.get(*cell).and_then(Option::as_ref));
+            sum.begin_epoch(&begin, own.get(*cell).and_then(Option::as_ref));
             for (port, child) in children {
                 if let Some((epoch, words, restarted)) = said.get(*child).copied().flatten() {
                     if restarted {
-                        sum.handle_state(Micros(0), *port, epoch);
+                        sum.handle_state_message(Micros(0), *port, epoch);
                     }
-                    sum.receive(Micros(0), *port, epoch, words);
+                    sum.receive_sum(Micros(0), *port, epoch, words);
                 }
             }
             let says = sum.poll_sum(Micros(JOINTS_INTERVAL_US));
             if let (0, Some((_, words, _))) = (depth, &says) {
-                add(&mut came.sum, words.torque.map(|word| word.to_f64()));
+                add_torque(&mut came.sum, words.torque.map(|word| word.to_f64()));
                 came.count += usize::from(words.count);
             }
             if let Some(said) = said.get_mut(*cell) {
@@ -162,7 +162,7 @@ impl SumTree {
     }
 }
 
-fn add(sum: &mut [f64; MAX_JOINTS], more: [f64; MAX_JOINTS]) {
+fn add_torque(sum: &mut [f64; MAX_JOINTS], more: [f64; MAX_JOINTS]) {
     for (sum, more) in sum.iter_mut().zip(more) {
         *sum += more;
     }
@@ -170,6 +170,6 @@ fn add(sum: &mut [f64; MAX_JOINTS], more: [f64; MAX_JOINTS]) {
 
 /// Returns the torque in Nm after the bits below those of Q7.8 were dropped.
 #[expect(clippy::cast_precision_loss, reason = "a torque has far fewer than 2^53 steps")]
-fn truncated(exact: Accumulator<30>) -> f64 {
-    (exact.steps() >> DROPPED_BITS) as f64 / 256.0
+fn truncate_to_q7_8_nm(exact: Accumulator<30>) -> f64 {
+    (exact.steps() >> DROPPED_FRACTION_BITS) as f64 / 256.0
 }

@@ -56,7 +56,7 @@ impl ReferenceCell {
     }
 
     fn torque_words(&self, joints: &[Q1_14; MAX_JOINTS], force: Force) -> [i16; MAX_JOINTS] {
-        Torque::new(&self.jacobian(joints), force).words(self.format)
+        Torque::new(&self.jacobian(joints), force).torque_words(self.format)
     }
 }
 

@@ -173,7 +173,7 @@ pub enum ImportError {
 impl ImportError {
     /// Returns true if the error is in the cells, false if it is in the robot.
     #[must_use]
-    pub const fn is_in_cells(&self) -> bool {
+    pub const fn is_error_in_cells(&self) -> bool {
         !matches!(self, Self::Joints { .. } | Self::Robot { .. })
     }
 
@@ -246,8 +246,9 @@ impl SkinImport<'_> {
         let on_tips: Vec<_> = self.chains.iter().map(cell_on_tip).collect();
         let cells = if self.cells.is_empty() { &on_tips } else { self.cells };
         let mut buses: Vec<BusAssignment> = Vec::new();
-        let placed = cells.iter().map(|cell| self.place(cell, &mut buses)).collect::<Result<Vec<_>, _>>()?;
-        let text = self.text(&buses, &placed);
+        let placed =
+            cells.iter().map(|cell| self.place_cell(cell, &mut buses)).collect::<Result<Vec<_>, _>>()?;
+        let text = self.skin_text(&buses, &placed);
         match Skin::parse("imported skin", &text) {
             Ok(_) => Ok(text),
             Err(error) => Err(ImportError::from_check(error, cells, &buses)),
@@ -255,7 +256,7 @@ impl SkinImport<'_> {
     }
 
     /// Assigns a cell to the first chain that moves its link, and to a bus with a node id.
-    fn place<'a>(
+    fn place_cell<'a>(
         &self,
         cell: &'a CellOnLink,
         buses: &mut Vec<BusAssignment>,
@@ -374,7 +375,7 @@ impl SkinImport<'_> {
         joints
     }
 
-    fn text(&self, buses: &[BusAssignment], cells: &[PlacedCell<'_>]) -> String {
+    fn skin_text(&self, buses: &[BusAssignment], cells: &[PlacedCell<'_>]) -> String {
         let joints = self.joints();
         let each =
             |value: &dyn Fn(&ChainJoint) -> f64| joints.iter().map(|joint| value(joint)).collect::<Vec<_>>();
@@ -427,7 +428,7 @@ impl SkinImport<'_> {
         draft.set_with_comment("max_speed", Value::Numbers(&speed), 3, "rad/s, or m/s");
         for cell in cells {
             let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
-            let own = self.chains.get(cell.chain).and_then(|chain| row_of(chain, cell.joint));
+            let own = self.chains.get(cell.chain).and_then(|chain| row_of_joint(chain, cell.joint));
             let CellOnLink { link, neighbors, root, .. } = cell.cell;
             draft.add_cell(&DraftCell {
                 remark: Some(&format!("on {link}")),
@@ -436,8 +437,8 @@ impl SkinImport<'_> {
                 serial: None,
                 joint: cell.joint,
                 row: Some(cell.row).filter(|row| own != Some(*row)),
-                position: cell.position.map(without_residue),
-                facing: CellFacing::Normal(cell.normal.map(without_residue)),
+                position: cell.position.map(without_rounding_residue),
+                facing: CellFacing::Normal(cell.normal.map(without_rounding_residue)),
                 neighbors: neighbors
                     .iter()
                     .any(Option::is_some)
@@ -445,7 +446,7 @@ impl SkinImport<'_> {
                 root: *root,
             });
         }
-        draft.text()
+        draft.into_text()
     }
 }
 
@@ -455,7 +456,7 @@ fn add_chain(draft: &mut SkinDraft, chain: &UrdfChain) {
     draft.set("name", Value::Text(&chain.tip));
     let base = chain.below * chain.base;
     let [position, turn] = [base.translation.vector.as_slice(), base.rotation.coords.as_slice()]
-        .map(|all| all.iter().copied().map(without_residue).collect::<Vec<_>>());
+        .map(|all| all.iter().copied().map(without_rounding_residue).collect::<Vec<_>>());
     let base = [("position", Value::Numbers(&position)), ("orientation", Value::Numbers(&turn))];
     draft.set_table("base", &base);
     let mut names = chain.joints.iter();
@@ -465,11 +466,11 @@ fn add_chain(draft: &mut SkinDraft, chain: &UrdfChain) {
         let table = [("a", row.a), ("alpha", row.alpha), ("d", row.d), ("theta_offset", row.theta_offset)];
         joint.into_iter().chain(table.map(|(key, value)| (key, Value::Number(value)))).collect()
     });
-    draft.set_rows("rows", None, rows);
+    draft.set_table_rows("rows", None, rows);
 }
 
 /// Returns the number of the row that a joint moves. Rows and joints are counted from 1.
-fn row_of(chain: &UrdfChain, joint: usize) -> Option<usize> {
+fn row_of_joint(chain: &UrdfChain, joint: usize) -> Option<usize> {
     let moving = chain.rows.iter().enumerate().filter(|(_, row)| row.kind != RowKind::Fixed);
     moving.map(|(index, _)| index + 1).nth(joint.checked_sub(1)?)
 }
@@ -480,6 +481,6 @@ fn cell_on_tip(chain: &UrdfChain) -> CellOnLink {
 }
 
 /// Returns a value for output, without rounding residues and negative zeros.
-fn without_residue(value: f64) -> f64 {
+fn without_rounding_residue(value: f64) -> f64 {
     if value.abs() < 1e-12 { 0.0 } else { value }
 }

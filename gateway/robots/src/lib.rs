@@ -47,9 +47,9 @@ pub use links::LinkPose;
 pub use nalgebra::Isometry3;
 pub use protocol::parameters::RowKind;
 pub use protocol::skin::JointKind;
-pub use rows::{DhRow, MAX_LENGTH_M, MAX_RESIDUAL, frames, pose_of};
+pub use rows::{DhRow, MAX_LENGTH_M, MAX_RESIDUAL, chain_base_pose, frames};
 pub use taken::{UniqueNames, chain_prefixes, sanitized};
-pub use urdf::{Geometry, Shape, Urdf, text};
+pub use urdf::{Geometry, Shape, Urdf, decode_text};
 pub use written::{WrittenUrdf, write_urdf};
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
 use crate::error::{RobotError, RobotProblem};
-use crate::nearest::nearest;
+use crate::nearest::nearest_names;
 use crate::urdf::{Urdf, UrdfJoint, UrdfJointKind};
 
 /// The pose of a link relative to its parent link.
@@ -32,13 +32,13 @@ struct LinkMotion {
 impl LinkPose {
     /// Returns true if one of the given joints moves the link.
     #[must_use]
-    pub const fn moves(&self) -> bool {
+    pub const fn is_moved_by_joint(&self) -> bool {
         self.motion.is_some()
     }
 
     /// Returns the transform from the parent to the link, with the given joints at these positions in rad or m.
     #[must_use]
-    pub fn pose(&self, positions: &[f64]) -> Isometry3<f64> {
+    pub fn pose_in_parent(&self, positions: &[f64]) -> Isometry3<f64> {
         let Some(LinkMotion { joint, slides, axis, multiplier, offset }) = self.motion else {
             return self.origin;
         };
@@ -89,7 +89,7 @@ impl Urdf {
     ///
     /// # Errors
     /// Returns [`RobotError`] if the joint does not exist, or does not move by itself.
-    pub fn link_of(&self, joint: &str) -> Result<&str, RobotError> {
+    pub fn link_moved_by(&self, joint: &str) -> Result<&str, RobotError> {
         Ok(self.link_name(self.moving_joint(joint)?.child))
     }
 
@@ -104,7 +104,7 @@ impl Urdf {
         let found = self.joints().iter().filter(moves).find(|joint| joint.name == name);
         found.ok_or_else(|| {
             let names = self.joints().iter().filter(moves).map(|joint| joint.name.as_str());
-            let nearest = nearest(name, names);
+            let nearest = nearest_names(name, names);
             self.error(RobotProblem::NoSuchJoint { joint: name.to_owned(), nearest })
         })
     }

@@ -4,7 +4,7 @@
 const MAX_SUGGESTIONS: usize = 3;
 
 /// Returns a list of the names that are most similar to a mistyped name, at most three, the most similar first.
-pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>) -> String {
+pub(crate) fn nearest_names<'a>(target: &str, names: impl IntoIterator<Item = &'a str>) -> String {
     let target = target.to_lowercase();
     let mut found: Vec<_> =
         names.into_iter().map(|name| (edit_distance(&target, &name.to_lowercase()), name)).collect();
@@ -38,7 +38,7 @@ fn edit_distance(from: &str, to: &str) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::{edit_distance, nearest};
+    use super::{edit_distance, nearest_names};
 
     #[test]
     fn edits_are_counted() {
@@ -51,8 +51,8 @@ mod tests {
     #[test]
     fn three_names_are_proposed_nearest_first() {
         let names = ["shoulder", "link2", "LINK1", "link11"];
-        assert_eq!(nearest("link1", names), r#""LINK1", "link11" or "link2""#);
-        assert_eq!(nearest("x", ["one"]), r#""one""#);
-        assert_eq!(nearest("x", []), "none");
+        assert_eq!(nearest_names("link1", names), r#""LINK1", "link11" or "link2""#);
+        assert_eq!(nearest_names("x", ["one"]), r#""one""#);
+        assert_eq!(nearest_names("x", []), "none");
     }
 }

@@ -14,7 +14,7 @@ const RANDOM_POSITIONS: usize = 64;
 
 /// The largest difference between rows and URDF, and the link at which it occurs.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Residual {
+pub(crate) struct LargestResidual {
     /// The difference in m or rad.
     pub(crate) residual: f64,
     /// Name of the link.
@@ -22,18 +22,23 @@ pub(crate) struct Residual {
 }
 
 /// Compares the frames of all links that move with the chain, computed from the rows and from the URDF.
-pub(crate) fn residual(chain: &UrdfChain, path: &[&UrdfJoint], hanging: &[CarriedLink]) -> Residual {
-    let mut worst = Residual::default();
-    for positions in positions(chain) {
+pub(crate) fn largest_residual(
+    chain: &UrdfChain,
+    path: &[&UrdfJoint],
+    hanging: &[CarriedLink],
+) -> LargestResidual {
+    let mut worst = LargestResidual::default();
+    for positions in test_positions(chain) {
         let frames = chain.frames(&positions);
         let behind = frames_after_joints(path, &positions);
         for (CarriedLink { link, joint, fixed }, (_, found)) in hanging.iter().zip(chain.links()) {
             let urdf = joint.checked_sub(1).and_then(|index| behind.get(index)).map(|pose| pose * fixed);
             let rows = frames.get(found.row).map(|frame| frame * found.frame);
-            let residual = urdf.zip(rows).map_or(f64::INFINITY, |(urdf, rows)| difference(&urdf, &rows));
+            let residual =
+                urdf.zip(rows).map_or(f64::INFINITY, |(urdf, rows)| frame_difference(&urdf, &rows));
             // NaN counts as the largest difference.
             if residual.is_nan() || residual > worst.residual {
-                worst = Residual { residual, link: link.clone() };
+                worst = LargestResidual { residual, link: link.clone() };
             }
         }
     }
@@ -41,7 +46,7 @@ pub(crate) fn residual(chain: &UrdfChain, path: &[&UrdfJoint], hanging: &[Carrie
 }
 
 /// Returns the difference between two frames: the greater of the distance in m and the angle in rad.
-pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
+pub(crate) fn frame_difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
     let turn = one.rotation.rotation_to(&other.rotation);
     // The cosine of a small angle would lose its digits.
     let angle = 2.0 * turn.imag().norm().atan2(turn.scalar().abs());
@@ -49,7 +54,7 @@ pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
 }
 
 /// Returns sets of joint positions: zero, the limits, and random positions between them that are the same in every run.
-fn positions(chain: &UrdfChain) -> Vec<Vec<f64>> {
+fn test_positions(chain: &UrdfChain) -> Vec<Vec<f64>> {
     let limits = chain.joints.iter().map(|joint| match joint.kind {
         JointKind::Revolute => joint.limits.map(|limit| limit.clamp(-TAU, TAU)),
         JointKind::Prismatic => joint.limits,
@@ -75,15 +80,15 @@ fn positions(chain: &UrdfChain) -> Vec<Vec<f64>> {
 mod tests {
     use nalgebra::{Isometry3, Vector3};
 
-    use super::difference;
+    use super::frame_difference;
 
     #[test]
     fn a_small_angle_is_not_lost() {
         for angle in [1e-3, 1e-8, 1e-12] {
             let turned = Isometry3::rotation(Vector3::new(0.0, angle, 0.0));
-            let found = difference(&Isometry3::identity(), &turned);
+            let found = frame_difference(&Isometry3::identity(), &turned);
             assert!((found - angle).abs() < 1e-15, "{angle}: {found}");
         }
-        assert!(difference(&Isometry3::identity(), &Isometry3::translation(3.0, 4.0, 0.0)) > 4.9);
+        assert!(frame_difference(&Isometry3::identity(), &Isometry3::translation(3.0, 4.0, 0.0)) > 4.9);
     }
 }

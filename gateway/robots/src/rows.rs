@@ -21,18 +21,18 @@ const LENGTH_TOLERANCE_M: f64 = 1e-12;
 
 /// Distance in m below which two origins count as the same, and difference in m below which two paths count as equally
 /// long.
-const SAME_PLACE_M: f64 = 1e-9;
+const SAME_POINT_DISTANCE_M: f64 = 1e-9;
 
 /// Minimum sine of the angle between two axes. Below it, the common normal of the axes cannot be computed precisely.
 const MIN_NORMAL_SINE: f64 = 1e-3;
 
 /// Maximum distance in m of frame 0 from the origin of the first joint, and of the last frame from the origin of the
 /// last joint, both along the joint's axis.
-const MAX_SHIFT_M: f64 = 1.0;
+const MAX_AXIS_SHIFT_M: f64 = 1.0;
 
 /// Lengths in m that a fixed row must save. A row has a cost because it adds a rounding error to a cell's computation.
 /// The second value is for chains whose rows are too long with the first.
-pub(crate) const ROW_COSTS_M: [f64; 2] = [0.2, 0.0];
+pub(crate) const FIXED_ROW_COSTS_M: [f64; 2] = [0.2, 0.0];
 
 /// Cost in m of a length that exceeds the range of a row.
 const OUT_OF_RANGE_COST_M: f64 = 1e3;
@@ -143,7 +143,7 @@ struct RowPath {
 
 impl RowPath {
     /// Returns the path extended by these rows.
-    fn extended(&self, rows: &[DhRow], row_cost: f64) -> Self {
+    fn extended_by_rows(&self, rows: &[DhRow], row_cost: f64) -> Self {
         let frame = rows.iter().fold(self.frame, |frame, row| frame * row.transform(0.0));
         let cost = |row: &DhRow| row.length() + if row.kind == RowKind::Fixed { row_cost } else { 0.0 };
         let cost = self.cost + rows.iter().map(cost).sum::<f64>();
@@ -167,17 +167,17 @@ impl Axis {
 /// the length in m that a fixed row must save.
 pub(crate) fn rows_for_axes(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometry3<f64>, Vec<DhRow>) {
     let Some(first) = axes.first() else { return (Isometry3::identity(), Vec::new()) };
-    let base = base(first);
+    let base = base_frame(first);
     let mut ways = vec![RowPath { rows: Vec::new(), frame: base, cost: 0.0 }];
     for (index, axis) in axes.iter().enumerate() {
-        let kind = axis.kind.row();
+        let kind = axis.kind.row_kind();
         let next = axes.get(index + 1);
         let mut longer: Vec<RowPath> = Vec::new();
         for way in &ways {
             let local = |point: &Point3<f64>| way.frame.inverse_transform_point(point).coords;
             let Some(next) = next else {
-                let d = local(tip).z.clamp(-MAX_SHIFT_M, MAX_SHIFT_M);
-                longer.push(way.extended(
+                let d = local(tip).z.clamp(-MAX_AXIS_SHIFT_M, MAX_AXIS_SHIFT_M);
+                longer.push(way.extended_by_rows(
                     &[DhRow { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.rounded()],
                     row_cost,
                 ));
@@ -189,14 +189,14 @@ pub(crate) fn rows_for_axes(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> 
                 axes.get(index + 2).and_then(|beyond| next.nearest_point_to(beyond)).map(|foot| local(&foot)),
             );
             for rows in candidate_rows(kind, &places, &direction) {
-                let way = way.extended(&rows, row_cost);
+                let way = way.extended_by_rows(&rows, row_cost);
                 // Paths that end in the same frame have the same continuations.
                 let same = |other: &&mut RowPath| {
                     let apart = other.frame.translation.vector - way.frame.translation.vector;
-                    apart.norm() < SAME_PLACE_M
+                    apart.norm() < SAME_POINT_DISTANCE_M
                 };
                 match longer.iter_mut().find(same) {
-                    Some(other) if way.cost < other.cost - SAME_PLACE_M => *other = way,
+                    Some(other) if way.cost < other.cost - SAME_POINT_DISTANCE_M => *other = way,
                     Some(_) => {}
                     None => longer.push(way),
                 }
@@ -205,15 +205,16 @@ pub(crate) fn rows_for_axes(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> 
         ways = longer;
     }
     // Of equally long paths the first is chosen: it leads by way of common normals and joints.
-    let shortest =
-        ways.into_iter().reduce(|best, way| if way.cost < best.cost - SAME_PLACE_M { way } else { best });
+    let shortest = ways
+        .into_iter()
+        .reduce(|best, way| if way.cost < best.cost - SAME_POINT_DISTANCE_M { way } else { best });
     (base, shortest.map(|way| way.rows).unwrap_or_default())
 }
 
 /// Returns frame 0. Its z axis is the axis of the first joint, and its x axis is as close to the root's as possible.
 /// Its origin is the point of the axis that is nearest to the root, if that point is near the joint. For most robots,
 /// frame 0 is therefore the root frame itself.
-fn base(first: &Axis) -> Isometry3<f64> {
+fn base_frame(first: &Axis) -> Isometry3<f64> {
     let z = first.direction;
     let mut x = Vector3::x() - z * z.x;
     if x.norm() < 0.1 {
@@ -223,7 +224,7 @@ fn base(first: &Axis) -> Isometry3<f64> {
     let y = z.cross(&x);
     let turn = Rotation3::from_basis_unchecked(&[x, y, z]);
     let along = -z.dot(&first.point.coords);
-    let origin = if along.abs() <= MAX_SHIFT_M / 2.0 { first.point + z * along } else { first.point };
+    let origin = if along.abs() <= MAX_AXIS_SHIFT_M / 2.0 { first.point + z * along } else { first.point };
     Isometry3::from_parts(origin.into(), UnitQuaternion::from_rotation_matrix(&turn))
 }
 
@@ -238,7 +239,7 @@ fn candidate_rows(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f6
     if sine < ANGLE_TOLERANCE {
         return places.map(|place| vec![row_to_parallel_axis(kind, &place, direction)]).collect();
     }
-    let normal = (sine >= MIN_NORMAL_SINE).then(|| vec![common_normal(kind, point, direction)]);
+    let normal = (sine >= MIN_NORMAL_SINE).then(|| vec![row_along_common_normal(kind, point, direction)]);
     normal
         .into_iter()
         .chain(places.map(|place| rows_via_helper_axis(kind, &place, direction).to_vec()))
@@ -249,26 +250,26 @@ fn candidate_rows(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f6
 /// next joint's origin is used.
 fn row_to_parallel_axis(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let meets = point.xy().norm() < LENGTH_TOLERANCE_M;
-    let theta_offset = if meets { 0.0 } else { within_quarter_turn(point.y.atan2(point.x)) };
+    let theta_offset = if meets { 0.0 } else { fold_to_quarter_turn(point.y.atan2(point.x)) };
     let alpha = if direction.z > 0.0 { 0.0 } else { PI };
-    DhRow { kind, a: along_x(point, theta_offset), alpha, d: point.z, theta_offset }.rounded()
+    DhRow { kind, a: x_after_rotation(point, theta_offset), alpha, d: point.z, theta_offset }.rounded()
 }
 
 /// Returns the row that leads along the common normal to an axis through `point`.
-fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
+fn row_along_common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let along = -point.xy().dot(&direction.xy()) / direction.xy().norm_squared();
-    let theta_offset = within_quarter_turn(direction.x.atan2(-direction.y));
+    let theta_offset = fold_to_quarter_turn(direction.x.atan2(-direction.y));
     // The component of the direction that is perpendicular to the new x axis.
     let (sine, cosine) = theta_offset.sin_cos();
     let alpha = (sine * direction.x - cosine * direction.y).atan2(direction.z);
     let d = point.z + along * direction.z;
-    DhRow { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.rounded()
+    DhRow { kind, a: x_after_rotation(point, theta_offset), alpha, d, theta_offset }.rounded()
 }
 
 /// Returns the x coordinate of a point after a rotation of the axes by `theta` about z. It is used as the length of the
 /// common normal, because the angle may have been rounded to a quarter turn: the row must lead to the point with the
 /// rounded angle.
-fn along_x(point: &Vector3<f64>, theta: f64) -> f64 {
+fn x_after_rotation(point: &Vector3<f64>, theta: f64) -> f64 {
     let (sine, cosine) = theta.sin_cos();
     point.x * cosine + point.y * sine
 }
@@ -278,15 +279,15 @@ fn along_x(point: &Vector3<f64>, theta: f64) -> f64 {
 /// small.
 fn rows_via_helper_axis(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [DhRow; 2] {
     let normal = Vector3::new(-direction.y, direction.x, 0.0).normalize();
-    let row = common_normal(kind, at, &normal);
+    let row = row_along_common_normal(kind, at, &normal);
     let frame = row.transform(0.0);
     let at = frame.inverse_transform_point(&Point3::from(*at)).coords;
-    let back = common_normal(RowKind::Fixed, &at, &frame.inverse_transform_vector(direction));
+    let back = row_along_common_normal(RowKind::Fixed, &at, &frame.inverse_transform_vector(direction));
     [row, back]
 }
 
 /// Returns an angle within [-pi/2, pi/2] in rad that describes the same or the opposite direction.
-fn within_quarter_turn(angle: f64) -> f64 {
+fn fold_to_quarter_turn(angle: f64) -> f64 {
     let angle = round_to_quarter_turn(angle);
     if angle.abs() <= FRAC_PI_2 { angle } else { angle - PI.copysign(angle) }
 }
@@ -299,8 +300,8 @@ fn round_to_quarter_turn(angle: f64) -> f64 {
 
 /// Returns the base of a skin's chain as an isometry.
 #[must_use]
-pub fn pose_of(base: &ChainBase) -> Isometry3<f64> {
-    let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();
+pub fn chain_base_pose(base: &ChainBase) -> Isometry3<f64> {
+    let turn = Matrix4::from(base.transform_matrix()).fixed_view::<3, 3>(0, 0).into_owned();
     let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(turn));
     Isometry3::from_parts(base.position.into(), turn)
 }

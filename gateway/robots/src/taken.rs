@@ -11,18 +11,18 @@ pub struct UniqueNames(BTreeSet<String>);
 impl UniqueNames {
     /// Returns a unique name for each requested one, in order. A name that is already in use, possibly by an earlier
     /// name of the list, gets a number: `name_2`.
-    pub fn assign_all(&mut self, requested: Vec<String>) -> Vec<String> {
+    pub fn assign_unique_names(&mut self, requested: Vec<String>) -> Vec<String> {
         let is_free: Vec<_> = requested.iter().map(|name| self.0.insert(name.clone())).collect();
         let numbered = requested.into_iter().zip(is_free);
-        numbered.map(|(name, is_free)| if is_free { name } else { self.add_numbered(&name) }).collect()
+        numbered.map(|(name, is_free)| if is_free { name } else { self.add_numbered_name(&name) }).collect()
     }
 
     /// Returns a unique name for the requested name, and records it as used.
     pub fn assign(&mut self, name: String) -> String {
-        if self.0.insert(name.clone()) { name } else { self.add_numbered(&name) }
+        if self.0.insert(name.clone()) { name } else { self.add_numbered_name(&name) }
     }
 
-    fn add_numbered(&mut self, name: &str) -> String {
+    fn add_numbered_name(&mut self, name: &str) -> String {
         let mut number = 2_u64;
         loop {
             let other = format!("{name}_{number}");
@@ -48,7 +48,7 @@ pub fn chain_prefixes(skin: &Skin) -> Vec<String> {
     if chains.len() < 2 {
         return vec![String::new(); chains.len()];
     }
-    UniqueNames::default().assign_all(chains.iter().map(|chain| sanitized(&chain.name)).collect())
+    UniqueNames::default().assign_unique_names(chains.iter().map(|chain| sanitized(&chain.name)).collect())
 }
 
 #[cfg(test)]
@@ -58,7 +58,7 @@ mod tests {
     #[test]
     fn a_taken_name_gets_a_number_that_is_free() {
         let mut taken = UniqueNames::default();
-        let given = taken.assign_all(["a", "b", "a", "a_2", "a"].map(str::to_owned).to_vec());
+        let given = taken.assign_unique_names(["a", "b", "a", "a_2", "a"].map(str::to_owned).to_vec());
         assert_eq!(given, ["a", "b", "a_3", "a_2", "a_4"]);
         assert_eq!([taken.assign("b".to_owned()), taken.assign("c".to_owned())], ["b_2", "c"]);
     }

@@ -12,7 +12,7 @@ use protocol::parameters::RowKind;
 use protocol::skin::{JointKind, Skin};
 use protocol::xml::escaped;
 
-use crate::rows::{DhRow, pose_of};
+use crate::rows::{DhRow, chain_base_pose};
 use crate::taken::chain_prefixes;
 
 /// Name of the link that is the base of all chains.
@@ -20,7 +20,7 @@ const BASE_LINK: &str = "base";
 /// Radius of the cylinders that stand for segments, in m.
 const SEGMENT_RADIUS_M: f64 = 0.04;
 /// Minimum length of a segment that is drawn, in m.
-const MIN_DRAWN_M: f64 = 1e-3;
+const MIN_DRAWN_LENGTH_M: f64 = 1e-3;
 /// The effort limit in Nm or N. URDF requires one, and a skin has none.
 const EFFORT_LIMIT: f64 = 1000.0;
 
@@ -48,11 +48,11 @@ impl Origin {
     }
 
     fn of_base(base: &protocol::skin::ChainBase) -> Self {
-        let pose = pose_of(base);
+        let pose = chain_base_pose(base);
         Self { xyz: pose.translation.vector.into(), rpy: pose.rotation.euler_angles().into() }
     }
 
-    fn xml(&self) -> String {
+    fn origin_xml(&self) -> String {
         format!("<origin xyz=\"{}\" rpy=\"{}\"/>", format_three(self.xyz), format_three(self.rpy))
     }
 }
@@ -95,7 +95,7 @@ pub fn write_urdf(skin: &Skin) -> WrittenUrdf {
             } else {
                 let fixed = moved.is_none().then(|| format!("_row{}", index + 1));
                 let link = format!("{prefix}link{number}{}", fixed.unwrap_or_default());
-                let joint = joint(skin, &joints, (parent, origin, moved), link.clone());
+                let joint = joint_to_write(skin, &joints, (parent, origin, moved), link.clone());
                 joints.push(joint);
                 link
             };
@@ -104,14 +104,14 @@ pub fn write_urdf(skin: &Skin) -> WrittenUrdf {
             }
             (parent, origin) = (link, Origin::from_row(&DhRow::from(row)));
         }
-        joints.push(joint(skin, &joints, (parent, origin, None), format!("{prefix}tip")));
+        joints.push(joint_to_write(skin, &joints, (parent, origin, None), format!("{prefix}tip")));
         links.push(of_chain);
     }
-    WrittenUrdf { xml: xml(&robot.name, &joints), links }
+    WrittenUrdf { xml: urdf_xml(&robot.name, &joints), links }
 }
 
 /// Returns the joint to write between a link and a new link.
-fn joint(
+fn joint_to_write(
     skin: &Skin,
     before: &[WrittenJoint],
     (parent, origin, moved): (String, Origin, Option<usize>),
@@ -147,7 +147,7 @@ fn joint(
     WrittenJoint { parent, origin, moved, link, name, kind, inner }
 }
 
-fn xml(name: &str, joints: &[WrittenJoint]) -> String {
+fn urdf_xml(name: &str, joints: &[WrittenJoint]) -> String {
     let name = escaped(if name.is_empty() { "robot" } else { name });
     let mut out = format!(
         "<?xml version=\"1.0\"?>\n<robot name=\"{name}\">\n  <material name=\"grey\"><color rgba=\"0.6 0.6 0.6 1\"/></material>\n"
@@ -166,7 +166,7 @@ fn xml(name: &str, joints: &[WrittenJoint]) -> String {
             out,
             "  <joint name=\"{name}\" type=\"{kind}\">\n    <parent link=\"{parent}\"/>\n    <child link=\"{link}\"/>\n    \
              {}\n{inner}  </joint>\n",
-            origin.xml()
+            origin.origin_xml()
         );
     }
     out.push_str("</robot>\n");
@@ -177,7 +177,7 @@ fn xml(name: &str, joints: &[WrittenJoint]) -> String {
 fn write_segment(out: &mut String, to: [f64; 3]) {
     let way = Vector3::from(to);
     let length = way.norm();
-    if length < MIN_DRAWN_M {
+    if length < MIN_DRAWN_LENGTH_M {
         return;
     }
     let turn = UnitQuaternion::rotation_between(&Vector3::z(), &way)
@@ -187,7 +187,7 @@ fn write_segment(out: &mut String, to: [f64; 3]) {
 }
 
 fn write_shape(out: &mut String, xyz: [f64; 3], rpy: [f64; 3], geometry: &str) {
-    let origin = Origin { xyz, rpy }.xml();
+    let origin = Origin { xyz, rpy }.origin_xml();
     let _ = writeln!(
         out,
         "    <visual>{origin}<geometry>{geometry}</geometry><material name=\"grey\"/></visual>"

@@ -4,14 +4,14 @@ use std::path::Path;
 
 use calibration::Calibration;
 use protocol::skin::Skin;
-use view::{MovedCell, Scene};
+use view::{PreviousCellPlace, Scene};
 
-use crate::skin::still_view;
+use crate::skin::still_page;
 use crate::visuals::PackageOptions;
 
 /// Returns the HTML page, which shows the cells at the positions found, each with a line from the position that the
 /// skin describes.
-pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> String {
+pub(super) fn calibration_page(file: &Path, skin: &Skin, calibration: &Calibration) -> String {
     let mut found = skin.clone();
     for (cell, result) in found.cells.iter_mut().zip(&calibration.cells) {
         let Some(pose) = result.found.filter(|_| result.is_pose_written()) else { continue };
@@ -20,13 +20,13 @@ pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> Strin
         cell.orientation = Some(pose.orientation);
         cell.normal = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)];
     }
-    let mut still = still_view(file, &found, &PackageOptions::beside_urdf());
+    let mut still = still_page(file, &found, &PackageOptions::search_beside_urdf());
     let described = Scene::from_skin(skin, false);
     for (index, (old, result)) in described.cells.into_iter().zip(&calibration.cells).enumerate() {
         let chain = described.buses.get(old.bus).map_or(0, |bus| bus.chain);
         if result.found.is_some_and(|_| result.is_pose_written()) {
             let (position, normal) = (old.position, old.normal);
-            still.moved.push(MovedCell { cell: index, chain, row: old.row, position, normal });
+            still.moved.push(PreviousCellPlace { cell: index, chain, row: old.row, position, normal });
         }
         let Some(details) = still.details.get_mut(index) else { continue };
         let mut detail = |name: &str, value: String| details.push((name.to_owned(), value));

@@ -14,7 +14,7 @@ use protocol::time::Micros;
 use rustix::termios::tcgetwinsize;
 use serde::Serialize;
 
-use crate::print::{abbreviated, drop_empty_columns, space_separated};
+use crate::print::{abbreviate_names, drop_empty_columns, space_separated};
 
 /// A bus as a skin describes it, for comparison with the cells found.
 pub(super) struct DescribedBus {
@@ -28,12 +28,12 @@ pub(super) struct DescribedBus {
 type Column = (&'static str, fn(&DisplayedCell) -> Option<String>);
 
 const COLUMNS: [Column; 10] = [
-    ("cell", |it| text(Some(it.node))),
-    ("serial", |it| text(it.serial)),
+    ("cell", |it| optional_text(Some(it.node))),
+    ("serial", |it| optional_text(it.serial)),
     ("state", DisplayedCell::state),
-    ("joint", |it| text(it.joint)),
+    ("joint", |it| optional_text(it.joint)),
     ("up", |it| it.tree.as_ref().map(DisplayedTree::parent_text)),
-    ("depth", |it| text(it.tree.as_ref()?.depth)),
+    ("depth", |it| optional_text(it.tree.as_ref()?.depth)),
     ("ports", |it| {
         it.ports.as_ref().map(|ports| space_separated(ports.iter().map(DisplayedPort::neighbour_text)))
     }),
@@ -43,22 +43,22 @@ const COLUMNS: [Column; 10] = [
 ];
 
 /// Columns that are shown on wide terminals only.
-const COUNTERS: [Column; 9] = [
-    ("sent", |it| text(it.sent)),
-    ("refused", |it| text(it.refused)),
-    ("joints", |it| text(it.heard.map(|it| it.joints))),
-    ("late", |it| text(it.heard.map(|it| it.joints_late))),
-    ("torques", |it| text(it.heard.map(|it| it.torques))),
-    ("stimuli", |it| text(it.heard.map(|it| it.stimuli))),
-    ("sums", |it| text(it.tree.as_ref().map(|it| it.sums_sent))),
-    ("taken", |it| text(it.tree.as_ref().map(|it| it.sums_taken))),
-    ("dropped", |it| text(it.tree.as_ref().map(|it| it.sums_dropped))),
+const COUNTER_COLUMNS: [Column; 9] = [
+    ("sent", |it| optional_text(it.sent)),
+    ("refused", |it| optional_text(it.refused)),
+    ("joints", |it| optional_text(it.heard.map(|it| it.joints))),
+    ("late", |it| optional_text(it.heard.map(|it| it.joints_late))),
+    ("torques", |it| optional_text(it.heard.map(|it| it.torques))),
+    ("stimuli", |it| optional_text(it.heard.map(|it| it.stimuli))),
+    ("sums", |it| optional_text(it.tree.as_ref().map(|it| it.sums_sent))),
+    ("taken", |it| optional_text(it.tree.as_ref().map(|it| it.sums_taken))),
+    ("dropped", |it| optional_text(it.tree.as_ref().map(|it| it.sums_dropped))),
 ];
 
 /// Columns with text instead of numbers.
 const TEXT_COLUMNS: [&str; 3] = ["state", "ports", "skin"];
 
-fn text(value: Option<impl Display>) -> Option<String> {
+fn optional_text(value: Option<impl Display>) -> Option<String> {
     value.map(|value| value.to_string())
 }
 
@@ -100,12 +100,12 @@ impl<'a> CellList<'a> {
     /// Formats a table with one line per cell, and the anomalies below. The counters are left out if the terminal is
     /// too narrow.
     pub(super) fn table(&self) -> String {
-        let whole = self.lines(COLUMNS.into_iter().chain(COUNTERS));
+        let whole = self.lines(COLUMNS.into_iter().chain(COUNTER_COLUMNS));
         let text = match Table::new().width() {
             Some(wide) if width(&whole) > usize::from(wide) => self.lines(COLUMNS),
             _ => whole,
         };
-        text + &self.totals()
+        text + &self.format_totals()
     }
 
     /// Formats one line per cell, without empty columns.
@@ -124,7 +124,7 @@ impl<'a> CellList<'a> {
     }
 
     /// Formats the counts and anomalies below the table.
-    fn totals(&self) -> String {
+    fn format_totals(&self) -> String {
         let mut text = format!("{} cells on {} ({})", self.cells.len(), self.bus, self.kind);
         let active = self.cells.iter().filter(|cell| cell.has_state("active")).count();
         let bare = self.cells.iter().filter(|cell| cell.configured == Some(false)).count();
@@ -140,11 +140,11 @@ impl<'a> CellList<'a> {
         });
         let shared: Vec<_> = shared.collect();
         if !shared.is_empty() {
-            text += &format!("node ids used by two cells: {}\n", abbreviated(&shared));
+            text += &format!("node ids used by two cells: {}\n", abbreviate_names(&shared));
         }
         let missing: Vec<_> = self.missing.iter().flatten().map(u8::to_string).collect();
         if !missing.is_empty() {
-            text += &format!("missing cells of {}: {}\n", self.file, abbreviated(&missing));
+            text += &format!("missing cells of {}: {}\n", self.file, abbreviate_names(&missing));
         }
         text
     }
@@ -160,7 +160,7 @@ impl DescribedBus {
     }
 
     /// Returns how a cell differs from its description, or agrees with it, as text.
-    fn compare(&self, node: u8, heartbeat: &Heartbeat) -> Option<String> {
+    fn compare_cell(&self, node: u8, heartbeat: &Heartbeat) -> Option<String> {
         let Some((described, hash)) = self.cells.get(&heartbeat.serial) else {
             return Some("unknown".to_owned());
         };
@@ -179,7 +179,7 @@ fn width(text: &str) -> usize {
 }
 
 /// Returns the text that redraws the terminal from the top. Lines that do not fit are dropped.
-pub(super) fn redraw(text: &str) -> String {
+pub(super) fn terminal_redraw_text(text: &str) -> String {
     let rows = tcgetwinsize(std::io::stdout()).map_or(0, |size| usize::from(size.ws_row));
     let all = text.lines().count();
     let shown = if rows > 2 && all >= rows { rows - 2 } else { all };
@@ -218,7 +218,7 @@ impl DisplayedCell {
         let beat = cell.heartbeat.as_ref();
         let configured = beat.filter(|it| it.state.has(State::CONFIGURED));
         #[expect(clippy::cast_precision_loss, reason = "seconds, to the ms, which is what it is known to")]
-        let age_s = (cell.age(now).0 as f64 / 1e3).round() / 1e3;
+        let age_s = (cell.time_since_last_packet(now).0 as f64 / 1e3).round() / 1e3;
         Self {
             node,
             age_s,
@@ -228,7 +228,7 @@ impl DisplayedCell {
             joint: configured.map(|it| it.state.joint()),
             version: beat.map(|it| it.state.version()),
             hash: configured.map(|it| format!("{:04X}", it.configuration)),
-            skin: known.and_then(|known| known.compare(node, beat?)),
+            skin: known.and_then(|known| known.compare_cell(node, beat?)),
             sent: beat.map(|it| it.sent),
             refused: beat.map(|it| it.rejected),
             heard: cell.pages.received,

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use bench::processes::groups;
+use bench::processes::group_consecutive;
 use bench::run::RunError;
 use model::scenario::{
     BusFault, FaultKind, ForceErrors, ForceProfile, MotionKind, Scenario as Description, SensorFault,
@@ -14,11 +14,12 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 use crate::print::{
-    comma_separated, count_with_noun, decimals, json as pretty, or_else_text, space_separated, table,
+    comma_separated, count_with_noun, format_decimals, or_else_text, space_separated, table,
+    to_pretty_json as pretty,
 };
 
 /// Maximum number of values listed one by one.
-const MAX_LISTED: usize = 8;
+const MAX_LISTED_VALUES: usize = 8;
 
 /// Checks the text of a scenario file against a skin, and describes the scenario.
 ///
@@ -29,10 +30,11 @@ pub(super) fn describe_scenario(
     skin: &Skin,
     as_json: bool,
 ) -> Result<(String, Option<Failure>), Failure> {
-    let scenario = Description::parse(&file.display().to_string(), text, skin).map_err(Failure::usage)?;
-    let refused = RunError::bus_fault(&scenario, skin).map(Failure::usage);
+    let scenario =
+        Description::parse(&file.display().to_string(), text, skin).map_err(Failure::usage_error)?;
+    let refused = RunError::bus_fault(&scenario, skin).map(Failure::usage_error);
     let plan = ScenarioPlan::from_scenario(&scenario, skin);
-    let text = if as_json { pretty(&plan)? } else { plan.text(&file.display().to_string()) };
+    let text = if as_json { pretty(&plan)? } else { plan.to_text(&file.display().to_string()) };
     Ok((text, refused))
 }
 
@@ -132,7 +134,8 @@ impl ScenarioPlan {
         };
         let (duration_s, seed) = (scenario.duration.seconds(), scenario.seed);
         let remarks = scenario.warnings(skin);
-        let errors = errors(&scenario.sensors.force).into_iter().filter(|(_, error)| *error > 0.0);
+        let errors =
+            named_force_errors(&scenario.sensors.force).into_iter().filter(|(_, error)| *error > 0.0);
         let mut sensors: Map<_, _> = errors.map(|(key, error)| (key.to_owned(), json!(error))).collect();
         let temperature = scenario.sensors.temperature.iter().map(|(at, degrees)| [seconds(*at), *degrees]);
         let temperature: Vec<_> = temperature.collect();
@@ -147,7 +150,7 @@ impl ScenarioPlan {
         Self { skin, duration_s, touches_repeat_s, seed, motion, events, sensors, remarks }
     }
 
-    fn text(&self, file: &str) -> String {
+    fn to_text(&self, file: &str) -> String {
         let Self { skin, duration_s, touches_repeat_s, seed, motion, events, sensors, remarks } = self;
         let moves = match motion.kind {
             "hold" => "the robot stays at",
@@ -182,7 +185,7 @@ impl ScenarioPlan {
         if events.is_empty() {
             return head + "no touches and no faults\n" + &remarks;
         }
-        let rows = events.iter().map(PlannedEvent::row);
+        let rows = events.iter().map(PlannedEvent::table_row);
         head + &format!(
             "{}\n{remarks}",
             table(["at s", "for s", "what", "bus", "cells", "how"], rows, |column| column < 2)
@@ -191,16 +194,17 @@ impl ScenarioPlan {
 }
 
 impl PlannedEvent {
-    fn row(&self) -> Vec<String> {
+    fn table_row(&self) -> Vec<String> {
         let mut nodes = self.cells.clone();
         nodes.sort_unstable();
-        let runs = groups(&nodes, nodes.len()).into_iter().map(|(first, last)| match first == last {
-            true => first.to_string(),
-            false => format!("{first}-{last}"),
-        });
+        let runs =
+            group_consecutive(&nodes, nodes.len()).into_iter().map(|(first, last)| match first == last {
+                true => first.to_string(),
+                false => format!("{first}-{last}"),
+            });
         vec![
-            decimals(Some(self.at_s), 3, ""),
-            decimals(self.for_s, 3, ""),
+            format_decimals(Some(self.at_s), 3, ""),
+            format_decimals(self.for_s, 3, ""),
             self.what.to_owned(),
             or_else_text(self.bus.as_ref(), ""),
             space_separated(runs),
@@ -235,7 +239,7 @@ fn cell_events(
 }
 
 /// Returns the errors of the force sensors, by the file's keys.
-const fn errors(errors: &ForceErrors) -> [(&'static str, f64); 9] {
+const fn named_force_errors(errors: &ForceErrors) -> [(&'static str, f64); 9] {
     [
         ("offset_n", errors.offset_n),
         ("gain", errors.gain),
@@ -301,7 +305,7 @@ fn parameters_text(how: &Map<String, Value>) -> String {
     let words_of = |value: &Value| match value {
         Value::String(text) => text.clone(),
         Value::Array(values) => match values.as_slice() {
-            [first, second, .., last] if values.len() > MAX_LISTED => {
+            [first, second, .., last] if values.len() > MAX_LISTED_VALUES => {
                 format!("{first} {second} ... {last} ({} in all)", values.len())
             }
             few => space_separated(few),

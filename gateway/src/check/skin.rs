@@ -24,7 +24,7 @@ pub(super) enum ListedCells<'a> {
 }
 
 /// Checks a skin and its URDF as a run with a recording does. Returns the summary.
-pub(super) fn summary(
+pub(super) fn check_and_summarize(
     file: &Path,
     skin: &Skin,
     listed: ListedCells<'_>,
@@ -36,19 +36,19 @@ pub(super) fn summary(
     let is_listed = |cell: &&Cell| match listed {
         ListedCells::None => false,
         ListedCells::All => true,
-        ListedCells::Only(named) => named.fits(bus_name(skin, cell), cell.node),
+        ListedCells::Only(named) => named.matches_cell(bus_name(skin, cell), cell.node),
     };
     let cells: Vec<_> = skin.cells.iter().filter(is_listed).collect();
     if let ListedCells::Only(named) = listed
         && cells.is_empty()
     {
         let (file, buses) = (file.display(), comma_separated(bus_names(skin)));
-        return Err(Failure::usage(format!(
+        return Err(Failure::usage_error(format!(
             "--cell {named}: {file} does not have this cell on {buses}; --list lists all cells"
         )));
     }
     if as_json {
-        return crate::print::json(&skin_json(file, skin, &cells));
+        return crate::print::to_pretty_json(&skin_json(file, skin, &cells));
     }
     let lines: String = cells.iter().map(|cell| cell_line(skin, cell)).collect();
     Ok(if let ListedCells::Only(_) = listed { lines } else { describe(skin) + &lines })
@@ -179,7 +179,7 @@ fn rounded_normal(normal: &[f64; 3]) -> [f64; 3] {
 
 /// Returns a hash over the parameters of all cells.
 fn hash(skin: &Skin) -> u16 {
-    let images: Vec<u8> = skin.cells.iter().flat_map(|cell| skin.parameters(cell).image()).collect();
+    let images: Vec<u8> = skin.cells.iter().flat_map(|cell| skin.parameters(cell).encode_image()).collect();
     crc16(&images)
 }
 

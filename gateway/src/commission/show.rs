@@ -8,7 +8,7 @@ use protocol::id::CellId;
 use protocol::usage::Failure;
 use serde::Serialize;
 
-use crate::print::{KeyValueTable, abbreviated, count_with_noun};
+use crate::print::{KeyValueTable, abbreviate_names, count_with_noun};
 
 /// Maximum number of cells with other node ids that get a line each.
 const MAX_CELL_LINES: usize = 8;
@@ -81,11 +81,11 @@ impl<'a> DisplayedBus<'a> {
         };
         rows.add_section(format!("{} ({})", self.name, self.kind), cells, others);
         let compared = "read back, and compared word by word";
-        rows.row_unless_zero("written", self.written, compared);
-        rows.row_unless_zero("already so", self.already_so, "by their hash; --verify reads them back");
-        rows.row_unless_zero("already so, verified", self.verified, compared);
-        rows.row_unless_zero("would be written", self.would_write, "");
-        rows.row_unless_zero("failed", self.failed, "");
+        rows.add_row_unless_zero("written", self.written, compared);
+        rows.add_row_unless_zero("already so", self.already_so, "by their hash; --verify reads them back");
+        rows.add_row_unless_zero("already so, verified", self.verified, compared);
+        rows.add_row_unless_zero("would be written", self.would_write, "");
+        rows.add_row_unless_zero("failed", self.failed, "");
         // One row for each reason, whatever the number of cells.
         let mut reasons = BTreeMap::<String, Vec<String>>::new();
         for cell in self.cells {
@@ -94,19 +94,19 @@ impl<'a> DisplayedBus<'a> {
             }
         }
         for (why, cells) in reasons {
-            rows.add_row(format!("  {}", abbreviated(&cells)), why, "");
+            rows.add_row(format!("  {}", abbreviate_names(&cells)), why, "");
         }
         if let Some(failure) = &self.failure {
             rows.add_row("ended", failure, "");
         }
         let moved = self.renumbered_cells().count();
-        rows.row_unless_zero(
+        rows.add_row_unless_zero(
             "with another node id",
             moved,
             "than in the description; --node-ids writes a copy",
         );
-        rows.row_unless_zero("requests", self.requests, format!("{} retries", self.repeated));
-        rows.row_unless_zero("frames lost", self.frames_dropped, "they came faster than they were read");
+        rows.add_row_unless_zero("requests", self.requests, format!("{} retries", self.repeated));
+        rows.add_row_unless_zero("frames lost", self.frames_dropped, "they came faster than they were read");
     }
 }
 
@@ -127,7 +127,7 @@ impl CommissionResult<'_> {
                 }
             }
             if !unknown_nodes.is_empty() {
-                let unknown_nodes = abbreviated(&unknown_nodes);
+                let unknown_nodes = abbreviate_names(&unknown_nodes);
                 notes.push(format!("cells on {name} that are not in {file}, left alone: {unknown_nodes}"));
             }
             notes.extend(elsewhere);
@@ -166,14 +166,16 @@ impl CommissionResult<'_> {
         let are = if failed == 1 { "is" } else { "are" };
         let what = format!("{failed} of {cells} cells {are} not commissioned");
         if let Some(failure) = self.buses.iter().find_map(|bus| bus.failure) {
-            return Err(Failure::run(format!("{failure}; {what}")));
+            return Err(Failure::run_error(format!("{failure}; {what}")));
         }
         match (self.interrupted, failed) {
             (_, 0) => Ok(()),
-            (true, _) => Err(Failure::run(format!("interrupted: {what}; run the command again to continue"))),
-            (false, _) => {
-                Err(Failure::run(format!("{what}: see the table, fix the causes and run the command again")))
+            (true, _) => {
+                Err(Failure::run_error(format!("interrupted: {what}; run the command again to continue")))
             }
+            (false, _) => Err(Failure::run_error(format!(
+                "{what}: see the table, fix the causes and run the command again"
+            ))),
         }
     }
 }

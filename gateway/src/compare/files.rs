@@ -13,7 +13,7 @@ use trace::capture::{CaptureEntry, Reader};
 /// Finds the parts of a recording after the first file: `run-1.mcap`, `run-2.mcap` after `run.mcap`.
 pub(super) fn recording_parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
     if first.is_dir() {
-        return Err(Failure::usage(format!(
+        return Err(Failure::usage_error(format!(
             "{} is a directory: name a candump log or an MCAP recording",
             first.display()
         )));
@@ -22,14 +22,14 @@ pub(super) fn recording_parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
     if !can_be_read_again(first) {
         return Ok(files);
     }
-    let Some((began, 0)) = recording_part(first) else { return Ok(files) };
+    let Some((began, 0)) = recording_start_and_part(first) else { return Ok(files) };
     let (Some(stem), Some(end)) = (first.file_stem(), first.extension()) else { return Ok(files) };
     for number in 1_u32.. {
         let mut name = stem.to_owned();
         name.push(format!("-{number}."));
         name.push(end);
         let next = first.with_file_name(name);
-        if recording_part(&next).is_none_or(|part| part != (began.clone(), number)) {
+        if recording_start_and_part(&next).is_none_or(|part| part != (began.clone(), number)) {
             break;
         }
         files.push(next);
@@ -38,7 +38,7 @@ pub(super) fn recording_parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
 }
 
 /// Returns the start of a recording, by its metadata, and the number of the part that a file holds.
-fn recording_part(file: &Path) -> Option<(String, u32)> {
+fn recording_start_and_part(file: &Path) -> Option<(String, u32)> {
     let reader = can_be_read_again(file).then(|| Reader::open(file).ok()).flatten()?;
     let fact = |record, key| reader.extras().metadata_value(record, key).map(str::to_owned);
     Some((fact("program", "began_ns")?, fact("part", "number")?.parse().ok()?))
@@ -46,7 +46,7 @@ fn recording_part(file: &Path) -> Option<(String, u32)> {
 
 /// Returns for each capture the number of its first joints within the run. Reads a capture that starts in the middle of
 /// a run once more for that, if it can be read twice.
-pub(super) fn first_numbers(
+pub(super) fn first_joints_numbers(
     files: &PerCapture<Vec<PathBuf>>,
     skin: &Skin,
 ) -> Result<PerCapture<Option<u64>>, Failure> {
@@ -55,15 +55,17 @@ pub(super) fn first_numbers(
         return Ok(unknown);
     }
     let begins = |files: &[PathBuf]| {
-        let is_later =
-            files.first().and_then(|first| recording_part(first)).is_some_and(|(_, number)| number > 0);
-        !is_later && read_joints(files, skin, true).is_none_or(|trace| trace.first() == Some(0))
+        let is_later = files
+            .first()
+            .and_then(|first| recording_start_and_part(first))
+            .is_some_and(|(_, number)| number > 0);
+        !is_later && read_joints(files, skin, true).is_none_or(|trace| trace.first_epoch() == Some(0))
     };
     if begins(&files.a) && begins(&files.b) {
         return Ok(unknown);
     }
     let both = read_joints(&files.a, skin, false).zip(read_joints(&files.b, skin, false));
-    Ok(both.map_or(unknown, |(a, b)| compare::start_numbers(&a, &b)))
+    Ok(both.map_or(unknown, |(a, b)| compare::first_joints_numbers(&a, &b)))
 }
 
 /// Reads the joints of a capture, or only the first. Errors are reported later, when it is compared.
@@ -76,9 +78,9 @@ fn read_joints(files: &[PathBuf], skin: &Skin, is_first_enough: bool) -> Option<
         let nanos = record.time.nanos;
         let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
         if let Some(message) = decoded.message() {
-            trace.record(nanos, record.interface, message);
+            trace.record_message(nanos, record.interface, message);
         }
-        if is_first_enough && trace.first().is_some() {
+        if is_first_enough && trace.first_epoch().is_some() {
             break;
         }
     }

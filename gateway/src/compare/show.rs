@@ -5,18 +5,21 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use analysis::compare::{
-    ASPECTS, CaptureFigures, CaptureSide, CellRow, CompareReport, FirstDifference, PerCapture, ReplyCounts,
+    COMPARED_ASPECTS, CaptureFigures, CaptureSide, CompareReport, ComparedCellRow, FirstDifference,
+    PerCapture, ReplyCounts,
 };
 use model::quantiles::Quantiles;
 use protocol::usage::printable;
 
 use crate::junit::{Outcome, TestCase, TestSuite};
-use crate::print::{abbreviated, comma_separated, count_with_noun, decimals, or_else_text, table};
+use crate::print::{
+    abbreviate_names, comma_separated, count_with_noun, format_decimals, or_else_text, table,
+};
 
 /// Width of the tables in columns.
 const TABLE_WIDTH: u16 = 80;
 /// Maximum number of cells in the table.
-const MAX_CELLS: usize = 8;
+const MAX_LISTED_CELLS: usize = 8;
 
 /// Description of one of the compared captures: its name, its format and its files.
 #[derive(Debug)]
@@ -43,7 +46,7 @@ impl ComparisonText<'_> {
             let _ = writeln!(text, "{letter}  {} ({})", printable(about.name), about.format);
         }
         text += &self.table();
-        text += &self.cells();
+        text += &self.differing_cells_text();
         if let Some(first) = &self.report.first {
             text += &self.first_difference_text(first);
         }
@@ -104,7 +107,7 @@ impl ComparisonText<'_> {
                 row(name, a.to_string(), b.to_string(), both.to_owned());
             }
         }
-        row("last epoch, s", decimals(a.last_s, 3, "-"), decimals(b.last_s, 3, "-"), none());
+        row("last epoch, s", format_decimals(a.last_s, 3, "-"), format_decimals(b.last_s, 3, "-"), none());
         let only_joints = ReplyCounts {
             equal: joints.equal,
             tolerated: joints.tolerated,
@@ -123,13 +126,13 @@ impl ComparisonText<'_> {
                 continue;
             }
             row(name, a.to_string(), b.to_string(), replies_text(replies));
-            if replies.missing() > 0 {
+            if replies.missing_count() > 0 {
                 let [a, b] = [replies.missing_in_a, replies.missing_in_b].map(|it| it.to_string());
                 row("  missing", a, b, "the other has them".to_owned());
             }
         }
         let at = |of: fn(&Quantiles) -> f64, source: &CaptureFigures| {
-            decimals(source.reply_us.as_ref().map(of), 0, "-")
+            format_decimals(source.reply_us.as_ref().map(of), 0, "-")
         };
         let information = || "information only".to_owned();
         row("reply, 50 %, µs", at(|it| it.p50, a), at(|it| it.p50, b), information());
@@ -154,14 +157,14 @@ impl ComparisonText<'_> {
     }
 
     /// Formats the table of cells that differ, and the names of cells that only one capture has.
-    fn cells(&self) -> String {
-        let differs = |row: &&CellRow| row.replies.different + row.replies.missing() > 0;
+    fn differing_cells_text(&self) -> String {
+        let differs = |row: &&ComparedCellRow| row.replies.different + row.replies.missing_count() > 0;
         let mut cells: Vec<_> = self.report.cells.iter().filter(differs).collect();
         let total = cells.len();
-        cells.sort_by_key(|row| std::cmp::Reverse(row.replies.different + row.replies.missing()));
+        cells.sort_by_key(|row| std::cmp::Reverse(row.replies.different + row.replies.missing_count()));
         let mut text = String::new();
         if total > 0 {
-            let rows = cells.iter().take(MAX_CELLS).map(|row| {
+            let rows = cells.iter().take(MAX_LISTED_CELLS).map(|row| {
                 let ReplyCounts { different, missing_in_a, missing_in_b, max_steps, .. } = row.replies;
                 let numbers = [different, u64::from(max_steps), missing_in_a, missing_in_b];
                 let name = format!("{}:{}", row.bus, row.node);
@@ -173,11 +176,11 @@ impl ComparisonText<'_> {
                 table.set_width(TABLE_WIDTH);
             }
             let _ = writeln!(text, "{table}");
-            if total > MAX_CELLS {
+            if total > MAX_LISTED_CELLS {
                 let _ = writeln!(
                     text,
                     "and {}; --json has all",
-                    count_with_noun(total - MAX_CELLS, "further cell")
+                    count_with_noun(total - MAX_LISTED_CELLS, "further cell")
                 );
             }
         }
@@ -185,7 +188,7 @@ impl ComparisonText<'_> {
             let cells = self.report.extra_cells.iter().filter(|cell| cell.only_in == only_in);
             let names: Vec<_> = cells.map(|cell| format!("{}:{}", cell.bus, cell.node)).collect();
             if !names.is_empty() {
-                let _ = writeln!(text, "only {letter} has {}", printable(&abbreviated(&names)));
+                let _ = writeln!(text, "only {letter} has {}", printable(&abbreviate_names(&names)));
             }
         }
         text
@@ -285,7 +288,7 @@ impl ComparisonText<'_> {
     pub(super) fn junit(&self, took: Duration) -> TestSuite {
         let first =
             self.report.first.as_ref().map(|first| self.first_difference_text(first)).unwrap_or_default();
-        let cases = ASPECTS.into_iter().map(|aspect| {
+        let cases = COMPARED_ASPECTS.into_iter().map(|aspect| {
             let outcome = match self.report.differs.contains(&aspect) {
                 false => Outcome::Passed,
                 true => Outcome::Failed { message: self.failure_text(aspect), text: first.clone() },

@@ -132,7 +132,7 @@ impl GrowingCapture {
     }
 
     /// Returns text that names the file which holds the entries so far.
-    pub(super) fn remaining_file(&self) -> String {
+    pub(super) fn remaining_file_text(&self) -> String {
         match &self.part {
             Some(_) => {
                 let part = format!("{}.part", self.path.display());
@@ -144,7 +144,7 @@ impl GrowingCapture {
 
     /// Finishes the file, and gives a recording its name.
     pub(super) fn finish(mut self) -> io::Result<()> {
-        let ended = self.end_output(|state| {
+        let ended = self.end_thread_and_output(|state| {
             state.output.finish()?;
             Ok(())
         });
@@ -158,15 +158,15 @@ impl GrowingCapture {
     }
 
     /// Closes the unfinished file, which keeps the entries written so far.
-    pub(super) fn close(mut self) {
+    pub(super) fn close_unfinished(mut self) {
         // The reason why the conversion ended has been reported already.
-        let _ = self.end_output(|state| state.output.flush_all());
+        let _ = self.end_thread_and_output(|state| state.output.flush_all());
     }
 
     /// Closes the output, and removes its file unless it is a former file that was to be overwritten.
     pub(super) fn discard(mut self) {
         let is_there = self.part.is_some() || self.meeting.with_state(|_| Ok(())).is_ok();
-        let _ = self.end_output(|_| Ok(()));
+        let _ = self.end_thread_and_output(|_| Ok(()));
         match &self.part {
             Some((part, _)) => part.remove(),
             // The former file is replaced only when the first line is written, so before that it must stay.
@@ -176,7 +176,10 @@ impl GrowingCapture {
     }
 
     /// Ends the writing thread, then the output by calling `end`.
-    fn end_output(&mut self, end: impl FnOnce(&mut OutputState) -> io::Result<()>) -> io::Result<()> {
+    fn end_thread_and_output(
+        &mut self,
+        end: impl FnOnce(&mut OutputState) -> io::Result<()>,
+    ) -> io::Result<()> {
         let ended = self.meeting.with_state(|state| {
             state.is_over = true;
             end(state)

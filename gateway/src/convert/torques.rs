@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::Path;
 
-use analysis::explain::series::{EpochTorque, SeriesError, each_epoch, is_summed};
+use analysis::explain::series::{EpochSeriesError, EpochTorque, for_each_epoch, is_summed};
 use csv::{Writer, WriterBuilder};
 use protocol::skin::{Skin, SkinReply};
 use trace::capture::{Reader, seconds_since};
@@ -17,31 +17,32 @@ pub(super) fn is_csv(path: &Path) -> bool {
 }
 
 /// Writes a row for each epoch. Returns the number of epochs, and the counts of unreadable and lost items.
-pub(super) fn write(
+pub(super) fn write_torque_rows(
     reader: &mut Reader,
     skin: &Skin,
     out: impl Write,
-) -> Result<(u64, LossCounts), SeriesError<csv::Error>> {
+) -> Result<(u64, LossCounts), EpochSeriesError<csv::Error>> {
     let summed = (0..skin.robot.joints.len()).map(|joint| is_summed(skin, joint)).collect();
     let mut rows = TorqueRows { summed, out: WriterBuilder::new().from_writer(out) };
-    rows.out.write_record(header(skin)).map_err(SeriesError::Consumer)?;
+    rows.out.write_record(csv_header(skin)).map_err(EpochSeriesError::Consumer)?;
     let mut missing = LossCounts::default();
-    let done = each_epoch(reader, skin, |note| missing.count(note), |first, epoch| rows.write(first, epoch));
+    let done =
+        for_each_epoch(reader, skin, |note| missing.count(note), |first, epoch| rows.write_row(first, epoch));
     let epochs = done?.epochs;
-    rows.out.flush().map_err(|error| SeriesError::Consumer(error.into()))?;
+    rows.out.flush().map_err(|error| EpochSeriesError::Consumer(error.into()))?;
     Ok((epochs, missing))
 }
 
 /// Returns the names of the buses whose cells answer with sums, which do not contain the torques of single cells.
 /// Returns `None` if there are no such buses.
-pub(super) fn summed_buses(skin: &Skin) -> Option<String> {
+pub(super) fn buses_with_sums(skin: &Skin) -> Option<String> {
     let summed = skin.buses.iter().filter(|bus| bus.reply != SkinReply::Torque).map(|bus| bus.name.clone());
     let summed: Vec<_> = summed.collect();
     (!summed.is_empty()).then(|| comma_separated(summed))
 }
 
 /// Returns the names of the columns, with units.
-fn header(skin: &Skin) -> Vec<String> {
+fn csv_header(skin: &Skin) -> Vec<String> {
     let joints = skin.robot.joints.iter().flat_map(|joint| {
         let (name, unit, torque) = (&joint.name, joint.kind.unit(), joint.kind.torque_unit());
         [
@@ -68,7 +69,7 @@ struct TorqueRows<W: Write> {
 
 impl<W: Write> TorqueRows<W> {
     /// Writes a row with the torques that `skinbus explain` shows. Seconds count from `zero`, in ns since 1970.
-    fn write(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
+    fn write_row(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
         let EpochTorque { at_ns, epoch, positions, explanation } = epoch;
         let seconds = seconds_since(zero, *at_ns);
         let mut row = vec![format!("{seconds:.9}"), epoch.to_string()];
@@ -82,7 +83,7 @@ impl<W: Write> TorqueRows<W> {
                 of_words(total.difference_nm),
             ]);
         }
-        let most = |count: fn(&analysis::explain::JointTotal) -> u32| {
+        let most = |count: fn(&analysis::explain::JointTorqueTotal) -> u32| {
             explanation.total.iter().map(count).max().unwrap_or_default().to_string()
         };
         row.extend([most(|total| total.open), most(|total| total.saturated)]);

@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use std::sync::Arc;
 
 use analysis::explain::other_robot_text;
-use analysis::stats::{Stats, StatsReport};
+use analysis::stats::{CaptureStats, StatsReport};
 use model::decode::pick::FrameFilter;
 use model::decode::settle::OrderedDecoder;
 use model::decode::{Decoded, json};
@@ -14,13 +14,13 @@ use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
 use protocol::id::Kind;
 use protocol::message::Message;
-use protocol::schema::Units;
+use protocol::schema::BusUnits;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use protocol::usage::printable;
 
 use crate::output::print_note;
-use crate::print::{GREEN, PLAIN, RED, YELLOW, comma_separated, escape_controls};
+use crate::print::{GREEN, RED, RESET_COLOUR, YELLOW, comma_separated, escape_controls};
 
 /// Colours of a terminal.
 const DIM: &str = "\x1b[2m";
@@ -37,14 +37,14 @@ pub(super) enum OutputStyle {
     /// One JSON object per frame.
     Json,
     /// No lines; statistics at the end.
-    Stats(Box<Stats>),
+    Stats(Box<CaptureStats>),
 }
 
 /// A frame that waits for the rest of its packet before it can be decoded.
 struct PendingFrame {
     time: Timestamp,
     bus: Arc<str>,
-    units: Units,
+    units: BusUnits,
     frame: Frame,
     direction: Option<Direction>,
 }
@@ -55,9 +55,9 @@ pub(super) struct FrameOutput<W> {
     settler: OrderedDecoder<PendingFrame>,
     /// Bus of the last frame, with its units.
     bus: Arc<str>,
-    units: Units,
+    units: BusUnits,
     /// Buses that a skin describes, with their units and the numbers of their chains' joints.
-    described: Vec<(String, Units, usize)>,
+    described: Vec<(String, BusUnits, usize)>,
     pick: FrameFilter,
     /// True if only traffic of touches is shown.
     contact: bool,
@@ -86,7 +86,7 @@ impl<W: Write> FrameOutput<W> {
             settler: OrderedDecoder::new(format),
             absent,
             bus: Arc::from(""),
-            units: Units::default(),
+            units: BusUnits::default(),
             described: Vec::new(),
             pick,
             contact,
@@ -106,7 +106,7 @@ impl<W: Write> FrameOutput<W> {
     pub(super) fn set_units(&mut self, skin: &Skin) {
         let buses = skin.buses.iter().enumerate();
         let described = buses.map(|(index, bus)| {
-            (bus.name.clone(), Units::for_bus(skin, index), skin.joints_on_bus(index).len())
+            (bus.name.clone(), BusUnits::for_bus(skin, index), skin.joints_on_bus(index).len())
         });
         self.described = described.collect();
     }
@@ -119,24 +119,24 @@ impl<W: Write> FrameOutput<W> {
             self.bus = Arc::from(interface);
             self.absent.retain(|name| name != interface);
             let described = self.described.iter().find(|(name, ..)| name == interface);
-            self.units = described.map_or_else(Units::default, |(_, units, _)| *units);
+            self.units = described.map_or_else(BusUnits::default, |(_, units, _)| *units);
         }
         let waiting = PendingFrame { time, bus: Arc::clone(&self.bus), units: self.units, frame, direction };
         self.settler.push(Micros(time.nanos / 1_000), interface, &frame, waiting);
-        self.show_settled()
+        self.show_settled_frames()
     }
 
     /// Settles and shows frames whose packets have been incomplete for too long at `now`; call it when no frame
     /// arrives.
     pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<()> {
         self.settler.handle_time(now);
-        self.show_settled()
+        self.show_settled_frames()
     }
 
     /// Settles and shows all waiting frames at the end of the input.
     pub(super) fn finish(&mut self) -> io::Result<()> {
         self.settler.finish();
-        self.show_settled()
+        self.show_settled_frames()
     }
 
     /// Returns true if any frame waits for the rest of its packet.
@@ -145,13 +145,13 @@ impl<W: Write> FrameOutput<W> {
     }
 
     /// Shows the frames whose meaning is settled.
-    fn show_settled(&mut self) -> io::Result<()> {
+    fn show_settled_frames(&mut self) -> io::Result<()> {
         while self.remaining > 0
             && let Some((PendingFrame { time, bus, units, frame, direction }, decoded)) = self.settler.pop()
         {
-            self.check_robot(&bus, &decoded);
+            self.check_joint_count(&bus, &decoded);
             let is_described = self.described.iter().any(|(name, ..)| **name == *bus);
-            let units = if is_described { units } else { Units::default() };
+            let units = if is_described { units } else { BusUnits::default() };
             self.show(&Record { time, interface: &bus, frame, direction }, &decoded, units)?;
         }
         Ok(())
@@ -169,10 +169,10 @@ impl<W: Write> FrameOutput<W> {
 
     /// If a bus's joints differ in number from those of its chain in the skin, drops the bus's description, because the
     /// skin is for another robot.
-    fn check_robot(&mut self, bus: &str, decoded: &Decoded) {
+    fn check_joint_count(&mut self, bus: &str, decoded: &Decoded) {
         let Some(Message::Joints { joints, .. }) = decoded.message() else { return };
         let came = usize::from(joints.in_use);
-        let is_other = |it: &(String, Units, usize)| it.0 == bus && it.2 != came;
+        let is_other = |it: &(String, BusUnits, usize)| it.0 == bus && it.2 != came;
         if let Some(at) = self.described.iter().position(is_other) {
             let (name, _, chain) = self.described.remove(at);
             let another = other_robot_text(&name, came, chain);
@@ -184,7 +184,7 @@ impl<W: Write> FrameOutput<W> {
     }
 
     /// Shows a frame if the filters select it.
-    fn show(&mut self, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
+    fn show(&mut self, record: &Record<'_>, decoded: &Decoded, units: BusUnits) -> io::Result<()> {
         let nanos = record.time.nanos;
         let zero = *self.zero.get_or_insert(nanos);
         if !self.pick.matches(zero, nanos, record.interface, &record.frame, decoded)
@@ -199,10 +199,10 @@ impl<W: Write> FrameOutput<W> {
             OutputStyle::Json => {
                 // The bus name is the only free text in the line.
                 if let Cow::Borrowed(_) = printable(record.interface) {
-                    json::write(&mut self.out, record, decoded, units)?;
+                    json::write_json_line(&mut self.out, record, decoded, units)?;
                 } else {
                     let mut line = Vec::new();
-                    json::write(&mut line, record, decoded, units)?;
+                    json::write_json_line(&mut line, record, decoded, units)?;
                     self.out
                         .write_all(escape_controls(String::from_utf8_lossy(&line).into_owned()).as_bytes())?;
                 }
@@ -211,7 +211,8 @@ impl<W: Write> FrameOutput<W> {
                 // Times before the loop's start, or of a capture whose times run backwards, are negative.
                 let (sign, since) = if nanos < zero { ("-", zero - nanos) } else { ("", nanos - zero) };
                 let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
-                let (dim, of, plain) = if *colour { (DIM, colour_of(decoded), PLAIN) } else { ("", "", "") };
+                let (dim, of, plain) =
+                    if *colour { (DIM, colour_of(decoded), RESET_COLOUR) } else { ("", "", "") };
                 writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {interface}{plain} {of}{said}{plain}")?;
             }
             OutputStyle::Lines { colour } => {
@@ -226,7 +227,7 @@ impl<W: Write> FrameOutput<W> {
                 let raw = &self.raw;
                 if *colour {
                     let colour = colour_of(decoded);
-                    writeln!(self.out, "{DIM}{raw}{PLAIN}\t{colour}{said}{PLAIN}")?;
+                    writeln!(self.out, "{DIM}{raw}{RESET_COLOUR}\t{colour}{said}{RESET_COLOUR}")?;
                 } else {
                     writeln!(self.out, "{raw}\t{said}")?;
                 }
@@ -271,7 +272,7 @@ fn colour_of(decoded: &Decoded) -> &'static str {
         Decoded::Message(_) if decoded.is_saturated() => YELLOW,
         Decoded::Message(message) => match message.id().kind {
             Kind::Command => CYAN,
-            Kind::Torque | Kind::Sum => PLAIN,
+            Kind::Torque | Kind::Sum => RESET_COLOUR,
             Kind::Stimulus | Kind::Sensors => MAGENTA,
             Kind::Configure | Kind::Configured => GREEN,
             Kind::Network => DIM,

@@ -2,43 +2,54 @@
 
 use std::collections::BTreeMap;
 
-use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, StatsReport};
+use analysis::stats::{
+    BusReport, CellReport, EpochStatistics, ForeignFrames, ForeignId, FrameType, StatsReport,
+};
 use comfy_table::Table;
 use model::decode::error_classes;
 use protocol::usage::printable;
 use trace::capture::{RecordingExtras, Topic};
 
 use crate::print::{
-    self, KeyValueTable, comma_separated, decimals, drop_empty_columns, or_else_text, space_separated,
+    self, KeyValueTable, comma_separated, drop_empty_columns, format_decimals, or_else_text, space_separated,
 };
 
 /// Formats the whole report: the capture, each bus, and each bus's cells.
-pub(super) fn text(name: &str, what: &str, report: &StatsReport, extras: Option<&RecordingExtras>) -> String {
+pub(super) fn report_text(
+    name: &str,
+    what: &str,
+    report: &StatsReport,
+    extras: Option<&RecordingExtras>,
+) -> String {
     let head = format!("{what}, {:.3} s", report.duration_s);
     let mut rows = KeyValueTable::new(name, head, print::count_with_noun(report.frames, "frame"));
-    rows.row_unless_zero("frames before the one before them", report.times_backwards, "times run backwards");
-    rows.row_unless_zero("frames missing", report.dropped, "lost by the recorder");
-    rows.row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
+    rows.add_row_unless_zero(
+        "frames before the one before them",
+        report.times_backwards,
+        "times run backwards",
+    );
+    rows.add_row_unless_zero("frames missing", report.dropped, "lost by the recorder");
+    rows.add_row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     for bus in &report.buses {
         bus_rows(&mut rows, bus, report.duration_s);
     }
     if let Some(extras) = extras {
-        extra_rows(&mut rows, extras);
+        add_extra_rows(&mut rows, extras);
     }
     let mut text = rows.to_text();
     for bus in &report.buses {
         if !bus.cells.is_empty() {
-            text += &format!("\n{}\n", cells(bus));
+            text += &format!("\n{}\n", cell_table(bus));
         }
         if bus.foreign.frames > 0 {
-            text += &format!("\n{}\n", foreign(bus));
+            text += &format!("\n{}\n", foreign_identifier_table(bus));
         }
     }
     text
 }
 
 /// A rate with the time span that it covers.
-fn per_s(rate: Option<f64>, span_s: f64) -> String {
+fn rate_text(rate: Option<f64>, span_s: f64) -> String {
     or_else_text(rate.map(|rate| format!("{rate:.1} per s over {} s", seconds_text(span_s))), "")
 }
 
@@ -51,31 +62,32 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
     rows.add_section(
         &bus.bus,
         print::count_with_noun(bus.frames, "frame"),
-        per_s(bus.frames_per_s, duration_s),
+        rate_text(bus.frames_per_s, duration_s),
     );
     for kind in &bus.kinds {
-        rows.add_row(kind.kind, kind.packets, per_s(kind.packets_per_s, kind.span_s));
+        rows.add_row(kind.kind, kind.packets, rate_text(kind.packets_per_s, kind.span_s));
     }
-    let Epochs { first, last, missing, repeated, jumps } = bus.epochs;
+    let EpochStatistics { first, last, missing, repeated, jumps } = bus.epochs;
     if let (Some(first), Some(last)) = (first, last) {
         let odd = [(missing, "missing"), (repeated, "repeated"), (jumps, "restarts")];
         let odd = comma_separated(odd.map(|(count, what)| format!("{count} {what}")));
         rows.add_row("epochs", format!("{first} to {last}"), odd);
     }
-    rows.row_unless_zero(
+    rows.add_row_unless_zero(
         "wires",
         bus.wires,
-        format!("{}, on no real bus", per_s(bus.wires_per_s, bus.wires_span_s)),
+        format!("{}, on no real bus", rate_text(bus.wires_per_s, bus.wires_span_s)),
     );
-    let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
+    let refused: Vec<_> =
+        bus.refused.counts_by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
     let reasons = comma_separated(refused.iter().map(|(reason, count)| format!("{count} {reason}")));
     rows.add_row("damaged or refused", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
     let ForeignFrames { standard, extended, remote, error, packets_by_chance, .. } = bus.foreign;
     rows.add_row("foreign", bus.foreign.frames, "");
-    rows.row_unless_zero("  11-bit identifiers", standard, "");
-    rows.row_unless_zero("  29-bit identifiers", extended, "");
-    rows.row_unless_zero("  remote frames", remote, "");
-    rows.row_unless_zero("  error frames", error, comma_separated(error_counts(&bus.foreign)));
+    rows.add_row_unless_zero("  11-bit identifiers", standard, "");
+    rows.add_row_unless_zero("  29-bit identifiers", extended, "");
+    rows.add_row_unless_zero("  remote frames", remote, "");
+    rows.add_row_unless_zero("  error frames", error, comma_separated(error_counts(&bus.foreign)));
     if packets_by_chance >= 0.05 {
         let chance = format!("{packets_by_chance:.1}");
         rows.add_row("  packets by chance", chance, "expected");
@@ -85,7 +97,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
 }
 
 /// Adds rows on the contents of an MCAP recording other than frames.
-fn extra_rows(rows: &mut KeyValueTable, extras: &RecordingExtras) {
+fn add_extra_rows(rows: &mut KeyValueTable, extras: &RecordingExtras) {
     if !extras.topics.is_empty() {
         rows.add_section("other topics", "messages", "");
     }
@@ -115,7 +127,7 @@ fn error_counts(foreign: &ForeignFrames) -> Vec<String> {
 const MAX_FOREIGN: usize = 40;
 
 /// Formats a table with one line per foreign identifier, the most frequent ones first.
-fn foreign(bus: &BusReport) -> Table {
+fn foreign_identifier_table(bus: &BusReport) -> Table {
     let head = [
         &format!("{} foreign", printable(&bus.bus)),
         "frames",
@@ -137,7 +149,7 @@ fn foreign(bus: &BusReport) -> Table {
         };
         let first = format!("{:.3}", id.first_s);
         let in_s = if id.frames > 1 { seconds_text(id.last_s - id.first_s) } else { String::new() };
-        let per_s = decimals(id.frames_per_s, 1, "");
+        let per_s = format_decimals(id.frames_per_s, 1, "");
         vec![id.id.clone(), id.frames.to_string(), per_s, in_s, first, bytes, what]
     };
     let ForeignFrames { identifiers, frames_of_other_identifiers: unknown, .. } = &bus.foreign;
@@ -156,12 +168,12 @@ fn foreign(bus: &BusReport) -> Table {
 type Column<'a> = (&'a str, fn(&CellReport) -> Option<String>);
 
 /// Formats a table with one line per cell, without empty columns (unanswered, lost, ...).
-fn cells(bus: &BusReport) -> Table {
+fn cell_table(bus: &BusReport) -> Table {
     // A zero is left blank.
     fn blank_if_zero(count: u64) -> Option<String> {
         (count > 0).then(|| count.to_string())
     }
-    const STATE: &str = "last state";
+    const STATE_HEADING: &str = "last state";
     let name = printable(&bus.bus);
     let columns: [Column<'_>; 17] = [
         (&name, |cell| Some(cell.node.to_string())),
@@ -183,9 +195,9 @@ fn cells(bus: &BusReport) -> Table {
         ("refused", |cell| blank_if_zero(cell.refused?.into())),
         ("lost", |cell| blank_if_zero(cell.lost)),
         ("starts", |cell| blank_if_zero(cell.restarts)),
-        (STATE, |cell| Some(space_separated(&cell.state)).filter(|state| !state.is_empty())),
+        (STATE_HEADING, |cell| Some(space_separated(&cell.state)).filter(|state| !state.is_empty())),
     ];
     let (heads, lines) = drop_empty_columns(columns, &bus.cells, "");
-    let of_words = heads.iter().rposition(|head| *head == STATE);
+    let of_words = heads.iter().rposition(|head| *head == STATE_HEADING);
     print::table(heads, lines, |column| Some(column) != of_words)
 }

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use bench::summary::Outcome;
-use paper::arm::{self, Reply};
+use paper::arm::{self, ReplyMode};
 use paper::moving::BenchRun;
 use paper::scale::ScaleBench;
 use paper::{Effort, recorded};
@@ -44,8 +44,8 @@ struct RunFiles {
 
 impl BenchRunner {
     /// Runs `skinbus run` on the arm and reads the recording.
-    pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<BenchRun, Failure> {
-        let name = arm::run_name(reply);
+    pub(super) fn run_arm_bench(&self, reply: ReplyMode, effort: Effort) -> Result<BenchRun, Failure> {
+        let name = arm::run_file_name(reply);
         let what = format!("the bench of the moving arm ({name})");
         let file = |end: &str| self.folder.join(format!("arm-{name}{end}"));
         let recording = file(".mcap");
@@ -58,13 +58,13 @@ impl BenchRunner {
         let text = arm::skin_toml(reply, effort);
         let texts = [text.as_str(), arm::scenario_toml(effort)];
         let buses = buses::private_directory("experiment")?;
-        let ended = self.perform(&what, &files, texts, 1, buses.path())?;
+        let ended = self.run_to_end(&what, &files, texts, 1, buses.path())?;
         if !ended.status.success() {
             return Err(bench_failure(&what, &last_message(&ended)));
         }
         let rows = recorded::read(&recording).map_err(|error| file_error(&what, &recording, &error))?;
         let summary = read_summary(&what, &files.summary)?;
-        let joints = Skin::parse("the arm's skin", &text).map_err(Failure::run)?.robot.joints.len();
+        let joints = Skin::parse("the arm's skin", &text).map_err(Failure::run_error)?.robot.joints.len();
         if rows.is_empty() {
             return Err(file_error(&what, &recording, &"it has no ticks"));
         }
@@ -84,9 +84,9 @@ impl BenchRunner {
             summary: self.folder.join(format!("{}.json", bench.name())),
             recording: None,
         };
-        let texts = [bench.skin(), bench.scenario()];
+        let texts = [bench.skin_toml(), bench.scenario_toml()];
         let texts = texts.each_ref().map(String::as_str);
-        let ended = self.perform(&what, &files, texts, CellId::MAX.get(), buses.path())?;
+        let ended = self.run_to_end(&what, &files, texts, CellId::MAX.get(), buses.path())?;
         let is_invalid = |outcome: Outcome| ended.status.code() == Some(outcome.exit_code().into());
         let is_invalid = [Outcome::CellError, Outcome::NoController].into_iter().any(is_invalid);
         if files.summary.exists() && !is_invalid {
@@ -97,7 +97,7 @@ impl BenchRunner {
     }
 
     /// Writes the files of a run, and runs it to its end on embedded buses in a directory.
-    fn perform(
+    fn run_to_end(
         &self,
         what: &str,
         files: &RunFiles,
@@ -117,11 +117,11 @@ impl BenchRunner {
             command.arg("--record").arg(path);
         }
         command.env("SKINBUS_DIR", buses).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
-        self.wait(command).map_err(|error| file_error(what, &own, &error))
+        self.wait_for_command(command).map_err(|error| file_error(what, &own, &error))
     }
 
     /// Waits for the end of the bench; a signal ends it early.
-    fn wait(&self, mut command: Command) -> io::Result<Output> {
+    fn wait_for_command(&self, mut command: Command) -> io::Result<Output> {
         let mut child = command.spawn()?;
         let mut stated = false;
         while child.try_wait()?.is_none() {
@@ -137,7 +137,7 @@ impl BenchRunner {
 }
 
 fn bench_failure(what: &str, error: &dyn std::fmt::Display) -> Failure {
-    Failure::run(format!("{what}: {error}"))
+    Failure::run_error(format!("{what}: {error}"))
 }
 
 fn file_error(what: &str, path: &Path, error: &dyn std::fmt::Display) -> Failure {

@@ -25,7 +25,7 @@ impl ResultFolder {
     /// accepted only with `overwrite`.
     pub(super) fn create(path: &Path, overwrite: OverwriteOption) -> Result<Self, Failure> {
         let wrong = |error: &dyn std::fmt::Display| {
-            Failure::run(format!("-o {}: {error}; name a folder that can be written", path.display()))
+            Failure::run_error(format!("-o {}: {error}; name a folder that can be written", path.display()))
         };
         let made = !path.exists();
         if !made && !path.is_dir() {
@@ -35,7 +35,7 @@ impl ResultFolder {
         let taken = fs::read_dir(path).map_err(|error| wrong(&error))?.next().is_some();
         if taken && !overwrite.overwrite {
             let path = path.display();
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "-o {path}: the folder is not empty: name another folder, or overwrite files in it with --overwrite"
             )));
         }
@@ -52,7 +52,8 @@ impl ResultFolder {
 
     /// Writes a file.
     pub(super) fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
-        write_atomically(&self.inside.join(name), text, false).map_err(|error| self.failed(name, &error))
+        write_atomically(&self.inside.join(name), text, false)
+            .map_err(|error| self.write_failure(name, &error))
     }
 
     /// Gives all files their names, in alphabetical order. Existing files are replaced only with `overwrite`.
@@ -63,12 +64,15 @@ impl ResultFolder {
     /// Gives the files written so far their names.
     pub(super) fn publish_files(&self) -> Result<(), Failure> {
         let listed = fs::read_dir(&self.inside).and_then(Iterator::collect::<io::Result<Vec<_>>>);
-        let mut names: Vec<_> =
-            listed.map_err(|error| self.failed("", &error))?.iter().map(fs::DirEntry::file_name).collect();
+        let mut names: Vec<_> = listed
+            .map_err(|error| self.write_failure("", &error))?
+            .iter()
+            .map(fs::DirEntry::file_name)
+            .collect();
         names.sort();
         for name in names {
             rename(&self.inside.join(&name), &self.path.join(&name), self.overwrite.overwrite)
-                .map_err(|error| self.failed(&name.to_string_lossy(), &error))?;
+                .map_err(|error| self.write_failure(&name.to_string_lossy(), &error))?;
         }
         sync_folder(&self.inside);
         if self.made {
@@ -78,8 +82,8 @@ impl ResultFolder {
         Ok(())
     }
 
-    fn failed(&self, name: &str, error: &io::Error) -> Failure {
-        Failure::run(format!("{}: {error}", self.path.join(name).display()))
+    fn write_failure(&self, name: &str, error: &io::Error) -> Failure {
+        Failure::run_error(format!("{}: {error}", self.path.join(name).display()))
     }
 }
 

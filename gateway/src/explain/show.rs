@@ -3,14 +3,14 @@
 use std::collections::BTreeSet;
 
 use analysis::explain::{
-    BusExplained, CellExplained, ContactOrigin, Explanation, ForceSteps, JointTotal,
-    MAX_JACOBIAN_ERROR_STEPS, TorqueRow, WordVerdict,
+    BusExplanation, CellExplanation, ContactOrigin, ForceSteps, JointTorqueTotal, MAX_JACOBIAN_ERROR_STEPS,
+    TorqueExplanation, TorqueRow, WordVerdict,
 };
 use protocol::fixed::TorqueFormat;
 use protocol::usage::printable;
 use trace::capture::seconds_since;
 
-use crate::print::{self, decimals, or_else_text};
+use crate::print::{self, format_decimals, or_else_text};
 
 /// Selection of the parts of an explanation that are shown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -28,7 +28,7 @@ pub(super) fn format_explanation(
     name: &str,
     epoch: u8,
     (zero, is_of_run): (u64, bool),
-    explanation: &Explanation,
+    explanation: &TorqueExplanation,
     what: ExplainDetail,
 ) -> String {
     let mut text = String::new();
@@ -56,7 +56,7 @@ pub(super) fn format_explanation(
         (ExplainDetail::All, _) => text += &format_one_line_per_cell(cells, is_finest),
     }
     if what != ExplainDetail::Cells && !cells.is_empty() {
-        text += &totals(&explanation.total, is_finest);
+        text += &format_joint_totals(&explanation.total, is_finest);
     }
     if !explanation.missing.is_empty() {
         text += "\nnot known:\n";
@@ -71,7 +71,7 @@ pub(super) fn format_explanation(
 const JOINTS_PER_TABLE: usize = 6;
 
 /// Formats the joint positions that the cells of a bus received.
-fn positions(bus: &BusExplained) -> String {
+fn positions(bus: &BusExplanation) -> String {
     let unit = if bus.units.contains(&"m") { "rad, m" } else { "rad" };
     // Put seven joints side by side, because the last would otherwise stand alone.
     let beside =
@@ -91,11 +91,11 @@ fn positions(bus: &BusExplained) -> String {
 /// Formats a table with right-aligned columns, except for the first column and, if it holds text, the last. The columns
 /// are close together, so that the table fits on 80 columns.
 fn table(head: Vec<String>, rows: impl IntoIterator<Item = Vec<String>>, words_at_the_end: bool) -> String {
-    spaced_table(head, rows, words_at_the_end, 1)
+    format_spaced_table(head, rows, words_at_the_end, 1)
 }
 
 /// Formats such a table with at least `spaces` spaces before each number.
-fn spaced_table(
+fn format_spaced_table(
     head: Vec<String>,
     rows: impl IntoIterator<Item = Vec<String>>,
     words_at_the_end: bool,
@@ -112,17 +112,17 @@ fn spaced_table(
 }
 
 #[expect(clippy::cast_precision_loss, reason = "to be read")]
-fn millis(nanos: u64) -> String {
+fn format_millis(nanos: u64) -> String {
     format!("{:.3} ms", nanos as f64 / 1e6)
 }
 
 /// Formats tables with one line per cell, chain by chain. A chain with many joints gets several tables.
-fn format_one_line_per_cell(cells: &[CellExplained], is_finest: bool) -> String {
+fn format_one_line_per_cell(cells: &[CellExplanation], is_finest: bool) -> String {
     let turns = cells.iter().flat_map(|cell| &cell.rows).all(|row| row.unit == "Nm");
     let (unit, steps) =
         (if turns { " in Nm" } else { "" }, if is_finest { "2^-12" } else { "their bus's format" });
-    let joints = |cell: &CellExplained| cell.rows.iter().map(|row| row.joint).collect::<Vec<_>>();
-    let tables = cells.chunk_by(|one, other| joints(one) == joints(other)).map(torques);
+    let joints = |cell: &CellExplanation| cell.rows.iter().map(|row| row.joint).collect::<Vec<_>>();
+    let tables = cells.chunk_by(|one, other| joints(one) == joints(other)).map(format_torques);
     format!(
         "\ntorques of the cells{unit}, with the largest difference in steps of {steps}; --cell shows the whole computation\n{}",
         tables.collect::<String>()
@@ -130,9 +130,9 @@ fn format_one_line_per_cell(cells: &[CellExplained], is_finest: bool) -> String 
 }
 
 /// Formats the torques of the cells of one chain.
-fn torques(cells: &[CellExplained]) -> String {
+fn format_torques(cells: &[CellExplanation]) -> String {
     // If all is well, the joints after those that move any of the cells have only zeros.
-    let says = |cell: &CellExplained| {
+    let says = |cell: &CellExplanation| {
         let moved = cell.rows.iter().position(|row| row.joint == cell.joint);
         let rows = cell.rows.iter().enumerate();
         let used = rows.filter(|(at, row)| {
@@ -150,10 +150,10 @@ fn torques(cells: &[CellExplained]) -> String {
         head.extend(joints.iter().map(|row| format!("{} {}", row.unit, row.joint)));
         head.extend(["off", "which is"].iter().filter(|_| is_last).map(|&name| name.to_owned()));
         let lines = cells.iter().map(|cell| {
-            let mut line = vec![names.of_cell(cell)];
-            line.extend((part == 0).then(|| decimals(force_of(cell), 3, "?")));
+            let mut line = vec![names.name_of_cell(cell)];
+            line.extend((part == 0).then(|| format_decimals(force_n(cell), 3, "?")));
             let rows = cell.rows.iter().skip(part * JOINTS_PER_TABLE).take(joints.len());
-            line.extend(rows.map(|row| decimals(row.word_nm, 4, "-")));
+            line.extend(rows.map(|row| format_decimals(row.word_nm, 4, "-")));
             line.extend(
                 is_last
                     .then(|| [format_largest_difference(&cell.rows), worst_verdict(&cell.rows)])
@@ -162,12 +162,12 @@ fn torques(cells: &[CellExplained]) -> String {
             );
             line
         });
-        spaced_table(head, lines, is_last, u16::from(joints.len() < JOINTS_PER_TABLE))
+        format_spaced_table(head, lines, is_last, u16::from(joints.len() < JOINTS_PER_TABLE))
     });
     tables.collect()
 }
 
-fn force_of(cell: &CellExplained) -> Option<f64> {
+fn force_n(cell: &CellExplanation) -> Option<f64> {
     cell.force.as_ref().map(|force| force.force_n)
 }
 
@@ -175,7 +175,7 @@ fn force_of(cell: &CellExplained) -> Option<f64> {
 struct CellNames(Option<String>);
 
 impl CellNames {
-    fn for_cells(cells: &[CellExplained]) -> Self {
+    fn for_cells(cells: &[CellExplanation]) -> Self {
         let bus = cells.first().map(|cell| &cell.bus);
         Self(bus.filter(|bus| cells.iter().all(|cell| cell.bus == **bus)).cloned())
     }
@@ -184,12 +184,12 @@ impl CellNames {
         self.0.clone().unwrap_or_else(|| "cell".to_owned())
     }
 
-    fn of_cell(&self, cell: &CellExplained) -> String {
+    fn name_of_cell(&self, cell: &CellExplanation) -> String {
         if self.0.is_some() { cell.node.to_string() } else { name(cell) }
     }
 }
 
-fn name(cell: &CellExplained) -> String {
+fn name(cell: &CellExplanation) -> String {
     format!("{} {}", cell.bus, cell.node)
 }
 
@@ -243,26 +243,26 @@ fn verdict_with_jacobian(verdict: &WordVerdict) -> String {
 }
 
 /// Explains the verdicts that occur in the last column.
-fn legend(cells: &[CellExplained]) -> String {
+fn verdict_legend(cells: &[CellExplanation]) -> String {
     let said = cells.iter().flat_map(|cell| &cell.rows).map(|row| verdict_info(&row.verdict));
     let said: BTreeSet<_> = said.collect();
     said.iter().filter_map(|(_, short, means)| Some(format!("  {short}: {}\n", means.as_ref()?))).collect()
 }
 
-fn format_cell_steps(cell: &CellExplained, zero: u64) -> String {
+fn format_cell_steps(cell: &CellExplanation, zero: u64) -> String {
     let mut text = format!("\n{}, on the link that joint {} moves\n", name(cell), cell.joint);
     match &cell.force {
-        Some(force) => text += &force_steps(force, zero),
+        Some(force) => text += &format_force_steps(force, zero),
         None => text += "  contact    not known\n",
     }
     match cell.answered_after_ns {
-        Some(nanos) => text += &format!("  answered   {} after the joints\n", millis(nanos)),
+        Some(nanos) => text += &format!("  answered   {} after the joints\n", format_millis(nanos)),
         None => text += "  answered   nothing\n",
     }
     text + &format_joint_rows(std::slice::from_ref(cell), false)
 }
 
-fn force_steps(force: &ForceSteps, zero: u64) -> String {
+fn format_force_steps(force: &ForceSteps, zero: u64) -> String {
     let ForceSteps {
         contact_n: [a, b, c], proximity, touch_n, contact_threshold_n, proximity_threshold, ..
     } = *force;
@@ -301,7 +301,7 @@ fn format_force_origin(origin: &ContactOrigin, zero: u64) -> String {
     }
 }
 
-fn format_joint(cells: &[CellExplained]) -> String {
+fn format_joint(cells: &[CellExplanation]) -> String {
     if cells.is_empty() {
         return "\nno cell was in contact, and none answered\n".to_owned();
     }
@@ -309,28 +309,28 @@ fn format_joint(cells: &[CellExplained]) -> String {
 }
 
 /// Formats a table with one line per joint of each cell.
-fn format_joint_rows(cells: &[CellExplained], by_cell: bool) -> String {
+fn format_joint_rows(cells: &[CellExplanation], by_cell: bool) -> String {
     let names = CellNames::for_cells(cells);
     let first = if by_cell { names.column_heading() } else { "joint".to_owned() };
     let mut head = vec![first];
     head.extend(by_cell.then(|| "F_z N".to_owned()));
     head.extend(["J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"].map(str::to_owned));
-    let line = |cell: &CellExplained, row: &TorqueRow| {
-        let mut line = vec![if by_cell { names.of_cell(cell) } else { joint_name(row.joint, row.unit) }];
-        line.extend(by_cell.then(|| decimals(force_of(cell), 2, "?")));
+    let line = |cell: &CellExplanation, row: &TorqueRow| {
+        let mut line = vec![if by_cell { names.name_of_cell(cell) } else { joint_name(row.joint, row.unit) }];
+        line.extend(by_cell.then(|| format_decimals(force_n(cell), 2, "?")));
         line.extend([
-            decimals(row.jacobian_m, 6, "?"),
-            decimals(row.product_nm, 6, "?"),
+            format_decimals(row.jacobian_m, 6, "?"),
+            format_decimals(row.product_nm, 6, "?"),
             or_else_text(row.nearest_word, "-"),
             or_else_text(row.word, "-"),
-            decimals(row.word_nm, 6, "-"),
+            format_decimals(row.word_nm, 6, "-"),
             or_else_text(row.difference_steps.map(format_signed_steps), "?"),
             verdict_with_jacobian(&row.verdict),
         ]);
         line
     };
     let lines = cells.iter().flat_map(|cell| cell.rows.iter().map(move |row| (cell, row)));
-    table(head, lines.map(|(cell, row)| line(cell, row)), true) + &legend(cells)
+    table(head, lines.map(|(cell, row)| line(cell, row)), true) + &verdict_legend(cells)
 }
 
 /// Returns the number of a joint, with its unit if the joint is prismatic: the column's head names the unit of the
@@ -339,7 +339,7 @@ fn joint_name(joint: u8, unit: &str) -> String {
     if unit == "Nm" { joint.to_string() } else { format!("{joint} ({unit})") }
 }
 
-fn totals(total: &[JointTotal], is_finest: bool) -> String {
+fn format_joint_totals(total: &[JointTorqueTotal], is_finest: bool) -> String {
     // Words of a coarser format are added in steps of the finest one.
     let words = if is_finest { "words" } else { "x 2^-12" };
     let head = ["joint", words, "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"];

@@ -17,7 +17,7 @@ use serde::Serialize;
 
 use crate::arguments::find_cell;
 use crate::columns::{Columns, CsvTable};
-use crate::input::skin_in;
+use crate::input::read_skin_or_recording;
 use crate::print::{count_with_noun, json_line, table};
 
 /// Maximum size in bytes of a file of rows.
@@ -63,9 +63,9 @@ impl TorqueOptions {
         as_json: bool,
     ) -> Result<(), Failure> {
         let [file] = files else {
-            return Err(Failure::usage("--force and --batch need exactly one skin: name one file"));
+            return Err(Failure::usage_error("--force and --batch need exactly one skin: name one file"));
         };
-        let skin = skin_in(file)?;
+        let skin = read_skin_or_recording(file)?;
         let calculator = Calculator::new(&skin);
         let rows = match (cell, &self.batch) {
             (_, Some(path)) => calculator.compute_batch_file(path)?,
@@ -75,7 +75,7 @@ impl TorqueOptions {
                 vec![
                     calculator
                         .compute_for_named_cell(cell, "--cell", force, joints)
-                        .map_err(Failure::usage)?,
+                        .map_err(Failure::usage_error)?,
                 ]
             }
             (None, None) => Vec::new(),
@@ -96,14 +96,14 @@ struct Calculator<'a> {
 
 impl<'a> Calculator<'a> {
     fn new(skin: &'a Skin) -> Self {
-        let central =
-            (0..skin.buses.len()).map(|bus| CentralComputation::unquantised(&skin.with_cells_of_bus(bus)));
+        let central = (0..skin.buses.len())
+            .map(|bus| CentralComputation::without_quantisation(&skin.with_cells_of_bus(bus)));
         Self { skin, central: central.collect() }
     }
 
     fn compute_batch_file(&self, path: &Path) -> Result<Vec<ComputedRow>, Failure> {
         let file = path.display().to_string();
-        let text = document::read_text_within(path, MAX_BATCH_BYTES).map_err(Failure::usage)?;
+        let text = document::read_text_up_to(path, MAX_BATCH_BYTES).map_err(Failure::usage_error)?;
         let mut table = CsvTable::new(&file, &text, COLUMNS)?;
         let mut rows = Vec::new();
         while let Some(line) = table.next_row()? {
@@ -111,14 +111,15 @@ impl<'a> Calculator<'a> {
             let named = line
                 .text("cell")
                 .parse::<CellName>()
-                .map_err(|error| Failure::usage(format!("{at} {error}")))?;
+                .map_err(|error| Failure::usage_error(format!("{at} {error}")))?;
             let force = line.number("force_n")?;
             rows.push(
-                self.compute_for_named_cell(&named, &at, force, line.text("q")).map_err(Failure::usage)?,
+                self.compute_for_named_cell(&named, &at, force, line.text("q"))
+                    .map_err(Failure::usage_error)?,
             );
         }
         if rows.is_empty() {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{file}: it contains no rows: write a line for each computation"
             )));
         }
@@ -192,7 +193,7 @@ impl<'a> Calculator<'a> {
         let central = self
             .central
             .get(cell.bus)
-            .map(|central| central.torque(place, &central.frames_at_positions(&q), force));
+            .map(|central| central.cell_torque(place, &central.frames_at_positions(&q), force));
         // Adding 0.0 turns -0.0 into 0.0.
         let central: Vec<f64> =
             central.into_iter().flatten().take(joints.len()).map(|value| value + 0.0).collect();

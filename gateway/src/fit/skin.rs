@@ -1,6 +1,6 @@
 //! Fit of a skin on real buses in the worst case.
 
-use analysis::fit::{self, BusFit, COMPUTATION_NS, rates};
+use analysis::fit::{self, BusFit, PAPER_COMPUTATION_NS, rates};
 use protocol::can::Format;
 use protocol::skin::{Skin, SkinBus};
 use protocol::usage::{Failure, print_text};
@@ -8,15 +8,15 @@ use protocol::wire_time::BitRates;
 
 use super::{FitCommand, skin_text};
 use crate::output::print_note;
-use crate::print::{comma_separated, json};
+use crate::print::{comma_separated, to_pretty_json};
 
 impl FitCommand {
     /// Computes and prints the fit of a skin.
     pub(super) fn print_skin_fit(&self, skin: &Skin) -> Result<(), Failure> {
-        let computation_ns = self.computation.unwrap_or(COMPUTATION_NS);
-        let chosen = if self.table { None } else { self.rates(skin)? };
+        let computation_ns = self.computation.unwrap_or(PAPER_COMPUTATION_NS);
+        let chosen = if self.table { None } else { self.bit_rates_of_buses(skin)? };
         let (buses, whole, rows) = match chosen {
-            None => (Vec::new(), None, fit::table(skin, self.format, computation_ns)),
+            None => (Vec::new(), None, fit::rates_table(skin, self.format, computation_ns)),
             Some(chosen) => {
                 let buses = chosen.into_iter().enumerate();
                 let fit =
@@ -35,7 +35,7 @@ impl FitCommand {
             ));
         }
         print_text(&match self.json {
-            true => json(&fit::json(skin, &buses, whole.as_ref(), &rows))?,
+            true => to_pretty_json(&fit::fit_json(skin, &buses, whole.as_ref(), &rows))?,
             false => {
                 skin_text::table(skin, &rows) + &skin_text::format_bus_fits(skin, &buses, whole.as_ref())
             }
@@ -44,7 +44,7 @@ impl FitCommand {
 
     /// Returns the format and the bit rates of each bus, or `None` if neither the command line nor the skin gives rates
     /// for all buses.
-    fn rates(&self, skin: &Skin) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
+    fn bit_rates_of_buses(&self, skin: &Skin) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
         let formats: Vec<_> = skin.buses.iter().map(|bus| self.format.unwrap_or(bus.format)).collect();
         let Some(nominal) = self.nominal else {
             let described =
@@ -52,16 +52,16 @@ impl FitCommand {
             return described.collect();
         };
         if self.data.is_some() && !formats.contains(&Format::Fd) {
-            return Err(Failure::usage(
+            return Err(Failure::usage_error(
                 "--data is only for CAN FD, but all buses are classic: leave it out, or add --format fd",
             ));
         }
         let rates = |format| match (format, self.data) {
-            (Format::Classic, _) => BitRates::classic(nominal).map_err(Failure::usage),
-            (Format::Fd, Some(data)) => BitRates::new(nominal, data).map_err(Failure::usage),
+            (Format::Classic, _) => BitRates::classic(nominal).map_err(Failure::usage_error),
+            (Format::Fd, Some(data)) => BitRates::new(nominal, data).map_err(Failure::usage_error),
             (Format::Fd, None) => {
-                BitRates::classic(nominal).map_err(Failure::usage)?;
-                Err(Failure::usage(format!(
+                BitRates::classic(nominal).map_err(Failure::usage_error)?;
+                Err(Failure::usage_error(format!(
                     "CAN FD needs a data bit rate: add --data with {nominal} to {} bit/s, or --format classic",
                     BitRates::MAX_DATA_BIT_RATE
                 )))
@@ -74,6 +74,6 @@ impl FitCommand {
 /// Returns the bit rates that the skin gives for a bus, with the format.
 fn bit_rates_from_skin(bus: &SkinBus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
     let rates = rates::described_rates(bus, format).transpose();
-    let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;
+    let rates = rates.map_err(|error| Failure::usage_error(format!("bus {}: {error}", bus.name)))?;
     Ok(rates.map(|rates| (format, rates)))
 }

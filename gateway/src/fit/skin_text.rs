@@ -1,17 +1,17 @@
 //! Tables of `skinbus fit` for a skin.
 
 use analysis::fit::case::{AnswerPlan, BusCase};
-use analysis::fit::limits::{Limit, MAX_NODES, NeededBuses};
-use analysis::fit::verdict::{FitSummary, percent};
+use analysis::fit::limits::{Limit, MAX_NODES_PER_BUS, NeededBuses};
+use analysis::fit::verdict::{FitSummary, format_percent};
 use analysis::fit::{AssessedBus, BusFit, RatesRow, SkinFit, SpreadFit, rates_name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
 use protocol::usage::printable;
 
-use crate::print::{self, KeyValueTable, comma_separated, count_with_noun, decimals, or_else_text};
+use crate::print::{self, KeyValueTable, comma_separated, count_with_noun, format_decimals, or_else_text};
 
 /// Columns of the table over bit rates.
-const HEADER: [&str; 8] = [
+const TABLE_HEADER: [&str; 8] = [
     "bit rates",
     "packet\nµs",
     "load\n%",
@@ -30,7 +30,7 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
         let roots = answers.iter().map(|it| &it.after).find(|it| is_roots_only(&it.case));
         vec![
             rates_name(rated.case.format, rated.case.rates),
-            micros(rated.case.packet_ns()),
+            format_micros(rated.case.longest_packet_ns()),
             format_percent_number(rated.load.total()),
             last_ms(rated),
             most.max_cells_in_time().to_string(),
@@ -39,7 +39,7 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
             or_else_text(roots.map(last_ms), ""),
         ]
     });
-    let table = print::table(HEADER, lines, |column| column > 0);
+    let table = print::table(TABLE_HEADER, lines, |column| column > 0);
     let case = &first.fullest.rated.case;
     let cells = skin.cells.len();
     let bus = match skin.buses.len() {
@@ -57,11 +57,11 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
          buses   number needed for {cells} cells, and the limit that decides it: time or nodes\n\
          roots   sums if only roots are on this bus; with all cells on it, sums save no frames\n",
         printable(&skin.name),
-        millis(case.period_ns),
-        micros(case.computation_ns),
-        reply_name(case),
+        format_millis(case.period_ns),
+        format_micros(case.computation_ns),
+        answer_kind_name(case),
         sensor_traffic_suffix(case),
-        MAX_NODES - 1,
+        MAX_NODES_PER_BUS - 1,
     )
 }
 
@@ -69,8 +69,8 @@ pub(super) fn table(skin: &Skin, rows: &[RatesRow]) -> String {
 pub(super) fn format_bus_fits(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>) -> String {
     let Some(first) = buses.first() else { return String::new() };
     let case = &first.rated.case;
-    let period = format!("joints every {} ms", millis(case.period_ns));
-    let computation = format!("a cell computes {} µs", micros(case.computation_ns));
+    let period = format!("joints every {} ms", format_millis(case.period_ns));
+    let computation = format!("a cell computes {} µs", format_micros(case.computation_ns));
     let mut rows = KeyValueTable::new(&skin.name, period, computation).names_in_one_line();
     for bus in buses {
         add_bus_section(&mut rows, bus);
@@ -78,7 +78,7 @@ pub(super) fn format_bus_fits(skin: &Skin, buses: &[BusFit], whole: Option<&Skin
     // With one bus, its own section has the same values.
     if let Some(whole) = whole.filter(|_| buses.len() > 1) {
         rows.add_section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
-        rows.add_row("buses needed", format_needed_buses(&whole.need), each_need(&whole.need));
+        rows.add_row("buses needed", format_needed_buses(&whole.need), format_each_need(&whole.need));
         for SpreadFit { buses, fullest } in &whole.spread {
             let on = format!("{} of {} cells", count_with_noun(*buses, "bus"), fullest.case.answers.cells());
             rows.add_row(on, format_load_and_last_answer(fullest), fullest.verdict());
@@ -94,12 +94,12 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
     let worst = FitSummary::worst_case(rated);
     rows.add_section(
         format!("{bus_name} at {}", worst.rates),
-        format!("{cells} cells, {}", reply_name(case)),
+        format!("{cells} cells, {}", answer_kind_name(case)),
         "",
     );
     rows.add_row(worst.case_name(), worst.table_value(), worst.cells);
     let parts = [
-        (format!("joints and {}", reply_name(case)), load.joints + load.answers),
+        (format!("joints and {}", answer_kind_name(case)), load.joints + load.answers),
         ("sensors".to_owned(), load.sensors),
         ("heartbeats".to_owned(), load.heartbeats),
     ];
@@ -107,16 +107,17 @@ fn add_bus_section(rows: &mut KeyValueTable, bus: &BusFit) {
         .iter()
         .filter(|it| it.1 > 0.0)
         .map(|(what, share)| format!("{what} {}", format_percent_number(*share)));
-    rows.add_row("  load", percent(load.total()), comma_separated(parts));
+    rows.add_row("  load", format_percent(load.total()), comma_separated(parts));
     let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
-    let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
-    let due = format!("due after {} ms", millis(case.deadline_ns()));
+    let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", format_millis((*ns)?))));
+    let due = format!("due after {} ms", format_millis(case.deadline_ns()));
     rows.add_row("last answer", format_last_answer(rated), comma_separated([due].into_iter().chain(bounds)));
-    let heartbeat = or_else_text(times.heartbeat_ns.map(|ns| format!("{} ms", millis(ns))), "no bound");
+    let heartbeat =
+        or_else_text(times.heartbeat_ns.map(|ns| format!("{} ms", format_millis(ns))), "no bound");
     rows.add_row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
     let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
     rows.add_row("cells that fit", most.max_cells_in_time().min(most.nodes), others);
-    rows.add_row("buses needed", format_needed_buses(need), each_need(need));
+    rows.add_row("buses needed", format_needed_buses(need), format_each_need(need));
     if !hints.is_empty() {
         rows.add_section("  what to change", "", "");
         for hint in hints {
@@ -144,7 +145,7 @@ fn is_roots_only(case: &BusCase) -> bool {
     matches!(case.answers, AnswerPlan::Sums { shared: false, .. })
 }
 
-const fn reply_name(case: &BusCase) -> &'static str {
+const fn answer_kind_name(case: &BusCase) -> &'static str {
     match case.answers {
         AnswerPlan::Torques { .. } => "torques",
         AnswerPlan::Sums { .. } => "sums",
@@ -161,46 +162,46 @@ const fn sensor_traffic_suffix(case: &BusCase) -> &'static str {
 
 /// Formats the load of a bus and the time of the last answer.
 fn format_load_and_last_answer(rated: &AssessedBus) -> String {
-    format!("{}, {}", percent(rated.load.total()), format_last_answer(rated))
+    format!("{}, {}", format_percent(rated.load.total()), format_last_answer(rated))
 }
 
 fn format_last_answer(rated: &AssessedBus) -> String {
     let AssessedBus { case, load, times, .. } = rated;
     match times.last_answer_ns() {
-        Some(last_ns) => format!("{} ms", millis(last_ns)),
+        Some(last_ns) => format!("{} ms", format_millis(last_ns)),
         None if load.total() > 1.0 => "no bound".to_owned(),
-        None => format!("above {} ms", millis(case.period_ns)),
+        None => format!("above {} ms", format_millis(case.period_ns)),
     }
 }
 
 /// Formats the time of the last answer in ms for a column of numbers.
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn last_ms(rated: &AssessedBus) -> String {
-    decimals(rated.times.last_answer_ns().map(|ns| ns as f64 / 1e6), 2, "-")
+    format_decimals(rated.times.last_answer_ns().map(|ns| ns as f64 / 1e6), 2, "-")
 }
 
 fn format_needed_buses(need: &NeededBuses) -> String {
     let why = comma_separated(need.binding_limits().into_iter().map(Limit::name));
-    match need.buses() {
+    match need.required_buses() {
         None => format!("none: {why}"),
         Some(1) => "1".to_owned(),
         Some(buses) => format!("{buses}: {why}"),
     }
 }
 
-fn each_need(need: &NeededBuses) -> String {
+fn format_each_need(need: &NeededBuses) -> String {
     let needs = [("bandwidth", need.bandwidth), ("deadline", need.deadline), ("nodes", need.nodes)];
     comma_separated(needs.map(|(name, buses)| format!("{name} {}", or_else_text(buses, "no number"))))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
-fn millis(ns: u64) -> String {
+fn format_millis(ns: u64) -> String {
     // Write at most two decimals, without trailing zeros.
     format!("{:.2}", ns as f64 / 1e6).trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
-fn micros(ns: u64) -> String {
+fn format_micros(ns: u64) -> String {
     format!("{:.1}", ns as f64 / 1e3)
 }
 

@@ -17,8 +17,8 @@ use trace::capture::{CaptureEntry, NoteKind, Reader};
 use self::show::write_frames;
 use super::FitCommand;
 use crate::input::{
-    self, BusReceiver, LossCounts, POLL_TIMEOUT, is_file, location, no_frame, note_other_skin, open_capture,
-    skin_so_far, stop_flag,
+    self, BusReceiver, LossCounts, POLL_TIMEOUT, is_file, location, no_frame_failure, note_skin_difference,
+    open_capture, skin_found_so_far, stop_flag,
 };
 use crate::output;
 use crate::print::comma_separated;
@@ -39,9 +39,9 @@ struct TrafficInput {
 impl FitCommand {
     /// Computes and prints for each frame when it would be sent on a bus with bit rates.
     pub(super) fn print_traffic_fit(&self) -> Result<(), Failure> {
-        let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
+        let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage_error)?;
         if let (Some(path), Some(skin)) = (&self.skin, &skin) {
-            note_other_skin(&self.sources, path, skin);
+            note_skin_difference(&self.sources, path, skin);
         }
         let mut out = BufWriter::new(InterruptibleWriter::new(io::stdout()));
         let name = comma_separated(self.sources.iter().map(|source| source.display()));
@@ -50,7 +50,8 @@ impl FitCommand {
         let (mut shadow, taken) = if self.are_captures(&name)? {
             let reader = open_capture(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
-            let mut shadow = self.shadow(skin.or_else(|| skin_so_far(&reader, "name one with --skin")))?;
+            let mut shadow =
+                self.create_shadow(skin.or_else(|| skin_found_so_far(&reader, "name one with --skin")))?;
             for before in &reader.extras().latched {
                 shadow.receive_latched(&before.bus, before.nanos, &before.frame);
             }
@@ -59,7 +60,7 @@ impl FitCommand {
             (shadow, taken)
         } else {
             let stopped = stop_flag()?;
-            let mut shadow = self.shadow(skin)?;
+            let mut shadow = self.create_shadow(skin)?;
             let taken = self.receive_live_traffic(&mut shadow, &mut out, &stopped)?;
             (shadow, taken)
         };
@@ -86,19 +87,19 @@ impl FitCommand {
         match self.sources.iter().filter(|source| is_file(source)).count() {
             0 => return Ok(false),
             files if files < self.sources.len() => {
-                return Err(Failure::usage(format!(
+                return Err(Failure::usage_error(format!(
                     "{name}: name one file, the parts of one recording, or only buses"
                 )));
             }
             _ => {}
         }
         if self.duration.is_some() {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "--duration is only for live buses, but {name} is a file: leave it out"
             )));
         }
         self.sources.iter().find(|source| source.is_dir()).map_or(Ok(true), |folder| {
-            Err(Failure::usage(format!(
+            Err(Failure::usage_error(format!(
                 "{} is a directory: name a candump log, an MCAP recording or a bus",
                 folder.display()
             )))
@@ -107,12 +108,13 @@ impl FitCommand {
 
     /// Creates the model of the buses with the bit rates of the command line, or else those of the skin, or else common
     /// ones.
-    fn shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
+    fn create_shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
         let requested = RequestedRates { nominal: self.nominal, data: self.data };
         let mut of_bus = self.rates.clone();
         for bus in skin.iter().flat_map(|skin| &skin.buses) {
             let rates = requested.for_bus(bus);
-            let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?.rates;
+            let rates =
+                rates.map_err(|error| Failure::usage_error(format!("bus {}: {error}", bus.name)))?.rates;
             of_bus.push((bus.name.clone(), rates));
         }
         let options = shadow::ShadowOptions {
@@ -122,9 +124,9 @@ impl FitCommand {
             each_frame: self.json,
             bench_traffic: self.bench_traffic,
             skin,
-            ..shadow::ShadowOptions::new(requested.rates().map_err(Failure::usage)?)
+            ..shadow::ShadowOptions::new(requested.rates().map_err(Failure::usage_error)?)
         };
-        Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))
+        Shadow::new(options).map_err(|error| Failure::usage_error(format!("--ber: {error}")))
     }
 
     /// Receives from buses until a signal, and passes the frames to the model.
@@ -134,7 +136,7 @@ impl FitCommand {
         out: &mut impl Write,
         stopped: &AtomicBool,
     ) -> Result<TrafficInput, Failure> {
-        let kinds = self.kinds.any_kinds()?;
+        let kinds = self.kinds.kinds_of_any_buses()?;
         let options = BusOptions { receive_buffer: RECEIVE_BUFFER_BYTES, ..BusOptions::default() };
         let mut receive_ends = input::open_bus_receivers(&self.sources, &kinds, None, &options, None)?;
         let length = self.duration.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
@@ -145,7 +147,7 @@ impl FitCommand {
             input::wait(&receive_ends, POLL_TIMEOUT)?;
             for receive_end in &mut receive_ends {
                 if let Err(error) = pass_frames(receive_end, shadow) {
-                    ended = Err(Failure::run(error));
+                    ended = Err(Failure::run_error(error));
                 }
             }
             if let Err(error) = write_frames(shadow, out).and_then(|()| out.flush()) {
@@ -185,7 +187,7 @@ fn pass_capture(
     let mut ended = loop {
         match reader.next() {
             Ok(None) => break Ok(()),
-            Err(error) => break Err(Failure::run(error)),
+            Err(error) => break Err(Failure::run_error(error)),
             Ok(Some(CaptureEntry::Frame(record))) => {
                 frames += 1;
                 shadow.receive(record.interface, record.time.nanos, &record.frame);
@@ -200,7 +202,7 @@ fn pass_capture(
                     NoteKind::Dropped(lost) if !note.interface.is_empty() => {
                         shadow.record_missing(note.interface, lost);
                     }
-                    NoteKind::Unreadable(why) if missing.unreadable() == 1 => {
+                    NoteKind::Unreadable(why) if missing.unreadable_count() == 1 => {
                         output::print_note(format_args!("{}: {why}", location(&name, note.line)));
                     }
                     NoteKind::Text | NoteKind::CanXl | NoteKind::Dropped(_) | NoteKind::Unreadable(_) => {}
@@ -211,11 +213,11 @@ fn pass_capture(
     if !reader.has_times() {
         shadow.without_times();
     }
-    missing.report(&reader, "left out");
+    missing.print_counts(&reader, "left out");
     if stop::stop_flag().load(Ordering::Relaxed) {
         output::print_note(format_args!("{name}: stopped after {frames} frames"));
     } else if frames == 0 && ended.is_ok() {
-        ended = Err(no_frame(&reader));
+        ended = Err(no_frame_failure(&reader));
     }
     Ok(TrafficInput { what, missing: missing.frames, ended })
 }

@@ -4,7 +4,7 @@ use model::decode::pick::NodeSelector;
 use protocol::id::{CellId, Node};
 
 /// Returns the cell that a packet addresses, or `None` if it addresses all cells.
-pub(super) const fn only_cell(addressee: &NodeSelector) -> Option<CellId> {
+pub(super) const fn single_cell(addressee: &NodeSelector) -> Option<CellId> {
     if let Node::Cell(cell) = addressee.node { Some(cell) } else { None }
 }
 

@@ -4,7 +4,7 @@ use clap::{Arg, ArgMatches, Args, Command, Error, FromArgMatches};
 use model::decode::parameter;
 use protocol::id::Kind;
 use protocol::packet::WORDS;
-use protocol::schema::{Field, Layout, packets};
+use protocol::schema::{Field, Layout, packet_schemas};
 
 /// Options of the page of the skin, which exclude all others.
 const SKIN_PAGE_OPTIONS: [&str; 3] = ["force", "proximity", "temperature"];
@@ -17,25 +17,26 @@ pub(super) struct OtherPageOptions {
 }
 
 /// Returns the layouts of the pages that a stimulus sets.
-pub(super) fn layouts() -> impl Iterator<Item = &'static Layout> {
-    packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts)
+pub(super) fn stimulus_layouts() -> impl Iterator<Item = &'static Layout> {
+    packet_schemas().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts)
 }
 
 /// Returns the fields of the pages other than the skin's.
-fn fields() -> impl Iterator<Item = (&'static Layout, &'static Field)> {
-    let others = layouts().filter(|layout| layout.number != 0);
+fn page_fields() -> impl Iterator<Item = (&'static Layout, &'static Field)> {
+    let others = stimulus_layouts().filter(|layout| layout.number != 0);
     others.flat_map(|layout| layout.fields.iter().map(move |field| (layout, field)))
 }
 
 impl OtherPageOptions {
     /// Returns the number and the words of the page, if one is given.
-    pub(super) fn page(&self) -> Result<Option<(u8, [i16; WORDS])>, String> {
+    pub(super) fn given_page(&self) -> Result<Option<(u8, [i16; WORDS])>, String> {
         let Some((layout, ..)) = self.given.first() else { return Ok(None) };
         let mut words = [0; WORDS];
         for (_, field, texts) in &self.given {
             for (word, text) in words.iter_mut().skip(field.first_bit() / 16).zip(texts) {
                 let read = parameter::parse_finite(text).and_then(|_| parameter::parse_value(field, text));
-                *word = read.map_err(|allowed| format!("--{} {text}: {allowed}", field.bare_name()))?;
+                *word =
+                    read.map_err(|allowed| format!("--{} {text}: {allowed}", field.name_without_unit()))?;
             }
         }
         Ok(Some((layout.number, words)))
@@ -45,10 +46,10 @@ impl OtherPageOptions {
 impl FromArgMatches for OtherPageOptions {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, Error> {
         let texts = |field: &Field| {
-            let texts = matches.get_many::<String>(field.bare_name())?;
+            let texts = matches.get_many::<String>(field.name_without_unit())?;
             Some(texts.cloned().collect())
         };
-        let given = fields().filter_map(|(layout, field)| Some((layout, field, texts(field)?)));
+        let given = page_fields().filter_map(|(layout, field)| Some((layout, field, texts(field)?)));
         Ok(Self { given: given.collect() })
     }
 
@@ -60,8 +61,8 @@ impl FromArgMatches for OtherPageOptions {
 
 impl Args for OtherPageOptions {
     fn augment_args(command: Command) -> Command {
-        fields().fold(command, |command, (layout, field)| {
-            let name = field.bare_name();
+        page_fields().fold(command, |command, (layout, field)| {
+            let name = field.name_without_unit();
             let (first, rest) = name.split_at(name.chars().next().map_or(0, char::len_utf8));
             // The names last as long as the program, as clap requires.
             let labels: Vec<&'static str> = match field.labels.as_slice() {
@@ -69,15 +70,17 @@ impl Args for OtherPageOptions {
                 labels => labels.iter().map(|label| &*label.to_uppercase().leak()).collect(),
             };
             let unit = if field.unit.is_empty() { String::new() } else { format!(" in {}", field.unit) };
-            let pages = fields().filter(|(other, _)| other.number != layout.number);
+            let pages = page_fields().filter(|(other, _)| other.number != layout.number);
             command.arg(
                 Arg::new(name)
                     .long(name)
-                    .num_args(field.elements())
+                    .num_args(field.element_count())
                     .value_names(labels)
                     .allow_negative_numbers(true)
                     .conflicts_with_all(
-                        SKIN_PAGE_OPTIONS.into_iter().chain(pages.map(|(_, field)| field.bare_name())),
+                        SKIN_PAGE_OPTIONS
+                            .into_iter()
+                            .chain(pages.map(|(_, field)| field.name_without_unit())),
                     )
                     .help(format!("{}{rest}{unit}; sent instead of a touch", first.to_uppercase())),
             )

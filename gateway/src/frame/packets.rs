@@ -10,7 +10,7 @@ use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 
 use super::addressee::addressee;
-use super::others::{OtherPageOptions, layouts};
+use super::others::{OtherPageOptions, stimulus_layouts};
 use super::sensing;
 
 #[derive(Debug, Subcommand)]
@@ -190,16 +190,16 @@ impl StimulusCommand {
             self.cell.node,
             self.epoch.map_or(StimulusStart::Next, |epoch| StimulusStart::Epoch(Epoch(epoch))),
         );
-        if let Some((number, words)) = self.others.page()? {
+        if let Some((number, words)) = self.others.given_page()? {
             let page = SensorPage::from_stimulus(number, words).map_err(|error| error.to_string())?;
             return Ok(Message::Stimulus { to, from, page });
         }
         let page = SensorPage::Skin(SkinSensors {
-            contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), force_words)?,
+            contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), parse_force_words)?,
             proximity: self
                 .proximity
                 .as_deref()
-                .map_or(Ok(Q1_14::ZERO), |text| sensor_value("--proximity", "proximity", text))?,
+                .map_or(Ok(Q1_14::ZERO), |text| parse_sensor_value("--proximity", "proximity", text))?,
             temperature: sensor_values(
                 "--temperature",
                 "temperature_c",
@@ -235,8 +235,8 @@ fn parse_option_value<T>(
 }
 
 /// Parses a value of a sensor field.
-fn sensor_value<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
-    let field = layouts().flat_map(|layout| &layout.fields).find(|field| field.name == name);
+fn parse_sensor_value<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
+    let field = stimulus_layouts().flat_map(|layout| &layout.fields).find(|field| field.name == name);
     let field = field.ok_or_else(|| format!("{option}: cells do not measure {name}"))?;
     let word = parse_option_value(option, text, |text| {
         parameter::parse_finite(text).and_then(|_| parameter::parse_value(field, text))
@@ -252,13 +252,13 @@ fn sensor_values<const F: u32, const N: usize>(
 ) -> Result<[Q<F>; N], String> {
     let mut all = [Q::ZERO; N];
     for (one, text) in all.iter_mut().zip(texts) {
-        *one = sensor_value(option, name, text)?;
+        *one = parse_sensor_value(option, name, text)?;
     }
     Ok(all)
 }
 
 /// Parses a force in N, and divides it among the three contact words.
-fn force_words(text: &str) -> Result<[Q5_10; 3], String> {
+fn parse_force_words(text: &str) -> Result<[Q5_10; 3], String> {
     let force = parse_option_value("--force", text, parameter::parse_finite)?;
     let words = contact_words(force);
     let sum: f64 = words.into_iter().map(Q::to_f64).sum();

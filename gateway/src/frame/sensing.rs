@@ -10,7 +10,7 @@ use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::sensing::continuous_sensing;
 use protocol::usage::{Failure, print_text};
 
-use super::addressee::{addressee, only_cell};
+use super::addressee::{addressee, single_cell};
 use crate::arguments::{OptionValue, one_of_values};
 use model::decode::pick::NodeSelector;
 
@@ -58,9 +58,10 @@ impl SensingCommand {
 
     /// Switches the cells on a bus, and waits until all have confirmed.
     pub(super) fn send(&self, bus: Bus, format: Format) -> Result<(), Failure> {
-        let mode = self.sensing().map_err(Failure::usage)?;
+        let mode = self.sensing().map_err(Failure::usage_error)?;
         let on = format!("{} ({})", bus.name(), bus.kind());
-        let confirmed = switch_sensing(bus, format, only_cell(&self.cell), mode).map_err(Failure::run)?;
+        let confirmed =
+            switch_sensing(bus, format, single_cell(&self.cell), mode).map_err(Failure::run_error)?;
         print_text(&format!(
             "{confirmed} on {on}: {}\n",
             ParameterWords(Parameter::Sensing.number(), mode.words())

@@ -6,21 +6,23 @@ use std::cmp::Reverse;
 use std::fmt::Display;
 
 use analysis::paper;
-use bench::summary::{BusSummary, CELL_ERROR_NM, CellSummary, HaltSummary, Outcome, ProcessorUse, Summary};
+use bench::summary::{
+    BusSummary, CellSummary, HaltSummary, MAX_CELL_ERROR_NM, Outcome, ProcessorUse, Summary,
+};
 use comfy_table::Color;
-use model::listing::ranges;
+use model::listing::node_id_ranges;
 use model::table::TorqueErrors;
 use protocol::usage::printable;
 
 use crate::print::{
-    GREEN, KeyValueTable, PLAIN, RED, YELLOW, comma_separated, count_with_noun, hanging_indent, or_else_text,
-    quantiles, space_separated,
+    GREEN, KeyValueTable, RED, RESET_COLOUR, YELLOW, comma_separated, count_with_noun, format_quantiles,
+    hanging_indent, or_else_text, space_separated,
 };
 
 /// Maximum number of halts listed one by one.
-const MAX_HALTS: usize = 10;
+const MAX_LISTED_HALTS: usize = 10;
 /// Maximum number of a bus's conspicuous cells that are listed one by one.
-const MAX_CELLS: usize = 5;
+const MAX_LISTED_CELLS: usize = 5;
 /// Maximum number of lines of the verdict, except in verbose mode.
 const MAX_VERDICT_LINES: usize = 6;
 /// Maximum width of a row's name in columns, except in verbose mode.
@@ -39,8 +41,8 @@ pub(super) struct TableStyle {
 
 /// Returns the verdict and the table of a run.
 pub(super) fn format_summary(summary: &Summary, look: TableStyle) -> String {
-    let rows = rows(summary, look);
-    verdict(summary, look, rows.columns()) + &rows.to_text()
+    let rows = summary_rows(summary, look);
+    verdict(summary, look, rows.width_in_columns()) + &rows.to_text()
 }
 
 fn verdict(summary: &Summary, look: TableStyle, columns: usize) -> String {
@@ -65,10 +67,10 @@ fn verdict(summary: &Summary, look: TableStyle, columns: usize) -> String {
         (false, 0) if !is_unknown => YELLOW,
         (false, _) => RED,
     };
-    if look.is_coloured { format!("{colour}{text}{PLAIN}\n") } else { format!("{text}\n") }
+    if look.is_coloured { format!("{colour}{text}{RESET_COLOUR}\n") } else { format!("{text}\n") }
 }
 
-fn rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
+fn summary_rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
     let cells = format!("{}, {:.1} s", count_with_noun(summary.cells.len(), "cell"), summary.duration_s);
     let (cells, ended) = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
         Some(halted) => (cells, format!("halted at {:.3} s", halted.at_s)),
@@ -81,7 +83,7 @@ fn rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
         KeyValueTable::with_terminal_width(look.columns, &summary.skin, cells, ended)
             .with_name_width(MAX_NAME_WIDTH)
     };
-    rows = rows.coloured(look.is_coloured);
+    rows = rows.with_colours(look.is_coloured);
     add_halt_sections(&mut rows, summary);
     for error in &summary.cell_errors {
         rows.add_section(
@@ -103,11 +105,11 @@ fn rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
 }
 
 fn add_halt_sections(rows: &mut KeyValueTable, summary: &Summary) {
-    for HaltSummary { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(MAX_HALTS) {
+    for HaltSummary { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(MAX_LISTED_HALTS) {
         let until = until_s.map_or_else(|| "to the end".to_owned(), |until| format!("to {until:.3} s"));
         rows.add_section("halted", format!("{at_s:.3} s {until}, epoch {epoch}"), reason);
     }
-    let more = summary.halts.len().saturating_sub(MAX_HALTS) as u64 + summary.further_halts;
+    let more = summary.halts.len().saturating_sub(MAX_LISTED_HALTS) as u64 + summary.further_halts;
     if more > 0 {
         rows.add_section(
             "halted",
@@ -166,7 +168,7 @@ fn add_accuracy_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bo
             );
         }
     }
-    rows.row_unless_zero(
+    rows.add_row_unless_zero(
         "saturated words, left out",
         accuracy.saturated,
         "beyond the range of the torque format",
@@ -186,15 +188,15 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
     rows.add_section("control loop", "median / 90 % / 99 % / max", "µs");
     rows.add_row(
         "began late",
-        quantiles(&control.late_us),
-        format!("idle {}", quantiles(&control.idle_late_us)),
+        format_quantiles(&control.late_us),
+        format!("idle {}", format_quantiles(&control.idle_late_us)),
     );
     if is_verbose && control.central_us.count > 0 {
-        rows.add_row("tick", quantiles(&control.took_us), "");
-        rows.add_row("  central computation in it", quantiles(&control.central_us), "distributed: 0");
+        rows.add_row("tick", format_quantiles(&control.took_us), "");
+        rows.add_row("  central computation in it", format_quantiles(&control.central_us), "distributed: 0");
     }
     if is_verbose && control.took_distributed_us.count > 0 {
-        rows.add_row("tick, distributed", quantiles(&control.took_distributed_us), "");
+        rows.add_row("tick, distributed", format_quantiles(&control.took_distributed_us), "");
     }
     let counts = [
         ("ticks", control.ticks, control.ticks_skipped),
@@ -204,8 +206,8 @@ fn add_control_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: boo
         rows.add_row(name, count, format!("{skipped} skipped"));
     }
     let why = "the bus refused them, or this machine was busy";
-    rows.row_unless_zero("frames not sent", control.unsent, why);
-    rows.row_unless_zero("records of ticks lost", control.records_lost, why);
+    rows.add_row_unless_zero("frames not sent", control.unsent, why);
+    rows.add_row_unless_zero("records of ticks lost", control.records_lost, why);
     for (name, count) in &control.controller {
         rows.add_row("external controller", count, name);
     }
@@ -244,7 +246,7 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
         );
     }
     if !bus.silent_cells.is_empty() {
-        rows.add_row("silent cells", comma_separated(ranges(&bus.silent_cells)), "");
+        rows.add_row("silent cells", comma_separated(node_id_ranges(&bus.silent_cells)), "");
     }
     let complete =
         format!("{} of {} complete", bus.epochs_complete, count_with_noun(bus.epochs_due, "epoch"));
@@ -252,7 +254,7 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
         let parts = sums.contributions;
         let unexpected = parts.unasked - parts.contact_unknown;
         let is_brief = !is_verbose && parts.in_time == parts.due;
-        due_rows(
+        add_due_rows(
             rows,
             "cells due in sums",
             parts.due,
@@ -270,7 +272,7 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
         add_sum_rows(rows, bus, is_verbose);
     } else {
         let is_brief = !is_verbose && replies.in_time == replies.due;
-        due_rows(
+        add_due_rows(
             rows,
             "replies due",
             replies.due,
@@ -282,7 +284,8 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
             rows.add_row("  in time", replies.in_time, format!("{} late", replies.late));
             let missing = replies.due - replies.in_time - replies.late;
             if is_verbose || missing > 0 {
-                let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, key_words(why)));
+                let [reasons @ .., _] =
+                    replies.missing_replies_by_reason().map(|(why, count)| (count, key_words(why)));
                 add_unexplained_row(
                     rows,
                     "  missing",
@@ -296,14 +299,14 @@ fn add_reply_rows(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) 
     if is_verbose {
         let last = if bus.sums.is_some() { "last sum" } else { "last reply" };
         let name = format!("{last} after broadcast, µs");
-        rows.add_row(name, quantiles(&bus.last_reply_us), "by kernel time stamps");
+        rows.add_row(name, format_quantiles(&bus.last_reply_us), "by kernel time stamps");
         if bus.sums.is_none() {
-            rows.add_row("  each reply, µs", quantiles(&bus.reply_us), "late ones included");
+            rows.add_row("  each reply, µs", format_quantiles(&bus.reply_us), "late ones included");
         }
         add_joint_age_row(rows, bus);
     } else if bus.last_reply_us.count > 0 {
         let name = if bus.sums.is_some() { "last sum, µs" } else { "last reply, µs" };
-        rows.add_row(name, quantiles(&bus.last_reply_us), "after the joints");
+        rows.add_row(name, format_quantiles(&bus.last_reply_us), "after the joints");
     }
 }
 
@@ -355,7 +358,7 @@ fn add_unexplained_row(
 }
 
 /// Adds rows on replies that were due, and on torques that were not due and so not compared, by reason.
-fn due_rows(
+fn add_due_rows(
     rows: &mut KeyValueTable,
     name: &str,
     due: u64,
@@ -381,7 +384,7 @@ fn due_rows(
 /// Adds a row on the age of joints that cells have not received.
 fn add_joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
     let why = "large: busy machine; losses: see the bus";
-    rows.add_row("joint age at heartbeat, µs", quantiles(&bus.joints_not_taken_us), why);
+    rows.add_row("joint age at heartbeat, µs", format_quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Converts a key of the summary to words.
@@ -429,12 +432,12 @@ fn add_noteworthy_cell_rows(rows: &mut KeyValueTable, bus: &BusSummary, all: &[C
             "while it should have sent others",
         );
     }
-    let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > CELL_ERROR_NM);
+    let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > MAX_CELL_ERROR_NM);
     let rank =
         |cell: &CellSummary| (is_off(cell), cell.missing.values().sum::<u64>(), cell.late, cell.restarts);
     let mut worst: Vec<_> = all().filter(|cell| rank(cell) > (false, 0, 0, 0)).collect();
     worst.sort_by_key(|cell| Reverse(rank(cell)));
-    for cell in worst.iter().take(MAX_CELLS) {
+    for cell in worst.iter().take(MAX_LISTED_CELLS) {
         let CellSummary { due, in_time, late, restarts, .. } = **cell;
         let late = (late > 0).then(|| format!("{late} late"));
         let missing = cell.missing.iter().map(|(why, count)| format!("{count} {}", key_words(why)));
@@ -445,8 +448,8 @@ fn add_noteworthy_cell_rows(rows: &mut KeyValueTable, bus: &BusSummary, all: &[C
         let in_time = (due > 0).then(|| format!("{in_time} of {due} replies in time"));
         rows.add_row(format!("cell {}", cell.node), or_else_text(in_time, ""), comma_separated(why));
     }
-    let more = worst.len().saturating_sub(MAX_CELLS);
-    rows.row_unless_zero("further cells that stand out", more as u64, "--summary has each cell");
+    let more = worst.len().saturating_sub(MAX_LISTED_CELLS);
+    rows.add_row_unless_zero("further cells that stand out", more as u64, "--summary has each cell");
 }
 
 fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
@@ -472,7 +475,7 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
     let Some(recording) = &summary.recording else { return };
     for file in &recording.files {
         let frames = count_with_noun(file.frames, "frame");
-        let size = size(file.bytes);
+        let size = format_size(file.bytes);
         rows.add_section("recording", &file.path, format!("{frames}, {size}"));
     }
     if is_verbose || recording.lost > 0 || recording.files.is_empty() {
@@ -480,7 +483,7 @@ fn add_cost_rows(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) 
     }
 }
 
-fn size(bytes: u64) -> String {
+fn format_size(bytes: u64) -> String {
     match bytes {
         0..10_000 => format!("{bytes} bytes"),
         10_000..10_000_000 => format!("{} KB", bytes / 1_000),

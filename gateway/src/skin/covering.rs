@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 use clap::Args;
-use cover::{CoverOptions, KeepOut, LinkFigures, MAX_NODES, MAX_PITCH, MIN_PITCH, RobotLink, cover};
+use cover::{CoverOptions, KeepOut, LinkFigures, MAX_CELLS_PER_BUS, MAX_PITCH, MIN_PITCH, RobotLink, cover};
 use protocol::usage::Failure;
 use robots::{CellOnLink, Isometry3, Urdf, UrdfChain};
 
@@ -83,7 +83,7 @@ pub(super) struct CoverResult {
 
 impl CoverArguments {
     /// Covers the links with cells. A link belongs to the first chain that moves it, and each bus to one chain.
-    pub(super) fn cells(
+    pub(super) fn cover_links(
         &self,
         urdf: &Urdf,
         file: &Path,
@@ -106,14 +106,14 @@ impl CoverArguments {
             })?;
             Ok(RobotLink { name: name.to_owned(), parts, pose })
         });
-        let links: Vec<_> = links.collect::<Result<_, String>>().map_err(Failure::usage)?;
+        let links: Vec<_> = links.collect::<Result<_, String>>().map_err(Failure::usage_error)?;
         if let Some(bare) = self
             .cover
             .iter()
             .find(|name| links.iter().any(|link| link.name == **name && link.parts.is_empty()))
         {
             let file = &urdf.file;
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "--cover {bare}: {file} has no visual for this link: add one, or take the link out of --cover"
             )));
         }
@@ -141,10 +141,10 @@ impl CoverArguments {
                 .cloned()
                 .collect();
             let skin = cover(&own, &others, &self.options(&own))
-                .map_err(|error| Failure::usage(format!("--cover: {error}")))?;
+                .map_err(|error| Failure::usage_error(format!("--cover: {error}")))?;
             if let Some(bare) = skin.links.iter().find(|figures| figures.cells == 0) {
                 let is_flat = own.iter().any(|link| link.name == bare.name && !has_area(link));
-                return Err(Failure::usage(no_cells_reason(bare, is_flat)));
+                return Err(Failure::usage_error(no_cells_reason(bare, is_flat)));
             }
             covered.cells.extend(skin.cells.iter().map(|cell| CellOnLink {
                 link: own.get(cell.link).map_or_else(String::new, |link| link.name.clone()),
@@ -170,7 +170,7 @@ impl CoverArguments {
         };
         let mut owners = Vec::with_capacity(self.cover.len());
         for (index, name) in self.cover.iter().enumerate() {
-            let wrong = |why: String| Failure::usage(format!("--cover {name}: {why}"));
+            let wrong = |why: String| Failure::usage_error(format!("--cover {name}: {why}"));
             if self.cover.iter().take(index).any(|before| before == name) {
                 return Err(wrong("this link is named twice: name it once".to_owned()));
             }
@@ -181,7 +181,7 @@ impl CoverArguments {
             );
         }
         for name in &self.leave_out {
-            let wrong = |why: String| Failure::usage(format!("--leave-out {name}: {why}"));
+            let wrong = |why: String| Failure::usage_error(format!("--leave-out {name}: {why}"));
             urdf.pose(name, &|_| 0.0).map_err(|error| wrong(error.to_string()))?;
             if self.cover.contains(name) {
                 return Err(wrong("--cover names this link: take it out of one of them".to_owned()));
@@ -189,7 +189,7 @@ impl CoverArguments {
         }
         if let Some(lost) = self.keep_out.iter().find(|lost| !self.cover.contains(&lost.link)) {
             let links = comma_separated(&self.cover);
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "--keep-out {}: {} is not covered: the covered links are {links}",
                 lost.text, lost.link
             )));
@@ -206,7 +206,7 @@ impl CoverArguments {
             pitch: self.pitch,
             seed: self.seed,
             keep_out: keep_out.collect(),
-            nodes_per_bus: usize::from(self.nodes_per_bus).min(MAX_NODES),
+            nodes_per_bus: usize::from(self.nodes_per_bus).min(MAX_CELLS_PER_BUS),
             ..CoverOptions::default()
         }
     }

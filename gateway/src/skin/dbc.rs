@@ -2,14 +2,14 @@
 
 use std::path::PathBuf;
 
-use analysis::dbc::dbc;
+use analysis::dbc::dbc_text;
 use clap::Args;
 use protocol::can::Format;
 use protocol::usage::{Failure, print_text};
 
 use crate::arguments::bus_names;
-use crate::input::skin_in;
-use crate::output::{OverwriteOption, check_distinct};
+use crate::input::read_skin_or_recording;
+use crate::output::{OverwriteOption, check_distinct_files};
 use crate::print::comma_separated;
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
@@ -43,17 +43,17 @@ pub(super) struct DbcCommand {
 impl DbcCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let file = self.file.display();
-        check_distinct([("-o", self.output.as_deref())], [self.file.as_path()])?;
-        let skin = skin_in(&self.file)?;
+        check_distinct_files([("-o", self.output.as_deref())], [self.file.as_path()])?;
+        let skin = read_skin_or_recording(&self.file)?;
         let names = || comma_separated(bus_names(&skin));
         let bus = match (&self.bus, skin.buses.as_slice()) {
-            (Some(name), _) => skin.bus_named(name).ok_or_else(|| {
-                Failure::usage(format!("{file} has no bus {name:?}; its buses are {}", names()))
+            (Some(name), _) => skin.bus_index(name).ok_or_else(|| {
+                Failure::usage_error(format!("{file} has no bus {name:?}; its buses are {}", names()))
             })?,
             (None, [_]) => 0,
             (None, buses) => {
                 let many = buses.len();
-                return Err(Failure::usage(format!(
+                return Err(Failure::usage_error(format!(
                     "{file} has {many} buses, but a DBC file describes one: add --bus with one of {}",
                     names()
                 )));
@@ -62,21 +62,21 @@ impl DbcCommand {
         let description = skin.buses.get(bus).expect("just found");
         match (description.format, self.joined) {
             (Format::Classic, false) => {
-                return Err(Failure::usage(format!(
+                return Err(Failure::usage_error(format!(
                     "bus {} is classic: a packet consists of several frames with one identifier, which a DBC cannot \
                      tell apart; --joined describes the joined bytes of these frames, for a program that joins them first",
                     description.name
                 )));
             }
             (Format::Fd, true) => {
-                return Err(Failure::usage(format!(
+                return Err(Failure::usage_error(format!(
                     "--joined is for classic buses; on {} a packet is one FD frame",
                     description.name
                 )));
             }
             (Format::Fd, false) | (Format::Classic, true) => {}
         }
-        let text = dbc(&skin, bus);
+        let text = dbc_text(&skin, bus);
         match self.output {
             Some(path) => self.overwrite.write("-o", &path, &text),
             None => print_text(&text),

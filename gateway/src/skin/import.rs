@@ -9,7 +9,7 @@ use protocol::usage::{Failure, print_text};
 use robots::{CellOnLink, ImportError, JointKind, SkinImport as Described, UrdfChain};
 
 use super::super::columns::{Columns, CsvTable};
-use super::super::output::{OverwriteOption, check_distinct, is_standard_output, print_note};
+use super::super::output::{OverwriteOption, check_distinct_files, is_standard_output, print_note};
 use super::super::print::{comma_separated, count_with_noun};
 use super::super::robot_file::{read_urdf, relative_path};
 use super::covering::{self, CoverArguments, CoverResult};
@@ -62,22 +62,25 @@ const COLUMNS: Columns =
 impl ImportCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
         let read = [Some(self.urdf.as_path()), self.places.as_deref()].into_iter().flatten();
-        check_distinct([("-o", self.output.as_deref())], read)?;
+        check_distinct_files([("-o", self.output.as_deref())], read)?;
         let file = self.urdf.display().to_string();
-        let (urdf, _) = read_urdf(&self.urdf).map_err(Failure::usage)?;
-        let chain = |tip: &String| urdf.chain(self.root.as_deref(), tip).map_err(Failure::usage);
+        let (urdf, _) = read_urdf(&self.urdf).map_err(Failure::usage_error)?;
+        let chain = |tip: &String| urdf.chain(self.root.as_deref(), tip).map_err(Failure::usage_error);
         let chains = self.tip.iter().map(chain).collect::<Result<Vec<_>, _>>()?;
         if let Some(twice) =
             self.tip.iter().enumerate().find(|(index, tip)| self.tip.iter().take(*index).any(|it| it == *tip))
         {
-            return Err(Failure::usage(format!("--tip {}: this tip is named twice: name it once", twice.1)));
+            return Err(Failure::usage_error(format!(
+                "--tip {}: this tip is named twice: name it once",
+                twice.1
+            )));
         }
         let CoverResult { cells, figures } = match &self.places {
             Some(path) => CoverResult { cells: cells(path)?, figures: Vec::new() },
             None if self.covering.cover.is_empty() => CoverResult { cells: Vec::new(), figures: Vec::new() },
-            None => self.covering.cells(&urdf, &self.urdf, &chains)?,
+            None => self.covering.cover_links(&urdf, &self.urdf, &chains)?,
         };
-        let command = self.command();
+        let command = self.creating_command();
         // A skin cannot name a URDF that was read from a pipe.
         let is_named = |path: &&Path| !is_standard_output(path) && self.urdf.is_file();
         let output = self.output.as_deref().filter(is_named);
@@ -90,8 +93,10 @@ impl ImportCommand {
             cells: &cells,
         };
         let wrong = |error: ImportError| match &self.places {
-            Some(path) if error.is_in_cells() => Failure::usage(format!("{}: {error}", path.display())),
-            Some(_) | None => Failure::usage(format!("{file}: {error}")),
+            Some(path) if error.is_error_in_cells() => {
+                Failure::usage_error(format!("{}: {error}", path.display()))
+            }
+            Some(_) | None => Failure::usage_error(format!("{file}: {error}")),
         };
         let skin = import.toml().map_err(wrong)?;
         match &self.output {
@@ -111,7 +116,7 @@ impl ImportCommand {
     }
 
     /// Returns the command that creates the skin, with the names of files but without their directories.
-    fn command(&self) -> String {
+    fn creating_command(&self) -> String {
         let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let mut command = format!("skinbus skin import {}", name(&self.urdf));
         for tip in &self.tip {
@@ -156,7 +161,7 @@ fn suspicious_limits(chain: &UrdfChain) -> impl Iterator<Item = String> {
 }
 
 fn read_text(path: &Path) -> Result<String, Failure> {
-    document::read_text(path).map_err(Failure::usage)
+    document::read_text(path).map_err(Failure::usage_error)
 }
 
 /// Reads the cells from a CSV file.
@@ -187,7 +192,7 @@ fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
         });
     }
     if cells.is_empty() {
-        return Err(Failure::usage(format!(
+        return Err(Failure::usage_error(format!(
             "{file}: it contains no cells: write a line for each, or leave --places out"
         )));
     }

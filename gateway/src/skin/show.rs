@@ -6,12 +6,12 @@ use clap::Args;
 use protocol::parameters::RowKind;
 use protocol::skin::{Cell, Skin};
 use protocol::usage::{Failure, print_text};
-use view::{Scene, StillPage};
+use view::{Scene, StaticSkinPage};
 
-use super::super::output::{OverwriteOption, check_distinct};
+use super::super::output::{OverwriteOption, check_distinct_files};
 use super::super::print::space_separated;
 use super::super::robot_file::urdf_path;
-use super::super::surface::shells;
+use super::super::surface::robot_meshes;
 use super::super::visuals::PackageOptions;
 
 /// Maximum number of triangles of the robot in a page; larger meshes are simplified.
@@ -39,14 +39,14 @@ pub(super) struct ShowCommand {
 
 impl ShowCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
+        let skin = Skin::read(&self.file).map_err(Failure::usage_error)?;
         let urdf = skin.robot.urdf.as_deref().map(|urdf| urdf_path(&self.file, urdf));
         let read = [Some(self.file.as_path()), urdf.as_deref()].into_iter().flatten();
-        check_distinct([("-o", self.output.as_deref())], read)?;
+        check_distinct_files([("-o", self.output.as_deref())], read)?;
         if let Some(path) = &self.output {
-            self.overwrite.check("-o", path)?;
+            self.overwrite.check_writable("-o", path)?;
         }
-        let page = still_view(&self.file, &skin, &self.packages).to_html();
+        let page = still_page(&self.file, &skin, &self.packages).to_html();
         match &self.output {
             Some(path) => self.overwrite.write("-o", path, &page),
             None => print_text(&page),
@@ -55,11 +55,11 @@ impl ShowCommand {
 }
 
 /// Reads the meshes of a skin's robot, and returns the skin as a page shows it.
-pub(crate) fn still_view(file: &Path, skin: &Skin, packages: &PackageOptions) -> StillPage {
+pub(crate) fn still_page(file: &Path, skin: &Skin, packages: &PackageOptions) -> StaticSkinPage {
     let position = |[min, max]: [f64; 2]| 0.0_f64.clamp(min, max);
-    StillPage {
+    StaticSkinPage {
         scene: Scene::from_skin(skin, false),
-        surface: shells(file, skin, packages, MAX_TRIANGLES),
+        surface: robot_meshes(file, skin, packages, MAX_TRIANGLES),
         positions: skin.robot.joints.iter().map(|joint| position(joint.limits)).collect(),
         details: skin.cells.iter().map(|cell| details(skin, cell)).collect(),
         moved: Vec::new(),

@@ -7,7 +7,7 @@ use protocol::skin::Skin;
 use protocol::usage::{Failure, print_text};
 use robots::write_urdf;
 
-use super::super::output::{OverwriteOption, check_distinct};
+use super::super::output::{OverwriteOption, check_distinct_files};
 
 /// Describe a skin's robot as a URDF: its chains, row by row
 ///
@@ -30,8 +30,8 @@ pub(super) struct UrdfCommand {
 
 impl UrdfCommand {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
-        check_distinct([("-o", self.output.as_deref())], [self.file.as_path()])?;
+        let skin = Skin::read(&self.file).map_err(Failure::usage_error)?;
+        check_distinct_files([("-o", self.output.as_deref())], [self.file.as_path()])?;
         let text = write_urdf(&skin).xml;
         match &self.output {
             Some(path) => self.overwrite.write("-o", path, &text),

@@ -28,7 +28,7 @@ impl AddressFile {
             return print_text(&text).map(|()| None);
         }
         let refused =
-            |error: io::Error| Failure::usage(format!("--address-file {}: {error}", path.display()));
+            |error: io::Error| Failure::usage_error(format!("--address-file {}: {error}", path.display()));
         let is_file = fs::symlink_metadata(path).is_ok_and(|about| about.is_file());
         if is_file && !is_address_file(path) {
             let why = "it exists and does not contain the address of a page: name another file";
@@ -56,7 +56,7 @@ impl AddressFile {
 impl Drop for AddressFile {
     fn drop(&mut self) {
         // Remove the file only if no other page has replaced it.
-        if start_of(&self.path).is_ok_and(|text| text == self.text) {
+        if read_beginning(&self.path).is_ok_and(|text| text == self.text) {
             let _ = fs::remove_file(&self.path);
         }
     }
@@ -64,10 +64,10 @@ impl Drop for AddressFile {
 
 /// Returns true if an earlier page left the file.
 fn is_address_file(path: &Path) -> bool {
-    start_of(path).is_ok_and(|text| text.starts_with("http://") && text.lines().count() == 1)
+    read_beginning(path).is_ok_and(|text| text.starts_with("http://") && text.lines().count() == 1)
 }
 
-fn start_of(path: &Path) -> io::Result<String> {
+fn read_beginning(path: &Path) -> io::Result<String> {
     let mut text = String::new();
     File::open(path)?.take(MAX_FILE_BYTES).read_to_string(&mut text)?;
     Ok(text)

@@ -35,7 +35,7 @@ pub(super) fn required_token(
         Some(token) => Ok(Some(token)),
         None if acts || !listen.ip().is_loopback() => {
             let failed = |error| {
-                Failure::run(format!(
+                Failure::run_error(format!(
                     "cannot create a random token for the page: {error}; give one with --token-file"
                 ))
             };
@@ -50,7 +50,7 @@ fn token_from_environment() -> Result<Option<Token>, Failure> {
         return Ok(None);
     };
     let token = Token::parse(&text.to_string_lossy());
-    token.map(Some).map_err(|error| Failure::usage(format!("{TOKEN_VARIABLE}: {error}")))
+    token.map(Some).map_err(|error| Failure::usage_error(format!("{TOKEN_VARIABLE}: {error}")))
 }
 
 fn read(path: &Path) -> Result<Token, Failure> {
@@ -61,9 +61,10 @@ fn read(path: &Path) -> Result<Token, Failure> {
         (&file).take(MAX_FILE_BYTES).read_to_string(&mut text)?;
         Ok((text, file))
     };
-    let (text, file) = text().map_err(|error| Failure::usage(format!("--token-file {name}: {error}")))?;
+    let (text, file) =
+        text().map_err(|error| Failure::usage_error(format!("--token-file {name}: {error}")))?;
     let token = Token::parse(text.trim());
-    let token = token.map_err(|error| Failure::usage(format!("--token-file {name}: {error}")))?;
+    let token = token.map_err(|error| Failure::usage_error(format!("--token-file {name}: {error}")))?;
     let others =
         file.metadata().ok().filter(|about| about.is_file() && about.permissions().mode() & 0o077 != 0);
     if others.is_some() {

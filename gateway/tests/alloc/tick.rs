@@ -15,14 +15,14 @@ use bench::bus::link::SharedBus;
 use bench::bus::realtime;
 use control::controller::KinestheticController;
 use control::cycle::turn::{BusPort, BusState, SharedRunState, TickDriver};
-use control::cycle::{Cycle, Tick};
+use control::cycle::{ControlCycle, Tick};
 use control::robot::SimulatedArm;
 use model::generate::{SkinRequest, generate};
 use model::scenario::{ModeChange, Scenario, TorqueSource};
 use model::table::BusTable;
 use protocol::bus::{Bus, BusKind, BusOptions, KindChoice};
 use protocol::can::Frame;
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -81,7 +81,11 @@ fn turn_of(
     let modes = vec![ModeChange { at: Micros(0), mode }];
     let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
     let controller = Box::new(KinestheticController::new(skin).unwrap());
-    let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, padded(&[0.1; WORDS]))));
+    let cycle = ControlCycle::new(
+        skin,
+        controller,
+        Box::new(SimulatedArm::new(skin, pad_with_defaults(&[0.1; WORDS]))),
+    );
     let turn =
         TickDriver::new(cycle, vec![line], Arc::new(scenario), Arc::new(SharedRunState::default()), records);
     (turn, input, table, state)
@@ -213,7 +217,7 @@ fn ticks(mode: TorqueSource, bus: &Bus, carries: bool) -> Run {
         snapshots.publish();
         let tick = Tick { number, time: Micros(number * 2_000) };
         let before = ALLOCATIONS.with(Cell::get);
-        turn.run_tick(tick, 0, realtime::now(), realtime::now, |_, frames| {
+        turn.run_tick(tick, 0, realtime::monotonic_ns(), realtime::monotonic_ns, |_, frames| {
             let taken = bus.try_send_all(frames);
             run.sent += frames.len();
             run.taken += if taken { frames.len() } else { 0 };

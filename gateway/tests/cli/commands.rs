@@ -12,7 +12,7 @@ use std::process::{Command, Output, Stdio};
 use protocol::can::{Format, Frame};
 use protocol::candump;
 use protocol::message::Message;
-use protocol::packet::{Lengths, Packet, Reassembler, Reassembly, data_id};
+use protocol::packet::{Lengths, Packet, Reassembler, Reassembly, data_frame_id};
 use protocol::time::Micros;
 use tempfile::TempDir;
 
@@ -227,7 +227,7 @@ fn packet(frames: &[Frame], format: Format) -> Packet {
         (Format::Classic, [first, second]) => {
             let mut segment = Reassembler::NONE;
             let mut push = |frame: &Frame| {
-                segment.push(Micros(0), data_id(frame).unwrap(), Lengths::ALL, frame.data()).unwrap()
+                segment.push(Micros(0), data_frame_id(frame).unwrap(), Lengths::ALL, frame.data()).unwrap()
             };
             assert_eq!(push(first), Reassembly::Waiting);
             let Reassembly::Complete(packet) = push(second) else { panic!("{frames:?}") };

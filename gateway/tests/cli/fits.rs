@@ -13,7 +13,7 @@ use protocol::id::{CellId, Node};
 use protocol::message::{
     Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State, StimulusStart,
 };
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::packet::{Epoch, WORDS};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -100,7 +100,7 @@ fn run() -> Vec<(u64, Message)> {
     for node in 1..=CELLS {
         let heartbeat = Heartbeat {
             serial: u32::try_from(node).unwrap(),
-            state: State::CLAIMING,
+            state: State::CLAIMING_NODE_ID,
             ..Heartbeat::default()
         };
         let page = NetworkPage::Heartbeat(heartbeat);
@@ -116,7 +116,7 @@ fn run() -> Vec<(u64, Message)> {
                 Message::Stimulus { to: Node::Cell(cell(node)), from: StimulusStart::Next, page },
             ));
         }
-        let joints = Joints { positions: padded(&[Q1_14::from_bits(0x2345); WORDS]), in_use: 6 };
+        let joints = Joints { positions: pad_with_defaults(&[Q1_14::from_bits(0x2345); WORDS]), in_use: 6 };
         said.push((now, Message::Joints { epoch, joints }));
         for node in 1..=ANSWERING {
             let torque = [0x1234; WORDS];

@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use analysis::stats::{Stats, StatsReport};
+use analysis::stats::{CaptureStats, StatsReport};
 use model::decode::settle::OrderedDecoder;
 use model::decode::{Decoded, ForeignReason};
 use protocol::can::{Format, Frame};
@@ -42,7 +42,7 @@ fn record(nanos: u64, frame: Frame) -> Record<'static> {
 }
 
 fn statistics(frames: &[(u64, Frame)]) -> StatsReport {
-    let mut stats = Stats::default();
+    let mut stats = CaptureStats::default();
     for ((nanos, frame), decoded) in settled(frames) {
         stats.record(&record(nanos, frame), &decoded);
     }
@@ -153,7 +153,7 @@ fn our_packets_are_found_among_foreign_frames_of_the_same_bus() {
         let bus = &report.buses[0];
         assert_eq!((bus.cells.len(), bus.epochs.missing), (9, 0));
         assert_eq!(bus.foreign.frames, u64::try_from(foreign).unwrap());
-        assert_eq!(bus.refused.by_reason().map(|(_, count)| count), [0; 4]);
+        assert_eq!(bus.refused.counts_by_reason().map(|(_, count)| count), [0; 4]);
     }
 }
 
@@ -185,19 +185,19 @@ fn a_frame_waits_no_longer_than_the_reassembly_timeout() {
     settler.push(Micros(1_000_000), "can0", &first, 1);
     assert_eq!(settler.pop(), None, "the second segment may come");
     settler.push(Micros(1_000_150), "can0", &second, 2);
-    let settled = std::iter::from_fn(|| settler.pop()).map(|(item, it)| (item, it.verdict()));
+    let settled = std::iter::from_fn(|| settler.pop()).map(|(item, it)| (item, it.verdict_word()));
     assert_eq!(settled.collect::<Vec<_>>(), [(1, "segment"), (2, "ok")]);
     // A live bus on which no more frames come.
     settler.push(Micros(2_000_000), "can0", &first, 3);
     settler.handle_time(Micros(2_010_000));
     assert_eq!(settler.pop(), None);
     settler.handle_time(Micros(2_200_000));
-    assert_eq!(settler.pop().map(|(item, it)| (item, it.verdict())), Some((3, "foreign")));
+    assert_eq!(settler.pop().map(|(item, it)| (item, it.verdict_word())), Some((3, "foreign")));
     assert!(!settler.is_waiting());
     // A segment that has timed out is no longer a first segment.
     settler.push(Micros(2_200_100), "can0", &second, 4);
     settler.finish();
-    assert_eq!(settler.pop().map(|(item, it)| (item, it.verdict())), Some((4, "foreign")));
+    assert_eq!(settler.pop().map(|(item, it)| (item, it.verdict_word())), Some((4, "foreign")));
 }
 
 #[test]

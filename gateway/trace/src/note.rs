@@ -51,7 +51,7 @@ impl BusNote {
     /// Returns the text of the note.
     #[must_use]
     pub fn text(self, bus: &str) -> String {
-        format!("{START}{bus}{}", self.text_suffix())
+        format!("{BUS_NOTE_PREFIX}{bus}{}", self.text_suffix())
     }
 
     /// Parses a note. Returns the bus and its new state, or `None` if the note is not about the state of a bus.
@@ -60,12 +60,12 @@ impl BusNote {
         let text = core::str::from_utf8(note.text).ok().filter(|_| note.kind == NoteKind::Text)?;
         // In a log the note is a comment.
         let text = text.strip_prefix("# ").unwrap_or(text);
-        let of = |it: Self| Some((text.strip_prefix(START)?.strip_suffix(it.text_suffix())?, it));
+        let of = |it: Self| Some((text.strip_prefix(BUS_NOTE_PREFIX)?.strip_suffix(it.text_suffix())?, it));
         Self::ALL.into_iter().find_map(of)
     }
 }
 
-const START: &str = "the bus '";
+const BUS_NOTE_PREFIX: &str = "the bus '";
 
 #[cfg(test)]
 mod tests {

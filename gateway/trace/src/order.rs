@@ -13,9 +13,9 @@ use std::collections::BTreeMap;
 
 /// The time for which a frame waits for older ones, in ns: it is released when a frame newer by this much has been
 /// read.
-pub const WINDOW_NS: u64 = 1_000_000_000;
+pub const REORDER_WINDOW_NS: u64 = 1_000_000_000;
 /// The maximum number of waiting frames.
-pub const WINDOW_FRAMES: usize = 8_192;
+pub const MAX_WAITING_FRAMES: usize = 8_192;
 
 /// A frame that is released for sending.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -68,8 +68,9 @@ impl<T> BusMerger<T> {
     /// Returns the next frame in order of time. Returns `None` if an older frame may still be read from the capture.
     pub fn pop(&mut self) -> Option<ReleasedFrame<T>> {
         let (&(key, _), _) = self.waiting.first_key_value()?;
-        let waits = self.newest.saturating_sub(key) <= WINDOW_NS && self.waiting.len() <= WINDOW_FRAMES;
-        if waits { None } else { self.pop_last() }
+        let waits =
+            self.newest.saturating_sub(key) <= REORDER_WINDOW_NS && self.waiting.len() <= MAX_WAITING_FRAMES;
+        if waits { None } else { self.pop_without_waiting() }
     }
 
     /// Returns true if no frame waits.
@@ -79,7 +80,7 @@ impl<T> BusMerger<T> {
     }
 
     /// Returns the next frame without waiting, at the end of the capture.
-    pub fn pop_last(&mut self) -> Option<ReleasedFrame<T>> {
+    pub fn pop_without_waiting(&mut self) -> Option<ReleasedFrame<T>> {
         let ((key, _), (nanos, item)) = self.waiting.pop_first()?;
         let is_late = nanos < self.released;
         self.released = self.released.max(key);
@@ -100,7 +101,7 @@ mod tests {
             order.push(bus, nanos, (bus, place));
             out.extend(std::iter::from_fn(|| order.pop()));
         }
-        out.extend(std::iter::from_fn(|| order.pop_last()));
+        out.extend(std::iter::from_fn(|| order.pop_without_waiting()));
         out
     }
 
@@ -132,10 +133,10 @@ mod tests {
     #[test]
     fn no_more_frames_wait_than_are_said_to() {
         let mut order = BusMerger::default();
-        for place in 0..3 * WINDOW_FRAMES {
+        for place in 0..3 * MAX_WAITING_FRAMES {
             order.push(0, 7, place);
             while order.pop().is_some() {}
-            assert!(order.waiting.len() <= WINDOW_FRAMES);
+            assert!(order.waiting.len() <= MAX_WAITING_FRAMES);
         }
     }
 

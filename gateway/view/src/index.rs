@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use protocol::skin::Skin;
 use trace::capture::{CaptureError, Reader, SeekPoint};
 
-use crate::locked;
+use crate::lock_ignoring_poison;
 use crate::tape::{Event, EventDetector, EventKind, PlaybackState, PlaybackStep};
 
 /// The approximate maximum memory for all stored states, in bytes.
@@ -32,10 +32,10 @@ pub struct Checkpoint {
 
 /// The index of a recording. One thread builds it while another one reads it.
 #[derive(Debug, Default)]
-pub struct RecordingIndex(Mutex<Inner>);
+pub struct RecordingIndex(Mutex<IndexContents>);
 
 #[derive(Debug, Default)]
-struct Inner {
+struct IndexContents {
     checkpoints: Vec<Arc<Checkpoint>>,
     events: Vec<Event>,
     at: u64,
@@ -73,22 +73,22 @@ impl RecordingIndex {
         let mut tape = PlaybackState::new(skin, zero);
         tape.set_latched_frames(reader.extras());
         let mut watcher = EventDetector::default();
-        while !tape.is_over() && !stop.load(Ordering::Relaxed) {
-            match tape.step(u64::MAX) {
+        while !tape.has_ended() && !stop.load(Ordering::Relaxed) {
+            match tape.step_until(u64::MAX) {
                 PlaybackStep::NeedsEntries => {
                     if let Err(error) = tape.read_entry(&mut reader) {
-                        self.fail(&error);
+                        self.store_error(&error);
                     }
                 }
                 PlaybackStep::Updated => {
-                    let events = watcher.detect(tape.position(), tape.live());
-                    let kept = (tape.position() >= next).then(|| {
-                        let mut kept = Checkpoint { tape: tape.clone(), place: reader.place() };
-                        kept.tape.forget_recent();
+                    let events = watcher.detect(tape.position_ns(), tape.live());
+                    let kept = (tape.position_ns() >= next).then(|| {
+                        let mut kept = Checkpoint { tape: tape.clone(), place: reader.seek_point() };
+                        kept.tape.forget_recent_frames();
                         Arc::new(kept)
                     });
-                    let mut inner = locked(&self.0);
-                    (inner.at, inner.others) = (tape.position(), tape.foreign_frames());
+                    let mut inner = lock_ignoring_poison(&self.0);
+                    (inner.at, inner.others) = (tape.position_ns(), tape.foreign_frame_count());
                     inner.events.extend(events);
                     if let Some(kept) = kept {
                         inner.checkpoints.push(kept);
@@ -100,27 +100,27 @@ impl RecordingIndex {
                             });
                             spacing *= 2;
                         }
-                        next = tape.position().saturating_add(spacing);
+                        next = tape.position_ns().saturating_add(spacing);
                     }
                 }
                 PlaybackStep::Applied { .. } | PlaybackStep::Reached | PlaybackStep::Over => {}
             }
         }
-        let mut inner = locked(&self.0);
+        let mut inner = lock_ignoring_poison(&self.0);
         inner.unfinished.clone_from(&reader.extras().unfinished);
-        (inner.at, inner.others, inner.is_over) = (tape.position(), tape.foreign_frames(), true);
-        inner.events.extend(watcher.detect(tape.position(), tape.live()));
+        (inner.at, inner.others, inner.is_over) = (tape.position_ns(), tape.foreign_frame_count(), true);
+        inner.events.extend(watcher.detect(tape.position_ns(), tape.live()));
     }
 
-    fn fail(&self, error: &CaptureError) {
-        locked(&self.0).failed = Some(error.to_string());
+    fn store_error(&self, error: &CaptureError) {
+        lock_ignoring_poison(&self.0).failed = Some(error.to_string());
     }
 
     /// Returns how much of the recording is indexed, and what was found so far.
     #[must_use]
     pub fn progress(&self) -> Progress {
-        let inner = locked(&self.0);
-        let Inner { at, is_over, others, .. } = *inner;
+        let inner = lock_ignoring_poison(&self.0);
+        let IndexContents { at, is_over, others, .. } = *inner;
         let (failed, unfinished) = (inner.failed.clone(), inner.unfinished.clone());
         Progress { at, is_over, failed, unfinished, others, events: inner.events.len() }
     }
@@ -128,8 +128,8 @@ impl RecordingIndex {
     /// Returns the last stored state at or before the time `at`, in ns since 1970.
     #[must_use]
     pub fn checkpoint_before(&self, at: u64) -> Option<Arc<Checkpoint>> {
-        let inner = locked(&self.0);
-        let place = inner.checkpoints.partition_point(|kept| kept.tape.position() <= at).checked_sub(1)?;
+        let inner = lock_ignoring_poison(&self.0);
+        let place = inner.checkpoints.partition_point(|kept| kept.tape.position_ns() <= at).checked_sub(1)?;
         inner.checkpoints.get(place).cloned()
     }
 
@@ -137,7 +137,7 @@ impl RecordingIndex {
     /// it.
     #[must_use]
     pub fn find_event(&self, kind: EventKind, from: u64, forward: bool) -> Option<u64> {
-        let inner = locked(&self.0);
+        let inner = lock_ignoring_poison(&self.0);
         let mut of_kind = inner.events.iter().filter(|event| event.kind == kind).map(|event| event.at);
         if forward { of_kind.find(|at| *at > from) } else { of_kind.rev().find(|at| *at < from) }
     }
@@ -146,7 +146,7 @@ impl RecordingIndex {
     /// of a kind occur.
     #[must_use]
     pub fn parts_with_events(&self, kind: EventKind, (from, to): (u64, u64), parts: u16) -> Vec<u16> {
-        let inner = locked(&self.0);
+        let inner = lock_ignoring_poison(&self.0);
         let length = u128::from(to.saturating_sub(from).max(1));
         let part = |event: &Event| {
             let part = u128::from(event.at.saturating_sub(from)) * u128::from(parts) / length;

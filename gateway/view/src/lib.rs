@@ -12,7 +12,7 @@
 //! A recording is shown in the same way: [`tape`] applies its frames to [`LiveState`] up to a position in time, [`index`]
 //! stores the state at intervals, and [`player`] continues from a stored state to any position.
 //!
-//! A skin without buses is shown as a [`StillPage`]: one HTML file with the same scene, drawn by the same scripts.
+//! A skin without buses is shown as a [`StaticSkinPage`]: one HTML file with the same scene, drawn by the same scripts.
 //!
 //! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] use neither sockets nor clocks.
 //! [`server`], [`serve`] and [`play`] do the input and output for them.
@@ -36,11 +36,11 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 pub use live::LiveState;
 pub use scene::Scene;
-pub use still::{MovedCell, StillPage};
+pub use still::{PreviousCellPlace, StaticSkinPage};
 pub use surface::RowMesh;
 pub use token::Token;
 
 /// Locks a mutex, even if a thread has panicked while it held the lock.
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+fn lock_ignoring_poison<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -13,7 +13,8 @@ use protocol::time::Micros;
 use self::bus::LiveBus;
 pub use self::recent::{DecodedFrame, RecentFrames, TorqueExplanation};
 pub use self::said::{
-    BusStatus, CellDetail, DeadCell, Gains, SensorReading, StatusMessage, TorqueReply, TreePlace,
+    BusStatus, CellDetail, CellParentAndWires, DeadCell, GainsAndThresholds, SensorReading, StatusMessage,
+    TorqueReply,
 };
 use crate::pressed::{CellKey, TouchRegistry};
 use protocol::message::SkinSensors;
@@ -35,12 +36,12 @@ pub struct LiveState {
 
 /// The bits that describe a cell in a snapshot.
 mod flag {
-    pub(super) const UNCONFIGURED: u8 = 1;
-    pub(super) const OTHER_CONFIGURATION: u8 = 2;
-    pub(super) const MEASURING: u8 = 4;
-    pub(super) const HALTED: u8 = 8;
-    pub(super) const PRESSED: u8 = 16;
-    pub(super) const STUCK: u8 = 32;
+    pub(super) const UNCONFIGURED_BIT: u8 = 1;
+    pub(super) const OTHER_CONFIGURATION_BIT: u8 = 2;
+    pub(super) const MEASURING_BIT: u8 = 4;
+    pub(super) const HALTED_BIT: u8 = 8;
+    pub(super) const PRESSED_BIT: u8 = 16;
+    pub(super) const STUCK_BIT: u8 = 32;
 }
 
 impl LiveState {
@@ -59,7 +60,7 @@ impl LiveState {
 
     /// Creates the state of a skin of which no frame has been received yet. Times count from `began`.
     #[must_use]
-    pub fn with_start(skin: Skin, began: Micros) -> Self {
+    pub fn with_start_time(skin: Skin, began: Micros) -> Self {
         Self { began: Some(began), ..Self::new(skin) }
     }
 
@@ -70,7 +71,11 @@ impl LiveState {
     }
 
     /// Applies frames that were latched when a recording began, each with the index of its bus. They are not counted.
-    pub fn apply_latched<'a>(&mut self, at: Micros, latched: impl Iterator<Item = (usize, &'a Frame)>) {
+    pub fn apply_latched_frames<'a>(
+        &mut self,
+        at: Micros,
+        latched: impl Iterator<Item = (usize, &'a Frame)>,
+    ) {
         for (index, frame) in latched {
             if let Some(bus) = self.buses.get_mut(index) {
                 bus.apply_frame(at, frame);
@@ -93,23 +98,24 @@ impl LiveState {
     }
 
     /// Drops the stored frames of the last seconds, which the page lists for a cell.
-    pub fn forget_recent(&mut self) {
+    pub fn forget_recent_frames(&mut self) {
         self.recent.clear();
     }
 
     /// Returns for each bus the number of all losses so far, and true if the bus is halted.
-    pub fn losses(&self) -> impl Iterator<Item = (u64, bool)> {
-        self.buses.iter().map(|bus| (bus.losses(), bus.halted))
+    pub fn losses_and_halted_by_bus(&self) -> impl Iterator<Item = (u64, bool)> {
+        self.buses.iter().map(|bus| (bus.loss_count(), bus.halted))
     }
 
     /// Returns each cell by bus and node id, with two flags: touched and dead. A cell is touched if its sensors show
     /// it, or if its torque does while the sensor values are unknown.
-    pub fn touched_and_dead(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
+    pub fn touched_and_dead_cells(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
         self.buses.iter().enumerate().flat_map(move |(index, bus)| {
             let cells = bus.table.cells().iter().zip(bus.table.presumed_sensors(now)).enumerate();
             cells.map(move |(place, (cell, (sensors, status)))| {
                 let is_active = matches!(status, CellStatus::Active | CellStatus::Stale);
-                let touched = sensors.map_or(is_active, |sensors| bus.central.force(place, &sensors) > 0.0);
+                let touched =
+                    sensors.map_or(is_active, |sensors| bus.central.cell_force(place, &sensors) > 0.0);
                 (index, cell.node, [touched, status == CellStatus::Dead])
             })
         })
@@ -118,18 +124,22 @@ impl LiveState {
     /// Returns two torques for each joint of the robot in the last completed epoch, in Nm or N: the distributed and the
     /// central one.
     #[must_use]
-    pub fn torques(&self) -> Vec<[f64; 2]> {
-        self.joint_rows().into_iter().map(|[_, distributed, central]| [distributed, central]).collect()
+    pub fn joint_torques(&self) -> Vec<[f64; 2]> {
+        self.joint_positions_and_torques()
+            .into_iter()
+            .map(|[_, distributed, central]| [distributed, central])
+            .collect()
     }
 
     /// Returns three values for each joint of the robot: position, distributed torque and central torque.
-    fn joint_rows(&self) -> Vec<[f64; 3]> {
+    fn joint_positions_and_torques(&self) -> Vec<[f64; 3]> {
         let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {
-            for ((place, (joint, _)), torque) in self.skin.joints_on_bus(index).enumerate().zip(bus.torques())
+            for ((place, (joint, _)), torque) in
+                self.skin.joints_on_bus(index).enumerate().zip(bus.joint_torques())
             {
                 let Some([position, distributed, central]) = rows.get_mut(joint) else { continue };
-                *position = bus.position(place).unwrap_or(*position);
+                *position = bus.joint_position(place).unwrap_or(*position);
                 *distributed += torque.0;
                 *central += torque.1;
             }
@@ -139,7 +149,7 @@ impl LiveState {
 
     /// Sets the state of a bus: whether it is open and works, and the number of frames that this program did not
     /// receive.
-    pub fn set_bus(&mut self, bus: usize, is_up: bool, dropped: u64) {
+    pub fn set_bus_state(&mut self, bus: usize, is_up: bool, dropped: u64) {
         if let Some(bus) = self.buses.get_mut(bus) {
             bus.set_state(is_up, dropped);
         }
@@ -188,8 +198,8 @@ impl LiveState {
         for word in [self.number, count(joints), count(self.places.len()), 0] {
             bytes.extend(word.to_le_bytes());
         }
-        bytes.extend(self.seconds(now).to_le_bytes());
-        for value in self.joint_rows().into_iter().flatten() {
+        bytes.extend(self.seconds_since_start(now).to_le_bytes());
+        for value in self.joint_positions_and_torques().into_iter().flatten() {
             #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
             bytes.extend((value as f32).to_le_bytes());
         }
@@ -199,7 +209,7 @@ impl LiveState {
                 continue;
             };
             if pressed.is_pressed((bus, cell.node)) {
-                cell_bytes[1] |= flag::PRESSED;
+                cell_bytes[1] |= flag::PRESSED_BIT;
             }
             bytes.extend(cell_bytes);
         }
@@ -207,7 +217,7 @@ impl LiveState {
     }
 
     #[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
-    fn seconds(&self, at: Micros) -> f64 {
+    fn seconds_since_start(&self, at: Micros) -> f64 {
         let since = |began: Micros| at.0.saturating_sub(began.0) as f64 - began.0.saturating_sub(at.0) as f64;
         self.began.map_or(0.0, |began| since(began) * 1e-6)
     }

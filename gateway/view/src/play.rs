@@ -18,7 +18,7 @@ use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
 use crate::serve::ServeError;
 use crate::server::{PageAccess, Server, ServerCounts};
-use crate::surface::{RowMesh, pack};
+use crate::surface::{RowMesh, pack_meshes};
 use crate::tape::EventKind;
 
 /// The interval between snapshots.
@@ -52,7 +52,7 @@ pub struct PlayOptions {
 /// # Errors
 /// Returns an error if a thread cannot be started, or if the recording cannot be read or is damaged. The pages show the
 /// part before the damage.
-pub fn play(
+pub fn play_recording(
     options: PlayOptions,
     stop: &AtomicBool,
     is_served: impl FnOnce(),
@@ -61,7 +61,7 @@ pub fn play(
     let PlayOptions { paths, skin, surface, listener, access, at_s } = options;
     let mut player = Player::open(&paths, skin.clone())?;
     let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
-    let (shells, corners) = pack(&surface);
+    let (shells, corners) = pack_meshes(&surface);
     let scene =
         serde_json::to_string(&Scene { shells, ..Scene::from_skin(&skin, false) }).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
@@ -103,7 +103,7 @@ fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) 
             if matches!(command, Command::Seek { .. }) && is_passed {
                 continue;
             }
-            failed = execute(player, command).err().or(failed);
+            failed = execute_command(player, command).err().or(failed);
         }
         let elapsed = std::mem::replace(&mut before, Instant::now()).elapsed();
         match player.advance_time(elapsed) {
@@ -111,13 +111,13 @@ fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) 
             Err(error) => failed = Some(error.to_string()),
         }
         if let Some(failed) = failed {
-            player.fail(failed);
+            player.pause_with_error(failed);
         }
         if server.page_count() > 0 {
             let now = player.now();
-            if jumps != player.jumps() {
-                jumps = player.jumps();
-                server.publish_history(player.history());
+            if jumps != player.jump_count() {
+                jumps = player.jump_count();
+                server.publish_history(player.encode_torque_history());
             }
             let said = number.is_multiple_of(SNAPSHOTS_PER_STATUS).then(|| {
                 let playback = player.status();
@@ -129,18 +129,18 @@ fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) 
                     );
                 }
                 let live = player.live();
-                let playback = Some(playback.with_marks(marks.1.clone()));
+                let playback = Some(playback.with_event_marks(marks.1.clone()));
                 let mut said = StatusMessage { playback, ..live.status_message(now) };
                 let text = |said: &StatusMessage| serde_json::to_string(said).unwrap_or_default();
                 let all = text(&said);
                 let own = server.selected_cells().into_iter().map(|(page, chosen)| {
-                    said.detail = live.detail(chosen, now);
+                    said.detail = live.cell_detail(chosen, now);
                     (page, text(&said))
                 });
                 (all, own.collect())
             });
             if is_changed || said.is_some() {
-                server.publish(player.live().snapshot(now, &nobody), said);
+                server.publish_snapshot(player.live().snapshot(now, &nobody), said);
             }
             number += 1;
         }
@@ -150,7 +150,7 @@ fn publish_and_execute(player: &mut Player, server: &Server, stop: &AtomicBool) 
 }
 
 /// Executes a command of a page.
-fn execute(player: &mut Player, command: &Command) -> Result<(), String> {
+fn execute_command(player: &mut Player, command: &Command) -> Result<(), String> {
     let done = match *command {
         Command::Play { speed } => {
             player.play(speed);
@@ -161,8 +161,8 @@ fn execute(player: &mut Player, command: &Command) -> Result<(), String> {
             Ok(())
         }
         Command::Seek { at_s } => player.seek(at_s),
-        Command::Step { forward } => player.step(forward),
-        Command::Jump { to, forward } => player.jump(to, forward).map(|_| ()),
+        Command::Step { forward } => player.step_epoch(forward),
+        Command::Jump { to, forward } => player.jump_to_event(to, forward).map(|_| ()),
         // The cells of a recording cannot be pressed or halted. The server handles the remaining commands.
         Command::Press { .. }
         | Command::Release

@@ -15,16 +15,16 @@ use crate::live::LiveState;
 use crate::tape::{EventKind, PlaybackState, PlaybackStep};
 
 /// The time before a position for which the plots get values, in ns.
-const HISTORY_NS: u64 = 10_000_000_000;
+const PLOT_HISTORY_NS: u64 = 10_000_000_000;
 /// The time before a position for which the plots get values if the index has not passed the position yet, in ns.
-const PREVIEW_NS: u64 = 3_000_000_000;
+const PLOT_PREVIEW_NS: u64 = 3_000_000_000;
 /// The time between two values of a plot, in ns.
-const SAMPLE_NS: u64 = 20_000_000;
+const PLOT_INTERVAL_NS: u64 = 20_000_000;
 /// The minimum and the maximum playback speed, in s of the recording per s.
 const SPEED_RANGE: [f64; 2] = [0.01, 100.0];
 
 /// A time in ns since 1970, and the distributed and the central torque of each joint at that time.
-type Sample = (u64, Vec<[f64; 2]>);
+type TorqueSample = (u64, Vec<[f64; 2]>);
 
 /// A recording that is played, with its present position.
 #[derive(Debug)]
@@ -44,7 +44,7 @@ pub struct Player {
     is_exact: bool,
     playing: bool,
     speed: f64,
-    history: VecDeque<Sample>,
+    history: VecDeque<TorqueSample>,
     /// The number of jumps so far. After each jump the page clears its plots.
     jumps: u64,
     /// The error because of which the last requested position cannot be shown.
@@ -85,7 +85,7 @@ pub struct PlayerStatus {
 impl PlayerStatus {
     /// Returns the same playback state with these marks.
     #[must_use]
-    pub fn with_marks(self, marks: BTreeMap<EventKind, Vec<u16>>) -> Self {
+    pub fn with_event_marks(self, marks: BTreeMap<EventKind, Vec<u16>>) -> Self {
         Self { marks, ..self }
     }
 }
@@ -172,7 +172,7 @@ impl Player {
 
     /// Returns the number of jumps so far.
     #[must_use]
-    pub const fn jumps(&self) -> u64 {
+    pub const fn jump_count(&self) -> u64 {
         self.jumps
     }
 
@@ -192,7 +192,7 @@ impl Player {
     }
 
     /// Pauses, and stores the error because of which the recording cannot be read further.
-    pub fn fail(&mut self, why: String) {
+    pub fn pause_with_error(&mut self, why: String) {
         self.playing = false;
         self.failed = Some(why);
     }
@@ -207,8 +207,8 @@ impl Player {
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read further.
     pub fn advance_time(&mut self, elapsed: Duration) -> Result<bool, CaptureError> {
-        if !self.is_exact && self.is_indexed(self.at) {
-            self.go_to(self.at)?;
+        if !self.is_exact && self.is_indexed_until(self.at) {
+            self.go_to_time(self.at)?;
             return Ok(true);
         }
         if !self.playing {
@@ -218,7 +218,7 @@ impl Player {
         let passed = (elapsed.as_secs_f64() * self.speed * 1e9) as u64;
         let until = self.at.saturating_add(passed);
         let last = self.end_ns();
-        self.advance(until.min(last), false)?;
+        self.advance_until(until.min(last), false)?;
         self.playing &= until < last;
         Ok(true)
     }
@@ -231,55 +231,55 @@ impl Player {
     pub fn seek(&mut self, at_s: f64) -> Result<(), CaptureError> {
         #[expect(clippy::cast_possible_truncation, reason = "saturates")]
         let since = (at_s * 1e9).round() as i64;
-        self.go_to(self.zero.saturating_add_signed(since))
+        self.go_to_time(self.zero.saturating_add_signed(since))
     }
 
     /// Moves to the beginning of the next or the previous epoch, and pauses.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read there.
-    pub fn step(&mut self, forward: bool) -> Result<(), CaptureError> {
+    pub fn step_epoch(&mut self, forward: bool) -> Result<(), CaptureError> {
         self.playing = false;
         if forward {
-            return self.advance(self.end_ns(), true);
+            return self.advance_until(self.end_ns(), true);
         }
-        if self.tape.epoch_before(self.at).is_none() {
+        if self.tape.epoch_time_before(self.at).is_none() {
             // The time before the position is read again, because only its epochs are known that were read.
-            self.restart_before(self.at)?;
+            self.seek_from_checkpoint(self.at)?;
         }
-        let before = self.tape.epoch_before(self.at);
-        before.map_or(Ok(()), |before| self.go_to(before))
+        let before = self.tape.epoch_time_before(self.at);
+        before.map_or(Ok(()), |before| self.go_to_time(before))
     }
 
     /// Moves to the next or the previous event of a kind, and pauses. Returns false if there is none.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read there.
-    pub fn jump(&mut self, kind: EventKind, forward: bool) -> Result<bool, CaptureError> {
+    pub fn jump_to_event(&mut self, kind: EventKind, forward: bool) -> Result<bool, CaptureError> {
         let Some(at) = self.index.find_event(kind, self.at, forward) else { return Ok(false) };
         self.playing = false;
-        self.go_to(at)?;
+        self.go_to_time(at)?;
         Ok(true)
     }
 
-    fn is_indexed(&self, at: u64) -> bool {
+    fn is_indexed_until(&self, at: u64) -> bool {
         let progress = self.index.progress();
         progress.is_over || progress.at >= at
     }
 
-    fn go_to(&mut self, at: u64) -> Result<(), CaptureError> {
+    fn go_to_time(&mut self, at: u64) -> Result<(), CaptureError> {
         let at = at.clamp(self.first, self.end_ns());
-        let near = self.tape.position() <= at && at - self.tape.position() <= HISTORY_NS;
+        let near = self.tape.position_ns() <= at && at - self.tape.position_ns() <= PLOT_HISTORY_NS;
         if near && self.is_exact {
-            return self.advance(at, false);
+            return self.advance_until(at, false);
         }
-        self.restart_before(at)
+        self.seek_from_checkpoint(at)
     }
 
     /// Moves to a position by reading on from the last stored state before it.
-    fn restart_before(&mut self, at: u64) -> Result<(), CaptureError> {
-        self.is_exact = self.is_indexed(at) || at <= self.first.saturating_add(HISTORY_NS);
-        let kept = self.index.checkpoint_before(at.saturating_sub(HISTORY_NS)).filter(|_| self.is_exact);
+    fn seek_from_checkpoint(&mut self, at: u64) -> Result<(), CaptureError> {
+        self.is_exact = self.is_indexed_until(at) || at <= self.first.saturating_add(PLOT_HISTORY_NS);
+        let kept = self.index.checkpoint_before(at.saturating_sub(PLOT_HISTORY_NS)).filter(|_| self.is_exact);
         let place = match kept.as_deref() {
             Some(Checkpoint { tape, place }) => {
                 self.tape.clone_from(tape);
@@ -289,7 +289,7 @@ impl Player {
                 self.tape = PlaybackState::new(self.skin.clone(), self.zero);
                 match self.is_exact {
                     true => SeekPoint::default(),
-                    false => self.places.point_before(at.saturating_sub(PREVIEW_NS)),
+                    false => self.places.point_before(at.saturating_sub(PLOT_PREVIEW_NS)),
                 }
             }
         };
@@ -300,30 +300,30 @@ impl Player {
         self.history.clear();
         self.failed = None;
         self.jumps += 1;
-        self.advance(at, false)
+        self.advance_until(at, false)
     }
 
     /// Advances to a position, or with `to_epoch` only to the next epoch.
-    fn advance(&mut self, until: u64, to_epoch: bool) -> Result<(), CaptureError> {
+    fn advance_until(&mut self, until: u64, to_epoch: bool) -> Result<(), CaptureError> {
         loop {
-            match self.tape.step(until) {
+            match self.tape.step_until(until) {
                 PlaybackStep::NeedsEntries => self.tape.read_entry(&mut self.reader)?,
                 PlaybackStep::Updated => {}
                 PlaybackStep::Applied { epoch } => {
-                    let at = self.tape.position();
-                    let is_due = |(last, _): &(u64, _)| at.saturating_sub(*last) >= SAMPLE_NS;
+                    let at = self.tape.position_ns();
+                    let is_due = |(last, _): &(u64, _)| at.saturating_sub(*last) >= PLOT_INTERVAL_NS;
                     if epoch && self.history.back().is_none_or(is_due) {
-                        self.history.push_back((at, self.tape.live().torques()));
+                        self.history.push_back((at, self.tape.live().joint_torques()));
                     }
-                    if epoch && to_epoch && self.tape.position() > self.at {
+                    if epoch && to_epoch && self.tape.position_ns() > self.at {
                         break;
                     }
                 }
                 PlaybackStep::Reached | PlaybackStep::Over => break,
             }
         }
-        self.at = if to_epoch { self.tape.position().min(until) } else { until };
-        let old = self.at.saturating_sub(HISTORY_NS);
+        self.at = if to_epoch { self.tape.position_ns().min(until) } else { until };
+        let old = self.at.saturating_sub(PLOT_HISTORY_NS);
         while self.history.front().is_some_and(|(at, _)| *at < old) {
             self.history.pop_front();
         }
@@ -340,7 +340,7 @@ impl Player {
     /// | 4 | 1: a history |
     /// | 8 + 8 J for each moment | s of the run, or since the first frame, f64; distributed and central torque of each joint, f32 |
     #[must_use]
-    pub fn history(&self) -> Vec<u8> {
+    pub fn encode_torque_history(&self) -> Vec<u8> {
         let joints = self.skin.robot.joints.len();
         let count = |number: usize| u32::try_from(number).unwrap_or(u32::MAX);
         let mut bytes = Vec::with_capacity(16 + self.history.len() * (8 + 8 * joints));
@@ -349,7 +349,7 @@ impl Player {
             bytes.extend(word.to_le_bytes());
         }
         for (at, torques) in &self.history {
-            bytes.extend(self.seconds(*at).to_le_bytes());
+            bytes.extend(self.seconds_since_origin(*at).to_le_bytes());
             for value in torques.iter().flatten() {
                 #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
                 bytes.extend((*value as f32).to_le_bytes());
@@ -359,7 +359,7 @@ impl Player {
     }
 
     /// Converts a time in ns since 1970 to s of the run, or to s since the first frame.
-    fn seconds(&self, at: u64) -> f64 {
+    fn seconds_since_origin(&self, at: u64) -> f64 {
         seconds_since(self.zero, at)
     }
 
@@ -369,14 +369,18 @@ impl Player {
         let progress = self.index.progress();
         let (of, read) = (self.end_ns() - self.first, progress.at.saturating_sub(self.first));
         PlayerStatus {
-            at_s: self.seconds(self.at),
+            at_s: self.seconds_since_origin(self.at),
             at_ns: self.at.to_string(),
-            from_s: self.seconds(self.first),
-            of_s: self.seconds(self.end_ns()),
+            from_s: self.seconds_since_origin(self.first),
+            of_s: self.seconds_since_origin(self.end_ns()),
             playing: self.playing,
             speed: self.speed,
             exact: self.is_exact,
-            read: if progress.is_over { 1.0 } else { (seconds(read) / seconds(of.max(1))).min(1.0) },
+            read: if progress.is_over {
+                1.0
+            } else {
+                (nanos_to_seconds(read) / nanos_to_seconds(of.max(1))).min(1.0)
+            },
             failed: self.failed.clone().or(progress.failed),
             unfinished: progress.unfinished,
             others: progress.others,
@@ -394,7 +398,7 @@ impl Player {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "to be shown: some µs of a year")]
-fn seconds(nanos: u64) -> f64 {
+fn nanos_to_seconds(nanos: u64) -> f64 {
     nanos as f64 / 1e9
 }
 

@@ -41,20 +41,20 @@ impl TouchRegistry {
         let force_n = if force_n.is_finite() { force_n.clamp(0.0, MAX_FORCE_N) } else { 0.0 };
         let before = self.pages.insert(page, (cell, force_n));
         if let Some((before, _)) = before.filter(|(before, _)| *before != cell) {
-            self.update_target(before);
+            self.update_target_force(before);
         }
-        self.update_target(cell);
+        self.update_target_force(cell);
     }
 
     /// Releases the cell that a page presses, or pressed before it disconnected.
     pub fn release(&mut self, page: u64) {
         if let Some((cell, _)) = self.pages.remove(&page) {
-            self.update_target(cell);
+            self.update_target_force(cell);
         }
     }
 
     /// Sets the force on a cell to the sum of the forces by which pages press it.
-    fn update_target(&mut self, cell: CellKey) {
+    fn update_target_force(&mut self, cell: CellKey) {
         let pages = self.pages.values().filter(|(of, _)| *of == cell);
         let force_n = pages.map(|(_, force_n)| force_n).sum::<f64>().min(MAX_FORCE_N);
         self.targets.insert(cell, TargetForce { force_n, sent: None, attempts: 0 });

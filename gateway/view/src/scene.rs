@@ -9,12 +9,12 @@ use protocol::parameters::RowKind;
 use protocol::skin::{Chain, Skin};
 use serde::Serialize;
 
-use crate::surface::SceneShell;
+use crate::surface::SceneMeshRange;
 
 /// The number of cells from which the pitch is estimated.
-const PITCH_SAMPLES: usize = 200;
+const PITCH_SAMPLE_CELLS: usize = 200;
 /// The pitch that is assumed for a skin whose cells have no neighbours, in m.
-const DEFAULT_PITCH: f64 = 0.028;
+const DEFAULT_CELL_PITCH_M: f64 = 0.028;
 
 /// The scene that the page draws; lengths in m, angles in rad.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -32,9 +32,9 @@ pub struct Scene {
     /// The distance between the centres of neighbouring cells, in m.
     pub pitch: f64,
     /// Cylinders that represent links. They are drawn below the cells.
-    pub tubes: Vec<Tube>,
+    pub tubes: Vec<LinkCylinder>,
     /// The surface of the robot's links, if it is known. Its triangles are packed by [`surface`](crate::surface).
-    pub shells: Vec<SceneShell>,
+    pub shells: Vec<SceneMeshRange>,
     /// True if the page may press cells, and halt and resume the robot.
     pub may_press: bool,
 }
@@ -110,7 +110,7 @@ pub struct SceneCell {
 
 /// A cylinder that represents a link, in the frame of a row.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Tube {
+pub struct LinkCylinder {
     /// The index of the chain.
     pub chain: usize,
     /// The number of the row, from 1.
@@ -146,9 +146,9 @@ impl Scene {
         Self {
             name: skin.name.clone(),
             joints: joints.collect(),
-            chains: skin.robot.chains.iter().map(chain).collect(),
-            pitch: pitch(&cells),
-            tubes: tubes(&buses, &cells),
+            chains: skin.robot.chains.iter().map(scene_chain).collect(),
+            pitch: median_cell_pitch(&cells),
+            tubes: link_cylinders(&buses, &cells),
             buses,
             cells,
             shells: Vec::new(),
@@ -157,7 +157,7 @@ impl Scene {
     }
 }
 
-fn chain(chain: &Chain) -> SceneChain {
+fn scene_chain(chain: &Chain) -> SceneChain {
     let mut joints = chain.joints.iter();
     let rows = chain.rows.iter().map(|row| SceneRow {
         joint: if row.kind == RowKind::Fixed { None } else { joints.next().copied() },
@@ -167,41 +167,45 @@ fn chain(chain: &Chain) -> SceneChain {
         d: row.table.d,
         theta: row.table.theta_offset,
     });
-    SceneChain { name: chain.name.clone(), base: chain.base.matrix().concat(), rows: rows.collect() }
+    SceneChain {
+        name: chain.name.clone(),
+        base: chain.base.transform_matrix().concat(),
+        rows: rows.collect(),
+    }
 }
 
 /// Returns the median distance from a cell to the nearest other cell on the same link, in m.
-fn pitch(cells: &[SceneCell]) -> f64 {
+fn median_cell_pitch(cells: &[SceneCell]) -> f64 {
     let nearest = |cell: &SceneCell| {
         let same = cells.iter().filter(|other| (other.bus, other.row) == (cell.bus, cell.row));
         let distance =
             |other: &SceneCell| (Vector3::from(other.position) - Vector3::from(cell.position)).norm();
         same.map(distance).filter(|distance| *distance > 1e-6).min_by(f64::total_cmp)
     };
-    let each = cells.len().div_ceil(PITCH_SAMPLES).max(1);
+    let each = cells.len().div_ceil(PITCH_SAMPLE_CELLS).max(1);
     let mut all: Vec<_> = cells.iter().step_by(each).filter_map(nearest).collect();
     all.sort_by(f64::total_cmp);
-    all.get(all.len() / 2).copied().unwrap_or(DEFAULT_PITCH).min(0.1)
+    all.get(all.len() / 2).copied().unwrap_or(DEFAULT_CELL_PITCH_M).min(0.1)
 }
 
 /// Returns a cylinder for each link that has enough cells to fit one.
-fn tubes(buses: &[SceneBus], cells: &[SceneCell]) -> Vec<Tube> {
+fn link_cylinders(buses: &[SceneBus], cells: &[SceneCell]) -> Vec<LinkCylinder> {
     let mut links = BTreeMap::<(usize, u8), Vec<&SceneCell>>::new();
     for cell in cells {
         let chain = buses.get(cell.bus).map_or(0, |bus| bus.chain);
         links.entry((chain, cell.row)).or_default().push(cell);
     }
-    links.into_iter().filter_map(|((chain, row), cells)| tube(chain, row, &cells)).collect()
+    links.into_iter().filter_map(|((chain, row), cells)| fit_link_cylinder(chain, row, &cells)).collect()
 }
 
 /// Fits a cylinder to the cells of a link. It is made a little longer and thinner than the fit, so that it lies below
 /// the cells.
-fn tube(chain: usize, row: u8, cells: &[&SceneCell]) -> Option<Tube> {
+fn fit_link_cylinder(chain: usize, row: u8, cells: &[&SceneCell]) -> Option<LinkCylinder> {
     let placed: Vec<_> = cells.iter().map(|cell| (cell.position, cell.normal)).collect();
     let cylinder = Cylinder::fit(&placed)?;
     let ([from, to], radius) = (cylinder.along, cylinder.radius);
     let ends = [from - radius * 0.2, to + radius * 0.2].map(|along| cylinder.axis_point(along));
-    Some(Tube { chain, row, ends, radius: radius * 0.97 })
+    Some(LinkCylinder { chain, row, ends, radius: radius * 0.97 })
 }
 
 #[cfg(test)]
@@ -227,7 +231,7 @@ mod tests {
         }
         let plate = scene.cells.iter().map(|cell| SceneCell { normal: [0.0, 0.0, 1.0], ..cell.clone() });
         let plate: Vec<_> = plate.collect();
-        assert_eq!(tubes(&scene.buses, &plate), []);
+        assert_eq!(link_cylinders(&scene.buses, &plate), []);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use bench::bus::follow::{BusSource, FollowStep, FollowedItem, Follower};
-use bench::bus::listen::{now, open, send};
+use bench::bus::listen::{now, open_bus, send_message};
 use bench::remote::{BenchState, JsonPipe};
 use protocol::bus::batch::MAX_BATCH_DATAGRAMS;
 use protocol::bus::{self, Bus, BusError, KindChoices};
@@ -22,12 +22,12 @@ use protocol::time::Micros;
 
 use crate::command::Command;
 use crate::live::{LiveState, StatusMessage};
-use crate::locked;
+use crate::lock_ignoring_poison;
 use crate::player::PlayError;
 use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
 use crate::server::{PageAccess, Server, ServerCounts};
-use crate::surface::{RowMesh, pack};
+use crate::surface::{RowMesh, pack_meshes};
 
 /// The interval between snapshots.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_millis(33);
@@ -36,7 +36,7 @@ const SNAPSHOTS_PER_STATUS: u64 = 6;
 /// The time for which a thread waits for frames before it checks whether it must stop.
 const RECEIVE_TIMEOUT: Duration = Duration::from_millis(50);
 /// The time for which a thread lets frames accumulate after the first one, so that it wakes up less often.
-const GATHER_TIME: Duration = Duration::from_millis(8);
+const FRAME_GATHER_TIME: Duration = Duration::from_millis(8);
 
 /// The value of `read_to` while no frames wait to be read.
 const ALL_FRAMES_READ: u64 = u64::MAX;
@@ -109,7 +109,7 @@ pub fn serve(
             receive_buffer: 8 << 20,
             ..bus::BusOptions::default()
         };
-        open(name, kinds.kind_of(name), Some(format), options).map(Arc::new)
+        open_bus(name, kinds.kind_of(name), Some(format), options).map(Arc::new)
     };
     let buses = skin.buses.iter().map(|bus| {
         let first = match opened(&bus.name, bus.format) {
@@ -121,7 +121,7 @@ pub fn serve(
         Ok(SharedBus { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first), read_to })
     });
     let buses: Vec<_> = buses.collect::<Result<_, _>>()?;
-    let (shells, corners) = pack(&surface);
+    let (shells, corners) = pack_meshes(&surface);
     let scene = Scene { shells, ..Scene::from_skin(&skin, may_act) };
     let scene = serde_json::to_string(&scene).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
@@ -130,7 +130,7 @@ pub fn serve(
     thread::scope(|scope| {
         for (index, shared) in buses.iter().enumerate() {
             let (live, opened) = (&live, &opened);
-            let receive = move || receive(index, shared, live, stop, opened);
+            let receive = move || receive_frames(index, shared, live, stop, opened);
             if let Err(error) = thread::Builder::new().spawn_scoped(scope, receive) {
                 stop.store(true, Ordering::Relaxed);
                 return Err(ServeError::Thread(error));
@@ -157,36 +157,36 @@ impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> BusSource for ReopeningB
     fn reopen(&mut self) -> Result<(), BusError> {
         let bus = (self.opened)(&self.shared.name, self.shared.format)?;
         self.bus = Some(Arc::clone(&bus));
-        *locked(&self.shared.bus) = Some(bus);
+        *lock_ignoring_poison(&self.shared.bus) = Some(bus);
         Ok(())
     }
 }
 
 /// Receives frames on a bus until `stop` is set.
-fn receive(
+fn receive_frames(
     index: usize,
     shared: &SharedBus,
     live: &Mutex<LiveState>,
     stop: &AtomicBool,
     opened: &impl Fn(&str, Format) -> Result<Arc<Bus>, BusError>,
 ) {
-    let mut source = ReopeningBus { shared, opened, bus: locked(&shared.bus).clone() };
-    let mut follower = Follower::new(None, GATHER_TIME);
+    let mut source = ReopeningBus { shared, opened, bus: lock_ignoring_poison(&shared.bus).clone() };
+    let mut follower = Follower::new(None, FRAME_GATHER_TIME);
     while !stop.load(Ordering::Relaxed) {
         if let FollowStep::Gone(_) = follower.step(&mut source, RECEIVE_TIMEOUT) {
-            *locked(&shared.bus) = None;
+            *lock_ignoring_poison(&shared.bus) = None;
         }
         // If the batch was full, more frames may be waiting to be read.
         let last = follower.frames().last().filter(|_| follower.frames().len() == MAX_BATCH_DATAGRAMS);
         let read_to = last.map_or(ALL_FRAMES_READ, |last| last.at_nanos / 1_000);
         shared.read_to.store(read_to, Ordering::Relaxed);
-        let mut live = locked(live);
+        let mut live = lock_ignoring_poison(live);
         follower.for_each_item(|part| {
             if let FollowedItem::Frame(received) = part {
                 live.apply_frame(index, Micros(received.at_nanos / 1_000), &received.frame);
             }
         });
-        live.set_bus(index, !follower.is_lost(), follower.dropped());
+        live.set_bus_state(index, !follower.is_lost(), follower.dropped_frames());
     }
 }
 
@@ -205,11 +205,11 @@ fn publish_and_execute(
     while !stop.load(Ordering::Relaxed) {
         for (page, command) in server.commands() {
             let Command::Bench(command) = command else {
-                execute(page, &command, &locked(live), &mut pressed, buses);
+                execute_command(page, &command, &lock_ignoring_poison(live), &mut pressed, buses);
                 continue;
             };
             if !bench.as_mut().is_some_and(|run| run.send(&command)) {
-                server.count_ignored();
+                server.count_ignored_command();
             }
         }
         if let Some(run) = &mut bench {
@@ -218,12 +218,12 @@ fn publish_and_execute(
                 stop.store(true, Ordering::Relaxed);
             }
         }
-        server.take_gone_pages().into_iter().for_each(|page| pressed.release(page));
+        server.take_disconnected_pages().into_iter().for_each(|page| pressed.release(page));
         // While frames wait to be read, time ends at the last frame that was read, so that no cell seems silent.
         let read_to = buses.iter().map(|bus| Micros(bus.read_to.load(Ordering::Relaxed))).min();
         let now = read_to.map_or_else(now, |read_to| now().min(read_to));
         let due = {
-            let mut live = locked(live);
+            let mut live = lock_ignoring_poison(live);
             live.handle_time(now);
             let due = pressed.due_stimuli(now, |cell| live.latched_sensors(cell, now));
             if server.page_count() > 0 {
@@ -234,20 +234,20 @@ fn publish_and_execute(
                     let all = to_json(&said);
                     let own = server.selected_cells().into_iter().map(|(page, chosen)| {
                         said.bench = seen(Some((chosen.bus, chosen.node)));
-                        said.detail = live.detail(chosen, now);
+                        said.detail = live.cell_detail(chosen, now);
                         (page, to_json(&said))
                     });
                     (all, own.collect::<BTreeMap<_, _>>())
                 });
                 drop(live);
-                server.publish(snapshot, said);
+                server.publish_snapshot(snapshot, said);
                 number += 1;
             }
             due
         };
         for ((bus, node), sensors) in due {
             let page = SensorPage::Skin(sensors);
-            send_message(
+            send_or_lose(
                 buses.get(bus),
                 &Message::Stimulus { to: Node::Cell(node), from: StimulusStart::Next, page },
             );
@@ -261,8 +261,14 @@ fn to_json(said: &StatusMessage) -> String {
     serde_json::to_string(said).unwrap_or_default()
 }
 
-fn execute(page: u64, command: &Command, live: &LiveState, pressed: &mut TouchRegistry, buses: &[SharedBus]) {
-    let everywhere = |message: &Message| buses.iter().for_each(|bus| send_message(Some(bus), message));
+fn execute_command(
+    page: u64,
+    command: &Command,
+    live: &LiveState,
+    pressed: &mut TouchRegistry,
+    buses: &[SharedBus],
+) {
+    let everywhere = |message: &Message| buses.iter().for_each(|bus| send_or_lose(Some(bus), message));
     match *command {
         Command::Press { bus, node, force_n } => match live.pressable_cell(bus, node) {
             Some(cell) => pressed.press(page, cell, force_n),
@@ -284,9 +290,9 @@ fn execute(page: u64, command: &Command, live: &LiveState, pressed: &mut TouchRe
 }
 
 /// Sends a message on a bus. A failure counts as a lost frame.
-fn send_message(shared: Option<&SharedBus>, message: &Message) {
-    let bus = shared.and_then(|shared| Some((locked(&shared.bus).clone()?, shared.format)));
+fn send_or_lose(shared: Option<&SharedBus>, message: &Message) {
+    let bus = shared.and_then(|shared| Some((lock_ignoring_poison(&shared.bus).clone()?, shared.format)));
     if let Some((bus, format)) = bus {
-        let _ = send(&bus, message, format);
+        let _ = send_message(&bus, message, format);
     }
 }

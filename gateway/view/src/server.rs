@@ -20,7 +20,7 @@ use std::thread;
 use tungstenite::{Bytes, Utf8Bytes};
 
 use crate::command::{Command, SelectedCell};
-use crate::locked;
+use crate::lock_ignoring_poison;
 use crate::token::Token;
 
 /// The maximum number of pages at the same time.
@@ -127,7 +127,7 @@ impl Server {
         let of_pages = Arc::clone(&shared);
         let named = |name: &str| thread::Builder::new().name(name.to_owned());
         named("view pages").spawn(move || door::start_page_threads(begun, &of_pages))?;
-        named("view door").spawn(move || door::serve(&listener, &shared, &pages))?;
+        named("view door").spawn(move || door::serve_clients(&listener, &shared, &pages))?;
         Ok(server)
     }
 
@@ -139,15 +139,15 @@ impl Server {
 
     /// Sends the pages the torques before the next snapshot, for the plots.
     pub fn publish_history(&self, history: Vec<u8>) {
-        let mut newest = locked(&self.shared.newest);
+        let mut newest = lock_ignoring_poison(&self.shared.newest);
         newest.jumps += 1;
         newest.history = history.into();
     }
 
     /// Sends the pages a snapshot, and the status if there is a new one. The status is given for pages that have
     /// selected no cell, and for each of the other pages by its number.
-    pub fn publish(&self, snapshot: Vec<u8>, said: Option<(String, BTreeMap<u64, String>)>) {
-        let mut newest = locked(&self.shared.newest);
+    pub fn publish_snapshot(&self, snapshot: Vec<u8>, said: Option<(String, BTreeMap<u64, String>)>) {
+        let mut newest = lock_ignoring_poison(&self.shared.newest);
         newest.number += 1;
         newest.snapshot = snapshot.into();
         if let Some((said, own)) = said {
@@ -163,20 +163,20 @@ impl Server {
     }
 
     /// Counts a command that was not executed.
-    pub fn count_ignored(&self) {
+    pub fn count_ignored_command(&self) {
         self.shared.ignored.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Returns the numbers of the pages that have disconnected since the last call.
     #[must_use]
-    pub fn take_gone_pages(&self) -> Vec<u64> {
-        std::mem::take(&mut *locked(&self.shared.gone))
+    pub fn take_disconnected_pages(&self) -> Vec<u64> {
+        std::mem::take(&mut *lock_ignoring_poison(&self.shared.gone))
     }
 
     /// Returns the cell that each page has selected, by the number of the page.
     #[must_use]
     pub fn selected_cells(&self) -> BTreeMap<u64, SelectedCell> {
-        locked(&self.shared.chosen).clone()
+        lock_ignoring_poison(&self.shared.chosen).clone()
     }
 
     /// Returns the number of pages that are connected now.
@@ -202,7 +202,7 @@ impl Drop for Server {
 
 /// Returns the address by which a browser on the same machine opens the page.
 #[must_use]
-pub fn url(listen: SocketAddr, token: Option<&Token>) -> String {
+pub fn page_url(listen: SocketAddr, token: Option<&Token>) -> String {
     let ip = match listen.ip() {
         IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
         IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),

@@ -9,12 +9,12 @@ use protocol::xml::escaped;
 use serde::Serialize;
 
 use crate::scene::Scene;
-use crate::surface::{RowMesh, pack};
+use crate::surface::{RowMesh, pack_meshes};
 use crate::web;
 
 /// The contents of a page that shows a skin without buses.
 #[derive(Clone, Debug, PartialEq)]
-pub struct StillPage {
+pub struct StaticSkinPage {
     /// The scene to draw.
     pub scene: Scene,
     /// The surface of the robot's links; empty if it is unknown.
@@ -24,12 +24,12 @@ pub struct StillPage {
     /// Further properties of each cell as names and values, in the order of [`Scene::cells`].
     pub details: Vec<Vec<(String, String)>>,
     /// Cells that were at another place before. The page draws a line from the old place to the new one.
-    pub moved: Vec<MovedCell>,
+    pub moved: Vec<PreviousCellPlace>,
 }
 
 /// The place at which a cell was before.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct MovedCell {
+pub struct PreviousCellPlace {
     /// The index of the cell in [`Scene::cells`].
     pub cell: usize,
     /// The index of the chain to which the row belongs.
@@ -44,21 +44,21 @@ pub struct MovedCell {
 
 /// The data that the page's script reads.
 #[derive(Serialize)]
-struct PageData<'a> {
+struct StaticPageData<'a> {
     scene: &'a Scene,
     positions: &'a [f64],
     details: &'a [Vec<(String, String)>],
-    moved: &'a [MovedCell],
+    moved: &'a [PreviousCellPlace],
     /// The corners of the surface in base64, in the format of [`pack`].
     surface: String,
 }
 
-impl StillPage {
+impl StaticSkinPage {
     /// Returns the HTML text of the page.
     #[must_use]
     pub fn to_html(&self) -> String {
-        let (shells, corners) = pack(&self.surface);
-        let data = PageData {
+        let (shells, corners) = pack_meshes(&self.surface);
+        let data = StaticPageData {
             scene: &Scene { shells, may_press: false, ..self.scene.clone() },
             positions: &self.positions,
             details: &self.details,
@@ -74,7 +74,7 @@ impl StillPage {
                 "NAME" => text.push_str(&escaped(&self.scene.name)),
                 "CSS" => text.push_str(web::file_text("style.css").unwrap_or_default()),
                 "DATA" => text.push_str(&data),
-                "SCRIPT" => text.push_str(&web::bundle("still.js")),
+                "SCRIPT" => text.push_str(&web::bundle_modules("still.js")),
                 _ => {
                     debug_assert!(at % 2 == 0, "an unknown mark: {piece}");
                     text.push_str(piece);
@@ -90,16 +90,16 @@ mod tests {
     use super::*;
     use protocol::skin::Skin;
 
-    fn still() -> StillPage {
+    fn still() -> StaticSkinPage {
         let skin = Skin::parse("ur5", include_str!("../../examples/ur5-253.toml")).unwrap();
         let mut scene = Scene::from_skin(&skin, true);
         scene.name = "<arm> & @DATA@ 'x'".to_owned();
         let details = vec![vec![("a<b".to_owned(), "</script><b>".to_owned())]; scene.cells.len()];
         let triangles = vec![[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]];
         let [position, normal] = [[0.0, 0.1, 0.2], [0.0, 0.0, 1.0]];
-        StillPage {
+        StaticSkinPage {
             positions: vec![0.0; scene.joints.len()],
-            moved: vec![MovedCell { cell: 7, chain: 0, row: 2, position, normal }],
+            moved: vec![PreviousCellPlace { cell: 7, chain: 0, row: 2, position, normal }],
             surface: vec![RowMesh { chain: 0, row: 1, triangles }],
             scene,
             details,

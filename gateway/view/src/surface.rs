@@ -21,7 +21,7 @@ pub struct RowMesh {
 
 /// A shell of the scene: the range of its corners among those of all shells.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
-pub struct SceneShell {
+pub struct SceneMeshRange {
     /// The index of the chain in [`Scene::chains`](crate::Scene::chains).
     pub chain: usize,
     /// The number of the row, from 1; 0 is the base of the chain.
@@ -35,7 +35,7 @@ pub struct SceneShell {
 /// Returns the shells of the scene, and the corners of all shells as bytes. A corner has a position and a normal,
 /// together 6 little-endian f32.
 #[must_use]
-pub fn pack(shells: &[RowMesh]) -> (Vec<SceneShell>, Vec<u8>) {
+pub fn pack_meshes(shells: &[RowMesh]) -> (Vec<SceneMeshRange>, Vec<u8>) {
     let (mut all, mut bytes) = (Vec::new(), Vec::new());
     let mut first = 0;
     for RowMesh { chain, row, triangles } in shells {
@@ -43,9 +43,9 @@ pub fn pack(shells: &[RowMesh]) -> (Vec<SceneShell>, Vec<u8>) {
         if count == 0 {
             continue;
         }
-        all.push(SceneShell { chain: *chain, row: *row, first, count });
+        all.push(SceneMeshRange { chain: *chain, row: *row, first, count });
         first += count;
-        let corners = triangles.iter().flatten().zip(normals(triangles));
+        let corners = triangles.iter().flatten().zip(corner_normals(triangles));
         for value in corners.flat_map(|(place, normal)| [*place, normal.into()]).flatten() {
             #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
             bytes.extend((value as f32).to_le_bytes());
@@ -56,7 +56,7 @@ pub fn pack(shells: &[RowMesh]) -> (Vec<SceneShell>, Vec<u8>) {
 
 /// Returns the normal of each corner: the mean normal of those faces at the corner whose direction is similar to that
 /// of the corner's own face.
-fn normals(triangles: &[[[f64; 3]; 3]]) -> Vec<Vector3<f64>> {
+fn corner_normals(triangles: &[[[f64; 3]; 3]]) -> Vec<Vector3<f64>> {
     let key = |corner: &[f64; 3]| corner.map(f64::to_bits);
     let faces: Vec<_> = triangles
         .iter()
@@ -98,8 +98,8 @@ mod tests {
                 triangles: vec![[low, high, [0.0, 1.0, 0.0]], [high, low, [0.0, -cosine, sine]]],
             };
             let nothing = RowMesh { chain: 0, row: 0, triangles: Vec::new() };
-            let (shells, bytes) = pack(&[nothing, shell.clone(), shell]);
-            let of = |first| SceneShell { chain: 1, row: 2, first, count: 6 };
+            let (shells, bytes) = pack_meshes(&[nothing, shell.clone(), shell]);
+            let of = |first| SceneMeshRange { chain: 1, row: 2, first, count: 6 };
             assert_eq!(shells, [of(0), of(6)]);
             assert_eq!(bytes.len(), 2 * 6 * 24);
             let values: Vec<_> =

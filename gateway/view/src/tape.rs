@@ -26,7 +26,7 @@ const UPDATE_INTERVAL_NS: u64 = 20_000_000;
 /// The time in ns after which the rest of a pause in the recording is skipped.
 const MAX_PAUSE_NS: u64 = 60_000_000_000;
 /// The number of epochs whose times are stored.
-const MAX_EPOCHS: usize = 256;
+const MAX_EPOCH_TIMES: usize = 256;
 
 /// The result of a step on the tape.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -81,8 +81,8 @@ impl PlaybackState {
     #[must_use]
     pub fn new(skin: Skin, zero: u64) -> Self {
         let names: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
-        let mut live = LiveState::with_start(skin, Micros(zero / 1_000));
-        (0..names.len()).for_each(|bus| live.set_bus(bus, true, 0));
+        let mut live = LiveState::with_start_time(skin, Micros(zero / 1_000));
+        (0..names.len()).for_each(|bus| live.set_bus_state(bus, true, 0));
         Self {
             live,
             dropped: vec![0; names.len()],
@@ -139,7 +139,7 @@ impl PlaybackState {
                         let of_it = self.names.get(bus).is_some_and(|name| name == note.interface);
                         if of_it || (note.interface.is_empty() && bus == 0) {
                             *dropped = dropped.saturating_add(frames);
-                            self.live.set_bus(bus, true, *dropped);
+                            self.live.set_bus_state(bus, true, *dropped);
                         }
                     }
                 }
@@ -148,15 +148,15 @@ impl PlaybackState {
     }
 
     /// Advances by one frame, or by one interval of time without a frame, but not beyond `until`, in ns since 1970.
-    pub fn step(&mut self, until: u64) -> PlaybackStep {
+    pub fn step_until(&mut self, until: u64) -> PlaybackStep {
         if self.next.is_none() {
-            self.next = if self.ended { self.order.pop_last() } else { self.order.pop() };
+            self.next = if self.ended { self.order.pop_without_waiting() } else { self.order.pop() };
         }
         let Some(next) = self.next else {
             return match self.ended {
                 false => PlaybackStep::NeedsEntries,
                 true if self.first.is_none() => PlaybackStep::Over,
-                true => self.update_until(until).unwrap_or(PlaybackStep::Over),
+                true => self.apply_time_until(until).unwrap_or(PlaybackStep::Over),
             };
         };
         if self.first.is_none() {
@@ -164,10 +164,12 @@ impl PlaybackState {
             (self.at, self.next_update) =
                 (next.send_nanos, next.send_nanos.saturating_add(UPDATE_INTERVAL_NS));
             let latched = std::mem::take(&mut self.latched);
-            self.live
-                .apply_latched(Micros(next.send_nanos / 1_000), latched.iter().map(|it| (it.bus, &it.frame)));
+            self.live.apply_latched_frames(
+                Micros(next.send_nanos / 1_000),
+                latched.iter().map(|it| (it.bus, &it.frame)),
+            );
         }
-        if let Some(looked) = self.update_until(until.min(next.send_nanos.saturating_sub(1))) {
+        if let Some(looked) = self.apply_time_until(until.min(next.send_nanos.saturating_sub(1))) {
             return looked;
         }
         if next.send_nanos > until {
@@ -179,7 +181,7 @@ impl PlaybackState {
         let QueuedFrame { bus, frame } = next.item;
         let epoch = self.live.apply_frame(bus, Micros(next.send_nanos / 1_000), &frame);
         if epoch {
-            if self.epochs.len() == MAX_EPOCHS {
+            if self.epochs.len() == MAX_EPOCH_TIMES {
                 self.epochs.pop_front();
             }
             self.epochs.push_back(next.send_nanos);
@@ -188,7 +190,7 @@ impl PlaybackState {
     }
 
     /// Applies the passing of time to the state, if the next time to do so is not after `until`.
-    fn update_until(&mut self, until: u64) -> Option<PlaybackStep> {
+    fn apply_time_until(&mut self, until: u64) -> Option<PlaybackStep> {
         // Times in 64 bits of ns end in the year 2554, so there is no later time.
         if self.next_update > until || self.next_update == u64::MAX {
             return None;
@@ -216,31 +218,31 @@ impl PlaybackState {
 
     /// Returns the position in ns since 1970: all frames up to it were applied.
     #[must_use]
-    pub const fn position(&self) -> u64 {
+    pub const fn position_ns(&self) -> u64 {
         self.at
     }
 
     /// Returns true if all frames of the recording were applied.
     #[must_use]
-    pub fn is_over(&self) -> bool {
+    pub fn has_ended(&self) -> bool {
         self.ended && self.next.is_none() && self.order.is_empty()
     }
 
     /// Returns the time of the last epoch before `moment`, both in ns since 1970. Returns `None` if it is no longer
     /// stored.
     #[must_use]
-    pub fn epoch_before(&self, moment: u64) -> Option<u64> {
+    pub fn epoch_time_before(&self, moment: u64) -> Option<u64> {
         self.epochs.iter().rev().copied().find(|&at| at < moment)
     }
 
     /// Drops the frames of the last seconds, so that the tape takes less memory in the index.
-    pub fn forget_recent(&mut self) {
-        self.live.forget_recent();
+    pub fn forget_recent_frames(&mut self) {
+        self.live.forget_recent_frames();
     }
 
     /// Returns the number of frames on buses that the skin does not have.
     #[must_use]
-    pub const fn foreign_frames(&self) -> u64 {
+    pub const fn foreign_frame_count(&self) -> u64 {
         self.foreign_frames
     }
 

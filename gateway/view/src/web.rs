@@ -1,7 +1,7 @@
 //! The files of the pages. They are served one by one, or bundled into one script for a page without a server.
 
 /// The files of the live page, and of the page that shows a skin without buses.
-const FILES: [(&str, &str); 25] = [
+const WEB_FILES: [(&str, &str); 25] = [
     ("index.html", include_str!("../web/index.html")),
     ("still.html", include_str!("../web/still.html")),
     ("style.css", include_str!("../web/style.css")),
@@ -31,7 +31,7 @@ const FILES: [(&str, &str); 25] = [
 
 /// Returns the text of the file with this name.
 pub(crate) fn file_text(name: &str) -> Option<&'static str> {
-    FILES.iter().find(|(known, _)| *known == name).map(|(_, text)| *text)
+    WEB_FILES.iter().find(|(known, _)| *known == name).map(|(_, text)| *text)
 }
 
 /// Returns the media type and the contents of the file at a path of the server.
@@ -56,7 +56,7 @@ pub(crate) fn is_script_or_style(path: &str) -> bool {
 /// those that it imports.
 ///
 /// Supports only the syntax of the files here: an import is on one line, and a declaration follows `export`.
-pub(crate) fn bundle(entry: &'static str) -> String {
+pub(crate) fn bundle_modules(entry: &'static str) -> String {
     let mut script = String::from("\"use strict\";\nconst modules = {};\n");
     add_module(entry, &mut Vec::new(), &mut script);
     script
@@ -70,13 +70,13 @@ fn add_module(name: &'static str, added: &mut Vec<&'static str>, script: &mut St
     let Some(text) = file_text(name) else { return };
     let (mut body, mut exported) = (String::new(), Vec::new());
     for line in text.lines() {
-        if let Some((names, from)) = import(line) {
+        if let Some((names, from)) = parse_import(line) {
             add_module(from, added, script);
             let names =
                 names.strip_prefix("* as ").map_or_else(|| names.replace(" as ", ": "), str::to_owned);
             body.push_str(&format!("const {names} = modules[\"{from}\"];"));
         } else if let Some(declaration) = line.strip_prefix("export ") {
-            exported.extend(declared(declaration));
+            exported.extend(declared_names(declaration));
             body.push_str(declaration);
         } else {
             body.push_str(line);
@@ -88,13 +88,13 @@ fn add_module(name: &'static str, added: &mut Vec<&'static str>, script: &mut St
 }
 
 /// Returns the imported names and the file of an import line; `None` for another line.
-fn import(line: &'static str) -> Option<(&'static str, &'static str)> {
+fn parse_import(line: &'static str) -> Option<(&'static str, &'static str)> {
     let (names, from) = line.strip_prefix("import ")?.split_once(" from \"./")?;
     Some((names, from.strip_suffix("\";")?))
 }
 
 /// Returns the names that a declaration introduces: a function, a class, a constant, or constants in brackets.
-fn declared(declaration: &str) -> Vec<&str> {
+fn declared_names(declaration: &str) -> Vec<&str> {
     let Some((_, rest)) = declaration.split_once(' ') else { return Vec::new() };
     let is_of_name = |letter: char| letter.is_ascii_alphanumeric() || letter == '_';
     match rest.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
@@ -110,13 +110,13 @@ mod tests {
     #[test]
     fn the_page_is_small_and_asks_for_nothing_outside() {
         let mut bytes = 0;
-        for (name, text) in FILES {
+        for (name, text) in WEB_FILES {
             assert!(!text.contains("http:") && !text.contains("https:") && !text.contains("//cdn"), "{name}");
             assert!(!text.contains("innerHTML") && !text.contains("eval("), "{name}");
             assert!(text.lines().count() <= 500, "{name}");
             bytes += text.len();
             for line in text.lines().filter(|line| line.starts_with("import ")) {
-                let (_, from) = import(line).unwrap_or_else(|| panic!("{name}: {line}"));
+                let (_, from) = parse_import(line).unwrap_or_else(|| panic!("{name}: {line}"));
                 assert!(file_text(from).is_some(), "{name} imports {from}");
             }
         }
@@ -138,17 +138,19 @@ mod tests {
     #[test]
     fn a_bundle_has_each_module_once_behind_those_that_it_imports() {
         for entry in ["still.js", "app.js"] {
-            let script = bundle(entry);
+            let script = bundle_modules(entry);
             assert!(!script.lines().any(|line| line.starts_with("import ") || line.starts_with("export ")));
             assert!(!script.contains("</script"), "it would end the element that it is in");
             let place = |name: &str| script.find(&format!("modules[\"{name}\"] = (() =>"));
-            for (name, text) in FILES.into_iter().filter(|(name, _)| place(name).is_some()) {
+            for (name, text) in WEB_FILES.into_iter().filter(|(name, _)| place(name).is_some()) {
                 assert_eq!(script.matches(&format!("modules[\"{name}\"] = (() =>")).count(), 1, "{name}");
-                for (names, from) in text.lines().filter_map(import) {
+                for (names, from) in text.lines().filter_map(parse_import) {
                     assert!(place(from).unwrap() < place(name).unwrap(), "{name} before {from}");
-                    let exported = FILES.iter().find(|(known, _)| *known == from).unwrap().1.lines();
-                    let exported: Vec<_> =
-                        exported.filter_map(|line| line.strip_prefix("export ")).flat_map(declared).collect();
+                    let exported = WEB_FILES.iter().find(|(known, _)| *known == from).unwrap().1.lines();
+                    let exported: Vec<_> = exported
+                        .filter_map(|line| line.strip_prefix("export "))
+                        .flat_map(declared_names)
+                        .collect();
                     let names = names.trim_matches(|letter| "{} ".contains(letter)).split(", ");
                     for name in names.filter(|name| !name.starts_with('*')) {
                         let name = name.split(" as ").next().unwrap();
@@ -157,7 +159,7 @@ mod tests {
                 }
             }
         }
-        assert_eq!(declared("const [TREE, CUT] = [0, 1];"), ["TREE", "CUT"]);
-        assert_eq!(declared("function table(rows) {"), ["table"]);
+        assert_eq!(declared_names("const [TREE, CUT] = [0, 1];"), ["TREE", "CUT"]);
+        assert_eq!(declared_names("function table(rows) {"), ["table"]);
     }
 }

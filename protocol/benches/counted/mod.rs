@@ -4,7 +4,7 @@
 use std::process::{Command, Stdio, exit};
 
 /// The workspace's manifest, which pins the version of gungraun.
-const MANIFEST: &str = include_str!("../../../Cargo.toml");
+const WORKSPACE_MANIFEST: &str = include_str!("../../../Cargo.toml");
 
 /// Runs the benches: under valgrind (`counted`) when `cargo bench` starts the program with `--bench`, else once each
 /// (`once`), which needs no other programs. `--test` also selects `once`.
@@ -17,7 +17,7 @@ pub(crate) fn main(once: impl Fn(), counted: impl Fn()) {
     if said("--test") || !said("--bench") {
         return once();
     }
-    let version = MANIFEST.lines().find_map(|line| line.strip_prefix("gungraun = \"="));
+    let version = WORKSPACE_MANIFEST.lines().find_map(|line| line.strip_prefix("gungraun = \"="));
     let version = version.map_or("*", |version| version.trim_end_matches('"'));
     let runner = std::env::var("GUNGRAUN_RUNNER").unwrap_or_else(|_| "gungraun-runner".to_owned());
     for (program, hint) in [

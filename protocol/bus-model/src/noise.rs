@@ -45,7 +45,7 @@ impl BitErrors {
         }
         let mut errors =
             Self { dice: Pcg64Mcg::seed_from_u64(seed), log_undamaged: (-rate).ln_1p(), undamaged_bits: 0 };
-        errors.draw_next();
+        errors.draw_next_error();
         Ok(errors)
     }
 
@@ -55,7 +55,7 @@ impl BitErrors {
         clippy::cast_sign_loss,
         reason = "above 0; larger values saturate"
     )]
-    fn draw_next(&mut self) {
+    fn draw_next_error(&mut self) {
         let uniform: f64 = self.dice.random();
         // `1 - uniform` is in (0, 1]. Without errors the distance is unlimited.
         self.undamaged_bits = if self.log_undamaged < 0.0 {
@@ -68,13 +68,13 @@ impl BitErrors {
     /// Counts the bits of one attempt to send a frame. Returns the bits sent up to the first damaged one, plus the
     /// error frame; `None` if no bit is damaged.
     pub(super) fn damage_frame(&mut self, bits: FrameBits) -> Option<FrameBits> {
-        let exposed = bits.total().saturating_sub(INTERMISSION_BITS);
+        let exposed = bits.total_bits().saturating_sub(INTERMISSION_BITS);
         if self.undamaged_bits >= u64::from(exposed) {
             self.undamaged_bits = self.undamaged_bits.saturating_sub(u64::from(exposed));
             return None;
         }
         let sent = u32::try_from(self.undamaged_bits).unwrap_or(exposed) + 1;
-        self.draw_next();
+        self.draw_next_error();
         let head = if bits.data > 0 { bits.nominal.saturating_sub(FD_TAIL_BITS) } else { bits.nominal };
         let data = sent.saturating_sub(head).min(bits.data);
         Some(FrameBits { nominal: sent - data + ERROR_FRAME_BITS, data })

@@ -8,26 +8,26 @@ use std::os::fd::AsFd;
 
 use super::{Filter, calls};
 
-pub use client::seqpacket;
+pub use client::seqpacket_socket;
 pub(super) use client::{EmbeddedBackend, closed_error};
 pub use directory::{
-    DirectoryError, MARKER_FILE, address, default_directory, make_directory, open_directory,
-    remove_directory, socket_name, write_marker,
+    DirectoryError, MARKER_FILE, default_directory, make_directory, open_directory, remove_directory,
+    socket_address, socket_name, write_marker,
 };
 
 mod client;
 mod directory;
 
 /// The version of the protocol between client and server, which every hello contains.
-pub const VERSION: u8 = 2;
+pub const HELLO_VERSION: u8 = 2;
 /// Index of the byte in a frame that is 1 if the receiving client sent the frame itself.
-pub const OWN_FRAME_BYTE: usize = 6;
+pub const OWN_FRAME_BYTE_INDEX: usize = 6;
 /// Maximum length of a client's hello in bytes.
 pub const MAX_HELLO_BYTES: usize = HELLO_HEADER_BYTES + 8 * Filter::MAX_COUNT;
 
-const MAGIC: &[u8; 7] = b"skinbus";
+const HELLO_MAGIC: &[u8; 7] = b"skinbus";
 const HELLO_HEADER_BYTES: usize = 23;
-const ANSWER_LEN: usize = 17;
+const HELLO_REPLY_BYTES: usize = 17;
 
 /// Returns the id of the process that connected a socket; `None` if the process is in another pid namespace.
 #[must_use]
@@ -55,8 +55,8 @@ impl ClientHello {
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(HELLO_HEADER_BYTES + 8 * self.filters.len());
-        bytes.extend_from_slice(MAGIC);
-        bytes.extend_from_slice(&[VERSION, self.own_frames.into(), self.fd.into()]);
+        bytes.extend_from_slice(HELLO_MAGIC);
+        bytes.extend_from_slice(&[HELLO_VERSION, self.own_frames.into(), self.fd.into()]);
         bytes.extend_from_slice(&self.error_mask.to_le_bytes());
         bytes.extend_from_slice(&self.buffer.to_le_bytes());
         bytes.push(0);
@@ -68,8 +68,10 @@ impl ClientHello {
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let (head, filters) = bytes.split_first_chunk::<HELLO_HEADER_BYTES>()?;
-        let rest = head.strip_prefix(MAGIC)?;
-        let &[VERSION, own @ 0..=1, fd @ 0..=1, m0, m1, m2, m3, ref rest @ ..] = rest else { return None };
+        let rest = head.strip_prefix(HELLO_MAGIC)?;
+        let &[HELLO_VERSION, own @ 0..=1, fd @ 0..=1, m0, m1, m2, m3, ref rest @ ..] = rest else {
+            return None;
+        };
         let (buffer, [0]) = rest.split_first_chunk()? else { return None };
         Some(Self {
             filters: decode_filters(filters).filter(|filters| filters.len() <= Filter::MAX_COUNT)?,
@@ -94,19 +96,24 @@ pub struct FilterPart {
 
 impl FilterPart {
     const FILTER_TAG: u8 = b'F';
-    const FIRST_PART: u8 = 1;
-    const LAST_PART: u8 = 2;
+    const FIRST_PART_FLAG: u8 = 1;
+    const LAST_PART_FLAG: u8 = 2;
     /// Maximum number of filters in a piece. The datagram must not be longer than an FD frame, because a server reads
     /// no longer ones.
-    const MAX_FILTERS: usize = 8;
+    const MAX_FILTERS_PER_PART: usize = 8;
 
     /// Splits a list of filters into pieces for one datagram each.
-    pub fn split(filters: &[Filter]) -> impl Iterator<Item = Self> + use<'_> {
-        let parts = filters.len().div_ceil(Self::MAX_FILTERS).max(1);
+    pub fn split_filters(filters: &[Filter]) -> impl Iterator<Item = Self> + use<'_> {
+        let parts = filters.len().div_ceil(Self::MAX_FILTERS_PER_PART).max(1);
         (0..parts).map(move |part| Self {
             first: part == 0,
             last: part == parts - 1,
-            filters: filters.iter().skip(part * Self::MAX_FILTERS).take(Self::MAX_FILTERS).copied().collect(),
+            filters: filters
+                .iter()
+                .skip(part * Self::MAX_FILTERS_PER_PART)
+                .take(Self::MAX_FILTERS_PER_PART)
+                .copied()
+                .collect(),
         })
     }
 
@@ -114,8 +121,10 @@ impl FilterPart {
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
         let flag = |set, flag| if set { flag } else { 0 };
-        let mut bytes =
-            vec![Self::FILTER_TAG, flag(self.first, Self::FIRST_PART) | flag(self.last, Self::LAST_PART)];
+        let mut bytes = vec![
+            Self::FILTER_TAG,
+            flag(self.first, Self::FIRST_PART_FLAG) | flag(self.last, Self::LAST_PART_FLAG),
+        ];
         encode_filters(&self.filters, &mut bytes);
         bytes
     }
@@ -124,8 +133,12 @@ impl FilterPart {
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let &[Self::FILTER_TAG, flags @ 0..=3, ref rest @ ..] = bytes else { return None };
-        let filters = decode_filters(rest).filter(|filters| filters.len() <= Self::MAX_FILTERS)?;
-        Some(Self { first: flags & Self::FIRST_PART != 0, last: flags & Self::LAST_PART != 0, filters })
+        let filters = decode_filters(rest).filter(|filters| filters.len() <= Self::MAX_FILTERS_PER_PART)?;
+        Some(Self {
+            first: flags & Self::FIRST_PART_FLAG != 0,
+            last: flags & Self::LAST_PART_FLAG != 0,
+            filters,
+        })
     }
 }
 
@@ -163,15 +176,15 @@ pub enum HelloReply {
 impl HelloReply {
     /// Encodes the answer as a datagram.
     #[must_use]
-    pub fn encode(self) -> [u8; ANSWER_LEN] {
+    pub fn encode(self) -> [u8; HELLO_REPLY_BYTES] {
         let (code, version, granted) = match self {
-            Self::Welcome { granted } => (0, VERSION, granted),
+            Self::Welcome { granted } => (0, HELLO_VERSION, granted),
             Self::Refused { version } => (1, version, 0),
         };
-        let mut bytes = [0; ANSWER_LEN];
-        let (magic, rest) = bytes.split_at_mut(MAGIC.len());
+        let mut bytes = [0; HELLO_REPLY_BYTES];
+        let (magic, rest) = bytes.split_at_mut(HELLO_MAGIC.len());
         let (head, value) = rest.split_at_mut(2);
-        magic.copy_from_slice(MAGIC);
+        magic.copy_from_slice(HELLO_MAGIC);
         head.copy_from_slice(&[version, code]);
         value.copy_from_slice(&granted.to_le_bytes());
         bytes
@@ -180,10 +193,10 @@ impl HelloReply {
     /// Decodes a datagram. Returns `None` if it is not an answer. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
-        let &[version, code, ref value @ ..] = bytes.strip_prefix(MAGIC)? else { return None };
+        let &[version, code, ref value @ ..] = bytes.strip_prefix(HELLO_MAGIC)? else { return None };
         let granted = u64::from_le_bytes(value.try_into().ok()?);
         match (version, code) {
-            (VERSION, 0) => Some(Self::Welcome { granted }),
+            (HELLO_VERSION, 0) => Some(Self::Welcome { granted }),
             (version, 1) => Some(Self::Refused { version }),
             _ => None,
         }
@@ -192,14 +205,14 @@ impl HelloReply {
 
 /// Encodes a drop notice: the total number of frames dropped for a client.
 #[must_use]
-pub const fn encode_dropped(total: u32) -> [u8; 5] {
+pub const fn encode_drop_notice(total: u32) -> [u8; 5] {
     let [a, b, c, d] = total.to_le_bytes();
     [b'D', a, b, c, d]
 }
 
 /// Decodes a drop notice. Returns the total number of dropped frames; `None` for any other datagram.
 #[must_use]
-pub const fn decode_dropped(bytes: &[u8]) -> Option<u32> {
+pub const fn decode_drop_notice(bytes: &[u8]) -> Option<u32> {
     match *bytes {
         [b'D', a, b, c, d] => Some(u32::from_le_bytes([a, b, c, d])),
         _ => None,
@@ -242,9 +255,9 @@ mod tests {
             .map(|count| HELLO_HEADER_BYTES + 8 * count)
             .chain((0..=Filter::MAX_COUNT).flat_map(|count| {
                 let filters = vec![Filter::ALL; count];
-                FilterPart::split(&filters).map(|part| part.encode().len()).collect::<Vec<_>>()
+                FilterPart::split_filters(&filters).map(|part| part.encode().len()).collect::<Vec<_>>()
             }))
-            .chain([HelloReply::Refused { version: 1 }.encode().len(), encode_dropped(0).len()]);
+            .chain([HelloReply::Refused { version: 1 }.encode().len(), encode_drop_notice(0).len()]);
         assert!(lens.into_iter().all(|len| len != CLASSIC_BYTES && len != FD_BYTES && len != 0));
     }
 
@@ -252,7 +265,7 @@ mod tests {
     fn a_hello_of_another_version_is_none() {
         let mut bytes =
             ClientHello { filters: vec![], own_frames: false, fd: true, error_mask: 0, buffer: 0 }.encode();
-        bytes[7] = VERSION + 1;
+        bytes[7] = HELLO_VERSION + 1;
         assert_eq!(ClientHello::decode(&bytes), None);
     }
 
@@ -265,7 +278,7 @@ mod tests {
         #[test]
         fn every_change_of_filters_comes_back_in_parts_that_a_bus_can_read(words in proptest::collection::vec(any::<(u32, u32)>(), 0..40)) {
             let filters: Vec<_> = words.into_iter().map(|(id, mask)| Filter { id, mask }).collect();
-            let parts: Vec<_> = FilterPart::split(&filters).collect();
+            let parts: Vec<_> = FilterPart::split_filters(&filters).collect();
             for part in &parts {
                 let bytes = part.encode();
                 prop_assert!(bytes.len() <= FD_BYTES);
@@ -281,13 +294,13 @@ mod tests {
             for answer in [HelloReply::Welcome { granted }, HelloReply::Refused { version }] {
                 prop_assert_eq!(HelloReply::decode(&answer.encode()), Some(answer));
             }
-            prop_assert_eq!(decode_dropped(&encode_dropped(total)), Some(total));
+            prop_assert_eq!(decode_drop_notice(&encode_drop_notice(total)), Some(total));
         }
 
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..80)) {
             let _ = (ClientHello::decode(&bytes), FilterPart::decode(&bytes));
-            let _ = (HelloReply::decode(&bytes), decode_dropped(&bytes));
+            let _ = (HelloReply::decode(&bytes), decode_drop_notice(&bytes));
         }
     }
 }

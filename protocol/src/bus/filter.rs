@@ -5,7 +5,7 @@ use crate::id::{Id, Kind};
 use crate::port::LinkId;
 
 /// A receive filter. A frame passes if `identifier & mask == id & mask`. A filter whose `id` contains
-/// [`Filter::INVERTED`] passes all other frames instead.
+/// [`Filter::INVERTED_FLAG`] passes all other frames instead.
 ///
 /// `id` and `mask` hold the flags [`EXTENDED`] and [`REMOTE`] above the identifier. A socket receives a frame once if
 /// at least one of its filters passes the frame; a socket without filters receives nothing. The layout is that of
@@ -22,7 +22,7 @@ impl Filter {
     /// The filter that passes every data and remote frame.
     pub const ALL: Self = Self { id: 0, mask: 0 };
     /// Flag in `id` that inverts the filter (`CAN_INV_FILTER`).
-    pub const INVERTED: u32 = ERROR;
+    pub const INVERTED_FLAG: u32 = ERROR;
     /// The mask that selects exactly one 11-bit identifier. The kernel looks such filters up in a table, so their
     /// number costs no time.
     pub const EXACT_MASK: u32 = STANDARD_MASK | EXTENDED | REMOTE;
@@ -50,7 +50,7 @@ impl Filter {
     /// Returns the filter that passes exactly the frames that this one rejects.
     #[must_use]
     pub const fn inverted(self) -> Self {
-        Self { id: self.id ^ Self::INVERTED, mask: self.mask }
+        Self { id: self.id ^ Self::INVERTED_FLAG, mask: self.mask }
     }
 }
 

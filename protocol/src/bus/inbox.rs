@@ -51,14 +51,14 @@ impl Inbox {
     /// read fast enough: a running total that wraps (`SO_RXQ_OVFL`). The kernel reports a new total with the next frame
     /// that arrives. The embedded bus also reports it when the socket has been read empty.
     #[must_use]
-    pub const fn dropped(&self) -> u32 {
+    pub const fn dropped_count(&self) -> u32 {
         self.dropped
     }
 
     /// Returns the number of received datagrams that were neither a frame nor a drop notice; 0 unless the other end is
     /// faulty.
     #[must_use]
-    pub const fn unreadable(&self) -> u64 {
+    pub const fn unreadable_count(&self) -> u64 {
         self.unreadable
     }
 

@@ -107,7 +107,7 @@ fn configure_socket(socket: &CanFdSocket, options: &BusOptions) -> io::Result<us
     socket.set_recv_own_msgs(options.own_frames)?;
     socket.set_recv_timestamp(true)?;
     socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RXQ_OVFL, 1)?;
-    discard(socket);
+    discard_received_frames(socket);
     set_receive_buffer(socket, options.receive_buffer)
 }
 
@@ -130,7 +130,7 @@ pub fn set_receive_buffer(socket: impl AsFd, bytes: usize) -> io::Result<usize> 
 }
 
 /// Discards frames that arrived between the creation of the socket and the setting of its filters.
-fn discard(socket: &CanFdSocket) {
+fn discard_received_frames(socket: &CanFdSocket) {
     let mut batch = ReceiveBatch::new();
     for _ in 0..16 {
         if batch.receive(socket).is_err() {

@@ -5,7 +5,7 @@ use std::io;
 use netlink_packet_route::RouteNetlinkMessage;
 use netlink_packet_route::link::{InfoKind, LinkAttribute, LinkFlags, LinkHeader, LinkInfo, LinkMessage};
 
-use super::netlink::{RtnetlinkSocket, attributes};
+use super::netlink::{RtnetlinkSocket, link_attributes};
 
 /// A network interface.
 #[derive(Clone, Copy, Debug)]
@@ -28,7 +28,7 @@ impl NetworkInterface {
         let answer = answers.first().map_or(&[][..], Vec::as_slice);
         let LinkHeader { index, flags, .. } = LinkHeader::parse(answer).map_err(io::Error::other)?;
         let mut link = Self { index, mtu: 0, up: flags.contains(LinkFlags::Up), is_virtual: false };
-        for attribute in attributes(answer) {
+        for attribute in link_attributes(answer) {
             if let LinkAttribute::Mtu(mtu) = attribute {
                 link.mtu = mtu;
             } else if let LinkAttribute::LinkInfo(infos) = attribute {

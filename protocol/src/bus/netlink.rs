@@ -17,7 +17,7 @@ use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
 /// Maximum time to wait for the kernel, which normally answers at once.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of attempts to read a list that the kernel changes while it is read.
-const RETRIES: usize = 8;
+const MAX_READ_ATTEMPTS: usize = 8;
 /// Size of `struct ifinfomsg` in bytes; the attributes follow it.
 const INTERFACE_HEADER_BYTES: usize = 16;
 
@@ -51,7 +51,7 @@ impl RtnetlinkSocket {
     /// # Errors
     /// Returns the error that the kernel answers, or a timeout.
     pub fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
-        for _ in 0..RETRIES {
+        for _ in 0..MAX_READ_ATTEMPTS {
             let (answers, interrupted) = self.query(payload.clone(), flags)?;
             if !interrupted {
                 return Ok(answers);
@@ -103,7 +103,7 @@ impl RtnetlinkSocket {
 
 /// Decodes the attributes of an interface in an answer. Unknown attributes are skipped, so that an unusual
 /// interface does not hide the others.
-pub fn attributes(answer: &[u8]) -> impl Iterator<Item = LinkAttribute> {
+pub fn link_attributes(answer: &[u8]) -> impl Iterator<Item = LinkAttribute> {
     NlasIterator::new(answer.get(INTERFACE_HEADER_BYTES..).unwrap_or_default())
         .flatten()
         .filter_map(|attribute| LinkAttribute::parse_with_param(&attribute, AddressFamily::Unspec).ok())

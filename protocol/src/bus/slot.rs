@@ -27,7 +27,7 @@ impl DatagramInfo {
         let mut notes = Self::default();
         for ControlMessage { kind, data } in ControlMessages(control) {
             if kind == libc::SCM_TIMESTAMPNS {
-                notes.at_nanos = nanoseconds(data);
+                notes.at_nanos = parse_timespec_nanos(data);
             } else if kind == libc::SO_RXQ_OVFL {
                 notes.dropped = data.first_chunk().map(|&bytes| u32::from_ne_bytes(bytes));
             }
@@ -49,17 +49,17 @@ impl<'a> Iterator for ControlMessages<'a> {
     type Item = ControlMessage<'a>;
 
     fn next(&mut self) -> Option<ControlMessage<'a>> {
-        const WORD_LEN: usize = size_of::<usize>();
-        const HEADER_LEN: usize = size_of::<libc::cmsghdr>();
+        const USIZE_BYTES: usize = size_of::<usize>();
+        const CMSG_HEADER_BYTES: usize = size_of::<libc::cmsghdr>();
         loop {
-            let (head, _) = self.0.split_first_chunk::<HEADER_LEN>()?;
-            let (len, rest) = head.split_at(WORD_LEN);
+            let (head, _) = self.0.split_first_chunk::<CMSG_HEADER_BYTES>()?;
+            let (len, rest) = head.split_at(USIZE_BYTES);
             let len = len.try_into().map_or(0, usize::from_ne_bytes);
             let number = |at| {
                 rest.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |&bytes| i32::from_ne_bytes(bytes))
             };
-            let data = self.0.get(HEADER_LEN..len)?;
-            self.0 = self.0.get(len.next_multiple_of(WORD_LEN)..).unwrap_or_default();
+            let data = self.0.get(CMSG_HEADER_BYTES..len)?;
+            self.0 = self.0.get(len.next_multiple_of(USIZE_BYTES)..).unwrap_or_default();
             if number(0) == libc::SOL_SOCKET {
                 return Some(ControlMessage { kind: number(4), data });
             }
@@ -78,7 +78,7 @@ pub(super) fn for_each_descriptor(slot: &DatagramBuffer, mut take: impl FnMut(i3
 }
 
 /// Converts a `struct timespec` of two 64-bit words to nanoseconds.
-fn nanoseconds(timespec: &[u8]) -> Option<u64> {
+fn parse_timespec_nanos(timespec: &[u8]) -> Option<u64> {
     let (seconds, rest) = timespec.split_first_chunk()?;
     let nanos = rest.first_chunk()?;
     let seconds = u64::try_from(i64::from_ne_bytes(*seconds)).ok()?;

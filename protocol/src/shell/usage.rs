@@ -20,13 +20,13 @@ pub struct Failure {
 impl Failure {
     /// Creates an error for wrong usage or an invalid configuration, with exit code 2.
     #[must_use]
-    pub fn usage(text: impl Display) -> Self {
+    pub fn usage_error(text: impl Display) -> Self {
         Self::with_code(2, text)
     }
 
     /// Creates an error for an operation that failed, with exit code 1.
     #[must_use]
-    pub fn run(text: impl Display) -> Self {
+    pub fn run_error(text: impl Display) -> Self {
         Self::with_code(1, text)
     }
 
@@ -159,7 +159,7 @@ fn escape_chars(text: &str, is_coded: impl Fn(char) -> bool) -> Cow<'_, str> {
 pub fn ignore_broken_pipe(done: io::Result<()>) -> Result<(), Failure> {
     match done {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
-            Err(Failure::run(format!("standard output: {error}")))
+            Err(Failure::run_error(format!("standard output: {error}")))
         }
         Ok(()) | Err(_) => Ok(()),
     }
@@ -230,17 +230,20 @@ mod tests {
     fn an_exit_code_goes_with_each_error() {
         assert_eq!(exit_code("test", Ok(())), ExitCode::SUCCESS);
         assert_eq!(exit_code("test", Err(Failure::already_reported())), ExitCode::from(1));
-        assert_eq!(Failure::usage("no"), Failure::with_code(2, "no"));
-        assert_eq!(Failure::run("no"), Failure::with_code(1, "no"));
+        assert_eq!(Failure::usage_error("no"), Failure::with_code(2, "no"));
+        assert_eq!(Failure::run_error("no"), Failure::with_code(1, "no"));
         assert_eq!(exit_code("test", Err(Failure::with_code(3, ""))), ExitCode::from(3));
-        assert_eq!(Failure::usage("no").append("no again"), Failure::usage("no; and no again"));
+        assert_eq!(Failure::usage_error("no").append("no again"), Failure::usage_error("no; and no again"));
     }
     #[test]
     fn a_reader_may_leave_and_a_disk_may_not_be_full() {
         assert_eq!(ignore_broken_pipe(Ok(())), Ok(()));
         assert_eq!(ignore_broken_pipe(Err(ErrorKind::BrokenPipe.into())), Ok(()));
         let full = io::Error::from(ErrorKind::StorageFull);
-        assert_eq!(ignore_broken_pipe(Err(full)), Err(Failure::run("standard output: no storage space")));
+        assert_eq!(
+            ignore_broken_pipe(Err(full)),
+            Err(Failure::run_error("standard output: no storage space"))
+        );
     }
     #[test]
     fn what_is_wrong_and_its_tip_remain() {

@@ -60,13 +60,13 @@ impl KeyPath {
 
     /// Returns the path of a key in the table at this path.
     #[must_use]
-    pub fn key(&self, key: &'static str) -> Self {
+    pub fn with_key(&self, key: &'static str) -> Self {
         Self([&self.0[..], &[PathStep::Key(key)]].concat())
     }
 
     /// Returns the path of an element of the array at this path, counted from 0.
     #[must_use]
-    pub fn element(&self, index: usize) -> Self {
+    pub fn with_index(&self, index: usize) -> Self {
         Self([&self.0[..], &[PathStep::Index(index)]].concat())
     }
 
@@ -223,7 +223,7 @@ pub const MAX_FILE_BYTES: u64 = 16 << 20;
 
 /// Maximum number of keys, values and tables in a TOML file, estimated by the number of its punctuation characters. A
 /// skin of 10 000 cells has 280 000 of them; a file with the maximum takes up to 0.5 GB of memory to parse.
-const MAX_PUNCTUATION: usize = 500_000;
+const MAX_PUNCTUATION_CHARS: usize = 500_000;
 
 /// Converts seconds to a duration. The caller has checked that the seconds are not negative and within the limits of
 /// the file format.
@@ -238,14 +238,14 @@ pub fn span_from_seconds(seconds: f64) -> Span {
 /// # Errors
 /// Returns an error if the file is longer, or cannot be read as UTF-8.
 pub fn read_text(path: &Path) -> Result<String, DocumentError> {
-    read_text_within(path, MAX_FILE_BYTES)
+    read_text_up_to(path, MAX_FILE_BYTES)
 }
 
 /// Reads a file of at most `longest` bytes.
 ///
 /// # Errors
 /// Returns an error if the file is longer, or cannot be read as UTF-8.
-pub fn read_text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
+pub fn read_text_up_to(path: &Path, longest: u64) -> Result<String, DocumentError> {
     let read = || {
         String::from_utf8(input::read_bytes(path, longest)?).map_err(|_| io::Error::other("it is not UTF-8"))
     };
@@ -269,9 +269,10 @@ pub fn parse<Raw: DeserializeOwned, T>(
         DocumentError::InvalidValue { path: path.to_owned(), line, column, what }
     };
     let signs = text.bytes().filter(|byte| b"=.,[{".contains(byte)).count();
-    if signs > MAX_PUNCTUATION {
-        let reason =
-            format!("it has {signs} of the characters = . , [ {{, and at most {MAX_PUNCTUATION} are allowed");
+    if signs > MAX_PUNCTUATION_CHARS {
+        let reason = format!(
+            "it has {signs} of the characters = . , [ {{, and at most {MAX_PUNCTUATION_CHARS} are allowed"
+        );
         return Err(DocumentError::Unreadable { path: path.to_owned(), reason });
     }
     let raw = deserialize(text).map_err(|(at, what)| wrong(at, what))?;
@@ -282,7 +283,10 @@ pub fn parse<Raw: DeserializeOwned, T>(
 fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
     toml::from_str(text).map_err(|error| {
         let at = error.span().unwrap_or_default();
-        (at.start, mistakes::explain(text, at, &error.message().lines().collect::<Vec<_>>().join("; ")))
+        (
+            at.start,
+            mistakes::explain_parse_error(text, at, &error.message().lines().collect::<Vec<_>>().join("; ")),
+        )
     })
 }
 
@@ -324,8 +328,8 @@ mod tests {
             let text = format!("#{}", ".".repeat(signs));
             parse("x.toml", &text, |_: toml::Table| Ok(())).map_err(|error| error.to_string())
         };
-        assert_eq!(of(MAX_PUNCTUATION), Ok(()));
-        assert!(of(MAX_PUNCTUATION + 1).unwrap_err().contains("it has 500001 of the characters"));
-        assert!(of(MAX_PUNCTUATION * 2).is_err());
+        assert_eq!(of(MAX_PUNCTUATION_CHARS), Ok(()));
+        assert!(of(MAX_PUNCTUATION_CHARS + 1).unwrap_err().contains("it has 500001 of the characters"));
+        assert!(of(MAX_PUNCTUATION_CHARS * 2).is_err());
     }
 }

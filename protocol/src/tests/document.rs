@@ -14,7 +14,7 @@ use crate::id::{Command, Kind};
 use crate::message::State;
 use crate::parameters::Parameter;
 use crate::schema::{
-    Field, FieldFormat, FieldRange, Layout, PacketSchema, packets, refusal_reasons, wire_layouts,
+    Field, FieldFormat, FieldRange, Layout, PacketSchema, packet_schemas, refusal_reasons, wire_layouts,
 };
 
 /// The documents with the requirements.
@@ -30,7 +30,7 @@ const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference/proto
 
 /// Returns the name and the text of every table in the document.
 fn tables() -> [(&'static str, String); 4] {
-    let of = |kind| packets().iter().find(|schema| schema.kind == kind).unwrap();
+    let of = |kind| packet_schemas().iter().find(|schema| schema.kind == kind).unwrap();
     [
         ("packets", kinds()),
         ("sensors", fields("page", &of(Kind::Sensors).layouts)),
@@ -43,7 +43,7 @@ fn tables() -> [(&'static str, String); 4] {
 fn kinds() -> String {
     let head = "| identifier | name | from | node field | words | epoch byte | count byte |\n|---|---|---|---|---|---|---|\n";
     let mut out = head.to_owned();
-    for schema in packets() {
+    for schema in packet_schemas() {
         let PacketSchema { kind, command, end, layouts, .. } = schema;
         let digit = *kind as u8;
         let id = match (command, kind) {
@@ -108,7 +108,7 @@ fn fields(of: &str, layouts: &[Layout]) -> String {
             let meaning =
                 if names.is_empty() { field.meaning.clone() } else { format!("{}: {names}", field.meaning) };
             let place = words(field, within);
-            let name = if field.name.is_empty() { "" } else { field.bare_name() };
+            let name = if field.name.is_empty() { "" } else { field.name_without_unit() };
             let (format, unit, range) = (format_of(field), unit(field), range(field));
             let range = range.trim_start_matches(", ");
             writeln!(out, "| {title} | {place} | {name} | {format} | {unit} | {range} | {meaning} |")
@@ -145,9 +145,9 @@ fn unit(field: &Field) -> &str {
 
 /// Formats the position of a field in words or bytes: `0`, `0 to 2`, `2, bits 8 to 15`.
 fn words(field: &Field, within: bool) -> String {
-    let (word, bit, width) = (field.first_bit() / 16, field.first_bit() % 16, usize::from(field.width()));
+    let (word, bit, width) = (field.first_bit() / 16, field.first_bit() % 16, usize::from(field.bit_width()));
     let bits = if width == 1 { format!("bit {bit}") } else { format!("bits {bit} to {}", bit + width - 1) };
-    match (width, field.elements()) {
+    match (width, field.element_count()) {
         (32, _) => format!("{word}, {}", word + 1),
         (16, 1) => word.to_string(),
         (16, several) => format!("{word} to {}", word + several - 1),

@@ -17,9 +17,9 @@ use crate::candump::{self, CandumpLine};
 use crate::fixed::{Accumulator, TorqueFormat};
 use crate::id::{CellId, Id, Kind};
 use crate::message::{Answer, Message, Request};
-use crate::packet::{Epoch, Length, Lengths, Packet, Reassembler, Reassembly, crc16, data_id};
+use crate::packet::{Epoch, Length, Lengths, Packet, Reassembler, Reassembly, crc16, data_frame_id};
 use crate::parameters::{
-    Baseline, Events, Parameter, ParameterError, Parameters, Reply, Sensing, TareCommand,
+    Baseline, Events, Parameter, ParameterError, Parameters, ReplyKind, Sensing, TareCommand,
 };
 use crate::port::LinkId;
 use crate::time::Micros;
@@ -165,7 +165,7 @@ fn lengths_of(golden: &Golden<'_>) -> Lengths {
 fn classic_frames_pair_as_the_log_says() {
     let mut segments = BTreeMap::<u16, Reassembler>::new();
     for golden in lines(CLASSIC) {
-        let outcome = data_id(&golden.frame).and_then(|id| {
+        let outcome = data_frame_id(&golden.frame).and_then(|id| {
             let segment = segments.entry(id.to_bits()).or_default();
             segment.push(Micros(golden.micros), id, lengths_of(&golden), golden.frame.data())
         });
@@ -264,14 +264,14 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
         };
         let mut spoilt = sound;
         let expected = match Parameter::from_number(*number) {
-            None => (*number, Answer::UNKNOWN_PARAMETER),
-            Some(Parameter::Reply) => (*number, cannot_be(Reply::from_words(*words))),
+            None => (*number, Answer::REFUSED_UNKNOWN_PARAMETER),
+            Some(Parameter::Reply) => (*number, cannot_be(ReplyKind::from_words(*words))),
             Some(Parameter::Sensing) => (*number, cannot_be(Sensing::from_words(*words))),
             Some(Parameter::Events) => (*number, cannot_be(Events::from_words(*words))),
             Some(Parameter::Baseline) => (*number, cannot_be(Baseline::from_words(*words))),
             Some(Parameter::Tare) => (*number, cannot_be(TareCommand::from_words(*words))),
             // The cell of the session is not in test mode.
-            Some(Parameter::LinksDown) => (*number, Answer::INVALID_WORDS),
+            Some(Parameter::LinksDown) => (*number, Answer::REFUSED_INVALID_WORDS),
             Some(parameter) => match spoilt.set(parameter, *words) {
                 Err(error) => (*number, error.code()),
                 Ok(()) => (127, spoilt.check().map_err(ParameterError::code).unwrap_err()),
@@ -285,7 +285,7 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
 
 fn cannot_be<T: core::fmt::Debug>(read: Option<T>) -> i16 {
     assert!(read.is_none(), "{read:?} can be");
-    Answer::INVALID_WORDS
+    Answer::REFUSED_INVALID_WORDS
 }
 
 #[test]
@@ -323,7 +323,7 @@ fn the_documents_torque_comes_out() {
     assert!(force >= i64::from(parameters.contact.contact_threshold.to_bits()));
     let fused = Accumulator::<22>::from_steps(i64::from(parameters.contact.alpha_c.to_bits()) * force)
         .with_fraction_bits::<24>();
-    assert!(fused >= parameters.contact.force_threshold.widen().with_fraction_bits());
+    assert!(fused >= parameters.contact.force_threshold.to_accumulator().with_fraction_bits());
     let rounded = (fused.steps() + (1 << 7)) >> 8;
     let torque = [-1_433, 4_260, 0, 0, 0, 0]
         .map(|j| TorqueFormat::Q3_12.round(Accumulator::<30>::from_steps(j * rounded)));

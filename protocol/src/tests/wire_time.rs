@@ -82,7 +82,7 @@ fn times_are_rounded_up_where_they_are_no_whole_nanoseconds() {
     // 6666.67 and 428.57 ns.
     assert_eq!(bits.nanoseconds(rates), 6_667 + 429);
     assert!((bits.seconds(rates) - 7.095_238_095e-6).abs() < 1e-15);
-    assert_eq!(bits.total(), 5);
+    assert_eq!(bits.total_bits(), 5);
 }
 
 fn any_frame() -> impl Strategy<Value = Frame> {

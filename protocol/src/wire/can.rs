@@ -32,7 +32,7 @@ pub const ERROR_STATE: u8 = 2;
 pub const FD_FORMAT: u8 = 4;
 
 /// FD flags that fit the single hexadecimal digit in a log; the kernel reserves the other bits.
-const FD_FLAGS: u8 = 0xF;
+const FD_FLAGS_MASK: u8 = 0xF;
 
 /// Size of `struct can_frame` in bytes.
 pub const CLASSIC_BYTES: usize = 16;
@@ -42,7 +42,7 @@ pub const FD_BYTES: usize = 72;
 /// Returns the data length of an FD frame that carries `len` bytes: the smallest of 0 to 8, 12, 16, 20, 24, 32, 48 and
 /// 64 that is not less.
 #[must_use]
-pub const fn fd_len(len: usize) -> usize {
+pub const fn rounded_fd_len(len: usize) -> usize {
     dlc_len(fd_dlc(len))
 }
 
@@ -329,7 +329,7 @@ impl Frame {
     pub(crate) fn wire_bytes(&self) -> &[u8] {
         let len = match self.format {
             Format::Classic => self.data().len(),
-            Format::Fd => fd_len(usize::from(self.len)),
+            Format::Fd => rounded_fd_len(usize::from(self.len)),
         };
         self.data.get(..len).unwrap_or(&self.data)
     }
@@ -377,7 +377,7 @@ impl Frame {
                 let dlc = if got == 8 && matches!(dlc, 9..=15) { dlc } else { 0 };
                 Self::with_data(id, format, 0, body).map(|frame| frame.with_raw_dlc(dlc))
             }
-            Format::Fd => Self::with_data(id, format, flags & FD_FLAGS, body),
+            Format::Fd => Self::with_data(id, format, flags & FD_FLAGS_MASK, body),
         }
     }
 }
@@ -412,7 +412,7 @@ mod tests {
             assert_eq!(fd_dlc(len), dlc);
         }
         for len in 0..=64 {
-            assert_eq!(Some(fd_len(len)), lens.into_iter().find(|&it| it >= len), "{len}");
+            assert_eq!(Some(rounded_fd_len(len)), lens.into_iter().find(|&it| it >= len), "{len}");
         }
     }
 

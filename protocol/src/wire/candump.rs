@@ -31,7 +31,7 @@ use thiserror::Error;
 
 use crate::can::Frame;
 use read::{Cursor, is_blank};
-pub use read::{eight_digit_identifier, fraction_to_nanos};
+pub use read::{fraction_to_nanos, raw_id_from_eight_digits};
 pub use write::{write_frame, write_record};
 
 /// The time of a frame, and the number of digits with which it is written.
@@ -123,24 +123,25 @@ pub fn parse(line: &str) -> Result<CandumpLine<'_>, LineError> {
 /// valid frame.
 #[inline]
 pub fn parse_bytes(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
-    portable::parse_record(line).map_or_else(|| parse_general(line), |record| Ok(CandumpLine::Frame(record)))
+    portable::parse_record(line)
+        .map_or_else(|| parse_any_variant(line), |record| Ok(CandumpLine::Frame(record)))
 }
 
 /// Parses a line in any of the accepted variants.
-fn parse_general(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
+fn parse_any_variant(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
     let text = trim_end(line);
     // Blanks and quotation marks of e-mails and issue trackers.
     let indent = text.iter().take_while(|byte| matches!(byte, b' ' | b'\t' | b'>' | b'|')).count();
     match text.get(indent..).unwrap_or_default() {
-        [b'(', next, ..] if indent > 0 && next.is_ascii_digit() => parse_at(text, indent),
-        [b'(', ..] if indent == 0 => parse_at(text, 0),
-        [b'#' | b';' | b'/', ..] => Ok(classify_other(text)),
-        _ => Ok(parse_after_prefix(text).unwrap_or_else(|| classify_other(text))),
+        [b'(', next, ..] if indent > 0 && next.is_ascii_digit() => parse_from_parenthesis(text, indent),
+        [b'(', ..] if indent == 0 => parse_from_parenthesis(text, 0),
+        [b'#' | b';' | b'/', ..] => Ok(classify_line_without_frame(text)),
+        _ => Ok(parse_after_prefix(text).unwrap_or_else(|| classify_line_without_frame(text))),
     }
 }
 
 /// Parses a line whose opening parenthesis is at index `at`.
-fn parse_at(text: &[u8], at: usize) -> Result<CandumpLine<'_>, LineError> {
+fn parse_from_parenthesis(text: &[u8], at: usize) -> Result<CandumpLine<'_>, LineError> {
     let mut cursor = Cursor::new(text, at + 1);
     let time = cursor.parse_time()?;
     cursor.expect(b')', "`)` after the time")?;
@@ -159,7 +160,7 @@ fn parse_at(text: &[u8], at: usize) -> Result<CandumpLine<'_>, LineError> {
 fn parse_after_prefix(text: &[u8]) -> Option<CandumpLine<'_>> {
     let begins = |pair: &[u8]| matches!(pair, [before, b'('] if is_blank(*before));
     let places = text.windows(2).enumerate().filter(|(_, pair)| begins(pair));
-    places.map(|(at, _)| parse_at(text, at + 1)).find_map(Result::ok)
+    places.map(|(at, _)| parse_from_parenthesis(text, at + 1)).find_map(Result::ok)
 }
 
 /// Parses a frame without time and interface, in the notation of cansend: `123#DEADBEEF`. Never panics.
@@ -198,7 +199,7 @@ fn trim_end(line: &[u8]) -> &[u8] {
 
 /// Classifies a line without a frame. Recognises candump's `DROPCOUNT: dropped 12 CAN frames on 'vcan0'
 /// socket ...`.
-fn classify_other(text: &[u8]) -> CandumpLine<'_> {
+fn classify_line_without_frame(text: &[u8]) -> CandumpLine<'_> {
     text.strip_prefix(b"DROPCOUNT: dropped ")
         .and_then(|rest| rest.split(|&byte| byte == b' ').next())
         .and_then(|frames| core::str::from_utf8(frames).ok()?.parse().ok())

@@ -23,11 +23,11 @@ pub const RECORD_BYTES: usize = 32;
 /// The linker section that holds the record.
 pub const SECTION: &str = ".factory";
 /// The bytes of a record that was not written: erased flash.
-pub const ERASED: [u8; RECORD_BYTES] = [0xFF; RECORD_BYTES];
+pub const ERASED_RECORD: [u8; RECORD_BYTES] = [0xFF; RECORD_BYTES];
 
-const MAGIC: &[u8; 4] = b"CELL";
-const VERSION: u8 = 1;
-const CLASSIC_FLAG: u8 = 1;
+const RECORD_MAGIC: &[u8; 4] = b"CELL";
+const RECORD_VERSION: u8 = 1;
+const CLASSIC_CAN_FLAG: u8 = 1;
 const HOSTED_FLAG: u8 = 2;
 
 /// The settings of a cell that its manufacturer chooses.
@@ -50,7 +50,7 @@ impl FactoryRecord {
     #[must_use]
     pub fn encode(&self) -> [u8; RECORD_BYTES] {
         let flag = |set, flag| if set { flag } else { 0 };
-        let flags = flag(self.format == Format::Classic, CLASSIC_FLAG) | flag(self.hosted, HOSTED_FLAG);
+        let flags = flag(self.format == Format::Classic, CLASSIC_CAN_FLAG) | flag(self.hosted, HOSTED_FLAG);
         let [s0, s1, s2, s3] = self.serial.to_le_bytes();
         let (mut wired, mut back, mut wires) = (0, 0, [0; 2 * (PORTS + 1)]);
         for ((port, link_id), wire) in self.link_ids.iter().enumerate().zip(wires.as_chunks_mut().0) {
@@ -59,8 +59,8 @@ impl FactoryRecord {
             back |= flag(link_id.back, 1 << port);
             *wire = link_id.wire.to_le_bytes();
         }
-        let head = [VERSION, self.node.map_or(0, CellId::get), flags, 0, s0, s1, s2, s3, wired, back];
-        let body: [&[u8]; 3] = [MAGIC, &head, &wires];
+        let head = [RECORD_VERSION, self.node.map_or(0, CellId::get), flags, 0, s0, s1, s2, s3, wired, back];
+        let body: [&[u8]; 3] = [RECORD_MAGIC, &head, &wires];
         let mut bytes = [0; RECORD_BYTES];
         for (byte, value) in bytes.iter_mut().zip(body.into_iter().flatten()) {
             *byte = *value;
@@ -77,7 +77,7 @@ impl FactoryRecord {
         let (body, crc) = bytes.split_last_chunk()?;
         let (magic, rest) = body.split_first_chunk::<4>()?;
         let (&[version, node, flags, _, s0, s1, s2, s3, wired, back], rest) = rest.split_first_chunk()?;
-        if magic != MAGIC || version != VERSION || crc16(body) != u16::from_le_bytes(*crc) {
+        if magic != RECORD_MAGIC || version != RECORD_VERSION || crc16(body) != u16::from_le_bytes(*crc) {
             return None;
         }
         let (wires, _) = rest.as_chunks();
@@ -89,7 +89,7 @@ impl FactoryRecord {
         Some(Self {
             node: CellId::new(node.into()).ok(),
             serial: u32::from_le_bytes([s0, s1, s2, s3]),
-            format: if flags & CLASSIC_FLAG == 0 { Format::Fd } else { Format::Classic },
+            format: if flags & CLASSIC_CAN_FLAG == 0 { Format::Fd } else { Format::Classic },
             hosted: flags & HOSTED_FLAG != 0,
             link_ids: core::array::from_fn(link_id),
         })
@@ -120,7 +120,7 @@ mod tests {
 
     #[test]
     fn erased_flash_is_no_record() {
-        assert_eq!(FactoryRecord::decode(&ERASED), None);
+        assert_eq!(FactoryRecord::decode(&ERASED_RECORD), None);
         assert_eq!(FactoryRecord::decode(&[0; RECORD_BYTES]), None);
     }
 

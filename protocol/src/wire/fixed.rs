@@ -105,7 +105,7 @@ impl TorqueFormat {
 
     /// Converts a word to steps of 2^-12 Nm or N, the finest of all formats. The result is exact.
     #[must_use]
-    pub fn finest_steps(self, word: i16) -> i32 {
+    pub fn to_finest_steps(self, word: i16) -> i32 {
         i32::from(word) << (Self::Q3_12.fraction_bits() - self.fraction_bits())
     }
 
@@ -227,7 +227,7 @@ impl<const F: u32> Q<F> {
 
     /// Converts the number to an exact sum with one term.
     #[must_use]
-    pub fn widen(self) -> Accumulator<F> {
+    pub fn to_accumulator(self) -> Accumulator<F> {
         Accumulator(i64::from(self.0))
     }
 

@@ -113,7 +113,7 @@ impl Node {
 
     /// Returns true if the node field addresses `cell`, either by its node id or as one of all cells.
     #[must_use]
-    pub fn addresses(self, cell: CellId) -> bool {
+    pub fn addresses_cell(self, cell: CellId) -> bool {
         self == Self::Cell(cell) || self == Self::Everyone
     }
 }
@@ -274,7 +274,7 @@ impl Id {
     /// configuration and stimuli, addressed to the cell or to everyone. A cell also receives the sums of the cells at
     /// its ports, which are not listed here.
     #[must_use]
-    pub const fn received_by_cell(cell: CellId) -> [Self; 10] {
+    pub const fn ids_received_by_cell(cell: CellId) -> [Self; 10] {
         let cell = Node::Cell(cell);
         [
             Self::command(Command::Halt),

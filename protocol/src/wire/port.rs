@@ -73,7 +73,7 @@ impl TreeRank {
 
     /// Returns the rank of a child, one wire deeper.
     #[must_use]
-    pub const fn child(self) -> Self {
+    pub const fn child_rank(self) -> Self {
         Self { round: self.round, depth: self.depth.saturating_add(1) }
     }
 }
@@ -138,7 +138,7 @@ pub struct NodeIdWalk {
 }
 
 const RECEIVES_FLAG: u8 = 1 << 3;
-const IS_PARENT: u8 = 1 << 4;
+const PARENT_FLAG: u8 = 1 << 4;
 const UNNUMBERED_FLAG: u8 = 1 << 5;
 const HAS_RANK_FLAG: u8 = 1 << 6;
 
@@ -150,7 +150,7 @@ impl PortMessage {
             Self::Hello(hello) => {
                 let flag = |set, flag| if set { flag } else { 0 };
                 let flags = flag(hello.receives, RECEIVES_FLAG)
-                    | flag(hello.is_parent, IS_PARENT)
+                    | flag(hello.is_parent, PARENT_FLAG)
                     | flag(hello.unnumbered, UNNUMBERED_FLAG)
                     | flag(hello.rank.is_some(), HAS_RANK_FLAG);
                 let (round, depth) = hello.rank.map_or((0, 0), |rank| (rank.round, rank.depth));
@@ -179,7 +179,7 @@ impl PortMessage {
                 number: b,
                 port: c & 7,
                 receives: c & RECEIVES_FLAG != 0,
-                is_parent: c & IS_PARENT != 0,
+                is_parent: c & PARENT_FLAG != 0,
                 unnumbered: c & UNNUMBERED_FLAG != 0,
                 rank: if c & HAS_RANK_FLAG == 0 { None } else { Some(TreeRank { round: d, depth: e }) },
             }),
@@ -274,7 +274,7 @@ mod tests {
         assert!(rank(0, 9).is_better_than(rank(255, 1)));
         assert!(rank(4, 1).is_better_than(rank(4, 2)));
         assert!(!rank(4, 2).is_better_than(rank(4, 2)));
-        assert!(rank(4, 2).is_better_than(rank(4, 2).child()));
+        assert!(rank(4, 2).is_better_than(rank(4, 2).child_rank()));
     }
 
     proptest! {

@@ -32,7 +32,7 @@ impl Span {
 impl Micros {
     /// Returns the point in time `start` after the origin. Saturates at the maximum of 64 bits.
     #[must_use]
-    pub fn since_start(start: Duration) -> Self {
+    pub fn from_elapsed(start: Duration) -> Self {
         Self(u64::try_from(start.as_micros()).unwrap_or(u64::MAX))
     }
 

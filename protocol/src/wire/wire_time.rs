@@ -65,7 +65,7 @@ impl FrameBits {
 
     /// Returns the total number of bits, at both rates.
     #[must_use]
-    pub const fn total(self) -> u32 {
+    pub const fn total_bits(self) -> u32 {
         self.nominal + self.data
     }
 
@@ -93,12 +93,12 @@ fn classic_frame_bits(frame: &Frame) -> u32 {
     let dlc = u64::from(if frame.raw_dlc() > 8 { frame.raw_dlc() & 15 } else { frame.len() });
     let id = u64::from(frame.id());
     let (head, len) = if frame.is_extended() {
-        ((extended_id_bits(id) << 7) | (remote << 6) | dlc, 39)
+        ((extended_id_wire_pattern(id) << 7) | (remote << 6) | dlc, 39)
     } else {
         ((id << 7) | (remote << 6) | dlc, 19)
     };
     let data = frame.wire_bytes();
-    let mut run = BitRun::IDLE.push_bits(head, len);
+    let mut run = BitRun::IDLE_BUS.push_bits(head, len);
     let mut digest = CRC.digest();
     digest.update(head.to_be_bytes().get(3..).unwrap_or_default());
     digest.update(data);
@@ -117,25 +117,25 @@ fn fd_frame_bits(frame: &Frame) -> FrameBits {
     let fdf_res_brs = 0b100 | u64::from(switched);
     let id = u64::from(frame.id());
     let (head, len) = if frame.is_extended() {
-        ((extended_id_bits(id) << 4) | fdf_res_brs, 36)
+        ((extended_id_wire_pattern(id) << 4) | fdf_res_brs, 36)
     } else {
         ((id << 5) | fdf_res_brs, 17)
     };
     let data = frame.wire_bytes();
     let dlc = fd_dlc(data.len());
-    let head = BitRun::IDLE.push_bits(head, len);
+    let head = BitRun::IDLE_BUS.push_bits(head, len);
     let mut run = head.push_bits((u64::from(passive) << 4) | u64::from(dlc), 5);
     for &byte in data {
         run = run.push_byte(byte);
     }
     let last = data.last().copied().unwrap_or(dlc);
     let stuffed = run.stuffed - head.stuffed - u32::from(run.ended_with_stuff_bit(last));
-    fd_bits(switched, len + head.stuffed, data.len(), stuffed)
+    fd_bits_from_counts(switched, len + head.stuffed, data.len(), stuffed)
 }
 
 /// Returns the bits of an FD frame. The frame has `head` bits up to BRS (with stuff bits), `bytes` data bytes, and
 /// `stuffed` stuff bits after BRS.
-fn fd_bits(switched: bool, head: u32, bytes: usize, stuffed: u32) -> FrameBits {
+fn fd_bits_from_counts(switched: bool, head: u32, bytes: usize, stuffed: u32) -> FrameBits {
     let check = if bytes > 16 { FD_LONG_CRC_BITS } else { FD_CRC_BITS };
     let data = 5 + 8 * u32::try_from(bytes).unwrap_or(0) + check + stuffed;
     let nominal = head + FD_TAIL_BITS;
@@ -143,6 +143,6 @@ fn fd_bits(switched: bool, head: u32, bytes: usize, stuffed: u32) -> FrameBits {
 }
 
 /// Returns the bits of an extended identifier on the wire: SOF, the first 11 bits, SRR and IDE, and the other 18 bits.
-const fn extended_id_bits(id: u64) -> u64 {
+const fn extended_id_wire_pattern(id: u64) -> u64 {
     ((id >> 18) << 20) | (0b11 << 18) | (id & 0x3_FFFF)
 }

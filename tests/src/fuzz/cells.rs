@@ -74,7 +74,7 @@ fn run_cell(from: &mut Unstructured<'_>) -> Result<()> {
 /// Returns an identifier, mostly one that the cell receives.
 fn heard(from: &mut Unstructured<'_>, own: CellId) -> Result<Id> {
     let commands = [Command::Joints, Command::Halt, Command::Sync, Command::Resume, Command::Report];
-    let ids: Vec<Id> = commands.into_iter().map(Id::command).chain(Id::received_by_cell(own)).collect();
+    let ids: Vec<Id> = commands.into_iter().map(Id::command).chain(Id::ids_received_by_cell(own)).collect();
     Ok(*from.choose(&ids)?)
 }
 
@@ -126,11 +126,11 @@ fn track(from: &mut Unstructured<'_>) -> Result<()> {
                 cell.account.count_rejected();
                 came += 1;
             }
-            3 => cell.account.exclude_sums(),
+            3 => cell.account.exclude_unreceived_sums(),
             _ => {
                 let Ok(message) = Message::decode(&packet(from)?) else { continue };
                 let joints = from.arbitrary::<Option<u16>>()?.map(u64::from);
-                cell.receive(now, &message, joints);
+                cell.record_packet(now, &message, joints);
                 came += 1;
                 assert!(!cell.is_dead() && cell.last_packet() == Some(now));
             }

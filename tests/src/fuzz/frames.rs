@@ -3,16 +3,16 @@
 use std::fmt::Write as _;
 
 use analysis::shadow::{Shadow, ShadowOptions};
-use analysis::stats::Stats;
+use analysis::stats::CaptureStats;
 use arbitrary::{Result, Unstructured};
 use model::decode::json;
 use model::decode::settle::OrderedDecoder;
-use protocol::can::{Format, fd_len};
+use protocol::can::{Format, rounded_fd_len};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Id;
 use protocol::message::Message;
 use protocol::packet::{Length, Lengths, Packet, Reassembler, Reassembly};
-use protocol::schema::Units;
+use protocol::schema::BusUnits;
 use protocol::slcan::{self, Decoder, SlcanLine};
 use protocol::time::Micros;
 use protocol::wire_time::BitRates;
@@ -77,7 +77,7 @@ fn reassemble(from: &mut Unstructured<'_>) -> Result<()> {
                 }
             }
         }
-        assert!(segment.waiting() < Length::MAX_SEGMENTS);
+        assert!(segment.waiting_segment_count() < Length::MAX_SEGMENTS);
     }
     Ok(())
 }
@@ -95,7 +95,7 @@ pub(super) fn slcan(data: &[u8]) {
                     command.encode().as_bytes().iter().filter_map(|&byte| other.push(byte)).collect();
                 assert_eq!(lines, [SlcanLine::Command(command)]);
             }
-            Some(SlcanLine::Refused(_)) => assert!(decoder.refused().total() > 0),
+            Some(SlcanLine::Refused(_)) => assert!(decoder.rejected_lines().total() > 0),
             _ => {}
         }
     }
@@ -119,7 +119,10 @@ pub(super) fn hosts(data: &[u8]) {
             assert_eq!(message::decode(&bytes, &mut again), Ok(head));
             assert_eq!(again, frames);
         }
-        assert_eq!(incoming.receive(host, message).is_ok(), message::decode(message, &mut frames).is_ok());
+        assert_eq!(
+            incoming.receive_message(host, message).is_ok(),
+            message::decode(message, &mut frames).is_ok()
+        );
         waiting = waiting.max(incoming.waiting_frames().len());
         if from.arbitrary().unwrap_or(false) {
             incoming.remove_sent(from.int_in_range(0..=9).unwrap_or(0));
@@ -150,7 +153,7 @@ fn again(frame: &protocol::can::Frame) {
     // A DLC stands for a length of FD: the bytes after the data are zeros.
     let (data, rest) = read.data().split_at_checked(frame.data().len()).unwrap();
     assert!(data == frame.data() && rest.iter().all(|&byte| byte == 0), "{read:?}");
-    assert_eq!(read.data().len(), fd_len(frame.data().len()));
+    assert_eq!(read.data().len(), rounded_fd_len(frame.data().len()));
 }
 
 /// Generates frames, each with a time and a bus.
@@ -177,7 +180,7 @@ fn traffic(
 pub(super) fn decoder(data: &[u8]) {
     let mut settler = OrderedDecoder::new(None);
     let (mut sent, mut came) = (0_u64, 0_u64);
-    let mut stats = Stats::default();
+    let mut stats = CaptureStats::default();
     let mut out = |settler: &mut OrderedDecoder<(u64, u64, &'static str, protocol::can::Frame)>| {
         while let Some(((number, nanos, bus, frame), decoded)) = settler.pop() {
             assert_eq!(number, came, "in order");
@@ -187,7 +190,7 @@ pub(super) fn decoder(data: &[u8]) {
             let time = Timestamp::with_nine_digits(nanos);
             let record = Record { time, interface: bus, frame, direction: None };
             let mut line = Vec::new();
-            json::write(&mut line, &record, &decoded, Units::default()).unwrap();
+            json::write_json_line(&mut line, &record, &decoded, BusUnits::default()).unwrap();
             let _: serde_json::Value = serde_json::from_slice(&line).unwrap();
             stats.record(&record, &decoded);
         }

@@ -17,7 +17,7 @@ use rand_pcg::Pcg64Mcg;
 
 use super::{PortEnd, positions};
 use crate::life::PowerState;
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 
 /// An input of a cell.
 #[derive(Clone, Copy, Debug)]
@@ -84,11 +84,11 @@ impl WiredCell {
             },
             contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
             period_us: 16_000,
-            rows: padded(&rows),
+            rows: pad_with_defaults(&rows),
             ..Parameters::default()
         };
         let force = Force::from_steps(i64::from(dice.random_range(1_000_i32..4_000)) << 6);
-        let jacobian = Wrench::new(&parameters).jacobian(&padded(&positions()));
+        let jacobian = Wrench::new(&parameters).jacobian(&pad_with_defaults(&positions()));
         let own = Torque::new(&jacobian, force).exact_torques().map(|exact| {
             let word: Q7_8 = exact.round();
             i32::from(word.to_bits())

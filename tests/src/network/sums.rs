@@ -47,7 +47,7 @@ impl Wiring {
             }
         }
         let root = self.roots.iter().position(|&root| root == cell);
-        if root.is_some_and(|root| self.uplinks.is_child(root)) && self.epoch == Some(epoch) {
+        if root.is_some_and(|root| self.uplinks.is_gateway_child(root)) && self.epoch == Some(epoch) {
             let best = self.root_sums.entry(cell).or_insert((words, cells));
             if words.count >= best.0.count {
                 *best = (words, cells);
@@ -89,7 +89,7 @@ impl Wiring {
             choose(&heard, sum, own, u128::from(own) << cell, (&expected, words.count.into()), &mut found);
         }
         // The end of a contact: its own torque is zeros, and there is no other torque.
-        if words.is_end() {
+        if words.is_lease_end() {
             return 0;
         }
         let cells = found.unwrap_or_else(|| panic!("cell {cell} says {words:?} in {epoch:?}, of {heard:?}"));

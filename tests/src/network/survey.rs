@@ -18,7 +18,7 @@ impl Wiring {
     #[must_use]
     pub fn waits_for_children(&self, cell: usize) -> bool {
         let joints = Id::command(Command::Joints);
-        matches!(&self.cells[cell].life, PowerState::Runs(node) if node.may_defer(joints))
+        matches!(&self.cells[cell].life, PowerState::Runs(node) if node.may_receive_deferred(joints))
     }
 
     /// Returns the cells that have a route to the gateway over running cells and wires that work in both directions.

@@ -7,7 +7,7 @@ use protocol::candump::{self, CandumpLine};
 use protocol::fixed::Q;
 use protocol::id::{Kind, Node};
 use protocol::message::{Heartbeat, Message, NetworkPage, SensorPage, SkinSensors, StimulusStart};
-use protocol::packet::{Epoch, Lengths, Packet, Reassembler, Reassembly, data_id};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembler, Reassembly, data_frame_id};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
@@ -37,7 +37,7 @@ impl Log {
         let packet = |frame: &Frame| match format {
             Format::Fd => Packet::from_fd(frame).ok(),
             Format::Classic => {
-                let id = data_id(frame).ok()?;
+                let id = data_frame_id(frame).ok()?;
                 let segment = segments.entry(id).or_insert(Reassembler::NONE);
                 match segment.push(Micros(0), id, Lengths::ALL, frame.data()) {
                     Ok(Reassembly::Complete(packet)) => Some(packet),

@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use model::generate::{Reply, SkinRequest, generate};
+use model::generate::{ReplyMode, SkinRequest, generate};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage};
@@ -34,7 +34,7 @@ pub fn grid(place: &TestDir, format: Format) {
 }
 
 pub fn wired(place: &TestDir, format: Format, neighbors: impl Fn(u8) -> [u8; 4]) {
-    let expected = SkinRequest { cells: CELLS.into(), reply: Reply::Sum, ..SkinRequest::default() };
+    let expected = SkinRequest { cells: CELLS.into(), reply: ReplyMode::Sum, ..SkinRequest::default() };
     let classic: &[_] = if format == Format::Classic { &["vcan0"] } else { &[] };
     let text = mixed_skin(&generate(&expected).unwrap(), classic);
     let mut node = 0;

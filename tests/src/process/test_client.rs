@@ -146,7 +146,7 @@ impl TestClient {
                 from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), ..
             } = message
                 && heartbeat.state.has(State::CONFIGURED)
-                && !heartbeat.state.has(State::CLAIMING)
+                && !heartbeat.state.has(State::CLAIMING_NODE_ID)
             {
                 settled.insert(cell.get());
             }

@@ -48,7 +48,7 @@ fn connected(path: &Path) -> UnixStream {
 fn heartbeat(message: &Message, claiming: bool) -> Option<Heartbeat> {
     match message {
         Message::Network { page: NetworkPage::Heartbeat(it), .. }
-            if it.state.has(State::CLAIMING) == claiming =>
+            if it.state.has(State::CLAIMING_NODE_ID) == claiming =>
         {
             Some(*it)
         }
@@ -269,7 +269,7 @@ fn damaged_flash_is_noticed_and_a_commit_repairs_it() {
         Message::Configured { tag, answer, .. } if *tag == number => Some(*answer),
         _ => None,
     });
-    assert_eq!(answer, Answer::Refused { number, reason: Answer::FLASH_FAILED });
+    assert_eq!(answer, Answer::Refused { number, reason: Answer::REFUSED_FLASH_FAILED });
     assert_eq!(fs::read(&flash).unwrap(), sound);
 }
 

@@ -24,7 +24,7 @@ use process::{Running, Summary, TIMEOUT, TestDir, until};
 use protocol::bus::{Bus, BusError, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
 use protocol::candump::{CandumpLine, parse};
-use protocol::packet::{Length, Lengths, Reassembler, Reassembly, data_id};
+use protocol::packet::{Length, Lengths, Reassembler, Reassembly, data_frame_id};
 use protocol::time::Micros;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -144,7 +144,7 @@ fn numbers_until(bus: &Bus, last: u32) -> Vec<u32> {
         );
         (numbers.last() == Some(&last)).then_some(())
     });
-    assert_eq!(inbox.dropped(), 0);
+    assert_eq!(inbox.dropped_count(), 0);
     numbers
 }
 
@@ -185,7 +185,7 @@ fn pairs(log: &str) -> (u64, u64) {
     let (mut segments, mut whole, mut incomplete) = (vec![Reassembler::NONE; 1 << 11], 0, 0);
     for line in log.lines().filter(|line| !line.starts_with("# ")) {
         let Ok(CandumpLine::Frame(record)) = parse(line) else { panic!("{line}") };
-        let Ok(id) = data_id(&record.frame) else { continue };
+        let Ok(id) = data_frame_id(&record.frame) else { continue };
         let segment = &mut segments[usize::from(id.to_bits())];
         match segment.push(
             Micros(record.time.nanos / 1_000),
@@ -388,7 +388,7 @@ fn wires_are_not_simulated_on_a_real_bus() {
     let controllers = Controllers::up();
     assert!(!open("can0", &options(&[])).unwrap().is_virtual().unwrap());
     let place = TestDir::new();
-    let (reply, format) = (model::generate::Reply::Sum, Generated::Classic);
+    let (reply, format) = (model::generate::ReplyMode::Sum, Generated::Classic);
     let text = generate(&SkinRequest { cells: CELLS, reply, format, ..SkinRequest::default() }).unwrap();
     place.write("skin.toml", &text.replace("\"vcan0\"", "\"can0\""));
     let cell = place.start("cell-node", "--bus can0 --bus-kind socketcan --node 1 --skin skin.toml");

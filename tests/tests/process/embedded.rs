@@ -8,7 +8,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use skinbus_tests::process::until;
 
-use protocol::bus::embedded::{ClientHello, FilterPart, HelloReply, VERSION, address};
+use protocol::bus::embedded::{ClientHello, FilterPart, HELLO_VERSION, HelloReply, socket_address};
 use protocol::bus::{Bus, BusError, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{FD_FORMAT, Frame};
 use rustix::net::{AddressFamily, SendFlags, SocketFlags, SocketType};
@@ -61,7 +61,7 @@ impl Bench {
         let socket =
             rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)
                 .unwrap();
-        rustix::net::connect(&socket, &address(&self.directory(), BUS).unwrap()).unwrap();
+        rustix::net::connect(&socket, &socket_address(&self.directory(), BUS).unwrap()).unwrap();
         socket
     }
 
@@ -250,7 +250,7 @@ fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
     let bench = Bench::new();
     let filters = vec![exact(1), exact(2), exact(END_MARKER_ID)];
     let slow = bench.open_with(BusOptions { filters, receive_buffer: 64 * 1024, ..bench.options() });
-    assert!(slow.receive_buffer() >= 64 * 1024);
+    assert!(slow.receive_buffer_bytes() >= 64 * 1024);
     let sender = bench.open(&[]);
     for first in (0..SENT).step_by(50) {
         sender.send(&(first..first + 50).map(|n| frame(1, n)).collect::<Vec<_>>()).unwrap();
@@ -260,21 +260,25 @@ fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
     // Every frame that arrives is preceded by the number of missing ones.
     let mut inbox = Inbox::new();
     let mut heard = 0;
-    while heard + inbox.dropped() < SENT {
-        assert!(slow.wait(Some(FAILURE_TIMEOUT)).unwrap(), "{heard} heard, {} dropped", inbox.dropped());
+    while heard + inbox.dropped_count() < SENT {
+        assert!(
+            slow.wait(Some(FAILURE_TIMEOUT)).unwrap(),
+            "{heard} heard, {} dropped",
+            inbox.dropped_count()
+        );
         slow.receive(&mut inbox).unwrap();
         for received in inbox.frames() {
             assert_eq!(received.frame, frame(1, heard), "the oldest are kept");
             heard += 1;
         }
     }
-    assert!(heard > 100 && inbox.dropped() > 1000, "{heard} heard, {} dropped", inbox.dropped());
-    assert_eq!(heard + inbox.dropped(), SENT);
+    assert!(heard > 100 && inbox.dropped_count() > 1000, "{heard} heard, {} dropped", inbox.dropped_count());
+    assert_eq!(heard + inbox.dropped_count(), SENT);
 
     // After that, everything is as before.
     sender.send(&[frame(2, 0), frame(END_MARKER_ID, 0)]).unwrap();
     assert_eq!(read(&slow, &mut inbox), [frame(2, 0)]);
-    let dropped = inbox.dropped();
+    let dropped = inbox.dropped_count();
     assert_eq!(bench.end().dropped, u64::from(dropped));
 }
 
@@ -291,7 +295,7 @@ fn a_slow_client_holds_up_nobody() {
         sender.send(&[frame(END_MARKER_ID, 0)]).unwrap();
         assert_eq!(read(&fast, &mut inbox), frames);
     }
-    assert_eq!(inbox.dropped(), 0);
+    assert_eq!(inbox.dropped_count(), 0);
     let totals = bench.end();
     assert!(totals.dropped > 0 && totals.abandoned > 0, "{totals:?}");
 }
@@ -338,13 +342,13 @@ fn who_does_not_say_hello_is_turned_away() {
     let bench = Bench::new();
     let mut other_version =
         ClientHello { filters: vec![], own_frames: false, fd: true, error_mask: 0, buffer: 0 }.encode();
-    other_version[7] = VERSION + 1;
+    other_version[7] = HELLO_VERSION + 1;
     for first in [&frame(1, 1).to_bytes()[..], b"hello", &[0; 5000], &other_version] {
         let socket = bench.raw();
         rustix::net::send(&socket, first, SendFlags::empty()).unwrap();
         let mut answer = [0; 64];
         let (len, _) = rustix::net::recv(&socket, &mut answer, rustix::net::RecvFlags::empty()).unwrap();
-        assert_eq!(HelloReply::decode(&answer[..len]), Some(HelloReply::Refused { version: VERSION }));
+        assert_eq!(HelloReply::decode(&answer[..len]), Some(HelloReply::Refused { version: HELLO_VERSION }));
         let (len, _) = rustix::net::recv(&socket, &mut answer, rustix::net::RecvFlags::empty()).unwrap();
         assert_eq!(len, 0, "and then it is closed");
     }
@@ -454,7 +458,7 @@ fn one_receives_while_others_send_on_the_same_bus() {
                 *count += 1;
             }
         }
-        assert_eq!(inbox.dropped(), 0);
+        assert_eq!(inbox.dropped_count(), 0);
     });
     bench.end();
 }

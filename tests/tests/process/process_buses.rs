@@ -10,11 +10,11 @@ use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 
 use model::decode::{Decoded, Decoder};
-use model::generate::{Format as Wire, Reply, SkinRequest, generate};
+use model::generate::{Format as Wire, ReplyMode, SkinRequest, generate};
 use process::buses::{carries, mixed_skin};
 use process::test_client::TestClient;
 use process::{PRESSED, Running, TestDir, signal, skin_of, until};
-use protocol::bus::embedded::{HelloReply, MAX_HELLO_BYTES, address, seqpacket};
+use protocol::bus::embedded::{HelloReply, MAX_HELLO_BYTES, seqpacket_socket, socket_address};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, Request};
@@ -127,7 +127,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
 #[test]
 fn each_bus_has_its_own_tree_which_is_complete_again_when_the_bus_is_back() {
     let place = place();
-    let expected = SkinRequest { cells: CELLS, buses: 3, reply: Reply::Sum, ..SkinRequest::default() };
+    let expected = SkinRequest { cells: CELLS, buses: 3, reply: ReplyMode::Sum, ..SkinRequest::default() };
     place.write("skin.toml", &mixed_skin(&generate(&expected).unwrap(), &["vcan1"]));
     let bench = place.running_bench(600.0, "");
     let whole = || test_clients(&place).iter().for_each(|bus| bus.waits_for_a_sum_of(4));
@@ -315,8 +315,8 @@ impl PlayedServer {
         let directory = place.buses();
         DirBuilder::new().recursive(true).mode(0o700).create(&directory).unwrap();
         std::fs::set_permissions(&directory, Permissions::from_mode(0o700)).unwrap();
-        let listener = seqpacket(SocketFlags::empty()).unwrap();
-        rustix::net::bind(&listener, &address(&directory, "vcan0").unwrap()).unwrap();
+        let listener = seqpacket_socket(SocketFlags::empty()).unwrap();
+        rustix::net::bind(&listener, &socket_address(&directory, "vcan0").unwrap()).unwrap();
         rustix::net::listen(&listener, 8).unwrap();
         Self { listener, decoder: Decoder::new(None), packets: 0 }
     }

@@ -8,7 +8,7 @@ use std::fs;
 
 use cell_node::flash;
 use cell_node::identity::Identity;
-use model::generate::{Format, Reply, SkinRequest, generate};
+use model::generate::{Format, ReplyMode, SkinRequest, generate};
 use process::{Ended, Running, TestDir, skin, skin_of, until};
 use protocol::id::CellId;
 use protocol::parameters::Parameters;
@@ -253,7 +253,7 @@ fn node_ids_on_the_bus_are_written_into_a_copy_of_the_description() {
 #[test]
 fn new_cells_get_node_ids_from_the_network_and_then_their_parameters() {
     let place = TestDir::new();
-    let text = generate(&SkinRequest { cells: 8, reply: Reply::Sum, ..SkinRequest::default() }).unwrap();
+    let text = generate(&SkinRequest { cells: 8, reply: ReplyMode::Sum, ..SkinRequest::default() }).unwrap();
     place.write("skin.toml", &text);
     fs::create_dir(place.path("flash")).unwrap();
     let bus = place.start("vcan-setup", "serve vcan0");

@@ -439,7 +439,7 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
         _ => None,
     };
     let says = |bits| move |message: &Message| state(message).is_some_and(|state| state.has(bits));
-    let settled = |message: &Message| state(message).is_some_and(|state| !state.has(State::CLAIMING));
+    let settled = |message: &Message| state(message).is_some_and(|state| !state.has(State::CLAIMING_NODE_ID));
     test_client.waits_for("cell 3 that has its node id", settled);
     test_client.waits_for("another halt", |message| *message == Message::Halt);
     test_client.waits_for("a cell 3 that is halted", says(State::HALTED));
@@ -454,7 +454,7 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
         index + log.messages[index..].iter().position(|(message, _)| expected(message)).unwrap()
     };
     let halt = from(0, &|message| *message == Message::Halt);
-    let restarted = from(from(halt, &says(State::CLAIMING)), &settled);
+    let restarted = from(from(halt, &says(State::CLAIMING_NODE_ID)), &settled);
     let halted = from(restarted, &|message| *message == Message::Halt);
     let resumed = from(halted, &|message| *message == Message::Resume);
     assert_eq!(log.torques_after(halted, 3) - log.torques_after(resumed, 3), 0, "torques of a halted cell");

@@ -15,7 +15,7 @@ use process::{Running, Summary, TestDir, names, skin, until};
 use protocol::can::Format;
 use protocol::fixed::Q1_14;
 use protocol::message::{Joints, Message};
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::packet::{Epoch, WORDS};
 use rand::{RngExt, SeedableRng};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
@@ -300,7 +300,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     for epoch in 77..81 {
         test_client.send(&Message::Joints {
             epoch: Epoch(epoch),
-            joints: Joints { positions: padded(&positions), in_use: 6 },
+            joints: Joints { positions: pad_with_defaults(&positions), in_use: 6 },
         });
     }
     let ended = bench.end();

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use cell_node::flash;
 use cell_node::identity::Identity;
 use model::decode::Decoded;
-use model::generate::{Format as Target, Reply, generate};
+use model::generate::{Format as Target, ReplyMode, generate};
 use model::network::Uplinks;
 use process::test_client::TestClient;
 use process::{Running, TIMEOUT, TestDir, names, until};
@@ -28,9 +28,9 @@ use protocol::message::{
     Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart, TreePage,
 };
 use protocol::packet::Epoch;
-use protocol::parameters::{Parameter, Reply as Answers, SumSchedule};
+use protocol::parameters::{Parameter, ReplyKind as Answers, SumSchedule};
 use protocol::port::LinkId;
-use protocol::skin::{Skin, Wires};
+use protocol::skin::{BusWires, Skin};
 use protocol::time::Micros;
 use rustix::process::Signal;
 
@@ -42,7 +42,8 @@ const UNCONFIGURED: u16 = 0;
 /// Writes a skin of cells that answer with sums.
 fn sums(place: &TestDir, cells: u8, format: Target) -> Skin {
     let cells = usize::from(cells);
-    let expected = model::generate::SkinRequest { cells, reply: Reply::Sum, format, ..Default::default() };
+    let expected =
+        model::generate::SkinRequest { cells, reply: ReplyMode::Sum, format, ..Default::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     Skin::read(&place.path("skin.toml")).unwrap()
 }
@@ -73,8 +74,8 @@ struct Side {
 
 impl Side {
     fn new(place: &TestDir, skin: &Skin) -> Self {
-        let wires: Wires = skin.wires(0);
-        let roots: Vec<_> = wires.roots().collect();
+        let wires: BusWires = skin.wires(0);
+        let roots: Vec<_> = wires.roots_with_link_ids().collect();
         Self {
             test_client: TestClient::on(place, "vcan0", skin.buses[0].format),
             cells: skin.cells.len(),
@@ -143,7 +144,7 @@ impl Side {
         };
         match message {
             Message::Network { from: Node::Cell(cell), page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                self.uplinks.mark_used(cell);
+                self.uplinks.mark_node_id_used(cell);
                 self.heartbeats.insert(cell.get(), heartbeat);
             }
             Message::Network { from: Node::Cell(cell), page: NetworkPage::Tree(tree), .. } => {
@@ -158,7 +159,7 @@ impl Side {
 
     /// Returns true if every cell has a unique node id and a parent.
     fn is_tree_ready(&self) -> bool {
-        let settled = |heartbeat: &&Heartbeat| !heartbeat.state.has(State::CLAIMING);
+        let settled = |heartbeat: &&Heartbeat| !heartbeat.state.has(State::CLAIMING_NODE_ID);
         self.heartbeats.values().filter(settled).count() == self.cells
             && self.trees.len() == self.cells
             && self.trees.values().all(|tree| tree.parent.is_some())
@@ -292,7 +293,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
     let mut side = Side::new(&place, &skin);
     let after = heard(&mut side);
     for (cell, heartbeat) in &after {
-        assert!(!heartbeat.state.has(State::CLAIMING), "cell {cell} did not restart");
+        assert!(!heartbeat.state.has(State::CLAIMING_NODE_ID), "cell {cell} did not restart");
         assert!(heartbeat.sent.wrapping_sub(before[cell].sent) < 0x8000, "cell {cell} went on counting");
     }
     side.test_client.send(&Message::Report);

@@ -7,7 +7,7 @@ use skinbus_tests::process;
 use std::fs;
 
 use analysis::report::run::{ReportOptions, report};
-use model::generate::{Format, Reply, SkinRequest, generate};
+use model::generate::{Format, ReplyMode, SkinRequest, generate};
 use process::replay::{TOUCHED, send_every_message};
 use process::{TestDir, skin_of, until};
 use rustix::process::Signal;
@@ -103,7 +103,7 @@ fn parts_of_cells_that_send_continuously_on_a_slow_bus_come_back() {
 #[test]
 fn parts_of_sums_come_back_with_what_rounding_carries() {
     let place = TestDir::new();
-    let expected = SkinRequest { cells: 10, reply: Reply::Sum, ..SkinRequest::default() };
+    let expected = SkinRequest { cells: 10, reply: ReplyMode::Sum, ..SkinRequest::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(&touched(1));
     place.bench(4.2, "--record run.mcap --record-split 1s").end().succeeded();

@@ -159,7 +159,7 @@ fn two_buses_of_classic_frames_have_a_topic_each() {
     let described = place.start("skinbus", "skin dbc run.mcap --bus vcan1 --joined").end().succeeded();
     assert_eq!(
         described.stdout,
-        dbc::dbc(&Skin::parse("skin.toml", &skin_of(8, 2, Format::Classic)).unwrap(), 1)
+        dbc::dbc_text(&Skin::parse("skin.toml", &skin_of(8, 2, Format::Classic)).unwrap(), 1)
     );
 }
 

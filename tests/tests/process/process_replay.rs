@@ -280,7 +280,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
         |message: &Message| matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
     let beats = Counter::new(0);
     let heartbeat = |message: &Message| {
-        let it = matches!(message, Message::Network { page: NetworkPage::Heartbeat(beat), .. } if !beat.state.has(State::CLAIMING));
+        let it = matches!(message, Message::Network { page: NetworkPage::Heartbeat(beat), .. } if !beat.state.has(State::CLAIMING_NODE_ID));
         it && beats.replace(beats.get() + 1) >= 8
     };
     // Pages that a cell sends with its heartbeats cannot be compared without these.
@@ -309,8 +309,11 @@ fn is_sum(message: &Message, cell: u8) -> bool {
 #[test]
 fn sums_without_their_children_come_back_in_any_tree() {
     let place = TestDir::new();
-    let expected =
-        generate::SkinRequest { cells: 12, reply: generate::Reply::Sum, ..generate::SkinRequest::default() };
+    let expected = generate::SkinRequest {
+        cells: 12,
+        reply: generate::ReplyMode::Sum,
+        ..generate::SkinRequest::default()
+    };
     place.write("skin.toml", &generate::generate(&expected).unwrap());
     place.scenario(TOUCHED);
     place.bench(4.0, "--record run.mcap").end().succeeded();
@@ -402,7 +405,7 @@ fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
     };
     test_client.waits_for("a cell that has settled", |message| {
         matches!(message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
-            if *from == Node::Cell(cell(3)) && !beat.state.has(State::CLAIMING))
+            if *from == Node::Cell(cell(3)) && !beat.state.has(State::CLAIMING_NODE_ID))
     });
     test_client.send(&mode(1, Request::Write { number, words: [0; WORDS] }));
     test_client.waits_for("a cell that measures", answers(1, 0));

@@ -8,7 +8,7 @@ use skinbus_tests::process::recorded;
 
 use std::fs;
 
-use analysis::report::figure::{Drawing, Figure, Page, Table, quantity};
+use analysis::report::figure::{Drawing, Figure, Page, Table, format_quantity};
 use analysis::report::run::{ReportOptions, report};
 use process::{PRESSED, TestDir, names, skin};
 use recorded::Recorded;
@@ -116,7 +116,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
         let difference = span(torque.below.as_ref().unwrap().series[0].points.iter().map(|(_, y)| *y));
         let farthest = difference[1].abs().max(difference[2].abs());
         assert_eq!(
-            quantity(farthest, "Nm"),
+            format_quantity(farthest, "Nm"),
             errors[4],
             "the epoch that is farthest from the central computation"
         );
@@ -148,7 +148,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
     );
     assert!(summary.number("/buses/0/replies/in_time") > 0);
     let slowest = summary.figure("/buses/0/last_reply_us/max");
-    assert_eq!(replies[8], quantity(slowest, "µs"));
+    assert_eq!(replies[8], format_quantity(slowest, "µs"));
     let due: f64 =
         figure(&page, "replies-vcan0").series[0].points.iter().map(|(_, y)| *y).fold(0.0, f64::max);
     assert!((due - 8.0).abs() < 0.5, "all eight are due: {due}");
@@ -160,8 +160,8 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
         assert_eq!(
             cells,
             [
-                quantity(of("mean_nm"), "Nm"),
-                quantity(of("max_nm"), "Nm"),
+                format_quantity(of("mean_nm"), "Nm"),
+                format_quantity(of("max_nm"), "Nm"),
                 counted(&format!("/accuracy/{key}/count"))
             ]
         );
@@ -178,7 +178,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
         ("tick took", "took_us"),
         ("central computation in it", "central_us"),
     ] {
-        let quantile = |name: &str| quantity(summary.figure(&format!("/loop/{key}/{name}")), "µs");
+        let quantile = |name: &str| format_quantity(summary.figure(&format!("/loop/{key}/{name}")), "µs");
         let expected = ["p50", "p90", "p99", "max"].map(quantile);
         for (shown, expected) in row(control, name)[..4].iter().zip(&expected) {
             // The last of three digits may be rounded either way: 2.385 lies between two values.

@@ -221,7 +221,7 @@ fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
     let third = cell(3);
     test_client.waits_for("cell 3", |message| {
         matches!(*message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
-            if from == Node::Cell(third) && !beat.state.has(State::CLAIMING))
+            if from == Node::Cell(third) && !beat.state.has(State::CLAIMING_NODE_ID))
     });
     let request = Request::Write { number: Parameter::Mode.number(), words: [0; WORDS] };
     test_client.send(&Message::Configure { to: Node::Cell(third), tag: 9, request });

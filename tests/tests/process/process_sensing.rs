@@ -219,7 +219,7 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     let third = Node::Cell(process::replay::cell(3));
     test_client.waits_for("cell 3", |message| {
         matches!(*message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
-            if from == third && !beat.state.has(State::CLAIMING))
+            if from == third && !beat.state.has(State::CLAIMING_NODE_ID))
     });
     let contact = [Q5_10::nearest(1.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });

@@ -10,7 +10,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::bus::embedded::{ClientHello, HelloReply, address, encode_dropped, seqpacket};
+use protocol::bus::embedded::{
+    ClientHello, HelloReply, encode_drop_notice, seqpacket_socket, socket_address,
+};
 use protocol::bus::{Bus, BusError, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{EXTENDED, Frame};
 use protocol::candump::{self, CandumpLine};
@@ -301,8 +303,8 @@ fn greeted(listener: &OwnedFd, answer: HelloReply) -> OwnedFd {
 #[test]
 fn the_documents_programs_read_to_the_end_and_say_when_they_are_refused() {
     let folder = TempDir::new().unwrap();
-    let listener = seqpacket(SocketFlags::empty()).unwrap();
-    rustix::net::bind(&listener, &address(folder.path(), "vcan0").unwrap()).unwrap();
+    let listener = seqpacket_socket(SocketFlags::empty()).unwrap();
+    rustix::net::bind(&listener, &socket_address(folder.path(), "vcan0").unwrap()).unwrap();
     rustix::net::listen(&listener, 1).unwrap();
     for listing in listings(folder.path()) {
         let program = attach(&listing, folder.path());
@@ -311,7 +313,7 @@ fn the_documents_programs_read_to_the_end_and_say_when_they_are_refused() {
             let mut bytes = [0; 73];
             let (len, _) = rustix::net::recv(&socket, &mut bytes, flags).unwrap();
             assert_eq!(len, frame.byte_len());
-            rustix::net::send(&socket, &encode_dropped(3), SendFlags::empty()).unwrap();
+            rustix::net::send(&socket, &encode_drop_notice(3), SendFlags::empty()).unwrap();
             rustix::net::send(&socket, &frame.to_bytes()[..len], SendFlags::empty()).unwrap();
         }
         // With a frame of the program unread, which the system reports to it.

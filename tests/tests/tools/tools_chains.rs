@@ -155,7 +155,7 @@ fn in_words(robot: &str, text: &mut String) {
         let table = (0_u8..)
             .take(parameters.all_rows().len())
             .flat_map(|row| parameters.words(Parameter::Row(row))[..5].to_vec());
-        let (joint, row) = (parameters.joint, parameters.chain().len());
+        let (joint, row) = (parameters.joint, parameters.rows_to_cell().len());
         writeln!(
             text,
             "{robot},{joint},{row},{pose},{force},{positions},{}",

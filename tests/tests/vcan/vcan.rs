@@ -95,7 +95,7 @@ fn the_kernel_refuses_what_the_table_says() {
 fn the_kernel_marks_own_frames_and_counts_drops() {
     own_network();
     let bus = open(&BusOptions { own_frames: true, receive_buffer: 0, ..BusOptions::default() });
-    let small = bus.receive_buffer();
+    let small = bus.receive_buffer_bytes();
     for number in 0..100_u32 {
         bus.send(&[Frame::fd(1, 1, &number.to_le_bytes()).unwrap()]).unwrap();
     }
@@ -108,7 +108,7 @@ fn the_kernel_marks_own_frames_and_counts_drops() {
     assert!(heard < 100, "{heard} frames fit into {small} bytes");
     sender().send(&[Frame::classic(LAST, &[]).unwrap()]).unwrap();
     assert!(read(&bus, &mut inbox).is_empty());
-    assert_eq!(heard + inbox.dropped() as usize, 100, "the next frame brings the count");
+    assert_eq!(heard + inbox.dropped_count() as usize, 100, "the next frame brings the count");
 }
 
 #[test]
@@ -117,7 +117,11 @@ fn the_choice_is_socketcan_and_a_missing_interface_is_no_reason_for_another_bus(
     own_network();
     let bus = Bus::open("vcan0", KindChoice::Auto, &BusOptions::default()).unwrap();
     assert_eq!(bus.kind(), BusKind::SocketCan);
-    assert!(bus.receive_buffer() >= BusOptions::default().receive_buffer, "{}", bus.receive_buffer());
+    assert!(
+        bus.receive_buffer_bytes() >= BusOptions::default().receive_buffer,
+        "{}",
+        bus.receive_buffer_bytes()
+    );
     let error = Bus::open("vcan77", KindChoice::Auto, &BusOptions::default()).unwrap_err();
     let expected = "there is no interface vcan77: make it with `vcan-setup up vcan77`, or plug it in if \
                     it is hardware";

@@ -49,7 +49,11 @@ impl Pair {
         };
         let open = |options: &BusOptions| Bus::open("vcan0", KindChoice::Only(kind), options).unwrap();
         let (sender, sleeper) = (open(&options(&[], 0)), open(&options(filters, SMALL)));
-        assert!((SMALL..=2 * SMALL).contains(&sleeper.receive_buffer()), "{}", sleeper.receive_buffer());
+        assert!(
+            (SMALL..=2 * SMALL).contains(&sleeper.receive_buffer_bytes()),
+            "{}",
+            sleeper.receive_buffer_bytes()
+        );
         Self { kind, sender, sleeper, inbox: Inbox::new(), sent: 0, heard: 0 }
     }
 
@@ -86,7 +90,7 @@ impl Pair {
     fn read(&mut self) {
         while self.sleeper.wait(Some(Duration::from_millis(20))).unwrap() {
             self.sleeper.receive(&mut self.inbox).unwrap();
-            let dropped = self.inbox.dropped();
+            let dropped = self.inbox.dropped_count();
             let mut last = None;
             for received in self.inbox.frames() {
                 assert_eq!(received.frame.id(), EXPECTED);
@@ -114,7 +118,7 @@ impl Pair {
             self.sender.send(&[last]).unwrap();
             self.read();
             // On the embedded bus, frames that wait on the way arrive in between.
-            (self.heard > heard && self.heard + self.inbox.dropped() == self.sent).then_some(())
+            (self.heard > heard && self.heard + self.inbox.dropped_count() == self.sent).then_some(())
         });
     }
 }
@@ -134,10 +138,10 @@ fn what_is_lost_is_counted(kind: BusKind, place: &TestDir) {
             pair.overflow();
             pair.settle();
             let (sent, heard) = (pair.sent - sent, pair.heard - heard);
-            let lost = pair.inbox.dropped() - dropped;
+            let lost = pair.inbox.dropped_count() - dropped;
             assert_eq!(sent - heard, lost, "round {round}, {filters:?}");
             assert!(heard > 10 && lost > FRAMES / 3, "round {round}: {heard} heard, {lost} lost");
-            dropped = pair.inbox.dropped();
+            dropped = pair.inbox.dropped_count();
         }
         // No frame was lost on the way to the socket, which a socket could not know.
         assert_eq!(backlog(), before);
@@ -148,10 +152,10 @@ fn what_is_lost_is_counted(kind: BusKind, place: &TestDir) {
             pair.sender.send(&frames).unwrap();
             until("all of them", || {
                 pair.read();
-                (pair.heard + pair.inbox.dropped() == pair.sent).then_some(())
+                (pair.heard + pair.inbox.dropped_count() == pair.sent).then_some(())
             });
         }
-        assert_eq!((pair.inbox.dropped(), pair.heard + dropped), (dropped, pair.sent));
+        assert_eq!((pair.inbox.dropped_count(), pair.heard + dropped), (dropped, pair.sent));
     }
 }
 

@@ -16,7 +16,7 @@ use protocol::can::{Format, Frame};
 use protocol::candump::{CandumpLine, parse};
 use protocol::id::{Id, Kind, Node};
 use protocol::message::{Message, NetworkPage, RejectedCounts};
-use protocol::packet::{Packet, PacketError, WORDS, data_id};
+use protocol::packet::{Packet, PacketError, WORDS, data_frame_id};
 use protocol::skin::Skin;
 use rustix::process::Signal;
 
@@ -194,7 +194,7 @@ fn replies(log: &Log) -> BTreeSet<Reply> {
 fn joints_and_stimuli(log: &Path) -> String {
     let heard = |line: &&str| {
         let Ok(CandumpLine::Frame(record)) = parse(line) else { panic!("{line}") };
-        let id = data_id(&record.frame);
+        let id = data_frame_id(&record.frame);
         id.is_ok_and(|id| id.kind == Kind::Stimulus || id.to_bits() == 1)
     };
     let text = fs::read_to_string(log).unwrap();
@@ -302,7 +302,7 @@ fn reason(frame: &Frame) -> Option<&'static str> {
     match Packet::from_fd(frame) {
         _ if frame.is_error() => Some("error frame"),
         Err(PacketError::Foreign) => Some("foreign"),
-        Err(_) if data_id(frame).is_ok_and(|id| !is_used(id)) => Some("foreign"),
+        Err(_) if data_frame_id(frame).is_ok_and(|id| !is_used(id)) => Some("foreign"),
         Err(PacketError::Length { .. }) => Some("wrong length"),
         Err(PacketError::Crc { .. }) => Some("wrong CRC"),
         Err(_) => panic!("{frame:?}"),
@@ -315,7 +315,7 @@ fn refused_by(cell: u8, frames: &[Frame]) -> RejectedCounts {
     let cell = u16::from(cell);
     let heard = [0x000, 0x001, 0x002, 0x003, 0x004, 0x400 + cell, 0x500 + cell, 0x5FF, 0x700 + cell, 0x7FF];
     let mut refused = RejectedCounts::default();
-    let hears = |frame: &&Frame| data_id(frame).is_ok_and(|id| heard.contains(&id.to_bits()));
+    let hears = |frame: &&Frame| data_frame_id(frame).is_ok_and(|id| heard.contains(&id.to_bits()));
     for frame in frames.iter().filter(hears) {
         match reason(frame) {
             Some("wrong length") => refused.length += 1,
@@ -332,7 +332,7 @@ fn refused_by(cell: u8, frames: &[Frame]) -> RejectedCounts {
 fn all_are_counted(frames: &[Frame], summary: &Summary) {
     let (mut kinds, mut reasons) = (BTreeMap::<_, u64>::new(), BTreeMap::<_, u64>::new());
     for frame in frames {
-        if let Ok(id) = data_id(frame)
+        if let Ok(id) = data_frame_id(frame)
             && reason(frame) != Some("foreign")
         {
             *kinds.entry(id.kind.name()).or_default() += 1;
@@ -420,7 +420,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     }
     // Frames with a cell's node id from another sender are in the cell's account.
     let of_cells = |frame: &&Frame| {
-        data_id(frame).is_ok_and(|Id { kind, node }| {
+        data_frame_id(frame).is_ok_and(|Id { kind, node }| {
             kind.is_from_cells() && (1..=CELLS).contains(&node) && reason(frame).is_some()
         })
     };

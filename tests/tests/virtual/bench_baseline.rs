@@ -155,7 +155,10 @@ fn a_tare_while_touched_is_refused_and_reported() {
     let refused = |message| {
         matches!(
             message,
-            Message::Configured { answer: Answer::Refused { number: 12, reason: Answer::CELL_TOUCHED }, .. }
+            Message::Configured {
+                answer: Answer::Refused { number: 12, reason: Answer::REFUSED_CELL_TOUCHED },
+                ..
+            }
         )
     };
     assert!(messages(&bench).any(refused), "the refusal has its reason");

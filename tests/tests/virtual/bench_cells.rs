@@ -4,8 +4,8 @@
 
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
-use cell_node::node::{CLAIM_TIME, HEARTBEAT_INTERVAL, MAX_PENDING};
-use model::table::{CellStatus, Event, Notice, Replies};
+use cell_node::node::{HEARTBEAT_INTERVAL, MAX_PENDING_STIMULI, MIN_CLAIM_TIME};
+use model::table::{CellStatus, FrameEvent, Notice, Replies};
 use model::tracker::DEAD_AFTER;
 use protocol::can::Format;
 use protocol::id::{Kind, Node};
@@ -25,7 +25,7 @@ fn bench(seed: u64) -> Bench {
 }
 
 /// A time longer than a cell needs from its start to its first torque.
-const START_TIMEOUT: Span = Span(2 * CLAIM_TIME.0 + 2 * HEARTBEAT_INTERVAL.0);
+const START_TIMEOUT: Span = Span(2 * MIN_CLAIM_TIME.0 + 2 * HEARTBEAT_INTERVAL.0);
 
 fn status(bench: &Bench, place: usize) -> CellStatus {
     bench.gateway.table.statuses(bench.now()).nth(place).unwrap().1
@@ -189,7 +189,7 @@ fn a_restart_without_its_claim_is_detected_by_the_counter() {
         bench.act(Act::Kill(CELL));
         bench.act(Act::Start(CELL));
         // Its claim is lost; the first received packet comes when the node id is its own.
-        let claim = bench.now()..bench.now() + CLAIM_TIME;
+        let claim = bench.now()..bench.now() + MIN_CLAIM_TIME;
         bench.fault(
             Fault::new(Harm::Lose, 1.0).at_receiver(Party::Gateway).from(Party::CellSlot(CELL)).during(claim),
         );
@@ -238,7 +238,7 @@ fn joints_older_than_a_period_are_skipped_and_explain_what_is_missing() {
         finish(&mut bench);
         assert_eq!(bench.gateway.notices, [], "too short to be dead");
         let cell = &bench.gateway.table.cells()[CELL];
-        let (skipped, unheard) = cell.unanswered().unwrap();
+        let (skipped, unheard) = cell.unanswered_joint_counts().unwrap();
         let replies = replies(&bench, CELL);
         assert!(skipped >= 5 && unheard == 0, "{skipped} {unheard}");
         // The last broadcast of the hang may be recent enough to be answered late.
@@ -258,10 +258,10 @@ fn lost_joints_and_skipped_joints_are_counted_apart() {
     bench.run_epochs(100);
     bench.faults.clear();
     finish(&mut bench);
-    let (skipped, unheard) = bench.gateway.table.cells()[CELL].unanswered().unwrap();
+    let (skipped, unheard) = bench.gateway.table.cells()[CELL].unanswered_joint_counts().unwrap();
     assert_eq!((skipped, unheard), (0, replies(&bench, CELL).missing));
     assert!(unheard > 10, "{unheard}");
-    assert_eq!(bench.gateway.table.cells()[0].unanswered(), Some((0, 0)));
+    assert_eq!(bench.gateway.table.cells()[0].unanswered_joint_counts(), Some((0, 0)));
 }
 
 #[test]
@@ -273,7 +273,7 @@ fn a_long_run_does_not_confuse_the_count_of_joints() {
     bench.act(Act::SendFromGateway(Message::Report));
     bench.run_epochs(65_536 + 1_000);
     finish(&mut bench);
-    assert_eq!(bench.gateway.table.cells()[0].unanswered(), Some((0, 0)));
+    assert_eq!(bench.gateway.table.cells()[0].unanswered_joint_counts(), Some((0, 0)));
 }
 
 #[test]
@@ -281,7 +281,7 @@ fn a_cell_that_hung_takes_the_stimuli_of_meanwhile_and_refuses_none() {
     let mut bench = bench(6);
     bench.run_epochs(5);
     bench.act(Act::Hang(CELL));
-    for step in 0..2 * MAX_PENDING {
+    for step in 0..2 * MAX_PENDING_STIMULI {
         bench.press(CELL, 1.0 + 0.1 * step as f64);
         bench.run_epochs(1);
     }
@@ -308,7 +308,7 @@ fn of_two_cells_with_one_node_id_exactly_one_stays_whenever_they_start() {
             bench.run(Span::from_millis(2_000));
             let gave_up = [0, second].map(|cell_slot| bench.cell_slots[cell_slot].gave_up().is_some());
             assert_ne!(gave_up[0], gave_up[1], "{apart} us apart, serial {serial}");
-            if apart + 64_000 < CLAIM_TIME.0 {
+            if apart + 64_000 < MIN_CLAIM_TIME.0 {
                 let greater = usize::from(serial > first.serial);
                 assert!(gave_up[greater], "{apart} us apart both claim, so the lesser serial number stays");
             }
@@ -348,7 +348,7 @@ fn an_address_claim_for_a_settled_cells_node_id_changes_nothing_and_is_noticed()
         if let (Some(claim), Some((at, _))) = (claim, bench.gateway.notices.first()) {
             assert!(at.elapsed_since(claim) < Span::from_millis(6), "a claim is answered at once");
         }
-        assert_eq!(bench.gateway.table.counters().events(Event::Duplicate), u64::from(claimed));
+        assert_eq!(bench.gateway.table.counters().event_count(FrameEvent::Duplicate), u64::from(claimed));
         finish(&mut bench);
         let uplink = bench.gateway.table.cells()[0].uplink();
         let got = (uplink.restarts, uplink.lost, uplink.surplus);
@@ -392,7 +392,7 @@ fn a_damaged_flash_is_reported_and_nothing_is_due() {
 
 fn stuck(bench: &Bench) -> Vec<(usize, &'static str)> {
     let cells = bench.gateway.table.cells().iter().enumerate();
-    cells.flat_map(|(place, cell)| cell.stuck().map(move |(kind, _)| (place, kind))).collect()
+    cells.flat_map(|(place, cell)| cell.stuck_word_runs().map(move |(kind, _)| (place, kind))).collect()
 }
 
 #[test]

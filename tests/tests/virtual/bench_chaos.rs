@@ -8,7 +8,7 @@
     reason = "a test may stop, and say where"
 )]
 
-use model::table::{Event, Uplink};
+use model::table::{FrameEvent, UplinkCounts};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::Message;
@@ -46,7 +46,7 @@ fn campaign(skin: &Skin, seed: u64, inject: impl Fn(&mut Bench, &mut Pcg64Mcg)) 
     bench
 }
 
-fn uplink(bench: &Bench) -> Uplink {
+fn uplink(bench: &Bench) -> UplinkCounts {
     bench.gateway.table.uplink()
 }
 
@@ -147,7 +147,7 @@ fn loss_alone_is_found_to_the_last_packet() {
                 bench.wire.iter().filter(|it| it.frame.id() >> 8 == Kind::Torque as u32).count();
             on_the_wire as u64
         };
-        let arrived = bench.gateway.table.counters().received(Kind::Torque);
+        let arrived = bench.gateway.table.counters().received_count(Kind::Torque);
         let uplink = uplink(&bench);
         assert_eq!(uplink.lost, torques(&bench) - arrived, "{uplink:?}");
         assert!(uplink.lost > 0 && uplink.surplus == 0 && uplink.rejected == 0, "{uplink:?}");
@@ -165,8 +165,8 @@ fn no_torque_with_turned_bits_is_ever_used() {
         let table = &bench.gateway.table;
         assert!(table.accuracy().single.max() < 1e-3, "{:?}", table.accuracy());
         // Flipped bits of an identifier may produce another kind, which is in no cell's account.
-        assert!(uplink(&bench).rejected <= table.counters().events(Event::Crc));
-        flipped += table.counters().events(Event::Crc);
+        assert!(uplink(&bench).rejected <= table.counters().event_count(FrameEvent::Crc));
+        flipped += table.counters().event_count(FrameEvent::Crc);
     }
     assert!(flipped > SEEDS * 100, "{flipped}");
 }

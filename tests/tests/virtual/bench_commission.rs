@@ -236,7 +236,7 @@ fn cells_that_are_switched_off_and_on_in_the_middle_are_rewritten_or_named() {
 fn nobody_claims(packet: Packet) -> Packet {
     match Message::decode(&packet) {
         Ok(Message::Network { page: NetworkPage::Heartbeat(beat), .. })
-            if beat.state.has(State::CLAIMING) =>
+            if beat.state.has(State::CLAIMING_NODE_ID) =>
         {
             Message::Sync.encode()
         }

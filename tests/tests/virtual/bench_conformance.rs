@@ -31,15 +31,15 @@ fn test(
 ) -> (Vec<Finding>, Vec<&'static str>) {
     let cell = CellId::new(number.into()).unwrap();
     let survey = Survey::listen(bus, "vcan0").unwrap();
-    assert_eq!(survey.check(cell, "vcan0", None, false), Ok(format));
+    assert_eq!(survey.check_cell(cell, "vcan0", None, false), Ok(format));
     let mut session = Session::new(bus, "vcan0", cell, format, Span::from_millis(80_000));
     let saved = session.save().unwrap();
     let stopped = conformance::run(&mut session, only).err();
     if let Ok(saved) = &saved {
         let _ = session.restore(saved);
     }
-    let failed = session.findings.failed();
-    (session.findings.list(only, stopped.as_ref()), failed)
+    let failed = session.findings.failed_requirements();
+    (session.findings.requested_findings(only, stopped.as_ref()), failed)
 }
 
 fn failures(findings: &[Finding]) -> String {
@@ -176,7 +176,7 @@ fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
         let mut bus = VirtualBus::new(format, mutants::NODE, Box::new(wrong));
         let survey = Survey::listen(&mut bus, "vcan0").unwrap();
         let cell = CellId::new(mutants::NODE.into()).unwrap();
-        let why = survey.check(cell, "vcan0", None, false).unwrap_err();
+        let why = survey.check_cell(cell, "vcan0", None, false).unwrap_err();
         assert!(why.starts_with("cell 12 on vcan0 fails SEND-1: none of "), "{why}");
         assert!(
             why.contains("is a valid packet, for example 40C#") && why.contains(mistake),

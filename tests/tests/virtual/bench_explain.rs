@@ -3,7 +3,9 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use analysis::explain::{ContactOrigin, Explanation, JointsWatcher, RequestedJoints, WordVerdict, explain};
+use analysis::explain::{
+    ContactOrigin, JointsWatcher, RequestedJoints, TorqueExplanation, WordVerdict, explain,
+};
 use model::decode::{Decoded, Decoder};
 use protocol::can::Format;
 use protocol::id::Kind;
@@ -19,7 +21,7 @@ use skinbus_tests::skins;
 const EPOCHS: u64 = 60;
 
 /// Explains an epoch from a capture of these frames.
-fn explained(bench: &Bench, wire: &[WireFrame], epoch: u8) -> Explanation {
+fn explained(bench: &Bench, wire: &[WireFrame], epoch: u8) -> TorqueExplanation {
     let requested = RequestedJoints { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
     let bus = &bench.skin.buses[0].name;
     let (mut watch, mut decoder) = (JointsWatcher::new(&bench.skin, requested), Decoder::new(None));
@@ -30,7 +32,7 @@ fn explained(bench: &Bench, wire: &[WireFrame], epoch: u8) -> Explanation {
             break;
         }
     }
-    explain(&bench.skin, &watch.moments().unwrap())
+    explain(&bench.skin, &watch.into_joints().unwrap())
 }
 
 /// Returns a bench whose cells are pressed and released all the time, some so hard that they saturate.

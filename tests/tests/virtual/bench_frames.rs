@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use model::table::{Event, Notice, Replies, Uplink};
+use model::table::{FrameEvent, Notice, Replies, UplinkCounts};
 use protocol::can::Format;
 use protocol::id::{Kind, Node};
 use protocol::message::{Heartbeat, Joints, Message, NetworkPage, Request, StimulusStart};
@@ -31,12 +31,12 @@ fn replies(bench: &Bench) -> Replies {
     Replies::total(bench.gateway.table.cells().iter().map(|cell| cell.replies))
 }
 
-fn uplink(bench: &Bench) -> Uplink {
+fn uplink(bench: &Bench) -> UplinkCounts {
     bench.gateway.table.uplink()
 }
 
-fn events(bench: &Bench, event: Event) -> u64 {
-    bench.gateway.table.counters().events(event)
+fn events(bench: &Bench, event: FrameEvent) -> u64 {
+    bench.gateway.table.counters().event_count(event)
 }
 
 fn finish(bench: &mut Bench) {
@@ -48,13 +48,13 @@ fn finish(bench: &mut Bench) {
 #[test]
 fn torques_that_come_twice_are_dropped_and_counted() {
     let mut bench = pressed(Format::Fd, 1);
-    let before = bench.gateway.table.counters().received(Kind::Torque);
+    let before = bench.gateway.table.counters().received_count(Kind::Torque);
     bench.fault(Fault::new(Harm::Duplicate, 1.0).at_receiver(Party::Gateway).of_kind(Kind::Torque));
     bench.run_epochs(50);
     finish(&mut bench);
-    let twice = events(&bench, Event::RepeatedTorque);
+    let twice = events(&bench, FrameEvent::RepeatedTorque);
     assert_eq!(twice, 50 * CELLS as u64);
-    let torques = bench.gateway.table.counters().received(Kind::Torque) - before;
+    let torques = bench.gateway.table.counters().received_count(Kind::Torque) - before;
     assert_eq!(torques, 2 * twice + CELLS as u64, "the last epoch was clean");
     assert_eq!((replies(&bench).missing, replies(&bench).unasked), (0, 0));
     assert_eq!(uplink(&bench).surplus, twice);
@@ -67,10 +67,10 @@ fn joints_that_come_twice_are_answered_once() {
     bench.run_epochs(50);
     finish(&mut bench);
     assert_eq!((replies(&bench).missing, replies(&bench).unasked), (0, 0));
-    assert_eq!(events(&bench, Event::RepeatedTorque) + events(&bench, Event::StaleTorque), 0);
+    assert_eq!(events(&bench, FrameEvent::RepeatedTorque) + events(&bench, FrameEvent::StaleTorque), 0);
     for cell in bench.gateway.table.cells() {
         assert_eq!(cell.pages().received.unwrap().joints_repeated, 50);
-        assert_eq!(cell.unanswered(), Some((0, 0)));
+        assert_eq!(cell.unanswered_joint_counts(), Some((0, 0)));
     }
 }
 
@@ -83,7 +83,7 @@ fn a_torque_that_was_overtaken_by_a_later_one_is_dropped_as_stale() {
     bench.run_epochs(200);
     finish(&mut bench);
     let Replies { due, in_time, late, missing, .. } = replies(&bench);
-    let stale = events(&bench, Event::StaleTorque);
+    let stale = events(&bench, FrameEvent::StaleTorque);
     assert!(late > 10 && stale > 10 && in_time > due / 3, "{:?} {stale}", replies(&bench));
     assert_eq!(missing, stale, "what was overtaken counts as missing");
     assert!(
@@ -110,7 +110,7 @@ fn a_torque_may_be_three_epochs_late_and_not_four() {
         bench.run(Span(epoch.0 / 4));
         let now = bench.gateway.table.cells()[0].replies;
         assert_eq!(now.late - before.late, u64::from(used), "{late} epochs late");
-        assert_eq!(events(&bench, Event::StaleTorque), u64::from(!used), "{late} epochs late");
+        assert_eq!(events(&bench, FrameEvent::StaleTorque), u64::from(!used), "{late} epochs late");
         finish(&mut bench);
     }
 }
@@ -189,7 +189,7 @@ fn a_lost_stimulus_of_a_touch_shows_as_missing_replies() {
     let replies = replies(&bench);
     assert!(replies.due >= 30 && replies.missing == replies.due, "{replies:?}");
     assert_eq!(bench.gateway.table.counters().epochs_complete, 0);
-    assert_eq!(bench.gateway.table.cells()[0].unanswered(), Some((0, 0)), "it heard all joints");
+    assert_eq!(bench.gateway.table.cells()[0].unanswered_joint_counts(), Some((0, 0)), "it heard all joints");
 }
 
 #[test]
@@ -218,7 +218,7 @@ fn a_cell_that_others_switch_is_not_due_to_answer() {
     bench.run_epochs(40);
     finish(&mut bench);
     let replies = replies(&bench);
-    assert_eq!(events(&bench, Event::OtherWriter), 1);
+    assert_eq!(events(&bench, FrameEvent::OtherWriter), 1);
     assert_eq!(replies.missing, replies.in_doubt, "{replies:?}");
     assert!(replies.missing <= 4 * bench.skin.cells.len() as u64, "{replies:?}");
 }
@@ -233,7 +233,7 @@ fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
         let mut bench = pressed(Format::Fd, 11);
         bench.act(Act::Inject(message));
         bench.run(Span(5_000));
-        assert_eq!(events(&bench, Event::OtherGateway), 1);
+        assert_eq!(events(&bench, FrameEvent::OtherGateway), 1);
         let notices =
             |bench: &Bench| bench.gateway.notices.iter().map(|(_, notice)| *notice).collect::<Vec<_>>();
         assert_eq!(notices(&bench), [], "one frame may come from anybody");
@@ -245,7 +245,7 @@ fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
         let expected: &[_] = if goes_on { &[Notice::OtherGateway] } else { &[] };
         assert_eq!(notices(&bench), expected);
         assert_eq!(bench.gateway.table.snapshot().sums.other_gateways, u32::from(goes_on));
-        assert_eq!(events(&bench, Event::OtherGateway), 4);
+        assert_eq!(events(&bench, FrameEvent::OtherGateway), 4);
         finish(&mut bench);
         // This gateway uses none of the cells' answers to the other one.
         assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
@@ -263,7 +263,7 @@ fn a_lost_segment_loses_its_packet_and_no_other() {
         // One of two segments is lost in 18 of 100 packets, both in one.
         assert!(missing > 0 && missing < due * 28 / 100, "{:?}", replies(&bench));
         assert_eq!((late, unasked), (0, 0));
-        let incomplete = events(&bench, Event::Incomplete);
+        let incomplete = events(&bench, FrameEvent::Incomplete);
         assert!(incomplete > 0 && incomplete <= missing, "{incomplete} of {missing}");
         assert!(bench.gateway.table.accuracy().single.max() < 1e-3, "no segments of two packets are joined");
     }
@@ -279,7 +279,7 @@ fn cells_reassemble_segments_as_the_gateway_does() {
         bench.run_epochs(100);
         finish(&mut bench);
         let cell = &bench.gateway.table.cells()[0];
-        let (skipped, unheard) = cell.unanswered().unwrap();
+        let (skipped, unheard) = cell.unanswered_joint_counts().unwrap();
         assert!(cell.pages().rejected.unwrap().incomplete > 0);
         assert_eq!((skipped, unheard), (0, cell.replies.missing));
         assert!(bench.gateway.table.accuracy().single.max() < 1e-3);

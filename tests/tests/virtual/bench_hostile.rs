@@ -132,9 +132,9 @@ impl HostileFrame {
             Self::HeartbeatOfAnother => {
                 beat(Heartbeat { serial: bench.cell_slots[place].identity.serial ^ 0x5A5A, ..settled })
             }
-            Self::Claim => beat(Heartbeat { sent: 0, state: State::CLAIMING, ..own }),
+            Self::Claim => beat(Heartbeat { sent: 0, state: State::CLAIMING_NODE_ID, ..own }),
             Self::ClaimOfAnother => {
-                beat(Heartbeat { serial: own.serial - 1, sent: 0, state: State::CLAIMING, ..own })
+                beat(Heartbeat { serial: own.serial - 1, sent: 0, state: State::CLAIMING_NODE_ID, ..own })
             }
             Self::StaleTorque => Act::Inject(Message::Torque {
                 from,

@@ -172,5 +172,5 @@ fn a_press_moves_the_joints_the_way_it_pushes() {
     bench.run_epochs(10);
     assert!(f64::from_bits(q(&bench)[0]) > 0.01);
     finish(&mut bench);
-    assert_eq!(bench.gateway.table.counters().received(Kind::Sum), 0);
+    assert_eq!(bench.gateway.table.counters().received_count(Kind::Sum), 0);
 }

@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use analysis::explain::{JointsWatcher, RequestedJoints};
-use bench::replay::comparator::{Comparator, Tally};
+use bench::replay::comparator::{Comparator, ReplyTally};
 use bench::replay::replay_plan::{FrameRole, FrameSelection, PlayerStep, ReplayPlan, SenderFilter};
 use bench::replay::survey::{Survey, TimeRange};
 use cell_node::flash::FlashState;
@@ -172,7 +172,7 @@ impl Cells {
                 node.handle_stored(true);
             }
             while let Some(packet) = node.poll_transmit() {
-                comparator.observe(0, &Message::decode(&packet).unwrap());
+                comparator.observe_message(0, &Message::decode(packet).unwrap());
             }
         }
     }
@@ -186,18 +186,18 @@ impl Cells {
 fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[LatchedFrame]) -> Comparator {
     let format = skin.buses[0].format;
     let mut survey = Survey::new(TimeRange::default());
-    survey.add_latched(before);
+    survey.add_latched_frames(before);
     part.iter().for_each(|seen| survey.add_frame(&record(seen)));
     survey.finish();
     let bus = &survey.buses[0];
     let mut comparator = Comparator::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, Some(0));
-    comparator.expect_restart();
+    comparator.expect_next_pass();
     bus.latched.iter().for_each(|message| comparator.expect_message(0, message, false));
     let selection = FrameSelection { only: SenderFilter::Inputs, destinations: vec![Some(0)], reads: true };
     let mut replay_plan = ReplayPlan::new(&survey, &selection);
     let mut cells = Cells::of(skin);
     cells.tell(&Message::Report, format, &mut comparator);
-    if !bus.state.is_fresh() {
+    if !bus.state.is_start_state() {
         let PlayerStep::Restore(states) = replay_plan.restore_step() else { unreachable!() };
         for message in &states[0].1 {
             if let Message::Joints { epoch, .. } = message {
@@ -206,7 +206,7 @@ fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[LatchedFrame]
             cells.tell(message, format, &mut comparator);
         }
     }
-    comparator.mute(false);
+    comparator.set_muted(false);
     for seen in part {
         let _ = replay_plan.add_frame(&record(seen), &mut comparator);
     }
@@ -244,7 +244,7 @@ fn a_recording_that_is_split_anywhere_replays_from_there() {
             whole.tally().has_only_equal_replies(),
             "seed {seed}: {:#?} {:#?}",
             whole.tally(),
-            whole.first()
+            whole.first_difference()
         );
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         for _ in 0..12 {
@@ -252,13 +252,13 @@ fn a_recording_that_is_split_anywhere_replays_from_there() {
             let to = rng.random_range(from + 40..=seen.len());
             let part = &seen[from..to];
             let comparator = replayed(&skin, &before, part);
-            let Tally { lacking, .. } = *comparator.tally();
+            let ReplyTally { lacking, .. } = *comparator.tally();
             assert!(
                 comparator.tally().has_only_equal_replies(),
                 "seed {seed}, {from} to {to} of {}: {:#?} {:#?}",
                 seen.len(),
                 comparator.tally(),
-                comparator.first()
+                comparator.first_difference()
             );
             // Each recorded torque is compared, or has a reason for not being compared.
             let apart = lacking.joints_earlier + lacking.joints_unrecorded + lacking.said_later;
@@ -289,7 +289,7 @@ fn where_nothing_was_lost_or_late_nothing_is_explained() {
             assert!(
                 tally.has_only_equal_replies(),
                 "seed {seed}, {from} to {to}: {tally:#?} {:#?}",
-                comparator.first()
+                comparator.first_difference()
             );
             let mut lacking = tally.lacking;
             assert!(
@@ -349,7 +349,7 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
                 let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
                 watch.receive(seen.at_nanos, BUS, message);
             }
-            watch.moments().unwrap().remove(0).unwrap()
+            watch.into_joints().unwrap().remove(0).unwrap()
         };
         let (from, before) = split(&seen, seen.len() / 2 + usize::try_from(seed).unwrap());
         let requested = |epoch| RequestedJoints { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };

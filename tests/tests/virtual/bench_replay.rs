@@ -17,7 +17,7 @@ use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
 use protocol::message::{Joints, Message, Request, SensorPage, SkinSensors, StimulusStart};
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Parameters};
 use protocol::skin::Skin;
@@ -53,8 +53,8 @@ fn tell(node: &mut Node, message: &Message) -> Vec<Message> {
         if node.poll_store().is_some() {
             node.handle_stored(true);
         }
-        let said =
-            core::iter::from_fn(|| node.poll_transmit()).map(|packet| Message::decode(&packet).unwrap());
+        let said = core::iter::from_fn(|| node.poll_transmit().copied())
+            .map(|packet| Message::decode(&packet).unwrap());
         answers.extend(said.filter(|said| !matches!(said, Message::Network { .. })));
     }
     answers
@@ -77,7 +77,10 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
                 let angle = |random: &mut Pcg64| Q1_14::from_bits(random.random());
                 Message::Joints {
                     epoch,
-                    joints: Joints { positions: padded(&[(); WORDS].map(|()| angle(random))), in_use: 6 },
+                    joints: Joints {
+                        positions: pad_with_defaults(&[(); WORDS].map(|()| angle(random))),
+                        in_use: 6,
+                    },
                 }
             }
             9..=14 => {
@@ -143,9 +146,9 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
         let (before, after) = script_of_recording.split_at(link_down);
         let (mut recorded, mut state) = (started(), LatchedState::default());
         for message in before {
-            state.apply(message);
+            state.apply_message(message);
             for answer in tell(&mut recorded, message) {
-                state.apply(&answer);
+                state.apply_message(&answer);
             }
         }
         let next = after.iter().find_map(|message| match message {

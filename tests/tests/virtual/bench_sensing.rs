@@ -14,7 +14,7 @@ use model::scenario::Scenario;
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, Request, SensorPage, SkinSensors};
-use protocol::packet::{Lengths, Packet, Reassembler, Reassembly, data_id};
+use protocol::packet::{Lengths, Packet, Reassembler, Reassembly, data_frame_id};
 use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -73,7 +73,7 @@ fn sensors_frames(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPa
     let packet = |frame| match format {
         Format::Fd => Packet::from_fd(frame).ok(),
         Format::Classic => {
-            let id = data_id(frame).ok()?;
+            let id = data_frame_id(frame).ok()?;
             match segments.entry(id).or_insert(Reassembler::NONE).push(
                 Micros(0),
                 id,

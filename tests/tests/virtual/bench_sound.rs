@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use model::scenario::Scenario;
-use model::table::{CellStatus, Event, Replies, Uplink};
+use model::table::{CellStatus, FrameEvent, Replies, UplinkCounts};
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::StimulusStart;
@@ -18,7 +18,7 @@ use skinbus_tests::skins;
 /// The documented mean error of a single torque, in Nm.
 const PROMISED_NM: f64 = 1.2e-4;
 
-fn totals(bench: &Bench) -> (Uplink, Replies) {
+fn totals(bench: &Bench) -> (UplinkCounts, Replies) {
     let cells = || bench.gateway.table.cells().iter();
     (cells().map(|cell| cell.uplink()).sum(), Replies::total(cells().map(|cell| cell.replies)))
 }
@@ -30,8 +30,8 @@ fn assert_flawless(bench: &Bench) {
     assert_eq!((uplink.sent, uplink.lost, uplink.surplus), (uplink.delivered, 0, 0), "{uplink:?}");
     assert_eq!((replies.in_time, replies.missing), (replies.due, 0), "{replies:?}");
     let counters = bench.gateway.table.counters();
-    for event in Event::ALL.into_iter().filter(|event| *event != Event::Saturated) {
-        assert_eq!(counters.events(event), 0, "{}", event.name());
+    for event in FrameEvent::ALL.into_iter().filter(|event| *event != FrameEvent::Saturated) {
+        assert_eq!(counters.event_count(event), 0, "{}", event.name());
     }
     assert_eq!(counters.epochs_complete, counters.epochs_due);
     assert_eq!(bench.gateway.notices, []);
@@ -129,7 +129,7 @@ fn the_253_cell_arm_runs_its_demo_without_a_flaw() {
     assert_accurate(&bench);
     let (uplink, replies) = totals(&bench);
     assert!(replies.due > 1_000 && uplink.sent > 253 * 40, "{replies:?} {uplink:?}");
-    let heartbeats = bench.gateway.table.counters().received(Kind::Network);
+    let heartbeats = bench.gateway.table.counters().received_count(Kind::Network);
     assert!(heartbeats > 253 * 4 * 12, "{heartbeats}");
 }
 
@@ -152,7 +152,7 @@ fn cells_answer_in_a_few_microseconds_of_virtual_time() {
     (0..4).for_each(|place| bench.press(place, 1.0));
     bench.run_epochs(50);
     bench.finish();
-    let last = bench.gateway.table.delays().last_replies();
+    let last = bench.gateway.table.delays().last_reply_delays();
     assert!(last.len() > 49 && last.max() < 500, "{} {}", last.len(), last.max());
     assert_eq!(bench.epoch(), Span(16_000));
 }

@@ -6,7 +6,7 @@
 
 use std::path::Path;
 
-use paper::tree::{EpochResult, SumTree};
+use paper::tree::{EpochSums, SumTree};
 use protocol::fixed::Q5_10;
 use protocol::message::SkinSensors;
 use protocol::parameters::MAX_JOINTS;
@@ -30,7 +30,7 @@ fn tree(carry: bool) -> SumTree {
 }
 
 /// Runs one epoch, whose sum contains every touched cell.
-fn turn(tree: &mut SumTree, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochResult {
+fn turn(tree: &mut SumTree, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochSums {
     let came = tree.run_epoch(q, touch);
     assert_eq!(came.count, touch.len());
     came

@@ -40,7 +40,7 @@ fn the_torque_of_a_cell_follows_the_points_of_a_profile() {
         let since = f64::from(*epoch) / 62.5 - 0.32;
         let force = force_at(since).unwrap_or(0.0);
         pressed += usize::from(force > 0.0);
-        for (word, expected) in words.iter().zip(central.torque(5, &frames, force)) {
+        for (word, expected) in words.iter().zip(central.cell_torque(5, &frames, force)) {
             let got = Q3_12::from_bits(*word).to_f64();
             assert!((got - expected).abs() < 0.002, "epoch {epoch}, {force} N: {got} {expected}");
         }

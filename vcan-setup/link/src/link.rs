@@ -16,7 +16,7 @@ use vcan_setup::hosts::incoming::{HostsToBusQueue, MAX_SOURCES, SourceAccount};
 use vcan_setup::hosts::message::StampedFrame;
 use vcan_setup::hosts::outgoing::{BusAccount, BusToHostsQueue};
 use vcan_setup::hosts::report::{HostReport, LinkReport, listen};
-use vcan_setup::hosts::returned::CircleDetector;
+use vcan_setup::hosts::returned::ReturnedFrameDetector;
 use zenoh::bytes::ZBytes;
 use zenoh::key_expr::KeyExpr;
 use zenoh::pubsub::Publisher;
@@ -79,7 +79,7 @@ pub(crate) struct HostLink {
     declared: Vec<Box<dyn Send>>,
     bus: Option<Bus>,
     outgoing: BusToHostsQueue,
-    returned: CircleDetector,
+    returned: ReturnedFrameDetector,
     began: Instant,
     missed_before: u64,
     there: BTreeSet<String>,
@@ -141,7 +141,7 @@ impl HostLink {
             declared: Vec::new(),
             bus: Some(bus),
             outgoing: BusToHostsQueue::new(life()),
-            returned: CircleDetector::default(),
+            returned: ReturnedFrameDetector::default(),
             began: Instant::now(),
             missed_before: 0,
             there: BTreeSet::new(),
@@ -158,7 +158,7 @@ impl HostLink {
         let LinkSettings { bus, host, .. } = self.settings.clone();
         let shared = Arc::clone(&self.shared);
         self.subscribe(FRAMES, tell.clone(), move |from, bytes| {
-            shared.incoming().receive(from, bytes).map_err(|error| error.to_string())
+            shared.incoming().receive_message(from, bytes).map_err(|error| error.to_string())
         })?;
         let (shared, this) = (Arc::clone(&self.shared), host.clone());
         self.subscribe(HEARD, tell.clone(), move |from, bytes| {
@@ -247,16 +247,16 @@ impl HostLink {
             let lost = self.read(&mut inbox).and_then(|()| self.write());
             if let Err(error) = lost {
                 self.bus = None;
-                self.missed_before += u64::from(inbox.dropped());
+                self.missed_before += u64::from(inbox.dropped_count());
                 inbox = Inbox::new();
                 report(LinkEvent::BusAway(error.to_string()));
             }
             self.publish(&mut bytes);
             self.note_events(&mut report);
-            if self.returned.count() > 0 && warned.insert(None) {
+            if self.returned.returned_frame_count() > 0 && warned.insert(None) {
                 report(LinkEvent::Circle);
             }
-            let shared: Vec<_> = self.shared.incoming().shared_names().map(str::to_owned).collect();
+            let shared: Vec<_> = self.shared.incoming().shared_host_names().map(str::to_owned).collect();
             for host in shared {
                 if warned.insert(Some(host.clone())) {
                     report(LinkEvent::SameName(host));
@@ -324,7 +324,7 @@ impl HostLink {
                 let at_nanos = if received.at_nanos == 0 { wall() } else { received.at_nanos };
                 self.outgoing.push(StampedFrame { at_nanos, frame: received.frame });
             }
-            self.outgoing.set_missed(self.missed_before + u64::from(inbox.dropped()));
+            self.outgoing.set_missed_count(self.missed_before + u64::from(inbox.dropped_count()));
             if count == 0 {
                 break;
             }
@@ -339,11 +339,17 @@ impl HostLink {
         let mut incoming = self.shared.incoming();
         while !incoming.waiting_frames().is_empty() {
             let returned = &mut self.returned;
-            let copies =
-                incoming.waiting_frames().iter().take_while(|frame| returned.is_copy(now, frame)).count();
+            let copies = incoming
+                .waiting_frames()
+                .iter()
+                .take_while(|frame| returned.is_circled_copy(now, frame))
+                .count();
             incoming.remove_copies(copies);
-            let frames =
-                incoming.waiting_frames().iter().take_while(|frame| !returned.is_copy(now, frame)).count();
+            let frames = incoming
+                .waiting_frames()
+                .iter()
+                .take_while(|frame| !returned.is_circled_copy(now, frame))
+                .count();
             let sent = bus.send(incoming.waiting_frames().get(..frames).unwrap_or_default());
             let count = sent.as_ref().map_or_else(|error| error.sent, |()| frames);
             for frame in incoming.waiting_frames().iter().take(count) {
@@ -412,7 +418,8 @@ impl HostLink {
     fn losses(&self) -> (u64, u64) {
         let BusAccount { dropped, missed, .. } = self.outgoing.account();
         let incoming = self.shared.incoming();
-        let of_others = incoming.accounts().map(|(_, heard, _)| heard.missing()).fold(0, u64::saturating_add);
+        let of_others =
+            incoming.accounts().map(|(_, heard, _)| heard.missing_frame_count()).fold(0, u64::saturating_add);
         (dropped + missed, of_others)
     }
 
@@ -436,7 +443,7 @@ impl HostLink {
             host: self.settings.host.clone(),
             sent: self.outgoing.account(),
             hosts,
-            returned: self.returned.count(),
+            returned: self.returned.returned_frame_count(),
             unknown_hosts: incoming.unknown_hosts(),
         }
     }

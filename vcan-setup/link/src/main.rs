@@ -28,13 +28,14 @@ struct Arguments {
 }
 
 fn main() -> ExitCode {
-    let done = program::check_caller().map_err(Failure::run).and_then(|()| match Arguments::try_parse() {
-        Ok(arguments) => run(arguments.options),
-        // The user requested help or the version; clap prints them.
-        Err(queried) if !queried.use_stderr() => queried.exit(),
-        Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => Err(Failure::usage(one_line_error(&wrong.render().to_string()))),
-    });
+    let done =
+        program::check_caller().map_err(Failure::run_error).and_then(|()| match Arguments::try_parse() {
+            Ok(arguments) => run(arguments.options),
+            // The user requested help or the version; clap prints them.
+            Err(queried) if !queried.use_stderr() => queried.exit(),
+            Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
+            Err(wrong) => Err(Failure::usage_error(one_line_error(&wrong.render().to_string()))),
+        });
     exit_code("vcan-setup", done)
 }
 
@@ -55,8 +56,9 @@ fn run(options: LinkOptions) -> Result<(), Failure> {
         connect: options.connect,
         listen: options.listen,
     };
-    let link = HostLink::open(settings)
-        .map_err(|error| if error.is_usage() { Failure::usage(error) } else { Failure::run(error) })?;
+    let link = HostLink::open(settings).map_err(|error| {
+        if error.is_usage() { Failure::usage_error(error) } else { Failure::run_error(error) }
+    })?;
     let ready = format!("{} ({}) is linked as '{host}'", options.bus, link.kind());
     if options.json {
         print_to_stderr(&ready)
@@ -65,12 +67,12 @@ fn run(options: LinkOptions) -> Result<(), Failure> {
     }
     let report = link
         .run(stopped, |event| print_to_stderr(&format!("{}: {event}", options.bus)))
-        .map_err(Failure::run)?;
+        .map_err(Failure::run_error)?;
     print_text(&if options.json { json(&report)? } else { text(&report) })
 }
 
 fn json(report: &LinkReport) -> Result<String, Failure> {
-    serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run)
+    serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run_error)
 }
 
 fn text(report: &LinkReport) -> String {
@@ -99,7 +101,7 @@ fn text(report: &LinkReport) -> String {
 }
 
 fn no_signals(error: std::io::Error) -> Failure {
-    Failure::run(format!("cannot catch signals: {error}"))
+    Failure::run_error(format!("cannot catch signals: {error}"))
 }
 
 fn print_to_stderr(text: &str) {

@@ -6,10 +6,10 @@ use clap::Args;
 use protocol::bus::{BusKind, KindChoice, has_socketcan};
 use protocol::usage::{Failure, print_text};
 use serde::Serialize;
-use vcan_setup::doctor::{BusFacts, Finding, FindingLevel, MachineFacts, assess, would_run};
+use vcan_setup::doctor::{BusFacts, Finding, FindingLevel, MachineFacts, assess_machine, would_bench_run};
 use vcan_setup::look;
 
-use super::{buses_from_arguments, json, query_interfaces};
+use super::{buses_from_arguments, query_interfaces, to_json};
 
 /// Check whether a bench would run on this machine, with a hint for each fault
 ///
@@ -50,11 +50,11 @@ impl DoctorOptions {
             target.adopt_hardware_format(&present);
         }
         let facts = look::collect_facts(buses, self.bus_kind, self.no_spawn, &present);
-        let findings = assess(&facts);
-        let runs = would_run(&findings);
+        let findings = assess_machine(&facts);
+        let runs = would_bench_run(&findings);
         if self.json {
             let bus_kind = facts.bus_kind().name();
-            print_text(&json(&DoctorReport { would_run: runs, bus_kind, findings: &findings })?)?;
+            print_text(&to_json(&DoctorReport { would_run: runs, bus_kind, findings: &findings })?)?;
         } else {
             print_text(&format_findings(&facts, &findings, runs))?;
         }

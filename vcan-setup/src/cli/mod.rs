@@ -63,7 +63,7 @@ impl Command {
             Self::Serve(command) => command.run(),
             Self::Slcan(command) => command.run(),
             // The first two arguments are the names of this program and of the command.
-            Self::Link(_) => Err(Failure::run(program::run(std::env::args_os().skip(2)))),
+            Self::Link(_) => Err(Failure::run_error(program::exec_link_program(std::env::args_os().skip(2)))),
         }
     }
 }
@@ -75,14 +75,14 @@ pub(crate) fn main() -> ExitCode {
         // The user requested help or the version; clap prints them.
         Err(queried) if !queried.use_stderr() => queried.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => Err(Failure::usage(one_line_error(&wrong.render().to_string()))),
+        Err(wrong) => Err(Failure::usage_error(one_line_error(&wrong.render().to_string()))),
     };
     exit_code("vcan-setup", done)
 }
 
 /// Formats the output of `--json`.
-fn json(report: &impl Serialize) -> Result<String, Failure> {
-    serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run)
+fn to_json(report: &impl Serialize) -> Result<String, Failure> {
+    serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run_error)
 }
 
 /// Parses the name of a bus.
@@ -99,13 +99,13 @@ enum BusArgument {
 fn parse_argument(word: &OsStr) -> Result<BusArgument, Failure> {
     let bytes = word.as_encoded_bytes();
     if bytes.ends_with(b".toml") || bytes.contains(&b'/') {
-        let skin = Skin::read(Path::new(word)).map_err(Failure::usage)?;
+        let skin = Skin::read(Path::new(word)).map_err(Failure::usage_error)?;
         return Ok(BusArgument::File(Box::new(skin)));
     }
     let name = word.to_str().ok_or_else(|| {
-        Failure::usage(format!("{} is not a bus name: it is not UTF-8", shell_quoted_os(word)))
+        Failure::usage_error(format!("{} is not a bus name: it is not UTF-8", shell_quoted_os(word)))
     })?;
-    parse_bus_name(name).map(BusArgument::Name).map_err(Failure::usage)
+    parse_bus_name(name).map(BusArgument::Name).map_err(Failure::usage_error)
 }
 
 /// Returns the buses that positional arguments name, directly or by a skin.
@@ -137,5 +137,5 @@ fn query_interfaces() -> Result<(Netlink, Vec<Interface>), Failure> {
 }
 
 fn query_error(error: io::Error) -> Failure {
-    Failure::run(format!("cannot query the interfaces of the kernel: {error}"))
+    Failure::run_error(format!("cannot query the interfaces of the kernel: {error}"))
 }

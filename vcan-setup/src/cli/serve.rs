@@ -34,12 +34,12 @@ pub(crate) struct ServeBusOptions {
 
 impl ServeBusOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        serve(&self.name, self.until_eof).map_err(|error| Failure::run(with_causes(&error)))
+        serve(&self.name, self.until_eof).map_err(|error| Failure::run_error(format_with_causes(&error)))
     }
 }
 
 /// Formats an error with its causes. A cause whose text is already contained in the error is left out.
-fn with_causes(error: &anyhow::Error) -> String {
+fn format_with_causes(error: &anyhow::Error) -> String {
     error.chain().skip(1).fold(error.to_string(), |text, cause| match cause.to_string() {
         cause if text.contains(&cause) => text,
         cause => format!("{text}: {cause}"),

@@ -10,10 +10,10 @@ use protocol::usage::{Failure, print_text};
 use protocol::wire_time::BitRates;
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
-use vcan_setup::slcan::options::{ALLOWED_SETTLE, settle_time};
+use vcan_setup::slcan::options::{ALLOWED_SETTLE_TIMES, parse_settle_time};
 use vcan_setup::slcan::{Bridge, BridgeError, BridgeSettings, LineAccount, LineOptions};
 
-use super::{json, parse_bus_name};
+use super::{parse_bus_name, to_json};
 
 /// Connect serial lines with the slcan protocol to a bus, until SIGINT or SIGTERM
 ///
@@ -67,7 +67,7 @@ fn parse_cell_id(word: &str) -> Result<CellId, String> {
 }
 
 fn parse_settle(word: &str) -> Result<Duration, String> {
-    settle_time(word).ok_or_else(|| ALLOWED_SETTLE.to_owned())
+    parse_settle_time(word).ok_or_else(|| ALLOWED_SETTLE_TIMES.to_owned())
 }
 
 #[derive(Serialize)]
@@ -79,7 +79,7 @@ struct SlcanReport<'a> {
 
 impl SlcanOptions {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let lines = self.lines()?;
+        let lines = self.line_options()?;
         let (stop, stopped) = UnixStream::pair().map_err(signal_error)?;
         for signal in [SIGINT, SIGTERM] {
             let stop = stop.try_clone().map_err(signal_error)?;
@@ -89,7 +89,11 @@ impl SlcanOptions {
             BridgeSettings { bus: self.bus.clone(), choice: self.bus_kind, directory: None, wait: self.wait };
         let count = lines.len();
         let bridge = Bridge::open(settings, lines).map_err(|error| {
-            if matches!(error, BridgeError::Twice(_)) { Failure::usage(error) } else { Failure::run(error) }
+            if matches!(error, BridgeError::Twice(_)) {
+                Failure::usage_error(error)
+            } else {
+                Failure::run_error(error)
+            }
         })?;
         let (bus, kind, away) = (&self.bus, bridge.kind(), bridge.unavailable_lines());
         let noun = if count == 1 { "line" } else { "lines" };
@@ -104,18 +108,18 @@ impl SlcanOptions {
             print_text(&format!("{ready}\n"))?
         }
         let accounts = bridge.run(stopped, |line, event| print_to_stderr(&format!("{line}: {event}")));
-        let accounts = accounts.map_err(Failure::run)?;
+        let accounts = accounts.map_err(Failure::run_error)?;
         if self.json {
-            return print_text(&json(&SlcanReport { bus, bus_kind: kind.name(), lines: &accounts })?);
+            return print_text(&to_json(&SlcanReport { bus, bus_kind: kind.name(), lines: &accounts })?);
         }
         print_text(&accounts.iter().map(|account| format!("{account}\n")).collect::<String>())
     }
 
     /// Returns the lines of the command line. The general options are added to those of each line.
-    fn lines(&self) -> Result<Vec<LineOptions>, Failure> {
+    fn line_options(&self) -> Result<Vec<LineOptions>, Failure> {
         let mut lines = self.lines.clone();
         if !self.cell.is_empty() && self.cell.len() != lines.len() {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "{} --cell for {} lines: give one for each line, or write /dev/ttyACM0,cell=12",
                 self.cell.len(),
                 lines.len()
@@ -130,7 +134,7 @@ impl SlcanOptions {
             line.settle = if line.settle.is_zero() { self.settle.unwrap_or_default() } else { line.settle };
             if let Some(rates) = self.bit_rates.filter(|_| line.bit_rates.is_none()) {
                 line.set_bit_rates(rates)
-                    .map_err(|error| Failure::usage(format!("--bit-rates {rates}: {error}")))?;
+                    .map_err(|error| Failure::usage_error(format!("--bit-rates {rates}: {error}")))?;
             }
         }
         Ok(lines)
@@ -138,7 +142,7 @@ impl SlcanOptions {
 }
 
 fn signal_error(error: std::io::Error) -> Failure {
-    Failure::run(format!("cannot catch signals: {error}"))
+    Failure::run_error(format!("cannot catch signals: {error}"))
 }
 
 fn print_to_stderr(text: &str) {

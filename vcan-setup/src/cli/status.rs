@@ -15,7 +15,7 @@ use vcan_setup::link::{
 };
 use vcan_setup::look::{EmbeddedBus, embedded_buses};
 
-use super::{json, query_interfaces, targets_from_arguments};
+use super::{query_interfaces, targets_from_arguments, to_json};
 
 /// The time within which a link must answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
@@ -51,8 +51,8 @@ impl StatusOptions {
         let links = query_link_reports(kernel.chain(user));
         let text = match (self.json, interfaces.is_empty() && embedded.is_empty()) {
             (true, _) => {
-                let interfaces = interfaces.iter().map(|interface| report(interface)).collect();
-                json(&StatusReport { interfaces, embedded: &embedded, links: &links })?
+                let interfaces = interfaces.iter().map(|interface| interface_report(interface)).collect();
+                to_json(&StatusReport { interfaces, embedded: &embedded, links: &links })?
             }
             (false, false) => format_table(&interfaces, &embedded) + &format_link_reports(&links),
             (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
@@ -70,7 +70,7 @@ impl StatusOptions {
         }
         let (names, words) = (absent.join(", "), absent.join(" "));
         let first = absent.first().unwrap_or(&"vcan0");
-        Err(Failure::run(format!(
+        Err(Failure::run_error(format!(
             "not found: {names}; `vcan-setup serve {first}` serves an embedded bus, `vcan-setup doctor {words}` shows what \
              an interface needs"
         )))
@@ -82,7 +82,8 @@ fn query_link_reports<'a>(
     buses: impl Iterator<Item = (&'a str, BusKind)>,
 ) -> BTreeMap<&'a str, hosts::LinkReport> {
     let report = |(bus, kind)| {
-        let report = hosts::ReportReader::connect(bus, kind, None).and_then(|mut it| it.wait(ANSWER_TIMEOUT));
+        let report = hosts::ReportReader::connect(bus, kind, None)
+            .and_then(|mut it| it.wait_for_report(ANSWER_TIMEOUT));
         Some((bus, report.ok()?))
     };
     buses.filter_map(report).collect()
@@ -109,7 +110,7 @@ fn format_table(interfaces: &[&Interface], embedded: &[EmbeddedBus]) -> String {
     table.set_header(["bus", "kind", "made by", "state", "frames", "bit rates"].into_iter().chain(right));
     for interface in interfaces {
         let InterfaceCounters { received, sent, dropped, errors } = interface.counters;
-        let (made_by, frames) = (made_by(interface).to_owned(), frame_format_text(interface));
+        let (made_by, frames) = (creator_name(interface).to_owned(), frame_format_text(interface));
         let words = [
             interface.name.clone(),
             kind_text(interface),
@@ -153,7 +154,7 @@ fn kind_text(interface: &Interface) -> String {
     }
 }
 
-const fn made_by(interface: &Interface) -> &'static str {
+const fn creator_name(interface: &Interface) -> &'static str {
     match (interface.ours, interface.is_virtual()) {
         (true, true) => "skinbus",
         (false, true) => "others",
@@ -218,7 +219,7 @@ struct InterfaceReport<'a> {
     counters: InterfaceCounters,
 }
 
-fn report(interface: &Interface) -> InterfaceReport<'_> {
+fn interface_report(interface: &Interface) -> InterfaceReport<'_> {
     let Interface { index, ref name, ref kind, ours, up, mtu, counters } = *interface;
     InterfaceReport {
         name,

@@ -81,10 +81,10 @@ impl UpOptions {
 
     fn make_pair(&self, peer: &str) -> Result<(), Failure> {
         let [given] = self.what.as_slice() else {
-            return Err(Failure::usage("--peer makes one pair: give one NAME with it"));
+            return Err(Failure::usage_error("--peer makes one pair: give one NAME with it"));
         };
         let BusArgument::Name(name) = parse_argument(given)? else {
-            return Err(Failure::usage(format!(
+            return Err(Failure::usage_error(format!(
                 "--peer needs the NAME of an interface, but {} is a skin",
                 shell_quoted_os(given)
             )));
@@ -118,9 +118,9 @@ impl DownOptions {
 
 /// Checks that a name is allowed by the kernel, and needs no quotes in a shell.
 fn check_plain_name(name: &str) -> Result<(), Failure> {
-    super::parse_bus_name(name).map_err(Failure::usage)?;
+    super::parse_bus_name(name).map_err(Failure::usage_error)?;
     if !is_plain_name(name) || name.starts_with(['-', '.']) {
-        return Err(Failure::usage(format!(
+        return Err(Failure::usage_error(format!(
             "{name:?} is not allowed as a name of an interface: use letters, digits, '-', '_' and '.', as in vcan0"
         )));
     }
@@ -134,7 +134,7 @@ fn open_namespace(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Fa
     let denied = |error: &NamespaceError| matches!(error, NamespaceError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied);
     let file = namespace
         .open()
-        .map_err(|error| if denied(&error) { not_allowed() } else { Failure::usage(error) })?;
+        .map_err(|error| if denied(&error) { not_allowed() } else { Failure::usage_error(error) })?;
     let same = |file: &File| {
         let (there, here) = (file.metadata()?, std::fs::metadata("/proc/thread-self/ns/net")?);
         Ok::<_, io::Error>((there.dev(), there.ino()) == (here.dev(), here.ino()))
@@ -146,11 +146,11 @@ fn open_namespace(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Fa
         let path = namespace.path();
         match Errno::from_io_error(&error) {
             Some(Errno::PERM) => not_allowed(),
-            Some(Errno::INVAL) => Failure::usage(format!(
+            Some(Errno::INVAL) => Failure::usage_error(format!(
                 "{} is not a network namespace: name one that `ip netns` lists, a process, or a file like /proc/1/ns/net",
                 path.display()
             )),
-            _ => Failure::run(format!("cannot enter the network namespace {}: {error}", path.display())),
+            _ => Failure::run_error(format!("cannot enter the network namespace {}: {error}", path.display())),
         }
     })?;
     Ok(Some((namespace, file, inside)))
@@ -158,7 +158,7 @@ fn open_namespace(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Fa
 
 fn permission_error(what: &str) -> Failure {
     if rustix::process::geteuid().is_root() {
-        return Failure::run(format!(
+        return Failure::run_error(format!(
             "not allowed to {what}: root has no CAP_NET_ADMIN here; in a container, start the container with `--cap-add \
              NET_ADMIN`"
         ));
@@ -167,7 +167,7 @@ fn permission_error(what: &str) -> Failure {
         .chain(std::env::args_os().skip(1).map(|word| shell_quoted_os(&word)))
         .collect();
     let again = again.join(" ");
-    Failure::run(format!("not allowed to {what}, which needs root: `sudo {again}`"))
+    Failure::run_error(format!("not allowed to {what}, which needs root: `sudo {again}`"))
 }
 
 /// Executes the steps of a plan, or prints them.
@@ -196,10 +196,10 @@ impl PlanRunner<'_> {
         let mut undo = Vec::new();
         for step in &plan.steps {
             let there = self.there.as_mut().map(|(file, inside)| (*file, &mut **inside));
-            match self.netlink.execute(step, there) {
+            match self.netlink.execute_step(step, there) {
                 Ok(done) => undo.extend(done),
                 Err(error) => {
-                    let mut failure = explain(step, &error);
+                    let mut failure = explain_step_failure(step, &error);
                     for done in undo.iter().rev() {
                         if let Err(error) = self.netlink.undo(done) {
                             failure =
@@ -216,7 +216,7 @@ impl PlanRunner<'_> {
 }
 
 /// Returns an error that explains why a step failed and how to fix the cause.
-fn explain(step: &Step, error: &io::Error) -> Failure {
+fn explain_step_failure(step: &Step, error: &io::Error) -> Failure {
     let kind = match step.action {
         StepAction::MakeVcan => Some("vcan"),
         StepAction::MakePair { .. } => Some("vxcan"),
@@ -227,7 +227,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
     };
     let doing = step.short_description();
     let unknown = |kind: &str, kernel: &Kernel| {
-        let hints = kernel.hints(kernel.module(kind));
+        let hints = kernel.setup_hints(kernel.module_state(kind));
         let nearest = hints.first().map_or("", String::as_str);
         // A hint consists of a command and a comment.
         let (command, why) = nearest.split_once("# ").unwrap_or((nearest, ""));
@@ -238,32 +238,32 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
             (false, why) => format!(" ({why})"),
         };
         let release = &kernel.release;
-        Failure::run(format!(
+        Failure::run_error(format!(
             "cannot {doing}: the kernel ({release}) has no {kind}: {command}{why}; or use the embedded bus, which does \
              not need it"
         ))
     };
     let data = if let StepAction::SetRates { rates, .. } = step.action { rates.data_bitrate } else { None };
     match (Errno::from_io_error(error), kind) {
-        (Some(Errno::OPNOTSUPP), None) if data.is_some() => Failure::run(format!(
+        (Some(Errno::OPNOTSUPP), None) if data.is_some() => Failure::run_error(format!(
             "cannot {doing}: this hardware has no CAN FD; give the bus format = \"classic\", without data_bitrate"
         )),
         (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::detect()),
         (Some(Errno::PERM | Errno::ACCESS), kind) => {
             // This error does not depend on permissions: root would get it too.
             let kernel = Kernel::detect();
-            let missing = kind.filter(|kind| kernel.module(kind) == ModuleState::Missing);
+            let missing = kind.filter(|kind| kernel.module_state(kind) == ModuleState::Missing);
             missing.map_or_else(|| permission_error(&doing), |kind| unknown(kind, &kernel))
         }
         (Some(Errno::OPNOTSUPP), None) => {
-            Failure::run(format!("cannot {doing}: this hardware does not support it ({error})"))
+            Failure::run_error(format!("cannot {doing}: this hardware does not support it ({error})"))
         }
         (Some(Errno::INVAL), None) => {
-            Failure::run(format!("cannot {doing}: its driver rejects these settings ({error})"))
+            Failure::run_error(format!("cannot {doing}: its driver rejects these settings ({error})"))
         }
-        (Some(Errno::EXIST), Some(_)) => Failure::run(format!(
+        (Some(Errno::EXIST), Some(_)) => Failure::run_error(format!(
             "cannot {doing}: another interface now has this name or altname; `ip link show` lists them"
         )),
-        _ => Failure::run(format!("cannot {doing}: {error}")),
+        _ => Failure::run_error(format!("cannot {doing}: {error}")),
     }
 }

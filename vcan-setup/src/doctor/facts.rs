@@ -12,7 +12,7 @@ use crate::kernel::Kernel;
 use crate::link::Interface;
 use crate::plan::InterfaceTarget;
 
-/// The facts about a machine and its buses that [`assess`](super::assess) needs.
+/// The facts about a machine and its buses that [`assess`](super::assess_machine) needs.
 #[derive(Clone, Debug)]
 pub struct MachineFacts {
     /// The kind of bus that the user requested.

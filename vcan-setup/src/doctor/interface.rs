@@ -3,7 +3,7 @@
 use protocol::bus::KindChoice;
 use protocol::can::Format;
 
-use super::{BusFacts, Finding, MachineFacts, User, would_run};
+use super::{BusFacts, Finding, MachineFacts, User, would_bench_run};
 use crate::kernel::ModuleState;
 use crate::link::{CanHardware, ControllerState, FD_MTU, Interface, InterfaceKind};
 use crate::plan::set_fd_mtu_command;
@@ -16,20 +16,20 @@ impl MachineFacts {
         if self.buses.iter().find(missing).is_none() && !(self.buses.is_empty() && self.present.is_empty()) {
             return findings;
         }
-        let hints = self.kernel.hints(self.kernel.vcan);
+        let hints = self.kernel.setup_hints(self.kernel.vcan);
         findings.extend(match self.kernel.vcan {
             ModuleState::Available => None,
             ModuleState::Unknown => {
                 let text = "cannot see whether the kernel has vcan; if it has none:";
-                Some(Finding::note(text).hints(hints))
+                Some(Finding::note(text).with_hints(hints))
             }
             ModuleState::Loadable => {
                 let text = "the kernel's module vcan is not loaded; making an interface loads it";
-                Some(Finding::note(text).hint(self.with_sudo("modprobe vcan")))
+                Some(Finding::note(text).with_hint(self.with_sudo("modprobe vcan")))
             }
             ModuleState::Missing => {
                 let text = format!("the kernel ({}) has CAN but no vcan", self.kernel.release);
-                Some(Finding::fault(text).hints(hints))
+                Some(Finding::fault(text).with_hints(hints))
             }
         });
         findings.extend(match self.user {
@@ -41,7 +41,9 @@ impl MachineFacts {
                 Finding::fault(
                     "root may not make interfaces here: it has no CAP_NET_ADMIN, as in most containers",
                 )
-                .hint("docker run --cap-add NET_ADMIN ...  # or make the interface outside, in this network"),
+                .with_hint(
+                    "docker run --cap-add NET_ADMIN ...  # or make the interface outside, in this network",
+                ),
             ),
         });
         findings
@@ -57,7 +59,7 @@ impl MachineFacts {
             Some(Interface { name, mtu, .. }) => {
                 Finding::ok(format!("{name} is up and carries {}", carried_format(*mtu)))
             }
-            None => Finding::fault("no CAN interface is up").hint(self.own_command("up vcan0")),
+            None => Finding::fault("no CAN interface is up").with_hint(self.vcan_setup_command("up vcan0")),
         })
     }
 
@@ -72,13 +74,13 @@ impl MachineFacts {
             (false, _) => Finding::note(format!(
                 "there is no interface {name}: a run that starts its cells makes an embedded bus; for SocketCAN:"
             ))
-            .hint(up),
+            .with_hint(up),
             (true, true) => Finding::ok(format!("there is no interface {name}, and an embedded bus is served")),
             (true, false) => Finding::fault(format!(
                 "there is no interface {name}, and no embedded bus of this name is served"
             ))
-            .hint(up)
-            .hint(format!("{} serve {name} &", self.program)),
+            .with_hint(up)
+            .with_hint(format!("{} serve {name} &", self.program)),
         })
     }
 
@@ -93,32 +95,35 @@ impl MachineFacts {
             let (text, up) = (format!("there is no interface {name}"), self.up_command(&bus.target));
             return vec![if bus.target.hardware().is_some() {
                 Finding::fault(text + ", and the skin gives it a bitrate, so it is hardware")
-                    .hint("# plug it in and load its driver; `vcan-setup status` shows when it is there")
-                    .hint(up + "  # once bitrate is taken out of the skin: a vcan")
+                    .with_hint("# plug it in and load its driver; `vcan-setup status` shows when it is there")
+                    .with_hint(up + "  # once bitrate is taken out of the skin: a vcan")
             } else {
-                Finding::fault(text).hint(up)
+                Finding::fault(text).with_hint(up)
             }];
         };
         let mut findings = match &interface.kind {
             InterfaceKind::Other(what) => {
                 let text = format!("{name} is {what}, which carries no CAN");
-                return vec![Finding::fault(text).hint("# name another bus")];
+                return vec![Finding::fault(text).with_hint("# name another bus")];
             }
             InterfaceKind::Vcan | InterfaceKind::Vxcan(_) => self.virtual_faults(bus, interface),
             InterfaceKind::Hardware(hardware) => self.hardware_faults(bus, interface, hardware),
         };
-        if would_run(&findings) {
+        if would_bench_run(&findings) {
             let what = interface.description();
             let text = format!("{name} is {what}, up, and carries {}", carried_format(interface.mtu));
             findings.insert(0, Finding::ok(text));
             if interface.is_virtual() && bus.target.hardware().is_some() {
-                let command =
-                    if interface.ours { self.own_command("down") } else { self.with_sudo("ip link del") };
+                let command = if interface.ours {
+                    self.vcan_setup_command("down")
+                } else {
+                    self.with_sudo("ip link del")
+                };
                 let text = format!(
                     "{name} is {what} and has no bit rate; the skin gives it one, as if it were hardware"
                 );
                 let hint = format!("{command} {name}  # if hardware is to have this name");
-                findings.push(Finding::note(text).hint(hint));
+                findings.push(Finding::note(text).with_hint(hint));
             }
             findings.extend(self.check_traffic(bus, name));
         }
@@ -131,13 +136,13 @@ impl MachineFacts {
             let command = if self.user.admin { command } else { format!("sudo sh -c '{command}'") };
             if *ours { self.up_command(&bus.target) } else { command }
         };
-        if !bus.target.carried_by(*mtu) {
+        if !bus.target.fits_mtu(*mtu) {
             let text = format!("{name} has MTU {mtu} and CAN FD needs {FD_MTU}");
-            return vec![Finding::fault(text).hint(repair(set_fd_mtu_command("ip", name)))];
+            return vec![Finding::fault(text).with_hint(repair(set_fd_mtu_command("ip", name)))];
         }
         if !up {
             let hint = repair(format!("ip link set {name} up"));
-            return vec![Finding::fault(format!("{name} is down")).hint(hint)];
+            return vec![Finding::fault(format!("{name} is down")).with_hint(hint)];
         }
         Vec::new()
     }
@@ -148,7 +153,7 @@ impl MachineFacts {
         let skin = bus.target.skin.as_ref();
         // The command that sets the bit rates can be given only if the skin has them.
         let set = || match bus.target.hardware() {
-            Some(skin) => self.own_command(&format!("up {} --set-bit-rates", skin.file)),
+            Some(skin) => self.vcan_setup_command(&format!("up {} --set-bit-rates", skin.file)),
             None => {
                 let rates = match bus.target.format {
                     Format::Fd => "bitrate 1000000 dbitrate 5000000 fd on",
@@ -160,16 +165,16 @@ impl MachineFacts {
             }
         };
         let mut findings = Vec::new();
-        let has = hardware.rates();
+        let has = hardware.bit_rates();
         if let Some(skin) = skin.filter(|skin| !has.matches(skin.rates)) {
             let text = format!("{name} is {what} with {has}, but the skin requires {}", skin.rates);
-            findings.push(Finding::fault(text).hint(set()));
-        } else if !bus.target.carried_by(*mtu) {
+            findings.push(Finding::fault(text).with_hint(set()));
+        } else if !bus.target.fits_mtu(*mtu) {
             let text = format!("{name} is {what} with MTU {mtu}, and CAN FD needs {FD_MTU}");
             let classic = "format = \"classic\"  # in the skin";
-            findings.push(Finding::fault(text).hint(set()).hint(classic));
+            findings.push(Finding::fault(text).with_hint(set()).with_hint(classic));
         } else if !up {
-            findings.push(Finding::fault(format!("{name} is {what}, and down")).hint(set()));
+            findings.push(Finding::fault(format!("{name} is {what}, and down")).with_hint(set()));
         }
         if bus.sums {
             let text = format!(
@@ -177,14 +182,14 @@ impl MachineFacts {
                  not be sent there"
             );
             let hint = "reply = \"torque\"  # in the skin; or name a vcan or the embedded bus";
-            findings.push(Finding::fault(text).hint(hint));
+            findings.push(Finding::fault(text).with_hint(hint));
         }
         if hardware.listen_only {
             let off = "type can listen-only off";
             let hint =
                 self.with_sudo(&format!("sh -c 'ip link set {name} down; ip link set {name} up {off}'"));
             let text = format!("{name} only listens: it can neither send nor acknowledge");
-            findings.push(Finding::fault(text).hint(hint));
+            findings.push(Finding::fault(text).with_hint(hint));
         }
         findings.extend(match hardware.state.filter(|_| *up) {
             Some(ControllerState::BusOff) => Some(
@@ -192,18 +197,18 @@ impl MachineFacts {
                     "{name} is BUS-OFF: it no longer takes part after too many errors; wiring, termination or bit \
                      rates are wrong"
                 ))
-                .hint(self.with_sudo(&format!("ip link set {name} type can restart"))),
+                .with_hint(self.with_sudo(&format!("ip link set {name} type can restart"))),
             ),
             Some(state @ (ControllerState::ErrorPassive | ControllerState::ErrorWarning)) => Some(
                 Finding::note(format!(
                     "{name} is {}: it sees errors; is another node on the bus, terminated, at the same bit rates?",
                     state.name()
                 ))
-                .hint(format!("ip -details -statistics link show {name}")),
+                .with_hint(format!("ip -details -statistics link show {name}")),
             ),
             Some(ControllerState::ErrorActive | ControllerState::Stopped | ControllerState::Sleeping) | None => None,
         });
-        if would_run(&findings) {
+        if would_bench_run(&findings) {
             findings.push(match skin {
                 Some(skin) if skin.rates.bitrate.is_some() => {
                     Finding::ok(format!("{name} is at {has}, as the skin requires"))
@@ -211,7 +216,7 @@ impl MachineFacts {
                 Some(_) => Finding::note(format!(
                     "{name} is at {has}; the skin states no bit rate to compare it with"
                 ))
-                .hint("bitrate = ...  # under its [[bus]] in the skin"),
+                .with_hint("bitrate = ...  # under its [[bus]] in the skin"),
                 None => Finding::ok(format!("{name} is at {has}")),
             });
         }

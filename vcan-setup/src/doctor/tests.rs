@@ -68,7 +68,7 @@ fn complaints(facts: &MachineFacts) -> Vec<String> {
         (finding.level != FindingLevel::Ok)
             .then(|| format!("{}: {}{hints}", finding.level.name(), finding.text))
     };
-    assess(facts).into_iter().filter_map(bad).collect()
+    assess_machine(facts).into_iter().filter_map(bad).collect()
 }
 
 /// Changes the facts of a machine without faults, and returns the findings.
@@ -76,7 +76,11 @@ fn about(change: impl FnOnce(&mut MachineFacts)) -> Vec<String> {
     let mut facts = good();
     change(&mut facts);
     let said = complaints(&facts);
-    assert_eq!(would_run(&assess(&facts)), !said.iter().any(|line| line.starts_with("fault")), "{said:?}");
+    assert_eq!(
+        would_bench_run(&assess_machine(&facts)),
+        !said.iter().any(|line| line.starts_with("fault")),
+        "{said:?}"
+    );
     said
 }
 
@@ -124,7 +128,7 @@ fn cells(nodes: impl IntoIterator<Item = i64>) -> ObservedTraffic {
 #[test]
 fn a_machine_on_which_all_is_well() {
     assert_eq!(complaints(&good()), Vec::<String>::new());
-    assert!(assess(&good()).len() > 4, "and says what it looked at");
+    assert!(assess_machine(&good()).len() > 4, "and says what it looked at");
 }
 
 #[test]
@@ -147,7 +151,7 @@ fn no_can_in_the_kernel_matters_by_what_was_chosen() {
     let mut facts = no_can(KindChoice::Auto);
     facts.embedded = Err("/tmp/skinbus-1 has mode 0755".into());
     assert!(complaints(&facts).contains(&"fault: /tmp/skinbus-1 has mode 0755".to_owned()));
-    assert!(!would_run(&assess(&facts)));
+    assert!(!would_bench_run(&assess_machine(&facts)));
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::os::fd::OwnedFd;
 
 use protocol::bus::Filter;
 use protocol::bus::batch::{MAX_BATCH_DATAGRAMS, Outgoing, is_memory_shortage};
-use protocol::bus::embedded::{encode_dropped, peer_process};
+use protocol::bus::embedded::{encode_drop_notice, peer_process};
 use protocol::can::FD_BYTES;
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
@@ -15,7 +15,7 @@ use super::queue::{ClientQueue, QueueEntry};
 use super::routing::ClientId;
 
 /// The maximum number of frames in a client's queue, beyond those in its socket buffer.
-const QUEUE_FRAMES: usize = 256;
+const MAX_QUEUED_FRAMES: usize = 256;
 
 /// The objects that are needed to send to any client.
 #[derive(Debug)]
@@ -62,7 +62,7 @@ pub(super) struct Client {
 
 impl Client {
     pub(super) fn new(id: ClientId, socket: OwnedFd) -> Self {
-        let queue = ClientQueue::new(QUEUE_FRAMES);
+        let queue = ClientQueue::new(MAX_QUEUED_FRAMES);
         Self {
             id,
             process: peer_process(&socket),
@@ -86,7 +86,7 @@ impl Client {
             return false;
         }
         // If the client no longer reads, sending fails again at the end of the round, and is handled there.
-        if !self.blocked && self.queue.frames() >= MAX_BATCH_DATAGRAMS {
+        if !self.blocked && self.queue.frame_count() >= MAX_BATCH_DATAGRAMS {
             let _ = self.send(post);
         }
         !self.blocked && !std::mem::replace(&mut self.dirty, true)
@@ -94,7 +94,7 @@ impl Client {
 
     /// Sends the queue at once, before the same process gets a newer frame by its other socket. Errors are ignored,
     /// because they occur again at the end of the round.
-    pub(super) fn send_early(&mut self, post: &mut SendContext) {
+    pub(super) fn send_now(&mut self, post: &mut SendContext) {
         if self.dirty && !self.blocked {
             let _ = self.send(post);
         }
@@ -107,13 +107,13 @@ impl Client {
     }
 
     /// Excludes the socket from `epoll`, and sends nothing to it until it is resumed.
-    pub(super) fn pause(&mut self, post: &SendContext) {
+    pub(super) fn pause_sending(&mut self, post: &SendContext) {
         self.blocked = true;
         let _ = epoll::delete(&post.epoll, &self.socket);
     }
 
     /// Includes the socket in `epoll` again. Returns true on success.
-    pub(super) fn resume(&mut self, post: &SendContext) -> bool {
+    pub(super) fn resume_sending(&mut self, post: &SendContext) -> bool {
         let data = EventData::new_u64(self.id.0 as u64);
         let resumed = epoll::add(&post.epoll, &self.socket, data, EventFlags::IN).is_ok();
         self.blocked = !resumed;
@@ -121,22 +121,22 @@ impl Client {
     }
 
     /// Returns true if the client was blocked and can be sent to again.
-    pub(super) fn unblock(&mut self, post: &SendContext) -> bool {
+    pub(super) fn try_unblock(&mut self, post: &SendContext) -> bool {
         let free = self.blocked && self.set_epoll_flags(post, EventFlags::IN);
         self.blocked &= !free;
         free
     }
 
     /// Drops the frames in the queue, and counts them as abandoned.
-    pub(super) fn abandon(&mut self, post: &mut SendContext) {
-        post.totals.abandoned += self.queue.frames() as u64;
-        self.queue = ClientQueue::new(QUEUE_FRAMES);
+    pub(super) fn abandon_queue(&mut self, post: &mut SendContext) {
+        post.totals.abandoned += self.queue.frame_count() as u64;
+        self.queue = ClientQueue::new(MAX_QUEUED_FRAMES);
     }
 
     /// Sends the queue until it is empty or the socket is full.
     fn send(&mut self, post: &mut SendContext) -> SendOutcome {
         loop {
-            self.queue.report_dropped();
+            self.queue.push_drop_report();
             if self.queue.is_empty() {
                 return SendOutcome::Done;
             }
@@ -145,7 +145,7 @@ impl Client {
                 match entry {
                     QueueEntry::Frame(parcel) => post.outgoing.push(parcel.bytes(), parcel.byte_len()),
                     QueueEntry::Dropped(total) => {
-                        let notice = encode_dropped(*total);
+                        let notice = encode_drop_notice(*total);
                         let mut bytes = [0; FD_BYTES];
                         for (to, from) in bytes.iter_mut().zip(notice) {
                             *to = from;

@@ -1,10 +1,10 @@
 //! The datagrams by which clients and the server of a bus exchange frames.
 
-use protocol::bus::embedded::OWN_FRAME_BYTE;
+use protocol::bus::embedded::OWN_FRAME_BYTE_INDEX;
 use protocol::can::{FD_BYTES, FD_FORMAT, Format, Frame};
 
 /// The index of the byte that holds the FD flags.
-const FLAGS_BYTE: usize = 5;
+const FD_FLAGS_BYTE_INDEX: usize = 5;
 
 /// A frame in the form in which the bus forwards it: a `struct can_frame` or `struct canfd_frame`.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -29,16 +29,16 @@ impl FrameDatagram {
         let mut bytes = [0; FD_BYTES];
         bytes.get_mut(..datagram.len())?.copy_from_slice(datagram);
         if frame.format() == Format::Fd {
-            *bytes.get_mut(FLAGS_BYTE)? |= FD_FORMAT;
+            *bytes.get_mut(FD_FLAGS_BYTE_INDEX)? |= FD_FORMAT;
         }
-        *bytes.get_mut(OWN_FRAME_BYTE)? = 0;
+        *bytes.get_mut(OWN_FRAME_BYTE_INDEX)? = 0;
         Some(Self { bytes, id: frame.raw_id(), format: frame.format() })
     }
 
     /// Returns the frame with the mark that tells a client whether the frame is its own.
     #[must_use]
     pub fn with_own_mark(mut self, own: bool) -> Self {
-        if let Some(byte) = self.bytes.get_mut(OWN_FRAME_BYTE) {
+        if let Some(byte) = self.bytes.get_mut(OWN_FRAME_BYTE_INDEX) {
             *byte = own.into();
         }
         self
@@ -85,10 +85,10 @@ mod tests {
     #[test]
     fn the_fdf_flag_is_set_and_the_own_mark_cannot_be_forged() {
         let mut bytes = Frame::with_data(0x201, Format::Fd, 1, &[7]).unwrap().to_bytes();
-        bytes[OWN_FRAME_BYTE] = 1;
+        bytes[OWN_FRAME_BYTE_INDEX] = 1;
         let parcel = FrameDatagram::from_client_datagram(&bytes, true).unwrap();
         assert_eq!(parcel.bytes()[4..9], [1, 1 | FD_FORMAT, 0, 0, 7]);
-        assert_eq!(parcel.with_own_mark(true).bytes()[OWN_FRAME_BYTE], 1);
+        assert_eq!(parcel.with_own_mark(true).bytes()[OWN_FRAME_BYTE_INDEX], 1);
         assert_eq!(parcel.with_own_mark(true).with_own_mark(false), parcel);
     }
 

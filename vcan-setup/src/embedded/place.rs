@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 
 use protocol::bus::BusError;
 use protocol::bus::embedded::{
-    DirectoryError, address, make_directory, open_directory, remove_directory, seqpacket, socket_name,
+    DirectoryError, make_directory, open_directory, remove_directory, seqpacket_socket, socket_address,
+    socket_name,
 };
 use rustix::fs::{AtFlags, FileType, FlockOperation};
 use rustix::io::Errno;
@@ -62,25 +63,25 @@ pub(super) struct BusSocket {
 }
 
 /// The maximum number of clients that wait to be accepted. The kernel's own limit is often lower.
-const BACKLOG: i32 = 4096;
+const LISTEN_BACKLOG: i32 = 4096;
 
 impl BusSocket {
     pub(super) fn bind(directory: &Path, name: &str) -> Result<Self, BusSocketError> {
         protocol::bus::check_name(name).map_err(BusSocketError::Name)?;
         let file = socket_name(name);
         let path = directory.join(&file);
-        let address = address(directory, name)?;
+        let address = socket_address(directory, name)?;
         let failed = |doing| {
             let path = path.clone();
             move |errno: Errno| BusSocketError::Io { path, doing, source: errno.into() }
         };
-        let lock = lock(directory)?;
+        let lock = lock_directory(directory)?;
         match rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) if FileType::from_raw_mode(stat.st_mode) != FileType::Socket => {
                 return Err(BusSocketError::InTheWay(path));
             }
             Ok(_) => {
-                let probe = seqpacket(SocketFlags::NONBLOCK).map_err(failed("ask for"))?;
+                let probe = seqpacket_socket(SocketFlags::NONBLOCK).map_err(failed("ask for"))?;
                 // Connecting is refused only if the socket has no listener. A full backlog causes another error.
                 if rustix::net::connect(&probe, &address) != Err(Errno::CONNREFUSED) {
                     return Err(BusSocketError::Served { name: name.to_owned(), path });
@@ -90,9 +91,9 @@ impl BusSocket {
             Err(Errno::NOENT) => {}
             Err(errno) => return Err(failed("look at")(errno)),
         }
-        let listener = seqpacket(SocketFlags::NONBLOCK).map_err(failed("make"))?;
+        let listener = seqpacket_socket(SocketFlags::NONBLOCK).map_err(failed("make"))?;
         rustix::net::bind(&listener, &address).map_err(failed("make"))?;
-        rustix::net::listen(&listener, BACKLOG).map_err(failed("listen on"))?;
+        rustix::net::listen(&listener, LISTEN_BACKLOG).map_err(failed("listen on"))?;
         let stat = rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW).map_err(failed("look at"))?;
         let inode = (stat.st_dev, stat.st_ino);
         Ok(Self { listener, path, directory: directory.to_owned(), file, inode })
@@ -119,10 +120,10 @@ impl Drop for BusSocket {
 }
 
 /// The maximum number of attempts to lock the directory while other processes remove it.
-const MAX_ATTEMPTS: u32 = 1_000;
+const MAX_LOCK_ATTEMPTS: u32 = 1_000;
 
 /// Creates the directory if it does not exist, and locks it.
-fn lock(path: &Path) -> Result<OwnedFd, BusSocketError> {
+fn lock_directory(path: &Path) -> Result<OwnedFd, BusSocketError> {
     let failed =
         |errno: Errno| BusSocketError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
     let mut absent = 0;
@@ -133,7 +134,9 @@ fn lock(path: &Path) -> Result<OwnedFd, BusSocketError> {
             // limit is needed for a missing parent folder, and for file systems in which no directory can be created,
             // such as /proc.
             Err(error)
-                if error.is_absent() && absent < MAX_ATTEMPTS && path.parent().is_some_and(Path::exists) =>
+                if error.is_absent()
+                    && absent < MAX_LOCK_ATTEMPTS
+                    && path.parent().is_some_and(Path::exists) =>
             {
                 absent += 1;
                 continue;

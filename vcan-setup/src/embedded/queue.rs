@@ -37,7 +37,7 @@ impl ClientQueue {
             self.dropped = self.dropped.wrapping_add(1);
             return false;
         }
-        self.report_dropped();
+        self.push_drop_report();
         self.entries.push_back(QueueEntry::Frame(parcel));
         self.frames += 1;
         true
@@ -45,7 +45,7 @@ impl ClientQueue {
 
     /// Appends a report of the dropped frames, if their number has changed since the last report. Must also be called
     /// when the queue becomes empty, so that the report has its correct position among the frames.
-    pub fn report_dropped(&mut self) {
+    pub fn push_drop_report(&mut self) {
         if self.reported != self.dropped {
             self.entries.push_back(QueueEntry::Dropped(self.dropped));
             self.reported = self.dropped;
@@ -67,7 +67,7 @@ impl ClientQueue {
 
     /// Returns the number of queued frames.
     #[must_use]
-    pub const fn frames(&self) -> usize {
+    pub const fn frame_count(&self) -> usize {
         self.frames
     }
 
@@ -104,11 +104,11 @@ mod tests {
     #[test]
     fn a_total_is_reported_once() {
         let mut queue = ClientQueue::new(0);
-        queue.report_dropped();
+        queue.push_drop_report();
         assert!(queue.is_empty());
         queue.push(parcel(0));
-        queue.report_dropped();
-        queue.report_dropped();
+        queue.push_drop_report();
+        queue.push_drop_report();
         assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [QueueEntry::Dropped(1)]);
         assert_eq!(queue.remove_sent(1), 0);
     }
@@ -138,9 +138,9 @@ mod tests {
                 } else {
                     hear(&mut queue);
                 }
-                prop_assert!(queue.frames() <= limit);
+                prop_assert!(queue.frame_count() <= limit);
             }
-            queue.report_dropped();
+            queue.push_drop_report();
             while !queue.is_empty() {
                 hear(&mut queue);
             }

@@ -39,14 +39,14 @@ impl FilterClass {
         }
         let matched = Filter { id: id & mask, mask };
         let whole = if id & EXTENDED == 0 { Filter::EXACT_MASK } else { EXTENDED_MASK | EXTENDED | REMOTE };
-        match id & (Filter::INVERTED | REMOTE) {
+        match id & (Filter::INVERTED_FLAG | REMOTE) {
             0 if mask == whole => Self::Exact(matched.id),
-            flags => Self::Masked(matched, flags & Filter::INVERTED == 0),
+            flags => Self::Masked(matched, flags & Filter::INVERTED_FLAG == 0),
         }
     }
 
     /// Returns true if a frame passes the filter. `frame` is the identifier with its flags.
-    const fn passes(self, frame: u32) -> bool {
+    const fn passes_frame(self, frame: u32) -> bool {
         let error = frame & ERROR != 0;
         match self {
             Self::Errors(mask) => error && frame & mask != 0,
@@ -68,7 +68,7 @@ struct Subscription {
 }
 
 impl Subscription {
-    fn classes(&self) -> impl Iterator<Item = FilterClass> + use<'_> {
+    fn filter_classes(&self) -> impl Iterator<Item = FilterClass> + use<'_> {
         let errors = (self.error_mask != 0).then_some(FilterClass::Errors(self.error_mask & EXTENDED_MASK));
         self.filters.iter().copied().map(FilterClass::from_filter).chain(errors)
     }
@@ -118,7 +118,7 @@ impl Router {
     }
 
     fn add_to_lists(&mut self, client: ClientId, wants: &Subscription) {
-        for class in wants.classes() {
+        for class in wants.filter_classes() {
             match class {
                 FilterClass::Exact(id) => self.exact.entry(id).or_default().push(client),
                 FilterClass::Errors(_) | FilterClass::Masked(..) => self.masked.push((class, client)),
@@ -136,7 +136,7 @@ impl Router {
     /// Removes a client from the lists of its filters. Only these lists are searched, because hundreds of clients may
     /// change their filters while frames are waiting.
     fn remove_from_lists(&mut self, client: ClientId, wants: &Subscription) {
-        for class in wants.classes() {
+        for class in wants.filter_classes() {
             match class {
                 FilterClass::Exact(id) => {
                     if let Entry::Occupied(mut list) = self.exact.entry(id) {
@@ -173,7 +173,7 @@ impl Router {
                 deliver(client, own);
             }
         };
-        let walked = self.masked.iter().filter(|(class, _)| class.passes(id));
+        let walked = self.masked.iter().filter(|(class, _)| class.passes_frame(id));
         walked.for_each(|&(_, client)| offer(client));
         let standard = id & (EXTENDED | REMOTE | ERROR) == 0;
         let exact = self.exact.get(&if standard { id & STANDARD_MASK } else { id });
@@ -256,7 +256,7 @@ mod tests {
             if mask & EXTENDED != 0 && target & EXTENDED == 0 {
                 mask &= STANDARD_MASK | EXTENDED | REMOTE;
             }
-            (id & mask == target & mask) != (target & Filter::INVERTED != 0)
+            (id & mask == target & mask) != (target & Filter::INVERTED_FLAG != 0)
         })
     }
 

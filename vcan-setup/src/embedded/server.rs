@@ -168,7 +168,7 @@ impl Server {
             for &epoll::Event { flags, data } in &events {
                 match data.u64() {
                     STOP => return Ok(self.end()),
-                    LISTENER => self.accept(),
+                    LISTENER => self.accept_clients(),
                     token => {
                         if let Ok(index) = usize::try_from(token) {
                             self.serve(ClientId(index), flags, &mut batch);
@@ -194,7 +194,7 @@ impl Server {
         } else if let Some(client) =
             usize::try_from(token).ok().and_then(|index| client(&mut self.clients, index))
         {
-            client.pause(post);
+            client.pause_sending(post);
         }
         if !self.paused.contains(&token) {
             self.paused.push(token);
@@ -211,7 +211,7 @@ impl Server {
                 let data = EventData::new_u64(LISTENER);
                 let resumed = epoll::modify(&post.epoll, &place.listener, data, EventFlags::IN).is_ok();
                 if self.parting.is_some() || self.spare.is_none() {
-                    self.close_parting();
+                    self.close_parting_client();
                 }
                 if !resumed {
                     self.pause(LISTENER);
@@ -219,7 +219,7 @@ impl Server {
             } else if let Ok(index) = usize::try_from(token)
                 && let Some(client) = client(&mut self.clients, index)
             {
-                if client.resume(post) {
+                if client.resume_sending(post) {
                     self.flush(ClientId(index));
                 } else {
                     self.pause(token);
@@ -351,7 +351,7 @@ impl Server {
             // therefore sent first, so that the time stamps of both sockets are in order.
             let sibling = client(clients, to.0).and_then(|client| client.sibling);
             if let Some(sibling) = sibling.and_then(|sibling| client(clients, sibling.0)) {
-                sibling.send_early(post);
+                sibling.send_now(post);
             }
             let Some(client) = clients.get_mut(to.0).and_then(Option::as_mut) else { return };
             if client.enqueue(parcel.with_own_mark(own), post) {
@@ -386,7 +386,7 @@ impl Server {
     fn unblock(&mut self, id: ClientId) {
         let Self { clients, post, .. } = self;
         let Some(client) = client(clients, id.0) else { return };
-        if client.unblock(post) {
+        if client.try_unblock(post) {
             self.flush(id);
         }
     }
@@ -396,7 +396,7 @@ impl Server {
         self.router.remove(id);
         let Self { clients, post, .. } = self;
         if let Some(client) = clients.get_mut(id.0).and_then(Option::as_mut) {
-            client.abandon(post);
+            client.abandon_queue(post);
         }
     }
 

@@ -52,7 +52,7 @@ pub struct SourceAccount {
 impl SourceAccount {
     /// Returns the number of frames that were not sent to the local bus, wherever they were lost.
     #[must_use]
-    pub fn missing(&self) -> u64 {
+    pub fn missing_frame_count(&self) -> u64 {
         [self.dropped_there, self.lost, self.missed_there, self.dropped_here, self.refused]
             .into_iter()
             .fold(0, u64::saturating_add)
@@ -83,7 +83,7 @@ impl NodeSet {
 }
 
 /// Adds to a counter without overflow. The number comes from another host and may have any value.
-const fn add(counter: &mut u64, more: u64) {
+const fn add_saturating(counter: &mut u64, more: u64) {
     *counter = counter.saturating_add(more);
 }
 
@@ -104,8 +104,8 @@ impl SourceState {
         let account = &mut self.account;
         if account.lives == 0 || self.head.life != head.life {
             account.lives += 1;
-            add(&mut account.numbered, head.first);
-            add(&mut account.before, head.first);
+            add_saturating(&mut account.numbered, head.first);
+            add_saturating(&mut account.before, head.first);
             account.shared += u64::from(self.before == Some(head.life));
             self.before = (account.lives > 1).then_some(self.head.life);
             (self.head, self.next) = (*head, head.first);
@@ -118,11 +118,11 @@ impl SourceState {
         }
         let missing = head.first.saturating_sub(self.next);
         let there = head.dropped.saturating_sub(self.head.dropped).min(missing);
-        add(&mut account.dropped_there, there);
-        add(&mut account.lost, missing - there);
-        add(&mut account.missed_there, head.missed.saturating_sub(self.head.missed));
+        add_saturating(&mut account.dropped_there, there);
+        add_saturating(&mut account.lost, missing - there);
+        add_saturating(&mut account.missed_there, head.missed.saturating_sub(self.head.missed));
         account.taken += count - again;
-        add(&mut account.numbered, end - self.next);
+        add_saturating(&mut account.numbered, end - self.next);
         (self.head, self.next) = (*head, end);
         again
     }
@@ -146,7 +146,7 @@ impl HostsToBusQueue {
     ///
     /// # Errors
     /// Returns [`MessageError`] if the message is invalid; it is counted.
-    pub fn receive(&mut self, host: &str, bytes: &[u8]) -> Result<(), MessageError> {
+    pub fn receive_message(&mut self, host: &str, bytes: &[u8]) -> Result<(), MessageError> {
         if !self.sources.contains_key(host) {
             if self.sources.len() >= MAX_SOURCES {
                 self.unknown_hosts += 1;
@@ -216,7 +216,7 @@ impl HostsToBusQueue {
     }
 
     /// Returns the names that several hosts use at the same time.
-    pub fn shared_names(&self) -> impl Iterator<Item = &str> {
+    pub fn shared_host_names(&self) -> impl Iterator<Item = &str> {
         self.sources.iter().filter(|(_, source)| source.account.shared > 0).map(|(host, _)| host.as_str())
     }
 
@@ -250,7 +250,9 @@ mod tests {
     fn each_missing_frame_has_its_place() {
         let mut incoming = HostsToBusQueue::default();
         let mut take = |life, first, dropped, missed, count| {
-            incoming.receive("b", &message(MessageHeader { life, first, dropped, missed }, count)).unwrap();
+            incoming
+                .receive_message("b", &message(MessageHeader { life, first, dropped, missed }, count))
+                .unwrap();
         };
         take(1, 100, 3, 9, 10); // 100 were before
         take(1, 110, 3, 9, 10);
@@ -282,7 +284,9 @@ mod tests {
     fn two_hosts_of_one_name_are_noticed() {
         let mut incoming = HostsToBusQueue::default();
         for life in [1, 2, 3, 2, 3] {
-            incoming.receive("b", &message(MessageHeader { life, ..MessageHeader::default() }, 1)).unwrap();
+            incoming
+                .receive_message("b", &message(MessageHeader { life, ..MessageHeader::default() }, 1))
+                .unwrap();
         }
         assert_eq!((heard(&incoming).lives, heard(&incoming).shared), (5, 2));
     }
@@ -292,16 +296,18 @@ mod tests {
         let mut incoming = HostsToBusQueue::default();
         let head = |first| MessageHeader { life: 1, first, ..MessageHeader::default() };
         for first in (0..MAX_WAITING_FRAMES as u64).step_by(256) {
-            incoming.receive(if first % 512 == 0 { "b" } else { "c" }, &message(head(first), 256)).unwrap();
+            incoming
+                .receive_message(if first % 512 == 0 { "b" } else { "c" }, &message(head(first), 256))
+                .unwrap();
         }
-        incoming.receive("d", &message(head(0), 5)).unwrap();
+        incoming.receive_message("d", &message(head(0), 5)).unwrap();
         let of: Vec<_> = incoming.accounts().map(|(host, it, _)| (host, it.taken, it.dropped_here)).collect();
         let half = MAX_WAITING_FRAMES as u64 / 2;
         assert_eq!(of, [("b", half, 0), ("c", half, 0), ("d", 5, 5)]);
         incoming.remove_sent(300);
         let sent: Vec<_> = incoming.accounts().map(|(_, it, _)| it.sent).collect();
         assert_eq!(sent, [256, 44, 0]);
-        assert!(incoming.receive("b", &[9]).is_err());
+        assert!(incoming.receive_message("b", &[9]).is_err());
         assert_eq!(heard(&incoming).garbage, 1);
     }
 
@@ -318,7 +324,7 @@ mod tests {
             sent(of(Kind::Torque, 7) | protocol::can::EXTENDED),
         ];
         encode(&MessageHeader::default(), &frames, &mut bytes);
-        incoming.receive("b", &bytes).unwrap();
+        incoming.receive_message("b", &bytes).unwrap();
         let nodes: Vec<_> = incoming.accounts().next().unwrap().2.iter().map(CellId::get).collect();
         assert_eq!(nodes, [7, 126]);
     }
@@ -327,7 +333,7 @@ mod tests {
     fn hosts_without_end_fill_nothing() {
         let mut incoming = HostsToBusQueue::default();
         for host in 0..MAX_SOURCES + 3 {
-            incoming.receive(&host.to_string(), &message(MessageHeader::default(), 1)).unwrap();
+            incoming.receive_message(&host.to_string(), &message(MessageHeader::default(), 1)).unwrap();
         }
         assert_eq!((incoming.accounts().count(), incoming.unknown_hosts()), (MAX_SOURCES, 3));
     }
@@ -337,12 +343,12 @@ mod tests {
         let mut incoming = HostsToBusQueue::default();
         for life in 0..4 {
             let head = MessageHeader { life, first: u64::MAX / 2, dropped: u64::MAX / 2, missed: u64::MAX };
-            incoming.receive("b", &message(head, 1)).unwrap();
+            incoming.receive_message("b", &message(head, 1)).unwrap();
             let head = MessageHeader { first: u64::MAX - 5_000, dropped: u64::MAX - 5_000, ..head };
-            incoming.receive("b", &message(head, 1)).unwrap();
+            incoming.receive_message("b", &message(head, 1)).unwrap();
         }
         let [(_, heard, _)] = incoming.accounts().collect::<Vec<_>>()[..] else { panic!("one host") };
-        assert_eq!((heard.numbered, heard.taken, heard.missing()), (u64::MAX, 8, u64::MAX));
+        assert_eq!((heard.numbered, heard.taken, heard.missing_frame_count()), (u64::MAX, 8, u64::MAX));
     }
 
     proptest! {
@@ -351,7 +357,7 @@ mod tests {
             let mut incoming = HostsToBusQueue::default();
             for (life, first, dropped, missed, count, gone) in messages {
                 let head = MessageHeader { life, first, dropped: dropped.min(first), missed };
-                incoming.receive("b", &message(head, count)).unwrap();
+                incoming.receive_message("b", &message(head, count)).unwrap();
                 match gone % 3 {
                     0 => incoming.remove_sent(gone),
                     1 => incoming.remove_copies(gone),

@@ -113,14 +113,14 @@ pub fn encode<'a>(
 /// Returns [`MessageError`] if the message has another version, is incomplete, or contains an invalid frame.
 pub fn decode(bytes: &[u8], frames: &mut Vec<StampedFrame>) -> Result<MessageHeader, MessageError> {
     let before = frames.len();
-    let read = read(bytes, frames);
+    let read = decode_message(bytes, frames);
     if read.is_err() {
         frames.truncate(before);
     }
     read
 }
 
-fn read(bytes: &[u8], frames: &mut Vec<StampedFrame>) -> Result<MessageHeader, MessageError> {
+fn decode_message(bytes: &[u8], frames: &mut Vec<StampedFrame>) -> Result<MessageHeader, MessageError> {
     let wrong = MessageError::Length(bytes.len());
     let &version = bytes.first().ok_or(wrong)?;
     if version != VERSION {

@@ -61,7 +61,7 @@ impl BusToHostsQueue {
     }
 
     /// Sets the total number of frames that the bus has dropped before this process could read them.
-    pub const fn set_missed(&mut self, so_far: u64) {
+    pub const fn set_missed_count(&mut self, so_far: u64) {
         self.account.missed = so_far;
     }
 

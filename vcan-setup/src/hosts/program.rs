@@ -16,7 +16,7 @@ use rustix::fs::{Access, access};
 use thiserror::Error;
 
 /// The name of the program.
-pub const PROGRAM: &str = "vcan-link";
+pub const LINK_PROGRAM_NAME: &str = "vcan-link";
 /// The environment variable for the path of `vcan-link`. It is needed if the program is neither beside `vcan-setup` nor
 /// on `PATH`.
 pub const PATH_VARIABLE: &str = "SKINBUS_VCAN_LINK";
@@ -61,7 +61,7 @@ pub enum ProgramError {
 
 /// Replaces this process by `vcan-link`, with the same process id, so that signals and the exit code are those of
 /// `vcan-link`. Returns only if that fails.
-pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
+pub fn exec_link_program(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
     let start = |path: &Path| Command::new(path).args(arguments).env(CALLER_VERSION_VARIABLE, VERSION).exec();
     if let Some(path) = path_from_env(PATH_VARIABLE) {
         let source = start(&path);
@@ -84,7 +84,8 @@ fn find_program(beside: Option<&Path>, path: Option<&OsStr>) -> Option<PathBuf> 
     let folders = folders.chain(path.into_iter().flat_map(env::split_paths));
     // An empty entry in PATH means the current folder, which is not searched.
     let folders = folders.filter(|folder| !folder.as_os_str().is_empty());
-    let files: Vec<_> = folders.map(|folder| folder.join(PROGRAM)).filter(|file| file.is_file()).collect();
+    let files: Vec<_> =
+        folders.map(|folder| folder.join(LINK_PROGRAM_NAME)).filter(|file| file.is_file()).collect();
     let executable = files.iter().find(|file| access(file.as_path(), Access::EXEC_OK).is_ok());
     executable.or_else(|| files.first()).cloned()
 }
@@ -124,7 +125,7 @@ mod tests {
             folder
         });
         let put = |folder: &Path, mode| {
-            let file = folder.join(PROGRAM);
+            let file = folder.join(LINK_PROGRAM_NAME);
             fs::write(&file, "").unwrap();
             fs::set_permissions(&file, fs::Permissions::from_mode(mode)).unwrap();
             file
@@ -139,7 +140,7 @@ mod tests {
         let in_beside = put(&beside, 0o755);
         assert_eq!(found(), Some(in_beside));
         assert_eq!(find_program(None, None), None);
-        fs::create_dir(folder.path().join(PROGRAM)).unwrap();
+        fs::create_dir(folder.path().join(LINK_PROGRAM_NAME)).unwrap();
         assert_eq!(find_program(Some(folder.path()), None), None, "a folder");
     }
 

@@ -53,7 +53,7 @@ pub struct HostReport {
 
 /// Returns the address at which the link of a bus listens. `directory` is that of embedded buses, `None` for the
 /// default.
-fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<SocketAddr> {
+fn link_socket_address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<SocketAddr> {
     let place = if kind.is_interface() {
         PathBuf::new()
     } else {
@@ -71,7 +71,7 @@ fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<Soc
 /// # Errors
 /// Returns an error of the kind [`ErrorKind::AddrInUse`] if another process links the bus.
 pub fn listen(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<UnixListener> {
-    let listener = UnixListener::bind_addr(&address(bus, kind, directory)?)?;
+    let listener = UnixListener::bind_addr(&link_socket_address(bus, kind, directory)?)?;
     listener.set_nonblocking(true)?;
     Ok(listener)
 }
@@ -89,7 +89,7 @@ impl ReportReader {
     /// # Errors
     /// Returns an error of the kind [`ErrorKind::ConnectionRefused`] if the bus is not linked.
     pub fn connect(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<Self> {
-        let stream = UnixStream::connect_addr(&address(bus, kind, directory)?)?;
+        let stream = UnixStream::connect_addr(&link_socket_address(bus, kind, directory)?)?;
         stream.set_nonblocking(true)?;
         Ok(Self { stream, buffer: Vec::new() })
     }
@@ -98,7 +98,7 @@ impl ReportReader {
     ///
     /// # Errors
     /// Returns an error if no report arrives in time, or if the link has ended.
-    pub fn wait(&mut self, timeout: Duration) -> io::Result<LinkReport> {
+    pub fn wait_for_report(&mut self, timeout: Duration) -> io::Result<LinkReport> {
         let until = Instant::now() + timeout;
         loop {
             if let Some(report) = self.read_reports()?.pop() {
@@ -192,7 +192,7 @@ mod tests {
     #[test]
     fn a_long_path_is_shortened_from_its_beginning() {
         let directory = format!("/{}/end", "x".repeat(200));
-        let address = address("vcan0", BusKind::Embedded, Some(Path::new(&directory))).unwrap();
+        let address = link_socket_address("vcan0", BusKind::Embedded, Some(Path::new(&directory))).unwrap();
         assert!(address.as_abstract_name().unwrap().ends_with(b"x/end"));
     }
 }

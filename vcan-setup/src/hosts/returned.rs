@@ -16,11 +16,11 @@ pub const RETURN_WINDOW_NS: u64 = 100_000_000;
 /// The time after a frame has returned for which a circle is assumed, in ns.
 const CIRCLE_TIMEOUT_NS: u64 = 1_000_000_000;
 /// The maximum number of frames that are stored for comparison in each direction.
-const MAX_REMEMBERED: usize = 16_384;
+const MAX_REMEMBERED_FRAMES: usize = 16_384;
 
 /// The frames that passed the link recently, by direction.
 #[derive(Debug, Default)]
-pub struct CircleDetector {
+pub struct ReturnedFrameDetector {
     hasher: RandomState,
     put: RecentFrames,
     /// Frames that were received from the bus. They are stored only while a circle is assumed.
@@ -30,7 +30,7 @@ pub struct CircleDetector {
     count: u64,
 }
 
-impl CircleDetector {
+impl ReturnedFrameDetector {
     /// Stores a frame that the link puts on the bus. `now` is the time of a monotonic clock in ns.
     pub fn record_sent(&mut self, now: u64, frame: &Frame) {
         let hash = self.hash(frame);
@@ -38,14 +38,14 @@ impl CircleDetector {
     }
 
     /// Returns true if a frame from another host must not be put on the bus, because it has gone around a circle.
-    pub fn is_copy(&mut self, now: u64, frame: &Frame) -> bool {
-        self.is_circle(now) && self.put.contains(now, self.hash(frame))
+    pub fn is_circled_copy(&mut self, now: u64, frame: &Frame) -> bool {
+        self.is_circle_assumed(now) && self.put.contains(now, self.hash(frame))
     }
 
     /// Returns true if the link put this frame from the bus there itself, or, while a circle is assumed, if an equal
     /// frame was received before.
     pub fn is_returned(&mut self, now: u64, frame: &Frame) -> bool {
-        let is_circle = self.is_circle(now);
+        let is_circle = self.is_circle_assumed(now);
         // Usually there is nothing to compare, namely if this link puts no frames on the bus.
         if self.put.is_empty(now) && !is_circle {
             return false;
@@ -65,11 +65,11 @@ impl CircleDetector {
 
     /// Returns the number of frames from the bus that were recognised as returned.
     #[must_use]
-    pub const fn count(&self) -> u64 {
+    pub const fn returned_frame_count(&self) -> u64 {
         self.count
     }
 
-    fn is_circle(&self, now: u64) -> bool {
+    fn is_circle_assumed(&self, now: u64) -> bool {
         self.noticed.is_some_and(|at| now.saturating_sub(at) <= CIRCLE_TIMEOUT_NS)
     }
 
@@ -90,7 +90,7 @@ struct RecentFrames {
 impl RecentFrames {
     fn insert(&mut self, now: u64, hash: u64) {
         self.remove_expired(now);
-        if self.order.len() >= MAX_REMEMBERED {
+        if self.order.len() >= MAX_REMEMBERED_FRAMES {
             self.remove_oldest();
         }
         self.order.push_back((now, hash));
@@ -136,7 +136,7 @@ mod tests {
 
     #[test]
     fn a_frame_that_was_put_there_comes_back_and_others_do_not() {
-        let mut returned = CircleDetector::default();
+        let mut returned = ReturnedFrameDetector::default();
         let it = frame(0x201, &[1, 2]);
         assert!(!returned.is_returned(0, &it));
         returned.record_sent(MS, &it);
@@ -147,18 +147,18 @@ mod tests {
             "as often as it goes around"
         );
         assert!(!returned.is_returned(102 * MS, &it), "a torque may be the same again");
-        assert_eq!((returned.count(), returned.put.times.len()), (2, 0));
+        assert_eq!((returned.returned_frame_count(), returned.put.times.len()), (2, 0));
     }
 
     #[test]
     fn no_more_is_remembered_than_may() {
-        let mut returned = CircleDetector::default();
-        for number in 0..2 * MAX_REMEMBERED as u64 {
+        let mut returned = ReturnedFrameDetector::default();
+        for number in 0..2 * MAX_REMEMBERED_FRAMES as u64 {
             returned.record_sent(0, &frame(0x201, &(number / 3).to_le_bytes()));
         }
-        assert_eq!(returned.put.order.len(), MAX_REMEMBERED);
+        assert_eq!(returned.put.order.len(), MAX_REMEMBERED_FRAMES);
         let sum: u32 = returned.put.times.values().sum();
-        assert_eq!(sum as usize, MAX_REMEMBERED);
+        assert_eq!(sum as usize, MAX_REMEMBERED_FRAMES);
     }
 
     /// A bridge copies frames from the second bus to the first. Frames of the first bus go around the circle unnoticed,
@@ -166,7 +166,7 @@ mod tests {
     #[test]
     fn in_a_circle_that_was_noticed_a_frame_passes_once_in_100_ms() {
         let (it, other) = (frame(0x201, &[1]), frame(0x202, &[2]));
-        let mut first = CircleDetector::default();
+        let mut first = ReturnedFrameDetector::default();
         for at in 0..50 {
             assert!(!first.is_returned(at * MS, &it), "it could be sent again and again");
         }
@@ -176,13 +176,13 @@ mod tests {
         assert!(first.is_returned(53 * MS, &it) && first.is_returned(152 * MS, &it));
         assert!(!first.is_returned(153 * MS, &it), "whoever sends it means it");
 
-        let mut second = CircleDetector::default();
+        let mut second = ReturnedFrameDetector::default();
         second.record_sent(0, &it);
-        assert!(!second.is_copy(MS, &it), "no circle");
+        assert!(!second.is_circled_copy(MS, &it), "no circle");
         assert!(second.is_returned(2 * MS, &it));
-        assert!(second.is_copy(3 * MS, &it) && !second.is_copy(3 * MS, &other));
-        assert!(!second.is_copy(101 * MS, &it));
+        assert!(second.is_circled_copy(3 * MS, &it) && !second.is_circled_copy(3 * MS, &other));
+        assert!(!second.is_circled_copy(101 * MS, &it));
         second.record_sent(2_000 * MS, &it);
-        assert!(!second.is_copy(2_001 * MS, &it), "the circle is gone");
+        assert!(!second.is_circled_copy(2_001 * MS, &it), "the circle is gone");
     }
 }

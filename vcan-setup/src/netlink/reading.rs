@@ -6,7 +6,7 @@ use netlink_packet_route::link::{
     CanBitTiming, CanCtrlModeFlags, InfoCan, InfoData, InfoKind, LinkAttribute, LinkFlags, LinkHeader,
     LinkInfo, LinkLayerType,
 };
-use protocol::bus::netlink::attributes;
+use protocol::bus::netlink::link_attributes;
 
 use crate::link::{
     ALIAS_MARK, CanHardware, ControllerState, Interface, InterfaceCounters, InterfaceKind, Peer,
@@ -19,14 +19,14 @@ pub(super) fn decode_interface(bytes: &[u8]) -> Option<Interface> {
     let mut interface = Interface {
         index: header.index,
         name: String::new(),
-        kind: InterfaceKind::Other(description(header.link_layer_type, None)),
+        kind: InterfaceKind::Other(describe_non_can_interface(header.link_layer_type, None)),
         ours: false,
         up: header.flags.contains(LinkFlags::Up),
         mtu: 0,
         counters: InterfaceCounters::default(),
     };
     let (mut peer, mut namespace, mut info) = (None, None, Vec::new());
-    for attribute in attributes(bytes) {
+    for attribute in link_attributes(bytes) {
         if let LinkAttribute::IfName(name) = attribute {
             interface.name = name;
         } else if let LinkAttribute::IfAlias(alias) = attribute {
@@ -51,7 +51,7 @@ pub(super) fn decode_interface(bytes: &[u8]) -> Option<Interface> {
     let kind = info.iter().find_map(|it| if let LinkInfo::Kind(kind) = it { Some(kind) } else { None });
     let data = info.iter().find_map(|it| if let LinkInfo::Data(data) = it { Some(data) } else { None });
     interface.kind = match (is_can, kind) {
-        (false, kind) => InterfaceKind::Other(description(header.link_layer_type, kind)),
+        (false, kind) => InterfaceKind::Other(describe_non_can_interface(header.link_layer_type, kind)),
         (true, Some(InfoKind::Vcan)) => InterfaceKind::Vcan,
         (true, Some(InfoKind::Vxcan)) => InterfaceKind::Vxcan(peer.map(|index| Peer {
             index,
@@ -61,13 +61,13 @@ pub(super) fn decode_interface(bytes: &[u8]) -> Option<Interface> {
         })),
         (true, _) => {
             let data = if let Some(InfoData::Can(data)) = data { data.as_slice() } else { &[] };
-            InterfaceKind::Hardware(hardware(data))
+            InterfaceKind::Hardware(decode_hardware(data))
         }
     };
     Some(interface)
 }
 
-fn hardware(data: &[InfoCan]) -> CanHardware {
+fn decode_hardware(data: &[InfoCan]) -> CanHardware {
     let mut hardware = CanHardware::default();
     let set = |timing: &CanBitTiming| Some(timing.bitrate).filter(|&rate| rate > 0);
     for attribute in data {
@@ -86,7 +86,7 @@ fn hardware(data: &[InfoCan]) -> CanHardware {
 }
 
 /// Describes an interface that does not carry CAN, for errors.
-fn description(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
+fn describe_non_can_interface(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
     if layer == LinkLayerType::Loopback {
         return "the loopback interface".to_owned();
     }
@@ -97,7 +97,7 @@ fn description(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
 }
 
 /// Returns the name of the driver of an interface, as sysfs has it.
-pub(super) fn driver(name: &str) -> Option<String> {
+pub(super) fn driver_name(name: &str) -> Option<String> {
     let link = std::fs::read_link(Path::new("/sys/class/net").join(name).join("device/driver")).ok()?;
     Some(link.file_name()?.to_string_lossy().into_owned())
 }

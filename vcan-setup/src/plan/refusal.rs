@@ -192,6 +192,6 @@ impl PlanRefusal {
 
 impl From<PlanRefusal> for Failure {
     fn from(refusal: PlanRefusal) -> Self {
-        if refusal.is_usage() { Self::usage(refusal) } else { Self::run(refusal) }
+        if refusal.is_usage() { Self::usage_error(refusal) } else { Self::run_error(refusal) }
     }
 }

@@ -9,20 +9,20 @@ use serde::Serialize;
 /// Counts of frames from the bus to the line. `received` equals `sent` plus the sum of `dropped` if no frames are
 /// queued.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct ToLineCounts {
+pub struct BusToLineCounts {
     /// Frames received from the bus.
     pub received: u64,
     /// Frames that were written to the line completely.
     pub sent: u64,
     /// Frames that were not sent, by reason.
-    pub dropped: ToLineDropped,
+    pub dropped: BusToLineDropCounts,
     /// Frames that the bus dropped because this process did not read in time. They are not counted in `received`.
     pub dropped_by_bus: u64,
 }
 
 /// Counts of frames that were not sent to the line, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct ToLineDropped {
+pub struct BusToLineDropCounts {
     /// Frames that did not fit into the queue, because the line or the bus behind the adapter is too slow.
     pub queue_full: u64,
     /// Frames for a line that was unavailable, or became so before the frame was written completely.
@@ -40,15 +40,15 @@ pub struct ToLineDropped {
 /// Counts of frames from the line to the bus. `received` equals `sent` plus the sum of `dropped` if no frames are
 /// queued.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct ToBusCounts {
+pub struct LineToBusCounts {
     /// Frames received from the line, and error frames that were made from faults that the adapter reported.
     pub received: u64,
     /// Frames sent to the bus.
     pub sent: u64,
     /// Frames that were not sent, by reason.
-    pub dropped: ToBusDropped,
+    pub dropped: LineToBusDropCounts,
     /// Lines that could not be decoded, by reason. They are not counted in `received`.
-    pub refused: RefusedLines,
+    pub refused: RefusedLineCounts,
     /// The number of times that the adapter refused a line (it sent BEL).
     pub bells: u64,
     /// Lines that are neither frames nor acknowledgements, such as a version.
@@ -57,7 +57,7 @@ pub struct ToBusCounts {
 
 /// Counts of frames that were not sent to the bus, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct ToBusDropped {
+pub struct LineToBusDropCounts {
     /// Frames that did not fit into the queue, because the bus is too slow.
     pub queue_full: u64,
     /// Frames for a bus that was down or unavailable.
@@ -70,7 +70,7 @@ pub struct ToBusDropped {
 
 /// Counts of lines that could not be decoded, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct RefusedLines {
+pub struct RefusedLineCounts {
     /// Lines with bytes that slcan does not use.
     pub garbage: u32,
     /// Lines with more characters than the DLC requires, or than any line may have.
@@ -83,7 +83,7 @@ pub struct RefusedLines {
     pub identifier: u32,
 }
 
-impl From<RejectedLines> for RefusedLines {
+impl From<RejectedLines> for RefusedLineCounts {
     fn from(refused: RejectedLines) -> Self {
         let RejectedLines { garbage, long, short, dlc, identifier } = refused;
         Self { garbage, long, short, dlc, identifier }
@@ -102,9 +102,9 @@ pub struct LineAccount {
     /// The number of times the adapter was closed and opened again because it refused frames.
     pub reopened: u64,
     /// Frames from the bus to the line.
-    pub to_line: ToLineCounts,
+    pub to_line: BusToLineCounts,
     /// Frames from the line to the bus.
-    pub to_bus: ToBusCounts,
+    pub to_bus: LineToBusCounts,
     /// Faults and changes of state that the adapter reported, by name.
     pub faults: FaultCounts,
 }
@@ -113,7 +113,7 @@ pub struct LineAccount {
 pub type FaultCounts = BTreeMap<&'static str, u64>;
 
 /// Lists the faults that were counted after `before`. The text is empty if there are none.
-pub(super) fn faults_since(before: &FaultCounts, now: &FaultCounts) -> String {
+pub(super) fn describe_faults_since(before: &FaultCounts, now: &FaultCounts) -> String {
     let more = now.iter().map(|(name, count)| (name, count - before.get(name).copied().unwrap_or(0)));
     let words = more.filter(|(_, count)| *count > 0).map(|(name, count)| match count {
         1 => (*name).to_owned(),
@@ -122,7 +122,7 @@ pub(super) fn faults_since(before: &FaultCounts, now: &FaultCounts) -> String {
     words.collect::<Vec<_>>().join(", ")
 }
 
-impl ToLineDropped {
+impl BusToLineDropCounts {
     /// Returns the total number of dropped frames.
     #[must_use]
     pub fn total(&self) -> u64 {
@@ -141,7 +141,7 @@ impl ToLineDropped {
     }
 }
 
-impl ToBusDropped {
+impl LineToBusDropCounts {
     /// Returns the total number of dropped frames.
     #[must_use]
     pub fn total(&self) -> u64 {
@@ -158,7 +158,7 @@ impl ToBusDropped {
     }
 }
 
-impl RefusedLines {
+impl RefusedLineCounts {
     /// Returns the total number of lines that could not be decoded.
     #[must_use]
     pub fn total(&self) -> u64 {
@@ -176,7 +176,7 @@ impl RefusedLines {
     }
 }
 
-impl ToLineCounts {
+impl BusToLineCounts {
     /// Formats losses as `, 3 dropped (2 line too slow, 1 line away)`; empty if there are none.
     pub(super) fn losses(&self) -> String {
         format_losses("dropped", &self.dropped.named_counts())
@@ -184,7 +184,7 @@ impl ToLineCounts {
     }
 }
 
-impl ToBusCounts {
+impl LineToBusCounts {
     /// Formats the losses on the way to the bus, including lines that could not be decoded.
     pub(super) fn losses(&self) -> String {
         format_losses("dropped", &self.dropped.named_counts())
@@ -230,7 +230,7 @@ impl fmt::Display for LineAccount {
             write!(f, ", {} times BEL", to_bus.bells)?;
         }
         if !faults.is_empty() {
-            write!(f, "\n  the adapter reported: {}", faults_since(&FaultCounts::new(), faults))?;
+            write!(f, "\n  the adapter reported: {}", describe_faults_since(&FaultCounts::new(), faults))?;
         }
         Ok(())
     }
@@ -248,10 +248,10 @@ mod tests {
             account.to_string(),
             "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 0 received, 0 sent\n  to the bus:  0 received, 0 sent"
         );
-        account.to_line = ToLineCounts {
+        account.to_line = BusToLineCounts {
             received: 23,
             sent: 1,
-            dropped: ToLineDropped {
+            dropped: BusToLineDropCounts {
                 queue_full: 1,
                 line_away: 2,
                 not_classic: 3,
@@ -261,11 +261,11 @@ mod tests {
             },
             dropped_by_bus: 6,
         };
-        account.to_bus = ToBusCounts {
+        account.to_bus = LineToBusCounts {
             received: 11,
             sent: 1,
-            dropped: ToBusDropped { queue_full: 1, bus_away: 2, not_classic: 3, ended: 4 },
-            refused: RefusedLines { garbage: 1, long: 0, short: 2, dlc: 0, identifier: 3 },
+            dropped: LineToBusDropCounts { queue_full: 1, bus_away: 2, not_classic: 3, ended: 4 },
+            refused: RefusedLineCounts { garbage: 1, long: 0, short: 2, dlc: 0, identifier: 3 },
             bells: 7,
             other_lines: 8,
         };

@@ -12,7 +12,7 @@ use thiserror::Error;
 use super::account::LineAccount;
 use super::event::LineEvent;
 use super::options::LineOptions;
-use super::participant::{Participant, ReadyEnds};
+use super::participant::{LineParticipant, ReadyEnds};
 use super::settings::{BridgeSettings, open};
 
 /// The time that the program takes at its end to complete a line of text and to close the adapters.
@@ -50,7 +50,7 @@ pub enum BridgeError {
 pub struct Bridge {
     settings: BridgeSettings,
     kind: BusKind,
-    participants: Vec<Participant>,
+    participants: Vec<LineParticipant>,
 }
 
 impl Bridge {
@@ -60,14 +60,14 @@ impl Bridge {
     /// Returns [`BridgeError`] if the bus or a line cannot be opened.
     pub fn open(settings: BridgeSettings, lines: Vec<LineOptions>) -> Result<Self, BridgeError> {
         let kind = settings.choice.resolve(&settings.bus);
-        let mut participants: Vec<Participant> = Vec::new();
+        let mut participants: Vec<LineParticipant> = Vec::new();
         for line in lines {
             let name = line.address.to_string();
             if participants.iter().any(|other| other.name() == name) {
                 return Err(BridgeError::Twice(name));
             }
             let bus = open(&settings, &line)?;
-            let participant = Participant::new(line, bus);
+            let participant = LineParticipant::new(line, bus);
             participants.push(participant.map_err(|error| line_error(name, error))?);
         }
         let mut bridge = Self { settings, kind, participants };
@@ -77,7 +77,7 @@ impl Bridge {
                 if participant.is_up() || bridge.settings.wait {
                     break;
                 }
-                if let Some(error) = participant.take_reason() {
+                if let Some(error) = participant.take_closed_reason() {
                     return Err(line_error(participant.name(), error));
                 }
                 // A TCP connection is established in the background, so its state is queried until it is known.
@@ -97,8 +97,8 @@ impl Bridge {
     #[must_use]
     pub fn unavailable_lines(&self) -> Vec<String> {
         let away = self.participants.iter().filter(|it| !it.is_up());
-        let words = |it: &Participant| {
-            it.reason().map_or_else(|| it.name(), |reason| format!("{} ({reason})", it.name()))
+        let words = |it: &LineParticipant| {
+            it.closed_reason().map_or_else(|| it.name(), |reason| format!("{} ({reason})", it.name()))
         };
         away.map(words).collect()
     }
@@ -126,7 +126,7 @@ impl Bridge {
 
     fn close(mut self, report: &mut impl FnMut(&str, LineEvent)) -> Result<Vec<LineAccount>, BridgeError> {
         let until = Instant::now() + CLOSE_TIMEOUT;
-        self.participants.iter_mut().for_each(Participant::start_closing);
+        self.participants.iter_mut().for_each(LineParticipant::start_closing);
         loop {
             // `count` visits all participants; `any` would stop at the first that is not finished.
             let left =
@@ -141,7 +141,7 @@ impl Bridge {
                 report(&participant.name(), LineEvent::NotClosed);
             }
         }
-        Ok(self.participants.iter().map(Participant::account).collect())
+        Ok(self.participants.iter().map(LineParticipant::account).collect())
     }
 
     /// Waits for data or for the next time at which there is something to do. Returns which ends of each line are
@@ -155,8 +155,8 @@ impl Bridge {
         let mut next = until;
         let mut interests = Vec::with_capacity(self.participants.len());
         for participant in &mut self.participants {
-            interests.push(participant.interest());
-            next = [next, participant.timeout(now)].into_iter().flatten().min();
+            interests.push(participant.poll_interest());
+            next = [next, participant.next_deadline(now)].into_iter().flatten().min();
         }
         let mut polled = Vec::with_capacity(1 + 2 * interests.len());
         polled.extend(stop.map(|stop| PollFd::from_borrowed_fd(stop, PollFlags::IN)));

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use protocol::can::{Format, Frame};
 use protocol::slcan::{AdapterFault, AdapterReport, BusState, Decoder, SlcanLine};
 
-use super::account::{FaultCounts, ToBusCounts};
+use super::account::{FaultCounts, LineToBusCounts};
 
 /// The maximum number of frames queued for the bus.
 pub const MAX_WAITING_FRAMES: usize = 1_024;
@@ -20,8 +20,8 @@ pub struct LineToBusQueue {
     /// True if the bus is virtual. Only then are error frames sent, because hardware would send them as data frames.
     is_virtual: bool,
     frames: VecDeque<Frame>,
-    account: ToBusCounts,
-    replies: Replies,
+    account: LineToBusCounts,
+    replies: AdapterReplies,
     /// The last error state that the adapter reported for its bus.
     state: BusState,
     faults: FaultCounts,
@@ -29,14 +29,14 @@ pub struct LineToBusQueue {
 
 /// The replies of an adapter since it was last opened.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Replies {
+pub struct AdapterReplies {
     /// True if the adapter acknowledged a line or sent a frame since then.
     pub accepted: bool,
     /// The number of refusals since the last acknowledgement.
     pub refusals: u64,
 }
 
-impl Replies {
+impl AdapterReplies {
     const ACCEPTED: Self = Self { accepted: true, refusals: 0 };
 }
 
@@ -49,36 +49,36 @@ impl LineToBusQueue {
 
     /// Records that the bus is open. With `classic`, FD frames are dropped. Error frames are sent only if `is_virtual`
     /// is true.
-    pub const fn bus_opened(&mut self, classic: bool, is_virtual: bool) {
+    pub const fn handle_bus_opened(&mut self, classic: bool, is_virtual: bool) {
         (self.is_up, self.classic, self.is_virtual) = (true, classic, is_virtual);
     }
 
     /// Records that the adapter was opened. Counting of its replies begins anew, and its bus is taken to be without
     /// errors.
-    pub fn adapter_opened(&mut self) {
-        (self.replies, self.state) = (Replies::default(), BusState::Active);
+    pub fn handle_adapter_opened(&mut self) {
+        (self.replies, self.state) = (AdapterReplies::default(), BusState::Active);
     }
 
     /// Records that the bus was lost, and drops the frames that are queued for it.
-    pub fn bus_lost(&mut self) {
+    pub fn handle_bus_lost(&mut self) {
         self.is_up = false;
-        self.account.dropped.bus_away += self.clear();
+        self.account.dropped.bus_away += self.clear_and_count();
     }
 
     /// Decodes bytes of the line, and queues the frames in them.
-    pub fn receive(&mut self, bytes: &[u8]) {
+    pub fn receive_bytes(&mut self, bytes: &[u8]) {
         for &byte in bytes {
             match self.decoder.push(byte) {
                 Some(SlcanLine::Frame(frame)) => {
-                    self.replies = Replies::ACCEPTED;
+                    self.replies = AdapterReplies::ACCEPTED;
                     self.push(frame);
                 }
                 Some(SlcanLine::Failed) => {
                     self.account.bells += 1;
                     self.replies.refusals += 1;
                 }
-                Some(SlcanLine::Done | SlcanLine::Sent) => self.replies = Replies::ACCEPTED,
-                Some(SlcanLine::Reported(report)) => self.report(report),
+                Some(SlcanLine::Done | SlcanLine::Sent) => self.replies = AdapterReplies::ACCEPTED,
+                Some(SlcanLine::Reported(report)) => self.record_adapter_report(report),
                 Some(SlcanLine::Other | SlcanLine::Command(_)) => self.account.other_lines += 1,
                 None | Some(SlcanLine::Refused(_)) => {}
             }
@@ -87,7 +87,7 @@ impl LineToBusQueue {
 
     /// Returns the adapter's replies since it was last opened.
     #[must_use]
-    pub const fn replies(&self) -> Replies {
+    pub const fn replies(&self) -> AdapterReplies {
         self.replies
     }
 
@@ -98,7 +98,7 @@ impl LineToBusQueue {
     }
 
     /// Counts the faults that the adapter reports, and queues an error frame for them.
-    fn report(&mut self, report: AdapterReport) {
+    fn record_adapter_report(&mut self, report: AdapterReport) {
         let before = self.state;
         self.state = report.state().unwrap_or(before);
         let changed = (self.state != before).then_some(self.state.name());
@@ -114,7 +114,7 @@ impl LineToBusQueue {
     }
 
     /// Records that the line was lost, and discards the incomplete text at its end.
-    pub fn line_lost(&mut self) {
+    pub fn handle_line_lost(&mut self) {
         self.decoder.discard_unfinished();
     }
 
@@ -130,14 +130,14 @@ impl LineToBusQueue {
     }
 
     /// Drops the queued frames, because the program ends.
-    pub fn drop_at_end(&mut self) {
-        self.account.dropped.ended += self.clear();
+    pub fn drop_remaining(&mut self) {
+        self.account.dropped.ended += self.clear_and_count();
     }
 
     /// Returns the counts of the frames.
     #[must_use]
-    pub fn account(&self) -> ToBusCounts {
-        ToBusCounts { refused: self.decoder.refused().into(), ..self.account }
+    pub fn account(&self) -> LineToBusCounts {
+        LineToBusCounts { refused: self.decoder.rejected_lines().into(), ..self.account }
     }
 
     fn push(&mut self, frame: Frame) {
@@ -156,7 +156,7 @@ impl LineToBusQueue {
         *reason += 1;
     }
 
-    fn clear(&mut self) -> u64 {
+    fn clear_and_count(&mut self) -> u64 {
         self.frames.drain(..).count() as u64
     }
 }
@@ -169,17 +169,17 @@ mod tests {
     #[test]
     fn frames_wait_in_order_and_the_rest_is_counted() {
         let mut incoming = LineToBusQueue::new();
-        incoming.receive(b"t1230\r");
-        incoming.bus_opened(true, true);
-        incoming.receive(b"\rz\r\x07V1013\rt1240\rb1250\rt1239\rS8\rt12");
-        incoming.receive(b"60\r");
+        incoming.receive_bytes(b"t1230\r");
+        incoming.handle_bus_opened(true, true);
+        incoming.receive_bytes(b"\rz\r\x07V1013\rt1240\rb1250\rt1239\rS8\rt12");
+        incoming.receive_bytes(b"60\r");
         assert_eq!(incoming.waiting_frames().iter().map(Frame::id).collect::<Vec<_>>(), [0x124, 0x126]);
         incoming.remove_sent(1);
-        incoming.receive(b"t12");
-        incoming.line_lost();
-        incoming.receive(b"t1270\r");
+        incoming.receive_bytes(b"t12");
+        incoming.handle_line_lost();
+        incoming.receive_bytes(b"t1270\r");
         assert_eq!(incoming.waiting_frames().iter().map(Frame::id).collect::<Vec<_>>(), [0x126, 0x127]);
-        incoming.bus_lost();
+        incoming.handle_bus_lost();
         let account = incoming.account();
         assert_eq!((account.received, account.sent, account.bells, account.other_lines), (5, 1, 1, 2));
         assert_eq!((account.dropped.bus_away, account.dropped.not_classic), (3, 1));
@@ -190,10 +190,10 @@ mod tests {
     fn faults_are_counted_and_go_to_a_virtual_bus_as_error_frames() {
         for (is_virtual, expected) in [(true, vec![0xA8, 0x40, 0x88, 0x204]), (false, vec![])] {
             let mut incoming = LineToBusQueue::new();
-            incoming.bus_opened(true, is_virtual);
-            incoming.receive(b"e1a\rsb256256\rsb256256\rF80\rF00\r");
-            incoming.adapter_opened();
-            incoming.receive(b"sp128000\r");
+            incoming.handle_bus_opened(true, is_virtual);
+            incoming.receive_bytes(b"e1a\rsb256256\rsb256256\rF80\rF00\r");
+            incoming.handle_adapter_opened();
+            incoming.receive_bytes(b"sp128000\r");
             let frames: Vec<_> = incoming.waiting_frames().iter().map(Frame::id).collect();
             assert_eq!(frames, expected);
             assert!(incoming.waiting_frames().iter().all(Frame::is_error));
@@ -208,16 +208,16 @@ mod tests {
     fn refusals_in_succession_are_counted_from_the_last_acceptance() {
         let mut incoming = LineToBusQueue::new();
         let mut after = |bytes: &[u8]| {
-            incoming.receive(bytes);
-            let Replies { accepted, refusals } = incoming.replies();
+            incoming.receive_bytes(bytes);
+            let AdapterReplies { accepted, refusals } = incoming.replies();
             (accepted, refusals)
         };
         assert_eq!(after(b"\x07\x07V1013\r"), (false, 2));
         assert_eq!(after(b"z\r\x07"), (true, 1));
         assert_eq!(after(b"\r"), (true, 0));
         assert_eq!(after(b"\x07t1230\r"), (true, 0));
-        incoming.adapter_opened();
-        assert_eq!(incoming.replies(), Replies::default());
+        incoming.handle_adapter_opened();
+        assert_eq!(incoming.replies(), AdapterReplies::default());
         assert_eq!(incoming.account().bells, 4);
     }
 
@@ -229,17 +229,17 @@ mod tests {
             let mut incoming = LineToBusQueue::new();
             for (kind, amount) in steps {
                 match kind {
-                    0 => incoming.bus_opened(amount % 2 == 0, amount % 3 == 0),
-                    1 => incoming.bus_lost(),
+                    0 => incoming.handle_bus_opened(amount % 2 == 0, amount % 3 == 0),
+                    1 => incoming.handle_bus_lost(),
                     2 => incoming.remove_sent(amount),
-                    _ => (0..amount).for_each(|_| incoming.receive(b"t1230\rb1230\re1a\rsp128000\r")),
+                    _ => (0..amount).for_each(|_| incoming.receive_bytes(b"t1230\rb1230\re1a\rsp128000\r")),
                 }
                 let waiting = incoming.waiting_frames().len();
                 prop_assert!(waiting <= MAX_WAITING_FRAMES);
                 let account = incoming.account();
                 prop_assert_eq!(account.received, account.sent + account.dropped.total() + waiting as u64);
             }
-            incoming.drop_at_end();
+            incoming.drop_remaining();
             let account = incoming.account();
             prop_assert_eq!(account.received, account.sent + account.dropped.total());
         }

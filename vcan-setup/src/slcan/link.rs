@@ -134,7 +134,7 @@ impl LinePort {
 
     /// Discards the output of a terminal that is not sent yet. Otherwise closing it would wait for an adapter that
     /// accepts nothing.
-    pub(super) fn discard(&self) {
+    pub(super) fn discard_output(&self) {
         if self.is_tty {
             let _ = termios::tcflush(&self.fd, QueueSelector::OFlush);
         }

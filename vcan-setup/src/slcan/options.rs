@@ -116,11 +116,11 @@ const ALLOWED_RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k,
                      for data 500k and whole Mbit/s up to 8M";
 
 /// A description of the allowed values of [`LineOptions::settle`], for an error.
-pub const ALLOWED_SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
+pub const ALLOWED_SETTLE_TIMES: &str = "seconds from 0 to 60, such as 2 or 0.5";
 
 /// Parses a value of [`LineOptions::settle`], given in s.
 #[must_use]
-pub fn settle_time(word: &str) -> Option<Duration> {
+pub fn parse_settle_time(word: &str) -> Option<Duration> {
     let seconds = word.parse().ok().filter(|seconds| (0.0..=MAX_SETTLE_S).contains(seconds))?;
     Duration::try_from_secs_f64(seconds).ok()
 }
@@ -142,7 +142,7 @@ impl LineOptions {
     /// Adds filters for the frames that a cell receives. The line then gets only these frames and those of its other
     /// filters.
     pub fn add_cell(&mut self, cell: CellId) {
-        for filter in Id::received_by_cell(cell).map(Filter::exact) {
+        for filter in Id::ids_received_by_cell(cell).map(Filter::exact) {
             if !self.filters.contains(&filter) {
                 self.filters.push(filter);
             }
@@ -194,7 +194,7 @@ impl LineOptions {
         self.bit_rates.is_none_or(|rates| rates.data_rate() != rates.nominal_rate())
     }
 
-    fn apply(&mut self, option: &str) -> Result<(), LineError> {
+    fn apply_option(&mut self, option: &str) -> Result<(), LineError> {
         let line = self.address.to_string();
         let wrong = |expected: &dyn fmt::Display| LineError::Value {
             line: line.clone(),
@@ -223,7 +223,7 @@ impl LineOptions {
                 }
             }
             "filter" => {
-                let filter = filter(value).ok_or_else(|| {
+                let filter = parse_filter(value).ok_or_else(|| {
                     wrong(&"identifier and mask as candump has them: filter=100:700, or 8 digits each for 29 bits")
                 })?;
                 self.filters.push(filter);
@@ -239,7 +239,7 @@ impl LineOptions {
                 self.baud = Some(baud.ok_or_else(|| wrong(&"bits in a second: baud=115200"))?);
             }
             "settle" => {
-                self.settle = settle_time(value).ok_or_else(|| wrong(&ALLOWED_SETTLE))?;
+                self.settle = parse_settle_time(value).ok_or_else(|| wrong(&ALLOWED_SETTLE_TIMES))?;
             }
             "classic" if option == "classic" => self.classic = true,
             _ => {
@@ -251,7 +251,7 @@ impl LineOptions {
 }
 
 /// Parses a filter: identifier and mask, with 3 digits for frames of 11 bits and 8 digits for frames of 29 bits.
-fn filter(text: &str) -> Option<Filter> {
+fn parse_filter(text: &str) -> Option<Filter> {
     let (id, mask) = text.split_once(':')?;
     let (max, flag) = match id.len() {
         3 => (STANDARD_MASK, 0),
@@ -272,7 +272,7 @@ impl FromStr for LineOptions {
         let mut words = text.split(',');
         let mut options = Self::new(words.next().unwrap_or_default().parse()?);
         for word in words {
-            options.apply(word)?;
+            options.apply_option(word)?;
         }
         Ok(options)
     }

@@ -8,7 +8,7 @@ use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
 use protocol::slcan::{CR, encode};
 use protocol::wire_time::{BitRates, FrameBits};
 
-use super::account::ToLineCounts;
+use super::account::BusToLineCounts;
 use super::options::{LineOptions, OpeningStage, OpeningStep};
 
 /// The maximum number of queued frames: those that a line at 1 Mbaud carries in a tenth of a second.
@@ -32,7 +32,7 @@ impl LinePace {
         Self { bit_rates: options.bit_rates, baud: options.baud }
     }
 
-    fn cost(self, frame: &Frame, bytes: usize) -> Duration {
+    fn sending_time(self, frame: &Frame, bytes: usize) -> Duration {
         let bus = self
             .bit_rates
             .zip(FrameBits::from_frame(frame))
@@ -83,7 +83,7 @@ pub struct BusToLineQueue {
     /// True if a frame was written since the adapter was opened.
     has_written_frame: bool,
     /// The counts of the frames.
-    pub account: ToLineCounts,
+    pub account: BusToLineCounts,
 }
 
 impl BusToLineQueue {
@@ -101,29 +101,29 @@ impl BusToLineQueue {
     }
 
     /// Records that the line is open. The commands `opening` are written before any frame.
-    pub fn line_opened(&mut self, opening: &[OpeningStep]) {
-        self.line_lost();
+    pub fn handle_line_opened(&mut self, opening: &[OpeningStep]) {
+        self.handle_line_lost();
         self.is_up = true;
-        opening.iter().for_each(|step| self.push_step(step));
+        opening.iter().for_each(|step| self.push_opening_step(step));
     }
 
     /// Queues the commands `opening` to open the adapter again. They are written after a frame that is being written,
     /// and before all others.
-    pub fn reopen(&mut self, opening: &[OpeningStep]) {
+    pub fn queue_reopening(&mut self, opening: &[OpeningStep]) {
         let begun = usize::from(self.written > 0);
         let rest = self.entries.front().filter(|_| begun > 0).map_or(0, |entry| entry.bytes - self.written);
         let text = self.text.split_off(rest);
         let entries = self.entries.split_off(begun);
         (self.released, self.released_bytes) = (begun, rest);
         self.stage = OpeningStage::Away;
-        opening.iter().for_each(|step| self.push_step(step));
+        opening.iter().for_each(|step| self.push_opening_step(step));
         self.text.extend(text);
         self.entries.extend(entries);
     }
 
     /// Returns the stage that the opening of the adapter has reached.
     #[must_use]
-    pub const fn stage(&self) -> OpeningStage {
+    pub const fn opening_stage(&self) -> OpeningStage {
         self.stage
     }
 
@@ -143,8 +143,8 @@ impl BusToLineQueue {
     }
 
     /// Records that the line was lost, and drops the queued frames.
-    pub fn line_lost(&mut self) {
-        let waiting = self.clear();
+    pub fn handle_line_lost(&mut self) {
+        let waiting = self.clear_and_count();
         self.account.dropped.line_away += waiting;
         self.is_up = false;
     }
@@ -167,7 +167,11 @@ impl BusToLineQueue {
         } else if self.entries.len() >= MAX_WAITING_FRAMES {
             &mut dropped.queue_full
         } else {
-            self.push(text.as_bytes(), self.pace.cost(frame, text.as_bytes().len()), QueuedTextKind::Frame);
+            self.push(
+                text.as_bytes(),
+                self.pace.sending_time(frame, text.as_bytes().len()),
+                QueuedTextKind::Frame,
+            );
             return;
         };
         *reason += 1;
@@ -217,7 +221,7 @@ impl BusToLineQueue {
     }
 
     /// Drops the queued frames, except one that is being written, and queues the bytes `closing`.
-    pub fn queue_closing(&mut self, closing: &[u8]) {
+    pub fn queue_closing_bytes(&mut self, closing: &[u8]) {
         let begun = usize::from(self.written > 0);
         let dropped = self.entries.iter().skip(begun).filter(|entry| entry.is_frame()).count();
         self.account.dropped.ended += dropped as u64;
@@ -233,8 +237,8 @@ impl BusToLineQueue {
     }
 
     /// Drops the frame that is being written, because the line is closed before its end.
-    pub fn drop_unfinished(&mut self) {
-        self.account.dropped.ended += self.clear();
+    pub fn drop_unfinished_frame(&mut self) {
+        self.account.dropped.ended += self.clear_and_count();
         self.is_up = false;
     }
 
@@ -244,7 +248,7 @@ impl BusToLineQueue {
         self.entries.is_empty()
     }
 
-    fn push_step(&mut self, step: &OpeningStep) {
+    fn push_opening_step(&mut self, step: &OpeningStep) {
         // Writing ahead of the computed pace must not shorten the gap between commands, so the gap is extended.
         self.push(&step.bytes, step.gap + MAX_WRITE_AHEAD, QueuedTextKind::Command(step.stage));
     }
@@ -255,7 +259,7 @@ impl BusToLineQueue {
     }
 
     /// Empties the queue. Returns the number of frames that were in it.
-    fn clear(&mut self) -> u64 {
+    fn clear_and_count(&mut self) -> u64 {
         let frames = self.entries.iter().filter(|entry| entry.is_frame()).count();
         let Self { classic, one_rate, pace, account, .. } = *self;
         *self = Self { account, one_rate, ..Self::new(classic, pace) };

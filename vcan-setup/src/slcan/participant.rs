@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use protocol::bus::{Bus, BusError, Inbox};
 use rustix::event::PollFlags;
 
-use super::account::{FaultCounts, LineAccount, faults_since};
+use super::account::{FaultCounts, LineAccount, describe_faults_since};
 use super::event::LineEvent;
 use super::incoming::LineToBusQueue;
 use super::link::{LinePort, PortOpener};
@@ -53,7 +53,7 @@ enum ClientState {
 
 /// A serial line, its client of the bus, and the queues between them.
 #[derive(Debug)]
-pub(super) struct Participant {
+pub(super) struct LineParticipant {
     opener: PortOpener,
     line: LineState,
     client: ClientState,
@@ -74,11 +74,11 @@ pub(super) struct Participant {
     began: Instant,
 }
 
-impl Participant {
+impl LineParticipant {
     pub(super) fn new(options: LineOptions, bus: Bus) -> io::Result<Self> {
         let outgoing = BusToLineQueue::from_options(&options);
         let mut incoming = LineToBusQueue::new();
-        incoming.bus_opened(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
+        incoming.handle_bus_opened(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
         let now = Instant::now();
         Ok(Self {
             opener: PortOpener::new(options)?,
@@ -110,7 +110,7 @@ impl Participant {
 
     pub(super) fn account(&self) -> LineAccount {
         let mut to_line = self.outgoing.account;
-        to_line.dropped_by_bus = self.dropped_before + u64::from(self.inbox.dropped());
+        to_line.dropped_by_bus = self.dropped_before + u64::from(self.inbox.dropped_count());
         let to_bus = self.incoming.account();
         LineAccount {
             line: self.name(),
@@ -124,7 +124,7 @@ impl Participant {
     }
 
     /// Returns the events to poll for at the line.
-    pub(super) fn interest(&mut self) -> PollInterest {
+    pub(super) fn poll_interest(&mut self) -> PollInterest {
         let now = self.began.elapsed();
         let line = match &self.line {
             LineState::Away(_) => None,
@@ -148,7 +148,7 @@ impl Participant {
     }
 
     /// Returns the time at which there is something to do even if no data arrives.
-    pub(super) fn timeout(&mut self, now: Instant) -> Option<Instant> {
+    pub(super) fn next_deadline(&mut self, now: Instant) -> Option<Instant> {
         let elapsed = now - self.began;
         let line = match &self.line {
             LineState::Away(at) => Some(*at),
@@ -191,7 +191,7 @@ impl Participant {
         self.write_line(now, report);
         let is_due = self.report_at <= now && self.has_more_to_report();
         if is_due || self.has_new_fault() {
-            self.report(report);
+            self.report_losses_and_faults(report);
             self.report_at = now + REPORT_INTERVAL;
         }
     }
@@ -206,8 +206,8 @@ impl Participant {
     }
 
     /// Reports the lost frames and faults since the last report.
-    fn report(&mut self, report: &mut impl FnMut(LineEvent)) {
-        let faults = faults_since(&self.reported_faults, self.incoming.faults());
+    fn report_losses_and_faults(&mut self, report: &mut impl FnMut(LineEvent)) {
+        let faults = describe_faults_since(&self.reported_faults, self.incoming.faults());
         if !faults.is_empty() {
             self.reported_faults = self.incoming.faults().clone();
             report(LineEvent::Reported(faults));
@@ -227,7 +227,7 @@ impl Participant {
             LineState::Open(port) if port.is_connecting() => match port.check_connected() {
                 Ok(false) => return,
                 Ok(true) => {
-                    self.line_opened(now, report);
+                    self.handle_line_opened(now, report);
                     return;
                 }
                 Err(error) => Err(error),
@@ -239,27 +239,27 @@ impl Participant {
                 let up = !port.is_connecting();
                 self.line = LineState::Open(port);
                 if up {
-                    self.line_opened(now, report);
+                    self.handle_line_opened(now, report);
                 }
             }
             Err(error) => {
                 self.line = LineState::Away(now + REOPEN_INTERVAL);
-                self.report_away(error, report);
+                self.report_line_away(error, report);
             }
         }
     }
 
     /// Returns the reason why the line is not open; `None` if it is not known yet.
-    pub(super) const fn reason(&self) -> Option<&io::Error> {
+    pub(super) const fn closed_reason(&self) -> Option<&io::Error> {
         self.reason.as_ref()
     }
 
     /// Returns the reason why the line is not open, and forgets it.
-    pub(super) const fn take_reason(&mut self) -> Option<io::Error> {
+    pub(super) const fn take_closed_reason(&mut self) -> Option<io::Error> {
         self.reason.take()
     }
 
-    fn line_opened(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
+    fn handle_line_opened(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         self.opened += 1;
         self.reason = None;
         let settle = self.opener.options().settle;
@@ -274,7 +274,7 @@ impl Participant {
     /// Queues the commands that open the adapter. Frames follow them.
     fn queue_opening(&mut self) {
         self.settled_at = None;
-        self.outgoing.line_opened(&self.opener.options().opening_steps());
+        self.outgoing.handle_line_opened(&self.opener.options().opening_steps());
     }
 
     /// Handles lines that the adapter refused.
@@ -283,11 +283,11 @@ impl Participant {
         let opening = self.opener.options().opening_steps();
         let settings: Vec<_> = opening.iter().filter(|step| step.stage == OpeningStage::Setting).collect();
         // Before the first frame, a refusal is a late answer to a setting.
-        let is_of_setting = self.outgoing.stage() == OpeningStage::Open
+        let is_of_setting = self.outgoing.opening_stage() == OpeningStage::Open
             && !self.outgoing.has_written_frame()
             && !settings.is_empty();
-        let stage = if is_of_setting { OpeningStage::Setting } else { self.outgoing.stage() };
-        match self.refusals.evaluate(now - self.began, stage, bells, replies) {
+        let stage = if is_of_setting { OpeningStage::Setting } else { self.outgoing.opening_stage() };
+        match self.refusals.evaluate_refusals(now - self.began, stage, bells, replies) {
             RefusalAction::Nothing => {}
             RefusalAction::Count(lines) => self.outgoing.count_refused(lines),
             RefusalAction::ReportSettings => {
@@ -296,22 +296,22 @@ impl Participant {
             }
             RefusalAction::Reopen(lines) => {
                 self.outgoing.count_refused(lines);
-                self.outgoing.reopen(&opening);
+                self.outgoing.queue_reopening(&opening);
                 report(LineEvent::Reopened);
             }
         }
     }
 
-    fn line_lost(&mut self, error: io::Error, now: Instant, report: &mut impl FnMut(LineEvent)) {
-        self.outgoing.line_lost();
-        self.incoming.line_lost();
+    fn handle_line_lost(&mut self, error: io::Error, now: Instant, report: &mut impl FnMut(LineEvent)) {
+        self.outgoing.handle_line_lost();
+        self.incoming.handle_line_lost();
         self.settled_at = None;
         self.line = LineState::Away(now + REOPEN_INTERVAL);
         self.lost += 1;
-        self.report_away(error, report);
+        self.report_line_away(error, report);
     }
 
-    fn report_away(&mut self, error: io::Error, report: &mut impl FnMut(LineEvent)) {
+    fn report_line_away(&mut self, error: io::Error, report: &mut impl FnMut(LineEvent)) {
         let why = error.to_string();
         if self.reason.as_ref().is_none_or(|before| before.to_string() != why) {
             report(LineEvent::LineAway(why));
@@ -328,8 +328,8 @@ impl Participant {
             let LineState::Open(port) = &self.line else { return };
             match port.read(&mut buffer) {
                 Ok(0) => return,
-                Ok(count) => self.incoming.receive(buffer.get(..count).unwrap_or_default()),
-                Err(error) => return self.line_lost(error, now, report),
+                Ok(count) => self.incoming.receive_bytes(buffer.get(..count).unwrap_or_default()),
+                Err(error) => return self.handle_line_lost(error, now, report),
             }
             self.handle_refusals(now, report);
             self.write_bus(now, report);
@@ -349,13 +349,13 @@ impl Participant {
             match port.write(bytes) {
                 Ok(0) => return,
                 Ok(count) => {
-                    let before = self.outgoing.stage();
+                    let before = self.outgoing.opening_stage();
                     self.outgoing.remove_written(count);
-                    if before != OpeningStage::Open && self.outgoing.stage() == OpeningStage::Open {
-                        self.incoming.adapter_opened();
+                    if before != OpeningStage::Open && self.outgoing.opening_stage() == OpeningStage::Open {
+                        self.incoming.handle_adapter_opened();
                     }
                 }
-                Err(error) => return self.line_lost(error, now, report),
+                Err(error) => return self.handle_line_lost(error, now, report),
             }
         }
     }
@@ -370,7 +370,7 @@ impl Participant {
                         self.outgoing.push_frame(&received.frame);
                     }
                 }
-                Err(error) => return self.bus_failed(&error, now, report),
+                Err(error) => return self.handle_bus_failure(&error, now, report),
             }
             self.write_line(now, report);
         }
@@ -390,16 +390,16 @@ impl Participant {
             Err(error) => {
                 self.incoming.remove_sent(error.sent);
                 if !matches!(error.cause, BusError::Full { .. }) {
-                    self.bus_failed(&error.cause, now, report);
+                    self.handle_bus_failure(&error.cause, now, report);
                 }
             }
         }
     }
 
     /// Handles an interface that went down or a bus that ended. The frames queued for it are lost.
-    fn bus_failed(&mut self, error: &BusError, now: Instant, report: &mut impl FnMut(LineEvent)) {
-        self.incoming.bus_lost();
-        self.dropped_before += u64::from(self.inbox.dropped());
+    fn handle_bus_failure(&mut self, error: &BusError, now: Instant, report: &mut impl FnMut(LineEvent)) {
+        self.incoming.handle_bus_lost();
+        self.dropped_before += u64::from(self.inbox.dropped_count());
         self.inbox = Inbox::new();
         self.client = ClientState::Away(now + REOPEN_INTERVAL);
         report(LineEvent::BusAway(error.to_string()));
@@ -408,7 +408,7 @@ impl Participant {
     fn open_client(&mut self, settings: &BridgeSettings, now: Instant, report: &mut impl FnMut(LineEvent)) {
         match open(settings, self.opener.options()) {
             Ok(bus) => {
-                self.incoming.bus_opened(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
+                self.incoming.handle_bus_opened(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
                 self.client = ClientState::Open(Box::new(bus));
                 report(LineEvent::BusUp);
             }
@@ -419,7 +419,7 @@ impl Participant {
     fn lost_frame_counts(&self) -> (u64, u64) {
         let to_line = &self.outgoing.account;
         let to_bus = self.incoming.account();
-        let by_bus = self.dropped_before + u64::from(self.inbox.dropped());
+        let by_bus = self.dropped_before + u64::from(self.inbox.dropped_count());
         (to_line.dropped.total() + by_bus, to_bus.dropped.total() + to_bus.refused.total())
     }
 
@@ -430,8 +430,8 @@ impl Participant {
         self.write_bus(now, &mut |_| {});
         self.read_bus(now, &mut |_| {});
         self.client = ClientState::Away(Instant::now());
-        self.incoming.drop_at_end();
-        self.outgoing.queue_closing(&closing_command());
+        self.incoming.drop_remaining();
+        self.outgoing.queue_closing_bytes(&closing_command());
     }
 
     /// Writes the remaining output. Returns true when everything is written.
@@ -446,9 +446,9 @@ impl Participant {
         if let LineState::Open(port) = &self.line
             && !closed
         {
-            port.discard();
+            port.discard_output();
         }
-        self.outgoing.drop_unfinished();
+        self.outgoing.drop_unfinished_frame();
         closed
     }
 }

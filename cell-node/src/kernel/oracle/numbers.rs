@@ -17,7 +17,7 @@ impl Scalar for f64 {
 /// Real numbers as reference: the library's sine and cosine, and no rounding to words.
 impl Number for f64 {
     type WideSum = Self;
-    type FineNumber = Self;
+    type UnroundedConstant = Self;
 
     fn from_word(word: Q1_14) -> Self {
         word.to_f64()
@@ -43,11 +43,11 @@ impl Number for f64 {
         sum
     }
 
-    fn negative(self) -> Self {
+    fn negated(self) -> Self {
         -self
     }
 
-    fn norm(_: [Self; 3]) -> Option<u32> {
+    fn norm_upper_bound(_: [Self; 3]) -> Option<u32> {
         None
     }
 
@@ -55,11 +55,11 @@ impl Number for f64 {
         [angle.to_radians().sin(), angle.to_radians().cos()]
     }
 
-    fn fine_from_word(word: Q1_14) -> Self {
+    fn unrounded_from_word(word: Q1_14) -> Self {
         word.to_f64()
     }
 
-    fn fine_sine_cosine_one(angle: Q1_14) -> [Self; 3] {
+    fn unrounded_sine_cosine_one(angle: Q1_14) -> [Self; 3] {
         [angle.to_radians().sin(), angle.to_radians().cos(), 1.0]
     }
 
@@ -74,14 +74,14 @@ std::thread_local! {
 
 impl Operations {
     /// Runs a computation on [`CountingWord`] numbers and returns its operation count.
-    pub fn count<T>(computation: impl FnOnce() -> T) -> (T, Self) {
+    pub fn count_operations<T>(computation: impl FnOnce() -> T) -> (T, Self) {
         OPERATIONS.set(Self::default());
         let result = computation();
         (result, OPERATIONS.take())
     }
 }
 
-/// A Q1.14 word whose operations [`Operations::count`] counts.
+/// A Q1.14 word whose operations [`Operations::count_operations`] counts.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct CountingWord(pub Q1_14);
 

@@ -25,14 +25,14 @@ use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
 use self::axes::{
     Axis, AxisFrame, BaseTransform, HorizontalTerms, Rotation, RotationProducts, Vector, VerticalTerms,
-    negate,
+    negate_axis,
 };
-use self::range::is_bounded;
+use self::range::stays_in_word_range;
 use self::sums::VectorSums;
 use crate::kernel::joint::Joint;
-use crate::kernel::rounding::{Bounded, Saturating};
-use crate::kernel::{Kernel, Number, Scalar, Twist, chain, cold_path};
-use crate::sine::QUARTER;
+use crate::kernel::rounding::{NonSaturatingRounding, SaturatingRounding};
+use crate::kernel::{Kernel, Number, Scalar, Twist, checked_chain_rows, cold_path};
+use crate::sine::QUARTER_TURN;
 
 /// The projection kernel of one cell, for comparison.
 ///
@@ -79,27 +79,27 @@ struct ChainLink<N> {
 /// Bits for the values that are computed for a row.
 mod due {
     /// Axis x_l, which requires a sine.
-    pub(super) const X_AXIS: u32 = 1;
+    pub(super) const NEEDS_X_AXIS: u32 = 1;
     /// All three axes, because the row ends a group of parallel axes.
-    pub(super) const ENDS_GROUP: u32 = 2;
+    pub(super) const ENDS_AXIS_GROUP: u32 = 2;
     /// Axis z_(l-1), stored for the joints of this group of parallel axes.
-    pub(super) const Z_AXIS: u32 = 4;
+    pub(super) const NEEDS_Z_AXIS: u32 = 4;
     /// The shift by the length a, for which x_l is stored.
-    pub(super) const SHIFT_BY_A: u32 = 8;
+    pub(super) const NEEDS_SHIFT_BY_A: u32 = 8;
     /// The shift by the offset d.
-    pub(super) const SHIFT_BY_D: u32 = 16;
+    pub(super) const NEEDS_SHIFT_BY_D: u32 = 16;
     /// The row has a revolute joint.
     pub(super) const IS_REVOLUTE: u32 = 32;
     /// The row continues a group of parallel axes. Its turn starts from the axes before the group.
-    pub(super) const CONTINUES_GROUP: u32 = 64;
+    pub(super) const CONTINUES_AXIS_GROUP: u32 = 64;
 }
 
 /// The axes that are stored for the way down: z_(l-1) of each group of parallel axes, and x_l of its rows.
-type KeptAxes<N> = heapless::Vec<Vector<N>, { 2 * MAX_ROWS }>;
+type StoredAxes<N> = heapless::Vec<Vector<N>, { 2 * MAX_ROWS }>;
 
 impl<S: Scalar> Kernel<S> for Projection<S> {
     fn new(parameters: &Parameters) -> Self {
-        let chain = chain(parameters);
+        let chain = checked_chain_rows(parameters);
         let (mut frame, mut goes_on) = (AxisFrame::BASE, false);
         let mut joints = Joint::ALL.into_iter();
         let mut links = [ChainLink::new(&Row::default(), Joint::J1, frame, false); MAX_ROWS];
@@ -107,12 +107,12 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
             let joint = if row.has_joint() { joints.next() } else { None }.unwrap_or(Joint::J1);
             *link = ChainLink::new(row, joint, frame, index + 1 == chain.len());
             if goes_on {
-                link.due |= due::CONTINUES_GROUP;
+                link.due |= due::CONTINUES_AXIS_GROUP;
             }
             if index == 0 && row.kind != RowKind::Prismatic {
-                (link.due, link.d) = (link.due & !due::SHIFT_BY_D, Q1_14::ZERO);
+                (link.due, link.d) = (link.due & !due::NEEDS_SHIFT_BY_D, Q1_14::ZERO);
             }
-            goes_on = !link.is_due(due::ENDS_GROUP);
+            goes_on = !link.has_due_bit(due::ENDS_AXIS_GROUP);
             if !goes_on {
                 (frame, _) = frame.after_twist(link.twist);
             }
@@ -121,12 +121,13 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
         let is_upright = |row: &Row| matches!(row.alpha.to_bits(), 0 | i16::MIN);
         let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
         let position = parameters.pose.position.map(S::Number::from_word);
-        let force = parameters.pose.normal.map(|word| S::Number::from_word(word).negative());
+        let force = parameters.pose.normal.map(|word| S::Number::from_word(word).negated());
         Self {
             force,
             position,
             to_base: BaseTransform::new(frame, !slides && below.unwrap_or_default().iter().all(is_upright)),
-            bounded: !slides && is_bounded(force, position, links.get(..chain.len()).unwrap_or_default()),
+            bounded: !slides
+                && stays_in_word_range(force, position, links.get(..chain.len()).unwrap_or_default()),
             links,
             rows: chain.len(),
         }
@@ -134,12 +135,12 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
 
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
-        let mut kept = KeptAxes::new();
-        let [zero, one] = [S::Number::zero(), S::Number::from_word(QUARTER)];
+        let mut kept = StoredAxes::new();
+        let [zero, one] = [S::Number::zero(), S::Number::from_word(QUARTER_TURN)];
         let mut axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]];
-        let axes = self.axes(joints, axes.each_mut(), &mut kept);
+        let axes = self.compute_cell_axes(joints, axes.each_mut(), &mut kept);
         if self.bounded {
-            self.write_jacobian_from_axes::<Bounded>(axes, &kept, None, jacobian);
+            self.write_jacobian_from_axes::<NonSaturatingRounding>(axes, &kept, None, jacobian);
         } else {
             cold_path();
             self.write_jacobian_saturating(axes, &kept, joints, jacobian);
@@ -156,30 +157,30 @@ impl<S: Scalar> Projection<S> {
 
     /// Computes the axes x, y, z of the cell's frame in base coordinates, from the base up.
     #[inline(always)]
-    fn axes<'a>(
+    fn compute_cell_axes<'a>(
         &self,
         joints: &[Q1_14; MAX_JOINTS],
         [x, mut y, mut z]: [&'a mut Vector<S::Number>; 3],
-        kept: &mut KeptAxes<S::Number>,
+        kept: &mut StoredAxes<S::Number>,
     ) -> [&'a Vector<S::Number>; 3] {
         let mut group = Q1_14::ZERO;
         for link in self.links() {
-            group = link.angle(group, joints);
-            if !link.is_due(due::X_AXIS) {
+            group = link.angle_in_group(group, joints);
+            if !link.has_due_bit(due::NEEDS_X_AXIS) {
                 continue;
             }
             let turn = Rotation(S::Number::sine_cosine(group));
             let [mix, _] = link.mixes;
             // The capacity is two vectors per row.
-            if !link.is_due(due::ENDS_GROUP) {
-                let _ = kept.push(turn.rotate_first(mix, x, y));
+            if !link.has_due_bit(due::ENDS_AXIS_GROUP) {
+                let _ = kept.push(turn.rotated_first_axis(mix, x, y));
                 continue;
             }
-            turn.rotate_both(mix, x, y);
-            if link.is_due(due::SHIFT_BY_A) {
+            turn.rotate_both_axes(mix, x, y);
+            if link.has_due_bit(due::NEEDS_SHIFT_BY_A) {
                 let _ = kept.push(*x);
             }
-            if link.is_due(due::Z_AXIS) {
+            if link.has_due_bit(due::NEEDS_Z_AXIS) {
                 let _ = kept.push(*z);
             }
             link.twist_by_alpha(&mut y, &mut z);
@@ -193,30 +194,30 @@ impl<S: Scalar> Projection<S> {
     fn write_jacobian_from_axes<R: VectorSums>(
         &self,
         axes: [&Vector<S::Number>; 3],
-        kept: &KeptAxes<S::Number>,
+        kept: &StoredAxes<S::Number>,
         slides: Option<&[Q1_14; MAX_JOINTS]>,
         jacobian: &mut [S; MAX_JOINTS],
     ) {
-        let [force, mut position] = self.in_base::<R>(axes);
+        let [force, mut position] = self.force_and_position_in_base::<R>(axes);
         let [.., mut z] = axes;
         let mut kept = kept.iter().rev();
         for link in self.links().iter().rev() {
-            if link.is_due(due::Z_AXIS) {
+            if link.has_due_bit(due::NEEDS_Z_AXIS) {
                 let Some(axis) = kept.next() else { return };
                 z = axis;
             }
             let slides = slides.filter(|_| link.kind == RowKind::Prismatic);
-            let d = match slides.and_then(|joints| link.joint.get(joints)) {
+            let d = match slides.and_then(|joints| link.joint.element_of(joints)) {
                 Some(position) => Some(S::Number::from_word(link.d.saturating_add(*position))),
-                None => link.is_due(due::SHIFT_BY_D).then(|| S::Number::from_word(link.d)),
+                None => link.has_due_bit(due::NEEDS_SHIFT_BY_D).then(|| S::Number::from_word(link.d)),
             };
-            let turned = link.step_down::<R>(&mut position, &force, z, d, || kept.next());
+            let turned = link.step_towards_base::<R>(&mut position, &force, z, d, || kept.next());
             let entry = match turned {
                 Some(entry) => entry,
                 None if slides.is_some() => link.force_along_axis::<R>(z, &force),
                 None => continue,
             };
-            if let Some(row) = link.joint.get_mut(jacobian) {
+            if let Some(row) = link.joint.element_of_mut(jacobian) {
                 *row = S::from_number(entry);
             }
         }
@@ -227,16 +228,19 @@ impl<S: Scalar> Projection<S> {
     fn write_jacobian_saturating(
         &self,
         axes: [&Vector<S::Number>; 3],
-        kept: &KeptAxes<S::Number>,
+        kept: &StoredAxes<S::Number>,
         joints: &[Q1_14; MAX_JOINTS],
         jacobian: &mut [S; MAX_JOINTS],
     ) {
-        self.write_jacobian_from_axes::<Saturating>(axes, kept, Some(joints), jacobian);
+        self.write_jacobian_from_axes::<SaturatingRounding>(axes, kept, Some(joints), jacobian);
     }
 
     /// Transforms the force and the cell's position to the base frame.
     #[inline(always)]
-    fn in_base<R: VectorSums>(&self, [x, y, z]: [&Vector<S::Number>; 3]) -> [Vector<S::Number>; 2] {
+    fn force_and_position_in_base<R: VectorSums>(
+        &self,
+        [x, y, z]: [&Vector<S::Number>; 3],
+    ) -> [Vector<S::Number>; 2] {
         let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (*x, *y, *z);
         let vectors = [self.force, self.position];
         let two = |a: S::Number, x, b: S::Number, y| R::round(R::plus::<S::Number>(a.times(x), b.times(y)));
@@ -253,9 +257,9 @@ impl<S: Scalar> Projection<S> {
         let height = match self.to_base.height {
             VerticalTerms::Nothing => [S::Number::zero(); 2],
             VerticalTerms::Y => vectors.map(|[_, b, _]| b),
-            VerticalTerms::MinusY => vectors.map(|[_, b, _]| R::negative(b)),
+            VerticalTerms::MinusY => vectors.map(|[_, b, _]| R::negated(b)),
             VerticalTerms::Z => vectors.map(|[_, _, c]| c),
-            VerticalTerms::MinusZ => vectors.map(|[_, _, c]| R::negative(c)),
+            VerticalTerms::MinusZ => vectors.map(|[_, _, c]| R::negated(c)),
             VerticalTerms::Yz => vectors.map(|[_, b, c]| two(b, y2, c, z2)),
             VerticalTerms::Xz => vectors.map(|[a, _, c]| two(a, x2, c, z2)),
             VerticalTerms::Xy => vectors.map(|[a, b, _]| two(a, x2, b, y2)),
@@ -272,20 +276,20 @@ impl<N: Number> ChainLink<N> {
         let ends = last || row.alpha != Q1_14::ZERO;
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
         let twist = Twist::new(row.alpha);
-        let axis = frame.z();
+        let axis = frame.z_axis();
         let (_, twisting) = frame.after_twist(twist);
         let due = [
-            (ends || a, due::X_AXIS),
-            (ends, due::ENDS_GROUP),
-            (ends && !axis.is_upright(), due::Z_AXIS),
-            (a, due::SHIFT_BY_A),
-            (d, due::SHIFT_BY_D),
+            (ends || a, due::NEEDS_X_AXIS),
+            (ends, due::ENDS_AXIS_GROUP),
+            (ends && !axis.is_vertical(), due::NEEDS_Z_AXIS),
+            (a, due::NEEDS_SHIFT_BY_A),
+            (d, due::NEEDS_SHIFT_BY_D),
             (row.kind == RowKind::Revolute, due::IS_REVOLUTE),
         ];
         Self {
             due: due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all }),
             joint,
-            mixes: [frame.turn_products(), twisting],
+            mixes: [frame.z_rotation_products(), twisting],
             axis,
             kind: row.kind,
             a: row.a,
@@ -295,21 +299,21 @@ impl<N: Number> ChainLink<N> {
         }
     }
 
-    fn is_due(&self, bit: u32) -> bool {
+    fn has_due_bit(&self, bit: u32) -> bool {
         self.due & bit != 0
     }
 
     /// Returns the angle between the axes before the group of parallel joints and those after this joint. `group` is
     /// that angle for the previous joint.
     #[inline(always)]
-    fn angle(&self, group: Q1_14, joints: &[Q1_14; MAX_JOINTS]) -> Q1_14 {
+    fn angle_in_group(&self, group: Q1_14, joints: &[Q1_14; MAX_JOINTS]) -> Q1_14 {
         let mut angle = self.offset;
-        if self.is_due(due::IS_REVOLUTE)
-            && let Some(position) = self.joint.get(joints)
+        if self.has_due_bit(due::IS_REVOLUTE)
+            && let Some(position) = self.joint.element_of(joints)
         {
-            angle = N::plus_angle(*position, angle);
+            angle = N::add_angles(*position, angle);
         }
-        if self.is_due(due::CONTINUES_GROUP) { N::plus_angle(group, angle) } else { angle }
+        if self.has_due_bit(due::CONTINUES_AXIS_GROUP) { N::add_angles(group, angle) } else { angle }
     }
 
     /// Computes y_l and z_l from v_l and the previous z axis, in place. For quarter turns the references y and z are
@@ -319,27 +323,27 @@ impl<N: Number> ChainLink<N> {
         match self.twist {
             Twist::None => {}
             Twist::Ahead => {
-                negate(y);
+                negate_axis(y);
                 core::mem::swap(y, z);
             }
             Twist::Half => {
-                negate(y);
-                negate(z);
+                negate_axis(y);
+                negate_axis(z);
             }
             Twist::Back => {
-                negate(z);
+                negate_axis(z);
                 core::mem::swap(y, z);
             }
             Twist::Other { sine, cosine } => {
                 cold_path();
-                twist_by(Rotation([sine, cosine]), self.mixes, y, z);
+                rotate_yz_by_twist(Rotation([sine, cosine]), self.mixes, y, z);
             }
         }
     }
 
     /// Computes p_(l-1) from p_l (Eq. 24), and J of a revolute joint: (z x p) . f (Eq. 8).
     #[inline(always)]
-    fn step_down<'a, R: VectorSums>(
+    fn step_towards_base<'a, R: VectorSums>(
         &self,
         p: &mut Vector<N>,
         &[f0, f1, f2]: &Vector<N>,
@@ -356,54 +360,50 @@ impl<N: Number> ChainLink<N> {
         let moment = match self.axis {
             // Below an upright axis all axes are upright, and no height is needed.
             Axis::Up | Axis::Down => {
-                if self.is_due(due::SHIFT_BY_A) {
+                if self.has_due_bit(due::NEEDS_SHIFT_BY_A) {
                     let ([x0, x1, _], a) = (*kept()?, a());
                     *p0 = R::add_product(*p0, a.times(x0));
                     *p1 = R::add_product(*p1, a.times(x1));
                 }
-                if !self.is_due(due::IS_REVOLUTE) {
+                if !self.has_due_bit(due::IS_REVOLUTE) {
                     return None;
                 }
-                if self.axis == Axis::Up {
-                    level(R::negative(*p1), *p0)
-                } else {
-                    level(*p1, R::negative(*p0))
-                }
+                if self.axis == Axis::Up { level(R::negated(*p1), *p0) } else { level(*p1, R::negated(*p0)) }
             }
             Axis::Level => {
-                if self.is_due(due::SHIFT_BY_A) {
+                if self.has_due_bit(due::NEEDS_SHIFT_BY_A) {
                     let ([x0, x1, x2], a) = (*kept()?, a());
-                    shift::<R, N>(p0, a.times(x0), d, z0);
-                    shift::<R, N>(p1, a.times(x1), d, z1);
+                    shift_position::<R, N>(p0, a.times(x0), d, z0);
+                    shift_position::<R, N>(p1, a.times(x1), d, z1);
                     *p2 = R::add_product(*p2, a.times(x2));
                 } else if let Some(d) = d {
                     *p0 = R::add_product(*p0, d.times(z0));
                     *p1 = R::add_product(*p1, d.times(z1));
                 }
-                if !self.is_due(due::IS_REVOLUTE) {
+                if !self.has_due_bit(due::IS_REVOLUTE) {
                     return None;
                 }
-                let [m0, m1] = [R::round(p2.times(z1)), R::round(R::negative(*p2).times(z0))];
-                let m2 = R::difference(p1.times(z0), p0.times(z1));
+                let [m0, m1] = [R::round(p2.times(z1)), R::round(R::negated(*p2).times(z0))];
+                let m2 = R::rounded_difference(p1.times(z0), p0.times(z1));
                 R::plus::<N>(level(m0, m1), f2.times(m2))
             }
             Axis::Any => {
-                if self.is_due(due::SHIFT_BY_A) {
+                if self.has_due_bit(due::NEEDS_SHIFT_BY_A) {
                     let ([x0, x1, x2], a) = (*kept()?, a());
-                    shift::<R, N>(p0, a.times(x0), d, z0);
-                    shift::<R, N>(p1, a.times(x1), d, z1);
-                    shift::<R, N>(p2, a.times(x2), d, z2);
+                    shift_position::<R, N>(p0, a.times(x0), d, z0);
+                    shift_position::<R, N>(p1, a.times(x1), d, z1);
+                    shift_position::<R, N>(p2, a.times(x2), d, z2);
                 } else if let Some(d) = d {
                     *p0 = R::add_product(*p0, d.times(z0));
                     *p1 = R::add_product(*p1, d.times(z1));
                     *p2 = R::add_product(*p2, d.times(z2));
                 }
-                if !self.is_due(due::IS_REVOLUTE) {
+                if !self.has_due_bit(due::IS_REVOLUTE) {
                     return None;
                 }
-                let m0 = R::difference(p2.times(z1), p1.times(z2));
-                let m1 = R::difference(p0.times(z2), p2.times(z0));
-                let m2 = R::difference(p1.times(z0), p0.times(z1));
+                let m0 = R::rounded_difference(p2.times(z1), p1.times(z2));
+                let m1 = R::rounded_difference(p0.times(z2), p2.times(z0));
+                let m2 = R::rounded_difference(p1.times(z0), p0.times(z1));
                 R::plus::<N>(level(m0, m1), f2.times(m2))
             }
         };
@@ -414,7 +414,7 @@ impl<N: Number> ChainLink<N> {
     fn force_along_axis<R: VectorSums>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
         match self.axis {
             Axis::Up => f2,
-            Axis::Down => R::negative(f2),
+            Axis::Down => R::negated(f2),
             Axis::Level => R::round(R::plus::<N>(f0.times(z0), f1.times(z1))),
             Axis::Any => R::round(R::plus::<N>(R::plus::<N>(f0.times(z0), f1.times(z1)), f2.times(z2))),
         }
@@ -423,7 +423,7 @@ impl<N: Number> ChainLink<N> {
 
 /// Adds the products with the length a and the offset d to a component of the position.
 #[inline(always)]
-fn shift<R: VectorSums, N: Number>(position: &mut N, by_a: N::WideSum, d: Option<N>, z: N) {
+fn shift_position<R: VectorSums, N: Number>(position: &mut N, by_a: N::WideSum, d: Option<N>, z: N) {
     *position = match d {
         None => R::add_product(*position, by_a),
         Some(d) => R::add_products(*position, by_a, d.times(z)),
@@ -432,11 +432,11 @@ fn shift<R: VectorSums, N: Number>(position: &mut N, by_a: N::WideSum, d: Option
 
 /// Rotates y and z by a twist that is not a multiple of quarter turns.
 #[inline(never)]
-fn twist_by<N: Number>(
+fn rotate_yz_by_twist<N: Number>(
     turn: Rotation<N>,
     [_, mix]: [RotationProducts; 2],
     y: &mut Vector<N>,
     z: &mut Vector<N>,
 ) {
-    turn.rotate_both(mix, y, z);
+    turn.rotate_both_axes(mix, y, z);
 }

@@ -9,10 +9,10 @@ use super::{Number, PerComponent};
 /// Returns the wrench of the contact, twisted and shifted by joint k's row, and rounded once.
 pub(super) fn constant_wrench<N: Number>(pose: &Pose, row: &Row) -> PerComponent<N> {
     let (force, moment) = exact_constant_wrench(
-        pose.normal.map(N::fine_from_word),
-        pose.position.map(N::fine_from_word),
-        N::fine_sine_cosine_one(row.alpha),
-        (N::fine_from_word(row.a), N::fine_from_word(row.d)),
+        pose.normal.map(N::unrounded_from_word),
+        pose.position.map(N::unrounded_from_word),
+        N::unrounded_sine_cosine_one(row.alpha),
+        (N::unrounded_from_word(row.a), N::unrounded_from_word(row.d)),
     );
     // 14 fraction bits of a word and 28 of the twist; for the moment 14 more of a length.
     PerComponent { force: force.map(N::round_constant::<42>), moment: moment.map(N::round_constant::<56>) }

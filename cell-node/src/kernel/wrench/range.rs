@@ -12,11 +12,12 @@ use crate::kernel::Number;
 /// The bound is computed from F and M, the maxima of |f| and |m|. A twist or a turn with words for sine and cosine,
 /// each at most 5e-4 off, lengthens a vector by a factor of at most 1 + 2^-10, and rounding its components adds less
 /// than one step. A shift adds at most |(a, d)| F to M, and its rounding adds less than one step.
-pub(super) fn bound<N: Number>(contact: &PerComponent<N>, rows: &[Row]) -> Option<u16> {
+pub(super) fn moment_bound<N: Number>(contact: &PerComponent<N>, rows: &[Row]) -> Option<u16> {
     let turned = |norm: u32| norm + (norm >> 10) + 2;
-    let (mut force, mut moment) = (turned(N::norm(contact.force)?), turned(N::norm(contact.moment)?));
+    let (mut force, mut moment) =
+        (turned(N::norm_upper_bound(contact.force)?), turned(N::norm_upper_bound(contact.moment)?));
     for row in rows.iter().rev() {
-        let reach = N::norm([N::from_word(row.a), N::from_word(row.d), N::zero()])?;
+        let reach = N::norm_upper_bound([N::from_word(row.a), N::from_word(row.d), N::zero()])?;
         (force, moment) = (turned(force), turned(moment));
         if force >= 1 << 15 || reach > 1 << 16 {
             return None;

@@ -108,7 +108,7 @@ impl Errors {
             let force = Force::from_steps((case.force * 65_536.0) as i64);
             let jacobian = jacobian(&case.parameters(), &case.words());
             let torque = Torque::new(&jacobian, force);
-            torque.words(TorqueFormat::Q3_12).map(|word| TorqueFormat::Q3_12.to_real(word))
+            torque.torque_words(TorqueFormat::Q3_12).map(|word| TorqueFormat::Q3_12.to_real(word))
         })
     }
 }
@@ -167,7 +167,7 @@ pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; MAX_JOINTS
     let mut frames: Vec<Transform> =
         vec![std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))))];
     let mut positions = positions.iter();
-    for row in parameters.chain() {
+    for row in parameters.rows_to_cell() {
         let position = if row.has_joint() { *positions.next().unwrap_or(&Q1_14::ZERO) } else { Q1_14::ZERO };
         frames.push(product(frames.last().unwrap(), &transform(row, position)));
     }
@@ -179,7 +179,7 @@ pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; MAX_JOINTS
     let cell: [f64; 3] = std::array::from_fn(|i| local[i] + last[i][3]);
 
     let mut jacobian = [0.0; MAX_JOINTS];
-    let moving = parameters.chain().iter().zip(&frames).filter(|(row, _)| row.has_joint());
+    let moving = parameters.rows_to_cell().iter().zip(&frames).filter(|(row, _)| row.has_joint());
     for (row, (of, frame)) in jacobian.iter_mut().zip(moving) {
         if of.kind == RowKind::Prismatic {
             *row = axis(frame, 2).iter().zip(force).map(|(z, f)| z * f).sum();

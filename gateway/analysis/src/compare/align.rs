@@ -8,12 +8,12 @@ use protocol::packet::Epoch;
 use protocol::skin::Skin;
 
 use super::PerCapture;
-use super::numbering::Numbering;
+use super::numbering::JointsNumbering;
 
 /// Maximum number of joints of a capture that are kept, counted from its start; a day at 62.5 Hz has 5.4 million.
 const MAX_JOINTS_KEPT: usize = 6_000_000;
 /// Number of joints that are compared to rate an alignment.
-const MAX_SAMPLES: usize = 512;
+const MAX_COMPARED_JOINTS: usize = 512;
 /// Minimum number of epochs that two captures must have in common to be aligned by their joints.
 const MIN_COMMON_EPOCHS: usize = 8;
 
@@ -21,7 +21,7 @@ const MIN_COMMON_EPOCHS: usize = 8;
 #[derive(Debug)]
 pub struct JointTrace {
     bus: Option<String>,
-    numbering: Numbering,
+    numbering: JointsNumbering,
     first: Option<Epoch>,
     /// Hash of each joints packet, by its number since the first one; `None` for missing joints.
     joints: Vec<Option<u32>>,
@@ -34,7 +34,7 @@ impl JointTrace {
         let bus = skin.cells.first().and_then(|cell| skin.buses.get(cell.bus));
         Self {
             bus: bus.map(|bus| bus.name.clone()),
-            numbering: Numbering::new(super::period_ns(skin), Some(0)),
+            numbering: JointsNumbering::new(super::period_ns(skin), Some(0)),
             first: None,
             joints: Vec::new(),
         }
@@ -42,12 +42,12 @@ impl JointTrace {
 
     /// Returns the epoch of the first joints in the capture; `None` before these.
     #[must_use]
-    pub fn first(&self) -> Option<u8> {
+    pub fn first_epoch(&self) -> Option<u8> {
         self.first.map(|first| first.0)
     }
 
     /// Records the next message; ignores messages other than joints, and other buses than the traced one.
-    pub fn record(&mut self, nanos: u64, bus: &str, message: &Message) {
+    pub fn record_message(&mut self, nanos: u64, bus: &str, message: &Message) {
         let Message::Joints { epoch, joints } = message else { return };
         if self.bus.as_deref() != Some(bus) {
             return;
@@ -75,14 +75,14 @@ fn joints_hash(joints: &Joints) -> u32 {
 
 /// Returns for each of two captures of one skin the number of its first joints since the run began; `None` if unknown.
 #[must_use]
-pub fn start_numbers(a: &JointTrace, b: &JointTrace) -> PerCapture<Option<u64>> {
+pub fn first_joints_numbers(a: &JointTrace, b: &JointTrace) -> PerCapture<Option<u64>> {
     let (Some(first_a), Some(first_b)) = (a.first, b.first) else { return PerCapture { a: None, b: None } };
     let of = |first: Epoch, laps: usize| u64::from(first.0) + 256 * laps as u64;
-    let mut best = (equal_share(a, b, of(first_a, 0), of(first_b, 0)).unwrap_or(0.0), 0, 0);
+    let mut best = (equal_joints_share(a, b, of(first_a, 0), of(first_b, 0)).unwrap_or(0.0), 0, 0);
     let most = a.joints.len().max(b.joints.len()) / 256 + 1;
     for laps in 1..=most {
         for (laps_a, laps_b) in [(0, laps), (laps, 0)] {
-            let share = equal_share(a, b, of(first_a, laps_a), of(first_b, laps_b)).unwrap_or(0.0);
+            let share = equal_joints_share(a, b, of(first_a, laps_a), of(first_b, laps_b)).unwrap_or(0.0);
             if share > best.0 && share >= 0.5 {
                 best = (share, laps_a, laps_b);
             }
@@ -93,7 +93,7 @@ pub fn start_numbers(a: &JointTrace, b: &JointTrace) -> PerCapture<Option<u64>> 
 
 /// Returns the share of joints that are equal if the captures begin with the numbers `start_a` and `start_b`; `None` if
 /// they then have too few epochs in common.
-fn equal_share(a: &JointTrace, b: &JointTrace, start_a: u64, start_b: u64) -> Option<f64> {
+fn equal_joints_share(a: &JointTrace, b: &JointTrace, start_a: u64, start_b: u64) -> Option<f64> {
     let begin = start_a.max(start_b);
     let [skip_a, skip_b] =
         [start_a, start_b].map(|start| usize::try_from(begin - start).unwrap_or(usize::MAX));
@@ -102,7 +102,7 @@ fn equal_share(a: &JointTrace, b: &JointTrace, start_a: u64, start_b: u64) -> Op
     if common < MIN_COMMON_EPOCHS {
         return None;
     }
-    let step = common.div_ceil(MAX_SAMPLES);
+    let step = common.div_ceil(MAX_COMPARED_JOINTS);
     let pairs = a.iter().zip(b).take(common).step_by(step).filter(|(a, b)| a.is_some() && b.is_some());
     let (equal, all) =
         pairs.fold((0_u32, 0_u32), |(equal, all), (a, b)| (equal + u32::from(a == b), all + 1));

@@ -22,14 +22,14 @@ use protocol::skin::Skin;
 use serde::Serialize;
 
 use self::numbering::JointsKey;
-use self::pair::{FirstDifferences, FoundDifference, Tally, compare_joints};
+use self::pair::{ComparisonCounts, FirstDifferences, FoundDifference, compare_joints};
 use self::side::{AnsweredJoints, ComparedCapture};
-use crate::explain::NotFound;
+use crate::explain::JointsNotFound;
 
-pub use self::align::{JointTrace, start_numbers};
+pub use self::align::{JointTrace, first_joints_numbers};
 pub use self::report::{
-    ASPECTS, CaptureFigures, CellRow, CompareReport, ContactCounts, EpochCounts, ExtraCell, FirstDifference,
-    JointCounts, Losses, ReplyCounts, UnpairedCounts,
+    COMPARED_ASPECTS, CaptureFigures, CellLosses, CompareReport, ComparedCellRow, ContactCounts, EpochCounts,
+    ExtraCell, FirstDifference, JointCounts, ReplyCounts, UnpairedCounts,
 };
 
 /// One of the two captures that are compared.
@@ -42,7 +42,7 @@ pub enum CaptureSide {
 }
 
 impl CaptureSide {
-    const fn other(self) -> Self {
+    const fn other_side(self) -> Self {
         if matches!(self, Self::A) { Self::B } else { Self::A }
     }
 }
@@ -92,7 +92,7 @@ pub struct Comparison<'a> {
     skin: &'a Skin,
     options: CompareOptions,
     sides: PerCapture<ComparedCapture<'a>>,
-    tallies: Vec<Tally>,
+    tallies: Vec<ComparisonCounts>,
     epochs: EpochCounts,
     /// The first difference that counts in any case, and the first missing item, each with its joints and bus.
     first: Option<(JointsKey, usize, FirstDifference)>,
@@ -115,7 +115,7 @@ impl<'a> Comparison<'a> {
             skin,
             options,
             sides: PerCapture { a: side(starts.a), b: side(starts.b) },
-            tallies: skin.buses.iter().map(|_| Tally::default()).collect(),
+            tallies: skin.buses.iter().map(|_| ComparisonCounts::default()).collect(),
             epochs: EpochCounts::default(),
             first: None,
             first_missing: None,
@@ -143,7 +143,7 @@ impl<'a> Comparison<'a> {
     /// Handles the next frame of a capture; `message` is the decoded message, if the frame completes one.
     pub fn receive(&mut self, which: CaptureSide, nanos: u64, bus: &str, message: Option<&Message>) {
         if self.sides.get_mut(which).receive(nanos, bus, message) {
-            self.compare_complete();
+            self.compare_complete_joints();
         }
     }
 
@@ -159,22 +159,22 @@ impl<'a> Comparison<'a> {
     }
 
     /// Declares the end of a capture; `is_unfinished` if it was cut off.
-    pub fn end(&mut self, which: CaptureSide, is_unfinished: bool) {
+    pub fn end_capture(&mut self, which: CaptureSide, is_unfinished: bool) {
         let side = self.sides.get_mut(which);
         side.counts.unfinished = is_unfinished;
-        side.end();
-        self.compare_complete();
+        side.end_capture();
+        self.compare_complete_joints();
     }
 
     /// Returns the reason why a capture that has been read to its end has no joints of the skin; `None` if it has some.
-    pub fn not_found(&mut self, which: CaptureSide) -> Option<NotFound> {
+    pub fn not_found_reason(&mut self, which: CaptureSide) -> Option<JointsNotFound> {
         self.sides.get_mut(which).not_found()
     }
 
     /// Returns two numbers of cells: those that reported a configuration, and those of them that have the skin's.
     /// Returns `None` if these are at least half.
     #[must_use]
-    pub fn other_configurations(&self, which: CaptureSide) -> Option<(usize, usize)> {
+    pub fn reported_and_matching_cells(&self, which: CaptureSide) -> Option<(usize, usize)> {
         let hash = |bus: usize, node| {
             let cell = self.sides.get(which).buses.get(bus)?.cells.get(node)?;
             cell.tracked.claim().heartbeat().map(|it| it.configuration).filter(|hash| *hash != 0)
@@ -187,7 +187,7 @@ impl<'a> Comparison<'a> {
     }
 
     /// Compares the next joints of all buses, as long as their answers are complete in both captures.
-    fn compare_complete(&mut self) {
+    fn compare_complete_joints(&mut self) {
         for bus in 0..self.skin.buses.len() {
             while self.compare_next_joints(bus).is_some() {}
         }
@@ -202,7 +202,7 @@ impl<'a> Comparison<'a> {
             (Some(a), Some(b)) if a == b => {
                 let mut take = |which| self.sides.get_mut(which).buses.get_mut(bus)?.ready.pop_front();
                 let (a, b) = (take(CaptureSide::A)?, take(CaptureSide::B)?);
-                self.compare_moments(bus, &a, &b);
+                self.compare_answered_joints(bus, &a, &b);
                 return Some(());
             }
             (Some(a), Some(b)) => {
@@ -217,26 +217,26 @@ impl<'a> Comparison<'a> {
             _ => return None,
         };
         let moment = self.sides.get_mut(which).buses.get_mut(bus)?.ready.pop_front()?;
-        self.count_unpaired(bus, which, &moment);
+        self.count_unpaired_joints(bus, which, &moment);
         Some(())
     }
 
-    fn compare_moments(&mut self, bus: usize, a: &AnsweredJoints, b: &AnsweredJoints) {
+    fn compare_answered_joints(&mut self, bus: usize, a: &AnsweredJoints, b: &AnsweredJoints) {
         self.epochs.compared += 1;
         let Some(tally) = self.tallies.get_mut(bus) else { return };
         let found = compare_joints(tally, (self.skin, bus), PerCapture { a, b }, &self.options);
-        self.keep_first(bus, PerCapture { a: Some(a), b: Some(b) }, found);
+        self.keep_first_differences(bus, PerCapture { a: Some(a), b: Some(b) }, found);
     }
 
     /// Counts joints that only one capture has.
-    fn count_unpaired(&mut self, bus: usize, which: CaptureSide, moment: &AnsweredJoints) {
-        let other = self.sides.get(which.other());
+    fn count_unpaired_joints(&mut self, bus: usize, which: CaptureSide, moment: &AnsweredJoints) {
+        let other = self.sides.get(which.other_side());
         let is_a = which == CaptureSide::A;
         match (other.first, other.newest()) {
-            (Some((first, _)), _) if moment.key < first => self.epochs.before.count_one(is_a),
-            (None, _) => self.epochs.before.count_one(is_a),
+            (Some((first, _)), _) if moment.key < first => self.epochs.before.count_item(is_a),
+            (None, _) => self.epochs.before.count_item(is_a),
             (_, Some(last)) if other.is_ended && moment.key > last && !other.counts.unfinished => {
-                self.epochs.after.count_one(is_a);
+                self.epochs.after.count_item(is_a);
             }
             _ => {
                 let missing =
@@ -246,14 +246,14 @@ impl<'a> Comparison<'a> {
                     CaptureSide::A => PerCapture { a: Some(moment), b: None },
                     CaptureSide::B => PerCapture { a: None, b: Some(moment) },
                 };
-                self.keep_first(bus, moments, FoundDifference::missing_epoch(!is_a));
+                self.keep_first_differences(bus, moments, FoundDifference::missing_epoch(!is_a));
             }
         }
     }
 
     /// Keeps the first differences of these joints if they are the earliest so far; buses are not compared in order of
     /// time.
-    fn keep_first(
+    fn keep_first_differences(
         &mut self,
         bus: usize,
         moments: PerCapture<Option<&AnsweredJoints>>,
@@ -264,33 +264,34 @@ impl<'a> Comparison<'a> {
             kept.as_ref().is_none_or(|(first, on, _)| (*first, *on) > (key, bus))
         };
         if let Some(found) = firsts.other.filter(|_| is_first(&self.first)) {
-            self.first = self.describe(bus, &moments, found).map(|first| (key, bus, first));
+            self.first = self.describe_difference(bus, &moments, found).map(|first| (key, bus, first));
         }
         if let Some(found) = firsts.missing.filter(|_| is_first(&self.first_missing)) {
-            self.first_missing = self.describe(bus, &moments, found).map(|first| (key, bus, first));
+            self.first_missing =
+                self.describe_difference(bus, &moments, found).map(|first| (key, bus, first));
         }
     }
 
-    fn describe(
+    fn describe_difference(
         &self,
         bus: usize,
         moments: &PerCapture<Option<&AnsweredJoints>>,
         mut found: FoundDifference,
     ) -> Option<FirstDifference> {
         if let Some(cell) = found.cell()
-            && self.restarts(bus, cell, CaptureSide::A) != self.restarts(bus, cell, CaptureSide::B)
+            && self.restart_count(bus, cell, CaptureSide::A) != self.restart_count(bus, cell, CaptureSide::B)
         {
             found.inputs.push("restart");
         }
         let PerCapture { a, b } = &self.sides;
         let time_s = PerCapture {
-            a: moments.a.and_then(|moment| a.seconds(moment.watched.at_ns)),
-            b: moments.b.and_then(|moment| b.seconds(moment.watched.at_ns)),
+            a: moments.a.and_then(|moment| a.run_seconds_at(moment.watched.at_ns)),
+            b: moments.b.and_then(|moment| b.run_seconds_at(moment.watched.at_ns)),
         };
-        found.describe((self.skin, bus), moments, time_s)
+        found.describe_difference((self.skin, bus), moments, time_s)
     }
 
-    fn restarts(&self, bus: usize, cell: CellId, which: CaptureSide) -> u32 {
+    fn restart_count(&self, bus: usize, cell: CellId, which: CaptureSide) -> u32 {
         let cell = self.sides.get(which).buses.get(bus).and_then(|bus| bus.cells.get(cell));
         cell.map_or(0, |cell| cell.tracked.account.uplink().restarts)
     }

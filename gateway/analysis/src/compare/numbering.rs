@@ -22,7 +22,7 @@ const ELAPSED_TOLERANCE_EPOCHS: u64 = 4;
 
 /// Numbers the joints of all buses of a capture, which share one counter.
 #[derive(Debug)]
-pub(super) struct Numbering {
+pub(super) struct JointsNumbering {
     /// Period of epochs in ns, at least 1.
     period_ns: u64,
     /// The number of the first joints in the capture, if known.
@@ -37,7 +37,7 @@ struct NewestJoints {
     nanos: u64,
 }
 
-impl Numbering {
+impl JointsNumbering {
     /// Creates a numbering for joints that are `period_ns` apart. The first joints get the number `start`, or else the
     /// number of their epoch.
     pub(super) const fn new(period_ns: u64, start: Option<u64>) -> Self {
@@ -70,7 +70,7 @@ impl Numbering {
             let key = JointsKey { number, ..newest.key };
             return last.is_none_or(|last| last < key).then_some(key);
         }
-        let key = match self.steps(newest, epoch, elapsed) {
+        let key = match self.epochs_since_newest(newest, epoch, elapsed) {
             Some(steps) => JointsKey { number: newest.key.number + steps, ..newest.key },
             None => JointsKey { run: newest.key.run + 1, number: epoch.0.into() },
         };
@@ -80,7 +80,7 @@ impl Numbering {
 
     /// Returns the number of epochs from the newest joints to those of `epoch`, which arrive `elapsed` periods later;
     /// `None` if the numbering restarted.
-    fn steps(&self, newest: NewestJoints, epoch: Epoch, elapsed: u64) -> Option<u64> {
+    fn epochs_since_newest(&self, newest: NewestJoints, epoch: Epoch, elapsed: u64) -> Option<u64> {
         let modulo = u64::from(epoch.0.wrapping_sub(newest.epoch.0));
         let laps = (elapsed + 128).saturating_sub(modulo) / 256;
         let steps = modulo + 256 * laps;
@@ -110,7 +110,7 @@ mod tests {
 
     /// Numbers the joints of one bus, each given as its number in the test and its time in periods.
     fn numbers(joints: &[(u64, u64)]) -> Vec<Option<JointsKey>> {
-        let (mut numbering, mut last) = (Numbering::new(PERIOD, None), None);
+        let (mut numbering, mut last) = (JointsNumbering::new(PERIOD, None), None);
         let each = joints.iter().map(|&(number, period)| {
             let epoch = Epoch(u8::try_from(number % 256).unwrap());
             let key = numbering.number_joints(1_000 + period * PERIOD, epoch, last);
@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn buses_share_the_count_and_repeated_joints_are_none() {
-        let mut numbering = Numbering::new(PERIOD, Some(1_000));
+        let mut numbering = JointsNumbering::new(PERIOD, Some(1_000));
         let mut take = |nanos, epoch, last| numbering.number_joints(nanos, Epoch(epoch), last);
         let (first, next) = (key(1_000), key(1_001));
         assert_eq!(take(5, 232, None), first);
@@ -163,7 +163,7 @@ mod tests {
             gaps in prop::collection::vec(prop_oneof![5 => Just(1_u64), 1 => 2_u64..3_000], 1..60),
             late in prop::collection::vec(0_u64..PERIOD * 2, 60),
         ) {
-            let (mut numbering, mut number) = (Numbering::new(PERIOD, None), first);
+            let (mut numbering, mut number) = (JointsNumbering::new(PERIOD, None), first);
             let mut last = numbering.number_joints(0, Epoch(u8::try_from(first).unwrap()), None);
             for (gap, late) in gaps.iter().zip(&late) {
                 number += gap;

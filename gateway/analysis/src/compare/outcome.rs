@@ -4,9 +4,9 @@ use model::quantiles::Quantiles;
 use protocol::id::CellId;
 
 use super::numbering::JointsKey;
-use super::report::{CaptureFigures, CellRow, CompareReport, ExtraCell, Losses, ReplyCounts};
+use super::report::{CaptureFigures, CellLosses, CompareReport, ComparedCellRow, ExtraCell, ReplyCounts};
 use super::side::{ComparedCapture, ComparedCell};
-use super::{ASPECTS, CaptureSide, Comparison, PerCapture};
+use super::{COMPARED_ASPECTS, CaptureSide, Comparison, PerCapture};
 
 impl Comparison<'_> {
     /// Returns the report; call it after both captures have ended.
@@ -37,13 +37,14 @@ impl Comparison<'_> {
             report.contacts.both += tally.contacts.both;
             report.contacts.only.only_a += tally.contacts.only.only_a;
             report.contacts.only.only_b += tally.contacts.only.only_b;
-            report.torques.add(&tally.torques);
-            report.sums.add(&tally.sums);
+            report.torques.add_counts(&tally.torques);
+            report.sums.add_counts(&tally.sums);
         }
-        report.cells = self.cells();
+        report.cells = self.differing_cells();
         let epochs = &report.epochs;
         let lost = epochs.missing_in_a + epochs.missing_in_b;
-        let are_missing = lost + report.torques.missing() + report.sums.missing() > self.options.missing;
+        let are_missing =
+            lost + report.torques.missing_count() + report.sums.missing_count() > self.options.missing;
         report.differs = differing_aspects(&report, lost, are_missing);
         report.equal = report.differs.is_empty();
         let firsts = [self.first, self.first_missing.filter(|_| are_missing)];
@@ -53,23 +54,28 @@ impl Comparison<'_> {
     }
 
     /// Returns the cells with differences or losses.
-    fn cells(&self) -> Vec<CellRow> {
+    fn differing_cells(&self) -> Vec<ComparedCellRow> {
         let mut rows = Vec::new();
         for (at, (bus, tally)) in self.skin.buses.iter().zip(&self.tallies).enumerate() {
             for (node, replies) in tally.cells.iter() {
-                let of = |which| self.cell(which, at, node).map(losses).unwrap_or_default();
+                let of = |which| self.compared_cell(which, at, node).map(losses).unwrap_or_default();
                 let losses = PerCapture { a: of(CaptureSide::A), b: of(CaptureSide::B) };
                 let is_quiet = losses == PerCapture::default()
-                    && replies.different + replies.tolerated + replies.missing() == 0;
+                    && replies.different + replies.tolerated + replies.missing_count() == 0;
                 if !is_quiet {
-                    rows.push(CellRow { bus: bus.name.clone(), node: node.get(), replies: *replies, losses });
+                    rows.push(ComparedCellRow {
+                        bus: bus.name.clone(),
+                        node: node.get(),
+                        replies: *replies,
+                        losses,
+                    });
                 }
             }
         }
         rows
     }
 
-    fn cell(&self, which: CaptureSide, bus: usize, node: CellId) -> Option<&ComparedCell> {
+    fn compared_cell(&self, which: CaptureSide, bus: usize, node: CellId) -> Option<&ComparedCell> {
         self.sides.get(which).buses.get(bus)?.cells.get(node)
     }
 
@@ -84,7 +90,7 @@ impl Comparison<'_> {
         let mut extra = Vec::new();
         for (at, bus) in self.skin.buses.iter().enumerate() {
             for node in CellId::all() {
-                let heard = |which| self.cell(which, at, node).and_then(|cell| cell.active_range);
+                let heard = |which| self.compared_cell(which, at, node).and_then(|cell| cell.active_range);
                 let (span, only_in) = match (heard(CaptureSide::A), heard(CaptureSide::B)) {
                     (Some(span), None) => (span, "a"),
                     (None, Some(span)) => (span, "b"),
@@ -102,22 +108,27 @@ impl Comparison<'_> {
 /// Returns the names of the aspects in which the captures differ.
 fn differing_aspects(report: &CompareReport, lost: u64, are_missing: bool) -> Vec<&'static str> {
     let CompareReport { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = report;
-    let replies = |it: &ReplyCounts| it.different > 0 || are_missing && it.missing() > 0;
+    let replies = |it: &ReplyCounts| it.different > 0 || are_missing && it.missing_count() > 0;
     let differs = [
         epochs.compared == 0 || are_missing && lost > 0,
         joints.different > 0,
-        halts.sum() > 0,
-        contacts.only.sum() > 0,
+        halts.total() > 0,
+        contacts.only.total() > 0,
         replies(torques),
         replies(sums),
         !extra_cells.is_empty(),
     ];
-    ASPECTS.into_iter().zip(differs).filter_map(|(name, differs)| differs.then_some(name)).collect()
+    COMPARED_ASPECTS.into_iter().zip(differs).filter_map(|(name, differs)| differs.then_some(name)).collect()
 }
 
-fn losses(cell: &ComparedCell) -> Losses {
+fn losses(cell: &ComparedCell) -> CellLosses {
     let uplink = cell.tracked.account.uplink();
-    Losses { late: cell.late, too_late: cell.too_late, lost: uplink.lost, restarts: uplink.restarts.into() }
+    CellLosses {
+        late: cell.late,
+        too_late: cell.too_late,
+        lost: uplink.lost,
+        restarts: uplink.restarts.into(),
+    }
 }
 
 fn capture_figures(side: &ComparedCapture<'_>) -> CaptureFigures {

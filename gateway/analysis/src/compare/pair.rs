@@ -5,7 +5,7 @@ use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::id::CellId;
 use protocol::message::SkinSensors;
 use protocol::packet::Words;
-use protocol::schema::Units;
+use protocol::schema::BusUnits;
 use protocol::skin::{JointKind, Skin};
 
 use super::report::{ContactCounts, FirstDifference, JointCounts, ReplyCounts, UnpairedCounts};
@@ -15,7 +15,7 @@ use crate::explain::ObservedCellState;
 
 /// The counts of a comparison for one bus.
 #[derive(Debug, Default)]
-pub(super) struct Tally {
+pub(super) struct ComparisonCounts {
     pub(super) joints: JointCounts,
     pub(super) halts: UnpairedCounts,
     pub(super) contacts: ContactCounts,
@@ -44,7 +44,7 @@ pub(super) struct FirstDifferences {
 }
 
 impl FirstDifferences {
-    fn note(&mut self, found: FoundDifference) {
+    fn note_difference(&mut self, found: FoundDifference) {
         let is_missing = found.how != "different" && matches!(found.what, "epoch" | "torque" | "sum");
         (if is_missing { &mut self.missing } else { &mut self.other }).get_or_insert(found);
     }
@@ -61,7 +61,7 @@ struct DifferingWords {
 
 impl FoundDifference {
     pub(super) fn missing_epoch(in_a: bool) -> FirstDifferences {
-        let found = Self { what: "epoch", how: missing(in_a), ..Self::default() };
+        let found = Self { what: "epoch", how: missing_side_text(in_a), ..Self::default() };
         FirstDifferences { missing: Some(found), other: None }
     }
 
@@ -71,7 +71,7 @@ impl FoundDifference {
     }
 
     /// Describes the difference for the report; `moments` are the joints and answers in both captures, if present.
-    pub(super) fn describe(
+    pub(super) fn describe_difference(
         self,
         (skin, bus): (&Skin, usize),
         moments: &PerCapture<Option<&AnsweredJoints>>,
@@ -107,13 +107,13 @@ impl FoundDifference {
     }
 }
 
-const fn missing(in_a: bool) -> &'static str {
+const fn missing_side_text(in_a: bool) -> &'static str {
     if in_a { "missing in a" } else { "missing in b" }
 }
 
 /// Compares a joints packet that both captures have, and the answers to it. Returns the first differences.
 pub(super) fn compare_joints(
-    tally: &mut Tally,
+    tally: &mut ComparisonCounts,
     (skin, bus): (&Skin, usize),
     moments: PerCapture<&AnsweredJoints>,
     options: &CompareOptions,
@@ -130,7 +130,7 @@ pub(super) fn compare_joints(
         tally.joints.tolerated += 1;
     } else {
         tally.joints.different += 1;
-        first.note(FoundDifference {
+        first.note_difference(FoundDifference {
             what: "joints",
             how: "different",
             word: joints,
@@ -138,10 +138,10 @@ pub(super) fn compare_joints(
         });
     }
     if a.watched.halted != b.watched.halted {
-        tally.halts.count_one(a.watched.halted);
-        first.note(FoundDifference {
+        tally.halts.count_item(a.watched.halted);
+        first.note_difference(FoundDifference {
             what: "halt",
-            how: missing(!a.watched.halted),
+            how: missing_side_text(!a.watched.halted),
             ..FoundDifference::default()
         });
     }
@@ -159,7 +159,13 @@ pub(super) fn compare_joints(
         };
         let inputs = || differing_inputs(moments, same_joints, (in_a, in_b));
         let all = (&mut tally.torques, tally.cells.get_mut(cell));
-        reply.compare_reply(all, moments, (Units::for_bus(skin, bus), options.tolerance), inputs, &mut first);
+        reply.compare_reply(
+            all,
+            moments,
+            (BusUnits::for_bus(skin, bus), options.tolerance),
+            inputs,
+            &mut first,
+        );
     }
     compare_sums(tally, (skin, bus), moments, (options.tolerance, same_joints), &mut first);
     first
@@ -167,7 +173,7 @@ pub(super) fn compare_joints(
 
 /// Compares the sums of roots.
 fn compare_sums(
-    tally: &mut Tally,
+    tally: &mut ComparisonCounts,
     (skin, bus): (&Skin, usize),
     moments: PerCapture<&AnsweredJoints>,
     (tolerance, same_joints): (u32, bool),
@@ -208,7 +214,7 @@ fn compare_sums(
             all
         };
         let all = (&mut tally.sums, tally.cells.get_mut(*root));
-        reply.compare_reply(all, moments, (Units::for_bus(skin, bus), tolerance), inputs, first);
+        reply.compare_reply(all, moments, (BusUnits::for_bus(skin, bus), tolerance), inputs, first);
     }
 }
 
@@ -227,7 +233,7 @@ impl ReplyPair {
         &self,
         (all, of_cell): (&mut ReplyCounts, Option<&mut ReplyCounts>),
         moments: PerCapture<&AnsweredJoints>,
-        (units, tolerance): (Units, u32),
+        (units, tolerance): (BusUnits, u32),
         inputs: impl Fn() -> (Vec<&'static str>, Vec<&'static str>),
         first: &mut FirstDifferences,
     ) {
@@ -252,7 +258,7 @@ impl ReplyPair {
                 let other = if is_in_a { moments.b } else { moments.a };
                 if other.is_settled {
                     *(if is_in_a { &mut once.missing_in_b } else { &mut once.missing_in_a }) = 1;
-                    how = Some(missing(!is_in_a));
+                    how = Some(missing_side_text(!is_in_a));
                 } else {
                     once.open = 1;
                 }
@@ -266,18 +272,18 @@ impl ReplyPair {
                 differ.push("cells");
             }
             let (what, cell) = (self.what, Some(self.cell));
-            first.note(FoundDifference { what, how, cell, word, inputs: differ, unknown });
+            first.note_difference(FoundDifference { what, how, cell, word, inputs: differ, unknown });
         }
         for counts in [Some(all), of_cell].into_iter().flatten() {
-            counts.add(&once);
+            counts.add_counts(&once);
         }
     }
 
     /// Returns the pair of words of two replies with the largest difference; `None` if the words are equal.
-    fn largest_difference(&self, a: &Words, b: &Words, units: Units) -> Option<DifferingWords> {
+    fn largest_difference(&self, a: &Words, b: &Words, units: BusUnits) -> Option<DifferingWords> {
         // Tolerances are in steps of 1/4096, for sums in steps of 1/256.
         let fine =
-            |word| if self.cells_in.is_some() { i32::from(word) } else { self.format.finest_steps(word) };
+            |word| if self.cells_in.is_some() { i32::from(word) } else { self.format.to_finest_steps(word) };
         let places = a.padded().into_iter().zip(b.padded()).enumerate();
         let differing = places.map(|(place, (a, b))| DifferingWords {
             place,
@@ -292,7 +298,7 @@ impl ReplyPair {
 }
 
 impl ReplyCounts {
-    pub(super) const fn add(&mut self, other: &Self) {
+    pub(super) const fn add_counts(&mut self, other: &Self) {
         self.equal += other.equal;
         self.tolerated += other.tolerated;
         self.different += other.different;
@@ -349,10 +355,10 @@ fn compare_contact(
     match both {
         Some((true, true)) => contacts.both += 1,
         Some((is_in_a, is_in_b)) if is_in_a != is_in_b => {
-            contacts.only.count_one(is_in_a);
-            first.note(FoundDifference {
+            contacts.only.count_item(is_in_a);
+            first.note_difference(FoundDifference {
                 what: "contact",
-                how: missing(is_in_b),
+                how: missing_side_text(is_in_b),
                 cell: Some(cell),
                 ..FoundDifference::default()
             });

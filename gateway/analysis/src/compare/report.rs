@@ -10,7 +10,7 @@ use super::PerCapture;
 pub struct CompareReport {
     /// True if the captures have no difference beyond the tolerances.
     pub equal: bool,
-    /// The aspects that differ, in the order of [`ASPECTS`].
+    /// The aspects that differ, in the order of [`COMPARED_ASPECTS`].
     pub differs: Vec<&'static str>,
     /// The two captures.
     pub captures: PerCapture<CaptureFigures>,
@@ -27,7 +27,7 @@ pub struct CompareReport {
     /// Comparison of the sums of roots.
     pub sums: ReplyCounts,
     /// Cells with differences or losses, by bus and node id.
-    pub cells: Vec<CellRow>,
+    pub cells: Vec<ComparedCellRow>,
     /// Cells that send packets in only one of the captures.
     pub extra_cells: Vec<ExtraCell>,
     /// The first difference; `None` if the captures are equal.
@@ -35,7 +35,7 @@ pub struct CompareReport {
 }
 
 /// The compared aspects.
-pub const ASPECTS: [&str; 7] = ["epochs", "joints", "halts", "contacts", "torques", "sums", "cells"];
+pub const COMPARED_ASPECTS: [&str; 7] = ["epochs", "joints", "halts", "contacts", "torques", "sums", "cells"];
 
 /// Counts and times of one of the two captures.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -99,13 +99,13 @@ pub struct UnpairedCounts {
 }
 
 impl UnpairedCounts {
-    pub(super) const fn count_one(&mut self, is_a: bool) {
+    pub(super) const fn count_item(&mut self, is_a: bool) {
         *(if is_a { &mut self.only_a } else { &mut self.only_b }) += 1;
     }
 
     /// Returns the sum of both counts.
     #[must_use]
-    pub const fn sum(self) -> u64 {
+    pub const fn total(self) -> u64 {
         self.only_a + self.only_b
     }
 }
@@ -157,14 +157,14 @@ pub struct ReplyCounts {
 impl ReplyCounts {
     /// Returns the number of replies that only one capture has.
     #[must_use]
-    pub const fn missing(&self) -> u64 {
+    pub const fn missing_count(&self) -> u64 {
         self.missing_in_a + self.missing_in_b
     }
 }
 
 /// The comparison of one cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct CellRow {
+pub struct ComparedCellRow {
     /// Name of the cell's bus.
     pub bus: String,
     /// Node id of the cell.
@@ -173,12 +173,12 @@ pub struct CellRow {
     #[serde(flatten)]
     pub replies: ReplyCounts,
     /// Losses of the cell in each capture.
-    pub losses: PerCapture<Losses>,
+    pub losses: PerCapture<CellLosses>,
 }
 
 /// Losses of a cell in one capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Losses {
+pub struct CellLosses {
     /// Replies that arrived after the next joints.
     pub late: u64,
     /// Late replies that arrived too late to be used; `late` includes them.

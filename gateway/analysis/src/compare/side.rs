@@ -10,9 +10,9 @@ use protocol::packet::{Epoch, Words};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use super::numbering::{JointsKey, Numbering};
+use super::numbering::{JointsKey, JointsNumbering};
 use super::report::CaptureFigures;
-use crate::explain::{self, JointsWatcher, NotFound};
+use crate::explain::{self, JointsNotFound, JointsWatcher};
 
 /// Number of epochs after which a silent bus is no longer waited for, while other buses continue.
 const SILENT_BUS_EPOCHS: u64 = 64;
@@ -88,7 +88,7 @@ const fn is_far_behind(newest: JointsKey, key: JointsKey) -> bool {
 pub(super) struct ComparedCapture<'a> {
     skin: &'a Skin,
     watch: JointsWatcher<'a>,
-    numbering: Numbering,
+    numbering: JointsNumbering,
     period_ns: u64,
     pub(super) buses: Vec<ComparedBus>,
     /// The first joints packet and its time in ns.
@@ -113,7 +113,7 @@ impl<'a> ComparedCapture<'a> {
         Self {
             skin,
             watch: JointsWatcher::for_all_joints(skin),
-            numbering: Numbering::new(period_ns, start),
+            numbering: JointsNumbering::new(period_ns, start),
             period_ns,
             buses: (0..skin.buses.len()).map(bus_side).collect(),
             first: None,
@@ -136,7 +136,7 @@ impl<'a> ComparedCapture<'a> {
     }
 
     fn bus(&mut self, name: &str) -> Option<&mut ComparedBus> {
-        let at = self.skin.bus_named(name)?;
+        let at = self.skin.bus_index(name)?;
         self.buses.get_mut(at)
     }
 
@@ -144,7 +144,7 @@ impl<'a> ComparedCapture<'a> {
     /// answers to some joints may be complete now.
     pub(super) fn receive(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         self.counts.frames += 1;
-        let at = self.skin.bus_named(bus);
+        let at = self.skin.bus_index(bus);
         let mut is_new = false;
         if let (Some(at), Some(message)) = (at, message) {
             if let Message::Joints { epoch, joints } = message {
@@ -193,7 +193,7 @@ impl<'a> ComparedCapture<'a> {
         let newest = self.numbering.newest().unwrap_or_default();
         let Some(bus) = self.buses.get_mut(at) else { return };
         let Some(cell) = bus.cells.get_mut(from) else { return };
-        cell.tracked.receive(Micros(nanos / 1_000), message, None);
+        cell.tracked.record_packet(Micros(nanos / 1_000), message, None);
         let (first, _) = cell.active_range.unwrap_or((newest, newest));
         cell.active_range = Some((first, newest));
         let (epoch, sum) = if let Message::Torque { epoch, .. } = *message {
@@ -219,7 +219,7 @@ impl<'a> ComparedCapture<'a> {
     }
 
     /// Ends the capture: all answers count as complete.
-    pub(super) fn end(&mut self) {
+    pub(super) fn end_capture(&mut self) {
         self.collect_complete_joints(true);
         self.is_ended = true;
     }
@@ -230,7 +230,7 @@ impl<'a> ComparedCapture<'a> {
             while let Some(first) = bus.pending.front() {
                 // After a gap, or on a bus that is silent while others continue, do not wait for replies.
                 let is_far = newest.zip(first.key).is_some_and(|(newest, key)| is_far_behind(newest, key));
-                let Some((epoch, watched)) = self.watch.pop(at, is_end || is_far) else { break };
+                let Some((epoch, watched)) = self.watch.pop_joints(at, is_end || is_far) else { break };
                 let Some(pending) = bus.pending.pop_front() else { break };
                 let answers = watched.cells.iter().filter_map(|cell| cell.answer.map(|(nanos, _)| nanos));
                 let sums = pending.sums.iter().map(|(_, sum)| sum.nanos);
@@ -268,7 +268,7 @@ impl<'a> ComparedCapture<'a> {
 
     /// Converts a time in ns to s of the run; `None` if the capture has no times.
     #[expect(clippy::cast_precision_loss, reason = "for display")]
-    pub(super) fn seconds(&self, nanos: u64) -> Option<f64> {
+    pub(super) fn run_seconds_at(&self, nanos: u64) -> Option<f64> {
         let (first, began) = self.first.filter(|_| self.has_times)?;
         let earlier = first.number as f64 * self.period_ns as f64;
         Some((nanos.saturating_sub(began) as f64 + earlier) / 1e9)
@@ -276,7 +276,7 @@ impl<'a> ComparedCapture<'a> {
 
     /// Returns the time of the last joints in s of the run.
     pub(super) fn last_joints_s(&self) -> Option<f64> {
-        self.seconds(self.last_nanos?)
+        self.run_seconds_at(self.last_nanos?)
     }
 
     /// Returns the times from joints to their answers.
@@ -291,8 +291,8 @@ impl<'a> ComparedCapture<'a> {
     }
 
     /// Returns the reason why the capture has no joints of the skin; `None` if it has some.
-    pub(super) fn not_found(&mut self) -> Option<NotFound> {
+    pub(super) fn not_found(&mut self) -> Option<JointsNotFound> {
         let watch = std::mem::replace(&mut self.watch, JointsWatcher::for_all_joints(self.skin));
-        if self.first.is_some() { None } else { watch.moments().err() }
+        if self.first.is_some() { None } else { watch.into_joints().err() }
     }
 }

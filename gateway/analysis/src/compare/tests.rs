@@ -1,11 +1,11 @@
 //! Tests on constructed captures with one or two cells, whose joints, stimuli and torques are lost, changed and moved.
 
 use super::*;
-use model::testing::SKIN;
+use model::testing::ONE_CELL_SKIN_TOML;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
 use protocol::message::{Heartbeat, NetworkPage, SensorPage, SkinSensors, State, StimulusStart};
-use protocol::packet::{Epoch, padded, padded_words};
+use protocol::packet::{Epoch, pad_with_defaults, padded_words};
 
 mod property;
 
@@ -15,16 +15,16 @@ const BEGAN: u64 = 1_700_000_000_000_000_000;
 pub(super) type Frames = Vec<(u64, &'static str, Message)>;
 
 pub(super) fn skin() -> Skin {
-    Skin::parse("skin.toml", SKIN).unwrap()
+    Skin::parse("skin.toml", ONE_CELL_SKIN_TOML).unwrap()
 }
 
 /// Returns a skin with two buses with one cell each; the second answers with sums.
 fn two_buses() -> Skin {
-    let (head, cell) = SKIN.split_once("[[cell]]").unwrap();
+    let (head, cell) = ONE_CELL_SKIN_TOML.split_once("[[cell]]").unwrap();
     let cell = cell.replace("bus = \"vcan0\"", "bus = \"vcan1\"") + "root = true\n";
     let bus = "[[bus]]\nname = \"vcan1\"\nreply = \"sum\"\nslot_us = 500\nformat = \"fd\"\n\n[controller]";
     let head = head.replace("[controller]", bus);
-    let first = SKIN.split_once("[[cell]]").unwrap().1;
+    let first = ONE_CELL_SKIN_TOML.split_once("[[cell]]").unwrap().1;
     Skin::parse("skin.toml", &format!("{head}[[cell]]{first}\n[[cell]]{cell}")).unwrap()
 }
 
@@ -43,7 +43,7 @@ pub(super) fn at(number: u64) -> u64 {
 
 pub(super) fn joints(number: u64) -> Message {
     let word = i16::try_from(number * 7 % 30_000).unwrap();
-    let positions = padded(&[Q1_14::from_bits(word), Q1_14::from_bits(-word)]);
+    let positions = pad_with_defaults(&[Q1_14::from_bits(word), Q1_14::from_bits(-word)]);
     Message::Joints { epoch: epoch(number), joints: protocol::message::Joints { positions, in_use: 6 } }
 }
 
@@ -53,7 +53,8 @@ pub(super) fn torque(node: i64, number: u64, word: i16) -> Message {
 
 fn heartbeat(skin: &Skin, sent: u16) -> Message {
     let configuration = skin.parameters(&skin.cells[0]).hash();
-    let state = State::CONFIGURED.with(State::TEST_MODE, true).with(State::CLAIMING, sent == 0);
+    let state =
+        State::CONFIGURED.with_flags(State::TEST_MODE, true).with_flags(State::CLAIMING_NODE_ID, sent == 0);
     let page = NetworkPage::Heartbeat(Heartbeat { configuration, state, sent, ..Heartbeat::default() });
     Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }
 }
@@ -94,7 +95,7 @@ pub(super) fn read<'a>(
     while let Some(which) = comparison.next_side() {
         match frames.get_mut(which).next() {
             Some((nanos, bus, message)) => comparison.receive(which, *nanos, bus, Some(message)),
-            None => comparison.end(which, false),
+            None => comparison.end_capture(which, false),
         }
         held = held.max(comparison.held());
     }
@@ -274,8 +275,8 @@ fn what_one_has_before_and_after_the_other_is_no_difference_but_a_missing_epoch_
     for (which, frames) in [(CaptureSide::A, &a), (CaptureSide::B, &run(&skin, 0..300))] {
         frames.iter().for_each(|(nanos, bus, message)| comparison.receive(which, *nanos, bus, Some(message)));
     }
-    comparison.end(CaptureSide::B, true);
-    comparison.end(CaptureSide::A, false);
+    comparison.end_capture(CaptureSide::B, true);
+    comparison.end_capture(CaptureSide::A, false);
     let report = comparison.report();
     assert_eq!((report.differs.as_slice(), report.epochs.missing_in_b), (&["epochs"][..], 300));
 }
@@ -387,13 +388,13 @@ fn a_part_is_put_where_its_joints_are() {
     let skin = skin();
     let trace = |frames: &Frames| {
         let mut trace = JointTrace::new(&skin);
-        frames.iter().for_each(|(nanos, bus, message)| trace.record(*nanos, bus, message));
+        frames.iter().for_each(|(nanos, bus, message)| trace.record_message(*nanos, bus, message));
         trace
     };
     let a = run(&skin, 0..2_000);
     for first in [1, 100, 256, 300, 1_000, 1_900] {
         let b = run(&skin, first..2_000);
-        let starts = start_numbers(&trace(&a), &trace(&b));
+        let starts = first_joints_numbers(&trace(&a), &trace(&b));
         assert_eq!(starts, PerCapture { a: Some(0), b: Some(first) });
         let report = read(&skin, (CompareOptions::default(), starts), &a, &b).0.report();
         assert_eq!((report.equal, report.epochs.before.only_a), (true, first));
@@ -410,7 +411,7 @@ fn a_part_is_put_where_its_joints_are() {
         };
         frames.iter().map(|(nanos, bus, message)| (*nanos, *bus, same(message))).collect()
     };
-    let found = start_numbers(&trace(&standing(&a)), &trace(&standing(&run(&skin, 300..900))));
+    let found = first_joints_numbers(&trace(&standing(&a)), &trace(&standing(&run(&skin, 300..900))));
     assert_eq!(found, PerCapture { a: Some(0), b: Some(44) });
 }
 
@@ -419,19 +420,21 @@ fn a_capture_of_another_skin_is_known_by_its_buses_joints_and_configurations() {
     let skin = skin();
     let a = run(&skin, 0..10);
     let not_found = |b: &Frames| {
-        read(&skin, (CompareOptions::default(), PerCapture::default()), &a, b).0.not_found(CaptureSide::B)
+        read(&skin, (CompareOptions::default(), PerCapture::default()), &a, b)
+            .0
+            .not_found_reason(CaptureSide::B)
     };
     assert_eq!(not_found(&a), None);
     let elsewhere: Frames = a.iter().map(|(nanos, _, message)| (*nanos, "can9", *message)).collect();
-    assert!(matches!(not_found(&elsewhere), Some(NotFound::Buses { .. })));
-    assert!(matches!(not_found(&a[..1].to_vec()), Some(NotFound::Joints { .. })));
+    assert!(matches!(not_found(&elsewhere), Some(JointsNotFound::Buses { .. })));
+    assert!(matches!(not_found(&a[..1].to_vec()), Some(JointsNotFound::Joints { .. })));
     let mut robot = a.clone();
     for (.., message) in &mut robot {
         if let Message::Joints { joints, .. } = message {
             joints.in_use = 5;
         }
     }
-    assert!(matches!(not_found(&robot), Some(NotFound::Robot { came: 5, chain: 6, .. })));
+    assert!(matches!(not_found(&robot), Some(JointsNotFound::Robot { came: 5, chain: 6, .. })));
     let other = changed(&a, |_| true, None);
     let page = NetworkPage::Heartbeat(Heartbeat { configuration: 77, ..Heartbeat::default() });
     let mut configured = other;
@@ -440,6 +443,6 @@ fn a_capture_of_another_skin_is_known_by_its_buses_joints_and_configurations() {
         (at(0) - 5, "vcan0", Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }),
     );
     let comparison = read(&skin, (CompareOptions::default(), PerCapture::default()), &a, &configured).0;
-    assert_eq!(comparison.other_configurations(CaptureSide::A), None);
-    assert_eq!(comparison.other_configurations(CaptureSide::B), Some((1, 0)));
+    assert_eq!(comparison.reported_and_matching_cells(CaptureSide::A), None);
+    assert_eq!(comparison.reported_and_matching_cells(CaptureSide::B), Some((1, 0)));
 }

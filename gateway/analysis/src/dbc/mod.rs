@@ -22,7 +22,7 @@ use core::iter;
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::packet::{Length, Lengths};
-use protocol::schema::{PacketSchema, Units, packets};
+use protocol::schema::{BusUnits, PacketSchema, packet_schemas};
 use protocol::skin::{Skin, SkinBus};
 
 use signal::Signal;
@@ -35,7 +35,7 @@ const HEARTBEAT_MS: u32 = 250;
 /// # Panics
 /// Never: writing to a string cannot fail.
 #[must_use]
-pub fn dbc(skin: &Skin, bus: usize) -> String {
+pub fn dbc_text(skin: &Skin, bus: usize) -> String {
     let mut out = String::new();
     if let Some(description) = skin.buses.get(bus) {
         text::write_dbc(&mut out, skin, bus, description, &messages(skin, bus))
@@ -84,10 +84,10 @@ struct DbcMessage {
 fn messages(skin: &Skin, bus: usize) -> Vec<DbcMessage> {
     let mut nodes: Vec<_> = skin.cells_on_bus(bus).map(|cell| Node::Cell(cell.node)).collect();
     nodes.sort_unstable_by_key(|node| node.to_byte());
-    let (units, rows) = (Units::for_bus(skin, bus), skin.chain(bus).rows.len());
+    let (units, rows) = (BusUnits::for_bus(skin, bus), skin.chain(bus).rows.len());
     let chain = signal::BusChain { length: skin.packet_length(bus), units, rows };
     let of = |schema: &'static PacketSchema| {
-        let said = |node| message(schema, node, period_ms(skin), &chain);
+        let said = |node| dbc_message(schema, node, period_ms(skin), &chain);
         let each = nodes.iter().map(|node| said(*node));
         match schema.kind {
             Kind::Command => vec![said(Node::Everyone)],
@@ -103,11 +103,11 @@ fn messages(skin: &Skin, bus: usize) -> Vec<DbcMessage> {
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => each.collect(),
         }
     };
-    packets().iter().flat_map(of).collect()
+    packet_schemas().iter().flat_map(of).collect()
 }
 
 /// Returns the DBC message for a kind of packet that a cell sends or receives, or for a command to all cells.
-fn message(
+fn dbc_message(
     schema: &'static PacketSchema,
     node: Node,
     period_ms: u32,

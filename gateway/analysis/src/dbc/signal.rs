@@ -7,7 +7,7 @@ use protocol::message::State;
 use protocol::packet::{Length, WORDS};
 use protocol::parameters::Parameter;
 use protocol::schema::{
-    Field, FieldFormat, FieldRange, Layout, PacketSchema, Units, parameter_layouts, refusal_reasons,
+    BusUnits, Field, FieldFormat, FieldRange, Layout, PacketSchema, parameter_layouts, refusal_reasons,
 };
 
 /// Position after the last word in a packet of six words, in bits.
@@ -19,7 +19,7 @@ pub(super) struct BusChain {
     /// Number of words in a joints, torque or sum packet.
     pub(super) length: Length,
     /// Units of joints, torques and sums.
-    pub(super) units: Units,
+    pub(super) units: BusUnits,
     /// Number of rows of the chain's table.
     pub(super) rows: usize,
 }
@@ -128,7 +128,7 @@ fn unsigned_signal(name: String, start: usize, bits: u8) -> Signal {
 }
 
 /// Returns the signals of a field: one for each element, or for a field of flags one for each named bit.
-fn field_signals(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
+fn field_signals(field: &'static Field, prefix: &str, units: BusUnits) -> Vec<Signal> {
     let at = field.first_bit();
     let named = |label: &str| field.signal_name(prefix, label);
     if matches!(field.format, FieldFormat::Total(_)) {
@@ -170,8 +170,8 @@ fn field_signals(field: &'static Field, prefix: &str, units: Units) -> Vec<Signa
 }
 
 /// Returns the signal of one element of a field.
-fn element_signal(field: &'static Field, element: usize, units: Units, name: String) -> Signal {
-    let unscaled = unsigned_signal(name, field.first_bit(), field.width());
+fn element_signal(field: &'static Field, element: usize, units: BusUnits, name: String) -> Signal {
+    let unscaled = unsigned_signal(name, field.first_bit(), field.bit_width());
     let factor = field.element_step_size(element, units);
     let signed = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
     let [min, max] = if field.is_signed() { signed } else { unscaled.range };

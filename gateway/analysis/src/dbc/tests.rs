@@ -19,7 +19,7 @@ fn full() -> Skin {
 }
 
 fn parsed(skin: &Skin, bus: usize) -> Dbc {
-    Dbc::try_from(dbc(skin, bus).as_str()).unwrap()
+    Dbc::try_from(dbc_text(skin, bus).as_str()).unwrap()
 }
 
 /// Decodes a frame by the DBC alone: the message's name, and the value of each signal that is present.
@@ -124,7 +124,7 @@ fn every_identifier_of_the_bus_is_there_and_no_other() {
 
 #[test]
 fn cells_of_the_bus_alone_are_named_and_send_what_is_theirs() {
-    let dbc = parsed(&model::testing::skin(), 0);
+    let dbc = parsed(&model::testing::one_cell_skin(), 0);
     let names: Vec<_> = dbc.nodes.iter().map(|node| node.0.as_str()).collect();
     assert_eq!(names, ["gateway", "cell_1"]);
     let messages: Vec<_> = dbc
@@ -160,7 +160,7 @@ fn cells_of_the_bus_alone_are_named_and_send_what_is_theirs() {
 
 #[test]
 fn words_have_names_units_and_ranges() {
-    let dbc = parsed(&model::testing::skin(), 0);
+    let dbc = parsed(&model::testing::one_cell_skin(), 0);
     let signal = |id: u16, name: &str| {
         let signal = dbc.signal_by_name(MessageId::Standard(id), name).unwrap();
         let names = dbc.value_descriptions.iter().find_map(|described| {
@@ -204,7 +204,8 @@ fn words_have_names_units_and_ranges() {
 
 #[test]
 fn frames_are_fd_with_their_rhythm_and_bit_rates_where_they_are_known() {
-    let text = model::testing::SKIN.replace("\"fd\"", "\"fd\"\nbitrate = 1000000\ndata_bitrate = 5000000");
+    let text = model::testing::ONE_CELL_SKIN_TOML
+        .replace("\"fd\"", "\"fd\"\nbitrate = 1000000\ndata_bitrate = 5000000");
     let skin = Skin::parse("rates.toml", &text).unwrap();
     let dbc = parsed(&skin, 0);
     let of = |name: &str, id: u16| {
@@ -236,7 +237,7 @@ fn frames_are_fd_with_their_rhythm_and_bit_rates_where_they_are_known() {
 
 #[test]
 fn what_the_file_and_its_nodes_are_stands_in_comments() {
-    let skin = model::testing::skin();
+    let skin = model::testing::one_cell_skin();
     let dbc = parsed(&skin, 0);
     let hash = skin.parameters(&skin.cells[0]).hash();
     let serial = skin.cells[0].serial;
@@ -272,13 +273,13 @@ fn each_bus_has_its_own_cells_and_one_that_is_not_has_no_text() {
         let nodes: BTreeSet<_> = parsed(&skin, bus).nodes.into_iter().skip(1).map(|node| node.0).collect();
         assert_eq!(nodes, cells);
     }
-    assert_eq!(dbc(&skin, 2), "");
+    assert_eq!(dbc_text(&skin, 2), "");
 }
 
 #[test]
 fn the_text_is_plain() {
     // Readers differ in the non-ASCII bytes that they accept, and most limit names to 32 characters.
-    let text = dbc(&full(), 0);
+    let text = dbc_text(&full(), 0);
     assert!(text.is_ascii());
     let names = text
         .lines()

@@ -9,9 +9,9 @@ use super::signal::{Signal, SignalPage};
 use super::{DbcMessage, DbcNode, SendSchedule, describes_packets};
 
 /// The format's placeholder for an unnamed sender or receiver.
-const UNNAMED: &str = "Vector__XXX";
+const UNNAMED_NODE: &str = "Vector__XXX";
 /// The sections of the DBC format that the text may contain.
-const SECTIONS: [&str; 6] = ["CM_", "BA_DEF_", "BA_", "VAL_", "BA_DEF_DEF_", "SIG_VALTYPE_"];
+const DBC_SECTIONS: [&str; 6] = ["CM_", "BA_DEF_", "BA_", "VAL_", "BA_DEF_DEF_", "SIG_VALTYPE_"];
 /// The values of `VFrameFormat`; the last but one is an FD frame with an 11-bit identifier.
 const FRAME_FORMATS: [&str; 16] = [
     "StandardCAN",
@@ -31,7 +31,7 @@ const FRAME_FORMATS: [&str; 16] = [
     "StandardCAN_FD",
     "ExtendedCAN_FD",
 ];
-const STANDARD_CAN_FD: u8 = 14;
+const STANDARD_CAN_FD_FORMAT: u8 = 14;
 /// The values of `GenMsgSendType`.
 const SEND_TYPES: [&str; 3] = ["NoMsgSendType", "Cyclic", "CyclicIfActive"];
 
@@ -43,7 +43,7 @@ pub(super) fn write_dbc(
     messages: &[DbcMessage],
 ) -> fmt::Result {
     writeln!(out, "VERSION \"{VERSION}\"\n\nNS_ :")?;
-    for section in SECTIONS {
+    for section in DBC_SECTIONS {
         writeln!(out, "\t{section}")?;
     }
     write!(out, "\nBS_:\n\nBU_: gateway")?;
@@ -106,8 +106,8 @@ fn write_nodes(out: &mut impl Write, party: DbcNode, everyone: &[u8]) -> fmt::Re
     match party {
         DbcNode::Gateway => write!(out, "gateway"),
         DbcNode::Cell(node) => write!(out, "cell_{node}"),
-        DbcNode::Unnamed => write!(out, "{UNNAMED}"),
-        DbcNode::Cells if everyone.is_empty() => write!(out, "{UNNAMED}"),
+        DbcNode::Unnamed => write!(out, "{UNNAMED_NODE}"),
+        DbcNode::Cells if everyone.is_empty() => write!(out, "{UNNAMED_NODE}"),
         DbcNode::Cells => {
             for (index, node) in everyone.iter().enumerate() {
                 write!(out, "{}cell_{node}", if index == 0 { "" } else { "," })?;
@@ -164,7 +164,7 @@ fn write_attributes(out: &mut impl Write, bus: &SkinBus, messages: &[DbcMessage]
     }
     for message in messages {
         let id = message.id.to_bits();
-        writeln!(out, "BA_ \"VFrameFormat\" BO_ {id} {STANDARD_CAN_FD};")?;
+        writeln!(out, "BA_ \"VFrameFormat\" BO_ {id} {STANDARD_CAN_FD_FORMAT};")?;
         writeln!(out, "BA_ \"CANFD_BRS\" BO_ {id} 1;")?;
         let (kind, ms) = match message.rhythm {
             SendSchedule::OnEvent => continue,

@@ -8,7 +8,7 @@
 //!
 //! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of its contact state, so a word
 //! that is not the step nearest to the exact product comes from the cell's own J: [`TorqueRow::verdict`] looks for a J near
-//! the exact one that gives this word. Information that the capture lacks is listed in [`Explanation::missing`].
+//! the exact one that gives this word. Information that the capture lacks is listed in [`TorqueExplanation::missing`].
 
 mod not_found;
 mod observed;
@@ -17,7 +17,7 @@ mod row;
 pub mod series;
 mod watch;
 
-pub use not_found::{NotFound, other_robot_text};
+pub use not_found::{JointsNotFound, other_robot_text};
 pub use observed::{ContactOrigin, ObservedCellState, ObservedJoints, RequestedJoints};
 pub use read::{FoundJoints, read_to_joints};
 pub use row::{MAX_JACOBIAN_ERROR_STEPS, TorqueRow, WordVerdict};
@@ -34,20 +34,20 @@ use model::central::CentralComputation;
 
 /// The derivation of all torques of one epoch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Explanation {
+pub struct TorqueExplanation {
     /// The joints on each bus that has them.
-    pub buses: Vec<BusExplained>,
+    pub buses: Vec<BusExplanation>,
     /// Cells that were in contact or answered, by bus and node id.
-    pub cells: Vec<CellExplained>,
+    pub cells: Vec<CellExplanation>,
     /// The total torque of the skin at each joint.
-    pub total: Vec<JointTotal>,
+    pub total: Vec<JointTorqueTotal>,
     /// Missing information, one line each.
     pub missing: Vec<String>,
 }
 
 /// The joints that were sent on a bus in the epoch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct BusExplained {
+pub struct BusExplanation {
     /// Name of the bus.
     pub bus: String,
     /// Time of the joints in ns since 1970.
@@ -68,7 +68,7 @@ pub struct BusExplained {
 
 /// The derivation of one cell's torque.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct CellExplained {
+pub struct CellExplanation {
     /// Name of the cell's bus.
     pub bus: String,
     /// Node id of the cell.
@@ -114,7 +114,7 @@ pub struct ForceSteps {
 
 /// The torque of the whole skin on one joint, as sent and as computed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct JointTotal {
+pub struct JointTorqueTotal {
     /// Number of the joint in the robot, from 1.
     pub joint: u8,
     /// Unit of the torques on the joint: Nm, or N for a prismatic joint.
@@ -140,7 +140,7 @@ pub struct JointTotal {
 /// Derives the torques for these joints; `moments` has the joints and answers of each bus of the skin, `None` if
 /// missing.
 #[must_use]
-pub fn explain(skin: &Skin, moments: &[Option<ObservedJoints>]) -> Explanation {
+pub fn explain(skin: &Skin, moments: &[Option<ObservedJoints>]) -> TorqueExplanation {
     Explainer::new(skin).explain(moments)
 }
 
@@ -159,7 +159,7 @@ impl<'a> Explainer<'a> {
     pub fn new(skin: &'a Skin) -> Self {
         let parts = (0..skin.buses.len()).map(|bus| {
             let part = skin.with_cells_of_bus(bus);
-            let both = [CentralComputation::new(&part), CentralComputation::unquantised(&part)];
+            let both = [CentralComputation::new(&part), CentralComputation::without_quantisation(&part)];
             (part, both)
         });
         Self { skin, buses: parts.collect() }
@@ -168,19 +168,19 @@ impl<'a> Explainer<'a> {
     /// Derives the torques for these joints; `moments` has the joints and answers of each bus of the skin, `None` if
     /// missing.
     #[must_use]
-    pub fn explain(&self, moments: &[Option<ObservedJoints>]) -> Explanation {
-        explain_with(self.skin, &self.buses, moments)
+    pub fn explain(&self, moments: &[Option<ObservedJoints>]) -> TorqueExplanation {
+        explain_torques_of_parts(self.skin, &self.buses, moments)
     }
 }
 
-fn explain_with(
+fn explain_torques_of_parts(
     skin: &Skin,
     parts: &[(Skin, [CentralComputation; 2])],
     moments: &[Option<ObservedJoints>],
-) -> Explanation {
+) -> TorqueExplanation {
     let mut explanation =
-        Explanation { buses: Vec::new(), cells: Vec::new(), total: Vec::new(), missing: Vec::new() };
-    let mut sums = [JointSum::default(); MAX_ROBOT_JOINTS];
+        TorqueExplanation { buses: Vec::new(), cells: Vec::new(), total: Vec::new(), missing: Vec::new() };
+    let mut sums = [JointTorqueSum::default(); MAX_ROBOT_JOINTS];
     for (index, ((bus, (part, both)), moment)) in skin.buses.iter().zip(parts).zip(moments).enumerate() {
         let name = &bus.name;
         let Some(moment) = moment else {
@@ -198,14 +198,14 @@ fn explain_with(
         }
         let positions = moment.joints.positions;
         let [central, _] = both;
-        let frames = both.each_ref().map(|central| central.frames(&positions));
+        let frames = both.each_ref().map(|central| central.link_frames(&positions));
         let chain: Vec<_> = skin.joints_on_bus(index).collect();
-        explanation.buses.push(BusExplained {
+        explanation.buses.push(BusExplanation {
             bus: name.clone(),
             at_ns: moment.at_ns,
             joints: chain.iter().map(|(joint, _)| joint_number(*joint)).collect(),
             position_words: positions.iter().take(chain.len()).map(|word| word.to_bits()).collect(),
-            position_rad: central.positions(&positions).into_iter().take(chain.len()).collect(),
+            position_rad: central.joint_positions(&positions).into_iter().take(chain.len()).collect(),
             units: chain.iter().map(|(_, joint)| joint.kind.unit()).collect(),
             torque_format: bus.torque_format.name(),
             halted: moment.halted,
@@ -236,12 +236,12 @@ fn explain_with(
             }
             let newtons = force.map_or(0.0, |force| force.effective_fused_n());
             let ([in_words, in_numbers], [rounded, real]) = (both, &frames);
-            let exact = in_words.torque(place, rounded, newtons);
-            let unit = in_words.torque(place, rounded, 1.0);
-            let unrounded = in_numbers.torque(place, real, newtons);
+            let exact = in_words.cell_torque(place, rounded, newtons);
+            let unit = in_words.cell_torque(place, rounded, 1.0);
+            let unrounded = in_numbers.cell_torque(place, real, newtons);
             let words = said.answer.map(|(_, words)| words);
             let format = bus.torque_format;
-            let steps = max_jacobian_error_steps(part.parameters(cell).chain().len());
+            let steps = max_jacobian_error_steps(part.parameters(cell).rows_to_cell().len());
             let rows = chain.iter().enumerate().map(|(at, joint)| {
                 let moves = at < usize::from(cell.joint);
                 let steps = moves.then_some(steps);
@@ -255,12 +255,12 @@ fn explain_with(
                 sum.central += of(&exact);
                 sum.unrounded += of(&unrounded);
                 if let Some(word) = words.and_then(|words| words.as_slice().get(at).copied()) {
-                    sum.words += i64::from(format.finest_steps(word));
+                    sum.words += i64::from(format.to_finest_steps(word));
                     sum.products += of(&exact);
                     sum.saturated += u32::from(is_saturated(word));
                 }
             }
-            explanation.cells.push(CellExplained {
+            explanation.cells.push(CellExplanation {
                 bus: name.clone(),
                 node: cell.node.get(),
                 joint: chain.get(usize::from(cell.joint) - 1).map_or(0, |(joint, _)| joint_number(*joint)),
@@ -284,7 +284,7 @@ fn explain_with(
 }
 
 #[derive(Clone, Copy, Default)]
-struct JointSum {
+struct JointTorqueSum {
     words: i64,
     products: f64,
     central: f64,
@@ -293,11 +293,11 @@ struct JointSum {
     open: u32,
 }
 
-impl JointSum {
+impl JointTorqueSum {
     #[expect(clippy::cast_precision_loss, reason = "254 words a bus: exact")]
-    fn total(self, joint: u8, unit: &'static str) -> JointTotal {
+    fn total(self, joint: u8, unit: &'static str) -> JointTorqueTotal {
         let words_nm = self.words as f64 / 4_096.0;
-        JointTotal {
+        JointTorqueTotal {
             joint,
             unit,
             word_steps: self.words,
@@ -323,7 +323,7 @@ fn silence_reason(halted: bool, state: Option<State>) -> &'static str {
     let has = |bit| state.is_some_and(|state| state.has(bit));
     if halted || has(State::HALTED) {
         "it was halted"
-    } else if has(State::CLAIMING) {
+    } else if has(State::CLAIMING_NODE_ID) {
         "it had just started and was claiming its node id"
     } else if state.is_some_and(|state| !state.has(State::CONFIGURED)) {
         "it had no configuration"

@@ -5,7 +5,7 @@ use thiserror::Error;
 /// The reason why the joints to explain were not found.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
-pub enum NotFound {
+pub enum JointsNotFound {
     /// The capture has none of the skin's buses.
     #[error("the skin has none of the capture's buses ({capture}); it has {skin}")]
     Buses {

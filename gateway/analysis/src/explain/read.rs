@@ -5,7 +5,7 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use trace::capture::{CaptureEntry, CaptureError, NoteKind, Reader};
 
-use super::NotFound;
+use super::JointsNotFound;
 use super::observed::{ObservedJoints, RequestedJoints};
 use super::watch::JointsWatcher;
 
@@ -14,7 +14,7 @@ use super::watch::JointsWatcher;
 pub struct FoundJoints {
     /// The joints and answers on each bus of the skin, `None` for a bus without these joints; or the reason why no bus
     /// has them.
-    pub moments: Result<Vec<Option<ObservedJoints>>, NotFound>,
+    pub moments: Result<Vec<Option<ObservedJoints>>, JointsNotFound>,
     /// Time that counts as 0 s, in ns since 1970.
     pub zero_ns: u64,
     /// True if `zero_ns` is the first tick of the run, false if it is the first frame.
@@ -68,7 +68,7 @@ pub fn read_to_joints(
         }
     }
     Ok(FoundJoints {
-        moments: watch.moments(),
+        moments: watch.into_joints(),
         is_empty,
         zero_ns: zero.unwrap_or_default(),
         counts_from_run: is_of_run,

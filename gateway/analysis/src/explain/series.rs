@@ -14,7 +14,7 @@ use trace::capture::{CaptureEntry, CaptureError, CaptureNote, Reader};
 
 use super::observed::ObservedJoints;
 use super::watch::JointsWatcher;
-use super::{Explainer, Explanation, NotFound};
+use super::{Explainer, JointsNotFound, TorqueExplanation};
 
 /// Number of epochs that a bus may be behind the others before they no longer wait for it.
 const MAX_BUS_LAG_EPOCHS: i64 = 64;
@@ -29,12 +29,12 @@ pub struct EpochTorque {
     /// The position of each joint of the robot in rad or m; `None` for a joint whose bus sent no joints in this epoch.
     pub positions: Vec<Option<f64>>,
     /// The derivation of the torques.
-    pub explanation: Explanation,
+    pub explanation: TorqueExplanation,
 }
 
 /// The error of reading a capture epoch by epoch.
 #[derive(Debug, Error)]
-pub enum SeriesError<E> {
+pub enum EpochSeriesError<E> {
     /// The capture cannot be read, or is damaged.
     #[error(transparent)]
     Capture(#[from] CaptureError),
@@ -44,7 +44,7 @@ pub enum SeriesError<E> {
         /// Name of the capture.
         name: String,
         /// The reason.
-        source: NotFound,
+        source: JointsNotFound,
     },
     /// The function that receives the epochs has failed.
     #[error("{0}")]
@@ -53,7 +53,7 @@ pub enum SeriesError<E> {
 
 /// The extent of a capture that was read epoch by epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct SeriesTotals {
+pub struct CaptureExtent {
     /// Number of epochs that were passed on.
     pub epochs: u64,
     /// Time that counts as 0 s, in ns since 1970: the first tick of the run, or else the first frame.
@@ -64,14 +64,14 @@ pub struct SeriesTotals {
 /// 1970. Memory is bounded.
 ///
 /// # Errors
-/// Returns [`SeriesError`] if the capture cannot be read or has no joints of the skin, or with the first error that
+/// Returns [`EpochSeriesError`] if the capture cannot be read or has no joints of the skin, or with the first error that
 /// `take` returns.
-pub fn each_epoch<E>(
+pub fn for_each_epoch<E>(
     reader: &mut Reader,
     skin: &Skin,
     mut note: impl FnMut(&CaptureNote<'_>),
     mut take: impl FnMut(u64, &EpochTorque) -> Result<(), E>,
-) -> Result<SeriesTotals, SeriesError<E>> {
+) -> Result<CaptureExtent, EpochSeriesError<E>> {
     let mut series = EpochJoiner::new(skin);
     let mut decoder = Decoder::new(None);
     for before in &reader.extras().latched {
@@ -80,7 +80,7 @@ pub fn each_epoch<E>(
             series.watch.receive_latched(before.nanos, &before.bus, &message);
         }
     }
-    let mut counted = SeriesTotals::default();
+    let mut counted = CaptureExtent::default();
     let mut zero = reader.extras().run_began();
     while let Some(entry) = reader.next()? {
         let record = match entry {
@@ -96,20 +96,20 @@ pub fn each_epoch<E>(
         let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
         series.watch.receive(nanos, record.interface, message);
         series.collect_complete_joints(false);
-        while let Some(epoch) = series.next(false) {
+        while let Some(epoch) = series.pop_oldest_epoch(false) {
             counted.epochs += 1;
-            take(counted.zero_ns, &epoch).map_err(SeriesError::Consumer)?;
+            take(counted.zero_ns, &epoch).map_err(EpochSeriesError::Consumer)?;
         }
     }
     series.collect_complete_joints(true);
-    while let Some(epoch) = series.next(true) {
+    while let Some(epoch) = series.pop_oldest_epoch(true) {
         counted.epochs += 1;
-        take(counted.zero_ns, &epoch).map_err(SeriesError::Consumer)?;
+        take(counted.zero_ns, &epoch).map_err(EpochSeriesError::Consumer)?;
     }
     if counted.epochs == 0
-        && let Err(source) = series.watch.moments()
+        && let Err(source) = series.watch.into_joints()
     {
-        return Err(SeriesError::NotFound { name: reader.name().to_owned(), source });
+        return Err(EpochSeriesError::NotFound { name: reader.name().to_owned(), source });
     }
     Ok(counted)
 }
@@ -151,7 +151,7 @@ impl<'a> EpochJoiner<'a> {
     /// Collects the joints of each bus whose answers are complete; at the end of the capture, all joints.
     fn collect_complete_joints(&mut self, is_end: bool) {
         for (bus, last) in &mut self.last {
-            while let Some((epoch, moment)) = self.watch.pop(*bus, is_end) {
+            while let Some((epoch, moment)) = self.watch.pop_joints(*bus, is_end) {
                 let (newest, of_newest) = self.newest.unwrap_or((0, epoch));
                 let mut number = newest + i64::from(epoch.epochs_since(of_newest));
                 while last.is_some_and(|last| number <= last) {
@@ -171,7 +171,7 @@ impl<'a> EpochJoiner<'a> {
     }
 
     /// Removes and returns the oldest epoch, once no bus can add joints to it.
-    fn next(&mut self, is_end: bool) -> Option<EpochTorque> {
+    fn pop_oldest_epoch(&mut self, is_end: bool) -> Option<EpochTorque> {
         let (number, _) = self.waiting.first_key_value()?;
         let newest = self.newest.map_or(*number, |(newest, _)| newest);
         let is_passed = self.last.iter().all(|(_, last)| last.is_some_and(|last| last >= *number));

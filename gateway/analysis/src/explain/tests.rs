@@ -4,7 +4,7 @@ use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
 use protocol::message::{Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, State, StimulusStart};
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::packet::{self, Epoch};
 use protocol::parameters::Parameter;
 
@@ -12,7 +12,8 @@ use protocol::parameters::Parameter;
 /// joints, the touch and the torque of that document.
 fn skin() -> Skin {
     let cell = "node = 12\njoint = 2\nposition = [0.1, 0.05, 0.06]";
-    let text = model::testing::SKIN.replace("node = 1\njoint = 3\nposition = [0.2, 0.01, 0.15]", cell);
+    let text =
+        model::testing::ONE_CELL_SKIN_TOML.replace("node = 1\njoint = 3\nposition = [0.2, 0.01, 0.15]", cell);
     let text = text.replace("[0.7071068, 0.0, 0.0, 0.7071068]", "[-0.4472135955, 0.0, 0.0, 0.894427191]");
     let contact =
         "alpha_p = 0.0\ncontact_threshold_n = 0.1\nproximity_threshold = 0.05\nforce_threshold_n = 0.1";
@@ -30,7 +31,10 @@ fn cell() -> CellId {
 fn joints(epoch: u8) -> Message {
     let words: [u16; 6] = [0, 0xCF1C, 0x28BE, 0xC6F5, 0xC008, 0];
     let positions = words.map(|word| Q1_14::from_bits(word.cast_signed()));
-    Message::Joints { epoch: Epoch(epoch), joints: Joints { positions: padded(&positions), in_use: 6 } }
+    Message::Joints {
+        epoch: Epoch(epoch),
+        joints: Joints { positions: pad_with_defaults(&positions), in_use: 6 },
+    }
 }
 
 fn press(from: StimulusStart, newtons: f64) -> Message {
@@ -44,20 +48,24 @@ fn torque(epoch: u8, words: [i16; 2]) -> Message {
 }
 
 fn heartbeat(configuration: u16) -> Message {
-    let state = State::CONFIGURED.with(State::TEST_MODE, true);
+    let state = State::CONFIGURED.with_flags(State::TEST_MODE, true);
     let page = NetworkPage::Heartbeat(Heartbeat { configuration, state, sent: 7, ..Heartbeat::default() });
     Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
 }
 
 /// Derives the torques at the requested joints from these messages, which are sent 1 ms apart.
-fn explained(skin: &Skin, messages: &[Message], requested: RequestedJoints) -> Result<Explanation, NotFound> {
+fn explained(
+    skin: &Skin,
+    messages: &[Message],
+    requested: RequestedJoints,
+) -> Result<TorqueExplanation, JointsNotFound> {
     let mut watch = JointsWatcher::new(skin, requested);
     for (at, message) in (1..).zip(messages) {
         if watch.receive(at * 1_000_000, "vcan0", Some(message)) {
             break;
         }
     }
-    watch.moments().map(|moments| explain(skin, &moments))
+    watch.into_joints().map(|moments| explain(skin, &moments))
 }
 
 fn first(epoch: u8) -> RequestedJoints {
@@ -202,7 +210,7 @@ fn what_is_not_there_is_named_with_what_is() {
     assert_eq!(error, "the capture has no joints messages on vcan0, and cells answer only those");
     let mut watch = JointsWatcher::new(&skin, first(5));
     watch.receive(0, "can7", None);
-    let error = watch.moments().unwrap_err().to_string();
+    let error = watch.into_joints().unwrap_err().to_string();
     assert_eq!(error, "the skin has none of the capture's buses (can7); it has vcan0");
     // Memory is bounded for any input.
     let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
@@ -240,7 +248,7 @@ fn a_torque_after_four_more_joints_is_named_and_not_used() {
 fn a_claim_of_an_owned_node_id_changes_nothing() {
     let skin = skin();
     let claim = {
-        let heartbeat = Heartbeat { serial: 9, state: State::CLAIMING, ..Heartbeat::default() };
+        let heartbeat = Heartbeat { serial: 9, state: State::CLAIMING_NODE_ID, ..Heartbeat::default() };
         let page = NetworkPage::Heartbeat(heartbeat);
         Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
     };

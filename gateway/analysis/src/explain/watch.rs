@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use model::tracker::{AddressClaim, ContactState, HeartbeatKind, MAX_LATE_EPOCHS, PerCell, is_late};
+use model::tracker::{AddressClaim, ContactState, HeartbeatKind, MAX_LATE_EPOCHS, PerCell, is_stimulus_late};
 use protocol::id::{CellId, Node};
 use protocol::message::{
     Answer, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, StimulusStart,
@@ -13,7 +13,7 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use trace::capture::seconds_since;
 
-use super::not_found::NotFound;
+use super::not_found::JointsNotFound;
 use super::observed::{ContactOrigin, ObservedCellState, ObservedJoints, RequestedJoints};
 
 /// Number of joints that must follow the requested ones, so that late torques and the configurations of cells have
@@ -42,7 +42,7 @@ struct BusWatch {
     halted: bool,
     occurrences: u32,
     /// Joints whose answers may still arrive, oldest first.
-    open: VecDeque<OpenJoints>,
+    open: VecDeque<AnswerableJoints>,
     cells: PerCell<WatchedCell>,
     runs: Vec<EpochRun>,
     /// The number of values in a joints packet whose length does not fit the chain.
@@ -53,7 +53,7 @@ struct BusWatch {
 
 /// Joints that cells may still answer.
 #[derive(Debug)]
-struct OpenJoints {
+struct AnswerableJoints {
     epoch: Epoch,
     moment: ObservedJoints,
     since: u32,
@@ -81,7 +81,7 @@ impl<'a> JointsWatcher<'a> {
         Self::with_request(skin, Some(requested))
     }
 
-    /// Creates a watch that returns all joints, by [`JointsWatcher::pop`].
+    /// Creates a watch that returns all joints, by [`JointsWatcher::pop_joints`].
     #[must_use]
     pub fn for_all_joints(skin: &'a Skin) -> Self {
         Self::with_request(skin, None)
@@ -101,12 +101,12 @@ impl<'a> JointsWatcher<'a> {
 
     /// Handles a packet from before the start of the capture, which still has an effect.
     pub fn receive_latched(&mut self, nanos: u64, bus: &str, message: &Message) {
-        let at = self.skin.bus_named(bus);
+        let at = self.skin.bus_index(bus);
         let joints = at.map_or(0, |at| self.skin.joints_on_bus(at).len());
         if let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) {
             if let Message::Joints { epoch, joints: Joints { in_use, .. } } = *message {
                 if usize::from(in_use) == joints && bus_watch.last != Some(epoch) {
-                    bus_watch.latch(epoch);
+                    bus_watch.latch_contacts(epoch);
                 }
             } else {
                 bus_watch.receive_message(nanos, 0, message, self.requested, joints);
@@ -118,7 +118,7 @@ impl<'a> JointsWatcher<'a> {
     /// requested joints and all answers to them are known.
     pub fn receive(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         let zero = *self.zero.get_or_insert(nanos);
-        let at = self.skin.bus_named(bus);
+        let at = self.skin.bus_index(bus);
         let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) else {
             if self.others.len() < MAX_LISTED_RUNS && !self.others.iter().any(|other| other == bus) {
                 self.others.push(bus.to_owned());
@@ -140,7 +140,7 @@ impl<'a> JointsWatcher<'a> {
 
     /// Removes and returns the oldest joints of a bus, if their answers are complete. At the end of the capture
     /// (`is_end`), all answers count as complete.
-    pub fn pop(&mut self, bus: usize, is_end: bool) -> Option<(Epoch, ObservedJoints)> {
+    pub fn pop_joints(&mut self, bus: usize, is_end: bool) -> Option<(Epoch, ObservedJoints)> {
         let moments = &mut self.bus_watches.get_mut(bus)?.open;
         moments.front().filter(|open| is_end || open.is_complete())?;
         moments.pop_front().map(|open| (open.epoch, open.moment))
@@ -155,8 +155,8 @@ impl<'a> JointsWatcher<'a> {
     /// the end of the capture, or once [`JointsWatcher::receive`] has returned true.
     ///
     /// # Errors
-    /// Returns [`NotFound`] if no bus has these joints.
-    pub fn moments(self) -> Result<Vec<Option<ObservedJoints>>, NotFound> {
+    /// Returns [`JointsNotFound`] if no bus has these joints.
+    pub fn into_joints(self) -> Result<Vec<Option<ObservedJoints>>, JointsNotFound> {
         let names = |there: bool| {
             let buses = self
                 .skin
@@ -168,7 +168,7 @@ impl<'a> JointsWatcher<'a> {
         };
         if !self.bus_watches.iter().any(|bus_watch| bus_watch.is_in_capture) {
             let capture = if self.others.is_empty() { "none".to_owned() } else { self.others.join(", ") };
-            return Err(NotFound::Buses { capture, skin: names(false) });
+            return Err(JointsNotFound::Buses { capture, skin: names(false) });
         }
         if self.bus_watches.iter().all(|bus_watch| bus_watch.open.is_empty()) {
             let zero = self.zero.unwrap_or_default();
@@ -176,26 +176,26 @@ impl<'a> JointsWatcher<'a> {
                 for (index, (bus, watch)) in self.skin.buses.iter().zip(&self.bus_watches).enumerate() {
                     if let Some(came) = watch.other_joints {
                         let chain = self.skin.joints_on_bus(index).len();
-                        return Err(NotFound::Robot { bus: bus.name.clone(), came, chain });
+                        return Err(JointsNotFound::Robot { bus: bus.name.clone(), came, chain });
                     }
                 }
-                return Err(NotFound::Joints { buses: names(true) });
+                return Err(JointsNotFound::Joints { buses: names(true) });
             };
             let Some(RequestedJoints { epoch, from_ns, occurrence }) = self.requested else {
-                return Err(NotFound::Joints { buses: names(true) });
+                return Err(JointsNotFound::Joints { buses: names(true) });
             };
             let mut requested = format!("of epoch {epoch}");
             if occurrence > 1 {
                 requested += &format!(" (occurrence {occurrence})");
             }
             if from_ns > 0 {
-                requested += &format!(" at {} s or later", seconds(from_ns));
+                requested += &format!(" at {} s or later", format_seconds(from_ns));
             }
-            let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.describe(zero)).collect();
+            let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.describe_run(zero)).collect();
             if bus_watch.further_runs > 0 {
                 runs.push(format!("{} further runs", bus_watch.further_runs));
             }
-            return Err(NotFound::Epoch { requested, runs: runs.join("; ") });
+            return Err(JointsNotFound::Epoch { requested, runs: runs.join("; ") });
         }
         let moment = |bus_watch: BusWatch| bus_watch.open.into_iter().next().map(|open| open.moment);
         Ok(self.bus_watches.into_iter().map(moment).collect())
@@ -203,12 +203,12 @@ impl<'a> JointsWatcher<'a> {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "for display")]
-fn seconds(nanos: u64) -> String {
+fn format_seconds(nanos: u64) -> String {
     format!("{:.3}", nanos as f64 / 1e9)
 }
 
 impl EpochRun {
-    fn describe(&self, zero: u64) -> String {
+    fn describe_run(&self, zero: u64) -> String {
         let Self { first, last, joints } = *self;
         let [from, to] = [first, last].map(|(_, at)| format!("{:.3}", seconds_since(zero, at)));
         let (first, last) = (first.0, last.0);
@@ -219,7 +219,7 @@ impl EpochRun {
     }
 }
 
-impl OpenJoints {
+impl AnswerableJoints {
     fn is_complete(&self) -> bool {
         // A cell that answered has reported its configuration, and a cell in contact has answered.
         let settled = |cell: &ObservedCellState| match cell.answer {
@@ -241,7 +241,7 @@ impl OpenJoints {
 impl BusWatch {
     /// Returns true if all answers to these joints have arrived, with the configuration of each cell that matters.
     fn is_complete(&self) -> bool {
-        self.open.front().is_some_and(OpenJoints::is_complete)
+        self.open.front().is_some_and(AnswerableJoints::is_complete)
     }
 
     fn receive_message(
@@ -267,11 +267,12 @@ impl BusWatch {
             }
             Message::Stimulus { to, from, page } => {
                 let from_epoch = if let StimulusStart::Epoch(epoch) = from { Some(epoch.0) } else { None };
-                let origin = ContactOrigin::Stimulus { at_ns: nanos, from_epoch, late: is_late(from, last) };
+                let origin =
+                    ContactOrigin::Stimulus { at_ns: nanos, from_epoch, late: is_stimulus_late(from, last) };
                 self.cells
                     .addressed_mut(to)
                     .iter_mut()
-                    .for_each(|cell| cell.contact.push(from, page, origin, last));
+                    .for_each(|cell| cell.contact.add_stimulus(from, page, origin, last));
             }
             Message::Configure { to, request: Request::Write { number, words }, .. } => {
                 if Parameter::from_number(number) == Some(Parameter::Mode) {
@@ -292,7 +293,7 @@ impl BusWatch {
                 self.apply_hash(from, hash);
             }
             Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } => {
-                if self.cells.get_mut(from).is_some_and(|cell| cell.heartbeat(nanos, &heartbeat)) {
+                if self.cells.get_mut(from).is_some_and(|cell| cell.handle_heartbeat(nanos, &heartbeat)) {
                     self.apply_hash(from, heartbeat.configuration);
                 }
             }
@@ -300,7 +301,7 @@ impl BusWatch {
                 let cell =
                     self.cells.get_mut(from).filter(|cell| cell.contact.obeys_stimuli() != Some(false));
                 cell.into_iter().for_each(|cell| {
-                    cell.contact.compare_count(heard.stimuli, ContactOrigin::Said { at_ns: nanos })
+                    cell.contact.compare_stimulus_count(heard.stimuli, ContactOrigin::Said { at_ns: nanos })
                 });
             }
             Message::Sensors { from, epoch, page: page @ SensorPage::Skin(skin) } => {
@@ -345,7 +346,7 @@ impl BusWatch {
         requested: Option<RequestedJoints>,
     ) {
         self.record_epoch(nanos, epoch);
-        self.latch(epoch);
+        self.latch_contacts(epoch);
         for open in &mut self.open {
             open.since += 1;
         }
@@ -364,13 +365,13 @@ impl BusWatch {
                     ..ObservedCellState::default()
                 });
             let moment = ObservedJoints { at_ns: nanos, joints, halted: self.halted, cells: cells.collect() };
-            self.open.push_back(OpenJoints { epoch, moment, since: 0 });
+            self.open.push_back(AnswerableJoints { epoch, moment, since: 0 });
         }
     }
 
-    fn latch(&mut self, epoch: Epoch) {
+    fn latch_contacts(&mut self, epoch: Epoch) {
         self.last = Some(epoch);
-        self.cells.iter_mut().for_each(|(_, cell)| cell.contact.latch(epoch, |_| {}));
+        self.cells.iter_mut().for_each(|(_, cell)| cell.contact.latch_due_stimuli(epoch, |_| {}));
     }
 
     /// Adds the epoch of new joints to the list of runs.
@@ -406,7 +407,7 @@ impl BusWatch {
 
 impl WatchedCell {
     /// Handles a heartbeat with the node id of the cell. Returns true if the cell itself sent it.
-    fn heartbeat(&mut self, at_ns: u64, heartbeat: &Heartbeat) -> bool {
+    fn handle_heartbeat(&mut self, at_ns: u64, heartbeat: &Heartbeat) -> bool {
         let obeys = heartbeat.state.has(State::TEST_MODE);
         match self.claim.receive(Micros(at_ns / 1_000), heartbeat) {
             HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken => return false,

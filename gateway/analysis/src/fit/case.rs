@@ -8,15 +8,15 @@ use protocol::parameters::Sensing;
 use protocol::skin::{Skin, SkinReply};
 use protocol::wire_time::{BitRates, FrameCoding, FrameShape};
 
-use super::response::{Response, Stream, response};
+use super::response::{FrameStream, ResponseTime, response_time};
 
 /// Period of heartbeats, in ns.
 const HEARTBEAT_NS: u64 = 250_000_000;
 /// With sensors on, the pages other than the skin's follow every fourth heartbeat.
-const OTHER_PAGES_PERIOD_NS: u64 = 4 * HEARTBEAT_NS;
+const NON_SKIN_PAGES_PERIOD_NS: u64 = 4 * HEARTBEAT_NS;
 /// Number of these pages.
 #[expect(clippy::cast_possible_truncation, reason = "a few pages")]
-const OTHER_PAGE_COUNT: u32 = SensorPage::SIMULATED.len() as u32 - 1;
+const NON_SKIN_PAGE_COUNT: u32 = SensorPage::SIMULATED_PAGE_NAMES.len() as u32 - 1;
 /// Share of the period that `skinbus skin generate` gives to slots, in percent.
 const SLOTS_SHARE_PERCENT: u64 = 75;
 
@@ -92,7 +92,7 @@ pub struct BusCase {
 
 /// Shares of a bus's time by kind of frame, if each frame has its maximum length.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Load {
+pub struct BusLoad {
     /// Share of joints.
     pub joints: f64,
     /// Share of torques or sums.
@@ -103,7 +103,7 @@ pub struct Load {
     pub heartbeats: f64,
 }
 
-impl Load {
+impl BusLoad {
     /// Returns the sum of all shares.
     #[must_use]
     pub fn total(&self) -> f64 {
@@ -120,7 +120,7 @@ pub struct WorstCaseTimes {
     /// joints, computation, blocking, and all answers.
     pub chain_ns: Option<u64>,
     /// Bound of the same time as in `chain_ns`, by response-time analysis; only for torques.
-    pub response_ns: Option<Response>,
+    pub response_ns: Option<ResponseTime>,
     /// From the time at which a heartbeat should be sent to its end, in ns. Cells may send it up to a period of the
     /// joints early.
     pub heartbeat_ns: Option<u64>,
@@ -164,7 +164,7 @@ impl BusCase {
 
     /// Returns the longest time of a frame of joints or of an answer; on a classic bus, of any frame.
     #[must_use]
-    pub fn frame_ns(&self) -> u64 {
+    pub fn longest_frame_ns(&self) -> u64 {
         self.frame_time_ns(self.length)
     }
 
@@ -177,7 +177,7 @@ impl BusCase {
     }
 
     /// Returns the number of frames that a packet of this length takes.
-    fn frames_of(&self, length: Length) -> u32 {
+    fn frames_per_packet(&self, length: Length) -> u32 {
         match self.format {
             Format::Fd => 1,
             Format::Classic => u32::try_from(length.segments()).unwrap_or(u32::MAX),
@@ -187,17 +187,17 @@ impl BusCase {
     /// Returns the longest time of the frames of joints or of an answer. A classic packet of three frames ends with one
     /// of 4 bytes, which counts as 8.
     #[must_use]
-    pub fn packet_ns(&self) -> u64 {
-        u64::from(self.frames_of(self.length)) * self.frame_ns()
+    pub fn longest_packet_ns(&self) -> u64 {
+        u64::from(self.frames_per_packet(self.length)) * self.longest_frame_ns()
     }
 
     /// Returns the time that the answers of this number of cells take on the bus, in ns.
-    fn answers_ns(&self, cells: u32) -> u64 {
-        self.packet_ns().saturating_mul(u64::from(cells))
+    fn answers_time_ns(&self, cells: u32) -> u64 {
+        self.longest_packet_ns().saturating_mul(u64::from(cells))
     }
 
     /// Returns the duration of an arbitration bit in ns, rounded up.
-    fn bit_ns(&self) -> u64 {
+    fn bit_time_ns(&self) -> u64 {
         1_000_000_000_u64.div_ceil(u64::from(self.rates.nominal_rate()))
     }
 
@@ -205,15 +205,15 @@ impl BusCase {
     /// heartbeats.
     ///
     /// Heartbeats, and pages that follow them, may be sent up to a period of the joints early.
-    fn streams(&self, answers_jitter_ns: u64) -> [Stream; 5] {
+    fn streams(&self, answers_jitter_ns: u64) -> [FrameStream; 5] {
         let (cells, early_ns) = (self.answers.cells(), self.period_ns);
         let of = |length, senders: u32, period_ns, jitter_ns| {
-            let count = senders.saturating_mul(self.frames_of(length));
-            Stream { count, period_ns, jitter_ns, frame_ns: self.frame_time_ns(length) }
+            let count = senders.saturating_mul(self.frames_per_packet(length));
+            FrameStream { count, period_ns, jitter_ns, frame_ns: self.frame_time_ns(length) }
         };
         let stream = |senders, period_ns, jitter_ns| of(Length::Six, senders, period_ns, jitter_ns);
-        let none = stream(0, OTHER_PAGES_PERIOD_NS, early_ns);
-        let others = stream(cells.saturating_mul(OTHER_PAGE_COUNT), OTHER_PAGES_PERIOD_NS, early_ns);
+        let none = stream(0, NON_SKIN_PAGES_PERIOD_NS, early_ns);
+        let others = stream(cells.saturating_mul(NON_SKIN_PAGE_COUNT), NON_SKIN_PAGES_PERIOD_NS, early_ns);
         let [page_0, others] = match self.sensing {
             Sensing::Off => [none; 2],
             Sensing::Continuous { period_ms } => {
@@ -235,21 +235,21 @@ impl BusCase {
     /// Returns the load of the bus. Sensors that send on changes count with the rate at which they send without
     /// changes.
     #[must_use]
-    pub fn load(&self) -> Load {
+    pub fn load(&self) -> BusLoad {
         let [joints, answers, page_0, others, heartbeats] = self.streams(0).map(|it| it.load());
-        Load { joints, answers, sensors: page_0 + others, heartbeats }
+        BusLoad { joints, answers, sensors: page_0 + others, heartbeats }
     }
 
     /// Returns the worst-case times.
     #[must_use]
     pub fn times(&self) -> WorstCaseTimes {
-        let joints_ns = self.joints_ns();
+        let joints_ns = self.joints_response_ns();
         // A heartbeat may be sent a period before it is due; its time counts from then.
-        let heartbeat = response(&self.streams(self.jitter_ns(joints_ns)), 4, self.bit_ns());
+        let heartbeat = response_time(&self.streams(self.answer_jitter_ns(joints_ns)), 4, self.bit_time_ns());
         WorstCaseTimes {
             joints_ns,
-            chain_ns: joints_ns.and_then(|it| self.chain_ns(it)),
-            response_ns: self.response_ns(joints_ns),
+            chain_ns: joints_ns.and_then(|it| self.additive_last_answer_ns(it)),
+            response_ns: self.answer_response(joints_ns),
             heartbeat_ns: heartbeat.map(|it| it.worst_ns.saturating_sub(self.period_ns)),
         }
     }
@@ -257,25 +257,25 @@ impl BusCase {
     /// Returns true if one of the bounds proves that the last answer is complete by [`BusCase::deadline_ns`].
     #[must_use]
     pub fn is_in_time(&self) -> bool {
-        let joints_ns = self.joints_ns();
+        let joints_ns = self.joints_response_ns();
         let is_early = |last_ns: u64| last_ns <= self.deadline_ns();
-        joints_ns.and_then(|it| self.chain_ns(it)).is_some_and(is_early)
-            || self.response_ns(joints_ns).is_some_and(|it| is_early(it.worst_ns))
+        joints_ns.and_then(|it| self.additive_last_answer_ns(it)).is_some_and(is_early)
+            || self.answer_response(joints_ns).is_some_and(|it| is_early(it.worst_ns))
     }
 
-    fn joints_ns(&self) -> Option<u64> {
-        response(&self.streams(0), 0, self.bit_ns()).map(|it| it.worst_ns)
+    fn joints_response_ns(&self) -> Option<u64> {
+        response_time(&self.streams(0), 0, self.bit_time_ns()).map(|it| it.worst_ns)
     }
 
     /// Returns the maximum delay in ns of the time at which cells begin to answer, after the joints should be sent.
-    fn jitter_ns(&self, joints_ns: Option<u64>) -> u64 {
+    fn answer_jitter_ns(&self, joints_ns: Option<u64>) -> u64 {
         joints_ns.unwrap_or(0).saturating_add(self.computation_ns)
     }
 
-    fn response_ns(&self, joints_ns: Option<u64>) -> Option<Response> {
+    fn answer_response(&self, joints_ns: Option<u64>) -> Option<ResponseTime> {
         match self.answers {
             AnswerPlan::Torques { .. } => {
-                response(&self.streams(self.jitter_ns(joints_ns)), 1, self.bit_ns())
+                response_time(&self.streams(self.answer_jitter_ns(joints_ns)), 1, self.bit_time_ns())
             }
             // The releases of sums depend on each other, which response-time analysis does not cover.
             AnswerPlan::Sums { .. } => None,
@@ -294,9 +294,9 @@ impl BusCase {
     /// once the answers. From then on the bus sends only answers until all are sent. With sums, the bus is idle only
     /// while every cell that has not sent yet waits for one that computes; this happens at most once per level of the
     /// tree. Returns `None` if the time exceeds a period: the remaining frames would delay the next answers.
-    fn chain_ns(&self, joints_ns: u64) -> Option<u64> {
+    fn additive_last_answer_ns(&self, joints_ns: u64) -> Option<u64> {
         // Answers that are ready when the joints end leave no gap for other frames.
-        let blocking_ns = if self.computation_ns > 0 { self.frame_ns() } else { 0 };
+        let blocking_ns = if self.computation_ns > 0 { self.longest_frame_ns() } else { 0 };
         let step_ns = self.computation_ns.saturating_add(blocking_ns);
         let ready_ns = match &self.answers {
             AnswerPlan::Torques { .. } => step_ns,
@@ -309,7 +309,8 @@ impl BusCase {
                 slot_ns.saturating_mul(deepest).saturating_add(step_ns)
             }
         };
-        let last_ns = joints_ns.checked_add(ready_ns)?.checked_add(self.answers_ns(self.answers.cells()))?;
+        let last_ns =
+            joints_ns.checked_add(ready_ns)?.checked_add(self.answers_time_ns(self.answers.cells()))?;
         (last_ns <= self.period_ns).then_some(last_ns)
     }
 
@@ -343,7 +344,7 @@ pub(super) fn sums_of_tree(
     slot_us: Option<u32>,
     shared: bool,
 ) -> Option<AnswerPlan> {
-    let depths = skin.wires(bus).depths();
+    let depths = skin.wires(bus).cell_depths();
     let mut by_depth = Vec::new();
     for cell in skin.cells_on_bus(bus) {
         let depth = usize::from((*depths.get(cell.node.index())?)?);

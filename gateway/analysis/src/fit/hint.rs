@@ -10,7 +10,7 @@ use super::limits::{Limit, MaxCells, NeededBuses, exceeded_limits};
 use super::{AssessedBus, COMMON_RATES};
 
 /// The longest period of joints that the wire protocol can express, in ns.
-const MAX_PERIOD_NS: u64 = 65_535_000;
+const MAX_JOINTS_PERIOD_NS: u64 = 65_535_000;
 
 /// A change that a hint suggests, and the bus as it would be after the change.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -29,12 +29,12 @@ pub fn hints(skin: &Skin, case: &BusCase) -> Vec<Hint> {
     if exceeded.is_empty() {
         return Vec::new();
     }
-    let mut hints = more_buses(case);
+    let mut hints = hints_for_more_buses(case);
     // The limit of transceivers does not depend on the bit rate.
     if exceeded != [Limit::Nodes] {
-        hints.extend(faster_rates(case));
-        hints.extend(slower_joints(skin, case));
-        hints.extend(event_sensing(case));
+        hints.extend(hints_for_faster_rates(case));
+        hints.extend(hint_for_slower_joints(skin, case));
+        hints.extend(hint_for_event_sensing(case));
     }
     hints
 }
@@ -44,11 +44,11 @@ fn hint(change: String, case: &BusCase) -> Hint {
 }
 
 /// Returns two hints: the number of buses that the timing needs, and the number that the transceivers need.
-fn more_buses(case: &BusCase) -> Vec<Hint> {
+fn hints_for_more_buses(case: &BusCase) -> Vec<Hint> {
     let cells = case.answers.cells();
     let need = NeededBuses::for_cells(&MaxCells::for_case(case), cells);
     let mut numbers: Vec<_> =
-        [need.buses_for_timing(), need.buses()].into_iter().flatten().filter(|&it| it > 1).collect();
+        [need.buses_for_timing(), need.required_buses()].into_iter().flatten().filter(|&it| it > 1).collect();
     numbers.dedup();
     let spread = |buses: u32| {
         let each = cells.div_ceil(buses);
@@ -59,12 +59,16 @@ fn more_buses(case: &BusCase) -> Vec<Hint> {
 
 /// Returns the slowest common rates that meet the timing limits: one hint for the same format, and for a classic bus
 /// one in CAN FD.
-fn faster_rates(case: &BusCase) -> Vec<Hint> {
+fn hints_for_faster_rates(case: &BusCase) -> Vec<Hint> {
     let at = |format: Format| {
         let rates = COMMON_RATES.iter().filter(|it| it.0 == format).filter_map(|it| it.rates());
         let others = rates.map(|rates| BusCase { format, rates, ..case.clone() }).filter(is_in_time);
         // Of equally slow rates, keep the first.
-        others.reduce(|slowest, other| if slowest.frame_ns() < other.frame_ns() { other } else { slowest })
+        others.reduce(
+            |slowest, other| {
+                if slowest.longest_frame_ns() < other.longest_frame_ns() { other } else { slowest }
+            },
+        )
     };
     let formats = match case.format {
         Format::Fd => [Some(Format::Fd), None],
@@ -79,21 +83,21 @@ fn is_in_time(case: &BusCase) -> bool {
 }
 
 /// Returns the hint of a slower broadcast: the shortest period in whole ticks that meets the timing limits.
-fn slower_joints(skin: &Skin, case: &BusCase) -> Option<Hint> {
+fn hint_for_slower_joints(skin: &Skin, case: &BusCase) -> Option<Hint> {
     let tick_ns = skin.timing.tick_nanos();
     let periods =
-        (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= MAX_PERIOD_NS);
+        (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= MAX_JOINTS_PERIOD_NS);
     let slower = periods.map(|period_ns| BusCase { period_ns, ..case.clone() }).find(is_in_time)?;
-    Some(hint(format!("joint_broadcast_hz = {}", hertz(slower.period_ns)), &slower))
+    Some(hint(format!("joint_broadcast_hz = {}", frequency_hz(slower.period_ns)), &slower))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "below 1e8")]
-fn hertz(period_ns: u64) -> f64 {
+fn frequency_hz(period_ns: u64) -> f64 {
     (1e9 / period_ns as f64 * 1e6).round() / 1e6
 }
 
 /// Returns the hint of cells that send sensors frames on changes only.
-fn event_sensing(case: &BusCase) -> Option<Hint> {
+fn hint_for_event_sensing(case: &BusCase) -> Option<Hint> {
     match case.sensing {
         Sensing::Off | Sensing::Event => None,
         Sensing::Continuous { .. } => {
@@ -106,7 +110,7 @@ fn event_sensing(case: &BusCase) -> Option<Hint> {
 /// Returns the bus with each other kind of answers: torques, sums with all cells on the bus, and sums with only the
 /// roots on it. Sums are omitted if the wires do not reach all cells.
 #[must_use]
-pub fn other_answers(skin: &Skin, bus: usize, case: &BusCase) -> Vec<Hint> {
+pub fn hints_for_other_answers(skin: &Skin, bus: usize, case: &BusCase) -> Vec<Hint> {
     let slot_us = match skin.buses.get(bus).map(|it| it.reply) {
         Some(SkinReply::Sum { slot_us, .. }) => Some(slot_us),
         Some(SkinReply::Torque) | None => None,

@@ -5,7 +5,7 @@ use protocol::skin::Skin;
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 
-use super::case::{AnswerPlan, Load};
+use super::case::{AnswerPlan, BusLoad};
 use super::limits::NeededBuses;
 use super::{AssessedBus, BusFit, RatesRow, SkinFit, rates_name};
 
@@ -24,7 +24,7 @@ struct Document<'a> {
 /// Returns the results as JSON: for each bus and for all cells together, or at common rates. Times are in µs, loads are
 /// shares of 1, and an unbounded time is null.
 #[must_use]
-pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>, table: &[RatesRow]) -> Value {
+pub fn fit_json(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>, table: &[RatesRow]) -> Value {
     // The number of buses in a row is that for all cells of the skin.
     let table = table.iter().map(|row| BusFit { need: row.need, ..row.fullest.clone() });
     let cells = skin.cells.len();
@@ -38,7 +38,7 @@ pub(super) fn needed<S: Serializer>(need: &NeededBuses, serializer: S) -> Result
         "bandwidth": bandwidth,
         "deadline": deadline,
         "nodes": nodes,
-        "buses": need.buses(),
+        "buses": need.required_buses(),
         "binding": need.binding_limits(),
     })
     .serialize(serializer)
@@ -52,7 +52,7 @@ impl Serialize for AssessedBus {
             AnswerPlan::Sums { shared: true, .. } => "sums",
             AnswerPlan::Sums { shared: false, .. } => "sums of roots",
         };
-        let Load { joints, answers: of_answers, sensors, heartbeats } = *load;
+        let BusLoad { joints, answers: of_answers, sensors, heartbeats } = *load;
         json!({
             "name": rates_name(case.format, case.rates),
             "verdict": self.verdict(),
@@ -61,9 +61,9 @@ impl Serialize for AssessedBus {
             "data": case.rates.data_rate(),
             "cells": case.answers.cells(),
             "answers": answers,
-            "period_us": micros(case.period_ns),
-            "computation_us": micros(case.computation_ns),
-            "packet_us": micros(case.packet_ns()),
+            "period_us": nanos_to_micros(case.period_ns),
+            "computation_us": nanos_to_micros(case.computation_ns),
+            "packet_us": nanos_to_micros(case.longest_packet_ns()),
             "load": {
                 "joints": joints,
                 "answers": of_answers,
@@ -71,12 +71,12 @@ impl Serialize for AssessedBus {
                 "heartbeats": heartbeats,
                 "total": load.total(),
             },
-            "joints_us": times.joints_ns.map(micros),
-            "last_answer_us": times.last_answer_ns().map(micros),
-            "by_chain_us": times.chain_ns.map(micros),
-            "by_response_us": times.response_ns.map(|it| micros(it.worst_ns)),
-            "deadline_us": micros(case.deadline_ns()),
-            "heartbeat_us": times.heartbeat_ns.map(micros),
+            "joints_us": times.joints_ns.map(nanos_to_micros),
+            "last_answer_us": times.last_answer_ns().map(nanos_to_micros),
+            "by_chain_us": times.chain_ns.map(nanos_to_micros),
+            "by_response_us": times.response_ns.map(|it| nanos_to_micros(it.worst_ns)),
+            "deadline_us": nanos_to_micros(case.deadline_ns()),
+            "heartbeat_us": times.heartbeat_ns.map(nanos_to_micros),
             "exceeded": exceeded,
         })
         .serialize(serializer)
@@ -85,6 +85,6 @@ impl Serialize for AssessedBus {
 
 /// Converts ns to µs.
 #[expect(clippy::cast_precision_loss, reason = "at most a minute")]
-fn micros(ns: u64) -> f64 {
+fn nanos_to_micros(ns: u64) -> f64 {
     ns as f64 / 1e3
 }

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::case::BusCase;
 
 /// The approximate number of nodes that common transceivers can drive on one bus, including the gateway.
-pub const MAX_NODES: u32 = 110;
+pub const MAX_NODES_PER_BUS: u32 = 110;
 
 /// Upper end of the search for the maximum number of cells.
 const MAX_SEARCHED_CELLS: u32 = 1 << 20;
@@ -62,7 +62,7 @@ impl ByLimit<bool> {
     }
 }
 
-/// The maximum number of cells on one bus by each limit; for nodes, [`MAX_NODES`] minus the gateway.
+/// The maximum number of cells on one bus by each limit; for nodes, [`MAX_NODES_PER_BUS`] minus the gateway.
 pub type MaxCells = ByLimit<u32>;
 
 impl MaxCells {
@@ -70,9 +70,9 @@ impl MaxCells {
     #[must_use]
     pub fn for_case(case: &BusCase) -> Self {
         Self {
-            bandwidth: largest_holding(|cells| has_room(&case.with_cells(cells))),
-            deadline: largest_holding(|cells| case.with_cells(cells).is_in_time()),
-            nodes: MAX_NODES - 1,
+            bandwidth: largest_count_where(|cells| is_load_within_limit(&case.with_cells(cells))),
+            deadline: largest_count_where(|cells| case.with_cells(cells).is_in_time()),
+            nodes: MAX_NODES_PER_BUS - 1,
         }
     }
 
@@ -84,7 +84,7 @@ impl MaxCells {
 }
 
 /// Returns true if the load is at most 100 %.
-fn has_room(case: &BusCase) -> bool {
+fn is_load_within_limit(case: &BusCase) -> bool {
     case.load().total() <= 1.0
 }
 
@@ -92,15 +92,15 @@ fn has_room(case: &BusCase) -> bool {
 #[must_use]
 pub fn exceeded_limits(case: &BusCase) -> Vec<Limit> {
     let holds = ByLimit {
-        bandwidth: has_room(case),
+        bandwidth: is_load_within_limit(case),
         deadline: case.is_in_time(),
-        nodes: case.answers.cells() < MAX_NODES,
+        nodes: case.answers.cells() < MAX_NODES_PER_BUS,
     };
     holds.exceeded()
 }
 
 /// Returns the largest number of cells up to which a condition holds; 0 if it does not hold for 1.
-fn largest_holding(holds: impl Fn(u32) -> bool) -> u32 {
+fn largest_count_where(holds: impl Fn(u32) -> bool) -> u32 {
     let mut beyond = 1;
     while beyond < MAX_SEARCHED_CELLS && holds(beyond) {
         beyond *= 2;
@@ -138,7 +138,7 @@ impl NeededBuses {
             nodes: sum(self.nodes, other.nodes),
         };
         // The two chains may be bound by different limits.
-        let buses = sum(self.buses(), other.buses());
+        let buses = sum(self.required_buses(), other.required_buses());
         for limit in both.binding_limits() {
             *match limit {
                 Limit::Bandwidth => &mut both.bandwidth,
@@ -157,7 +157,7 @@ impl NeededBuses {
 
     /// Returns the number of buses that all limits together require.
     #[must_use]
-    pub fn buses(&self) -> Option<u32> {
+    pub fn required_buses(&self) -> Option<u32> {
         Some(self.buses_for_timing()?.max(self.nodes?))
     }
 
@@ -180,7 +180,7 @@ impl NeededBuses {
         };
         let mut words: Vec<_> = self.binding_limits().into_iter().map(word).collect();
         words.dedup();
-        match self.buses() {
+        match self.required_buses() {
             Some(1) => "1".to_owned(),
             Some(buses) => format!("{buses} {}", words.join(", ")),
             None => format!("none {}", words.join(", ")),
@@ -195,21 +195,24 @@ mod tests {
     #[test]
     fn the_max_is_found_wherever_it_is() {
         for limit in [0, 1, 2, 3, 4, 5, 63, 64, 65, 253, 1_000] {
-            assert_eq!(largest_holding(|number| number <= limit), limit);
+            assert_eq!(largest_count_where(|number| number <= limit), limit);
         }
-        assert!(largest_holding(|_| true) >= MAX_SEARCHED_CELLS / 2);
+        assert!(largest_count_where(|_| true) >= MAX_SEARCHED_CELLS / 2);
     }
     #[test]
     fn the_larger_need_binds_and_equal_ones_both() {
         let need =
             |bandwidth, deadline| NeededBuses::for_cells(&MaxCells { bandwidth, deadline, nodes: 109 }, 253);
-        assert_eq!((need(212, 223).buses(), need(212, 223).binding_limits()), (Some(3), vec![Limit::Nodes]));
+        assert_eq!(
+            (need(212, 223).required_buses(), need(212, 223).binding_limits()),
+            (Some(3), vec![Limit::Nodes])
+        );
         assert_eq!(need(212, 223).buses_for_timing(), Some(2));
         assert_eq!(
-            (need(58, 57).buses(), need(58, 57).binding_limits()),
+            (need(58, 57).required_buses(), need(58, 57).binding_limits()),
             (Some(5), vec![Limit::Bandwidth, Limit::Deadline])
         );
-        assert_eq!((need(2, 0).buses(), need(2, 0).binding_limits()), (None, vec![Limit::Deadline]));
+        assert_eq!((need(2, 0).required_buses(), need(2, 0).binding_limits()), (None, vec![Limit::Deadline]));
         assert_eq!(need(90, 91).binding_limits(), Limit::all());
     }
 

@@ -27,15 +27,15 @@ use protocol::skin::Skin;
 use protocol::wire_time::BitRates;
 use serde::Serialize;
 
-pub use json::json;
+pub use json::fit_json;
 
-use case::{BusCase, Load, WorstCaseTimes};
+use case::{BusCase, BusLoad, WorstCaseTimes};
 use hint::Hint;
 use limits::{Limit, MaxCells, NeededBuses, exceeded_limits};
 use verdict::FitVerdict;
 
 /// Computation time of the paper's cell, 68.5 µs: 1096 instructions at 16 MIPS.
-pub const COMPUTATION_NS: u64 = 68_500;
+pub const PAPER_COMPUTATION_NS: u64 = 68_500;
 
 /// Common bit rates, in bit/s: nominal and data.
 pub const COMMON_RATES: [CommonRates; 7] = [
@@ -75,7 +75,7 @@ pub struct AssessedBus {
     /// The bus, with its rates and cells.
     pub case: BusCase,
     /// Shares of the bus's time, by kind of frame.
-    pub load: Load,
+    pub load: BusLoad,
     /// Worst-case times on the bus.
     pub times: WorstCaseTimes,
     /// The limits that the bus exceeds.
@@ -136,7 +136,7 @@ pub fn assess_bus(
         rated: AssessedBus::assess(&case),
         most,
         need: NeededBuses::for_cells(&most, case.answers.cells()),
-        answers: hint::other_answers(skin, index, &case),
+        answers: hint::hints_for_other_answers(skin, index, &case),
         hints: hint::hints(skin, &case),
     })
 }
@@ -144,13 +144,13 @@ pub fn assess_bus(
 /// Computes the worst case of one bus of a skin at these rates, with all cells answering. Returns `None` if a cell that
 /// answers with sums is unreachable.
 #[must_use]
-pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<AssessedBus> {
+pub fn assess_worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<AssessedBus> {
     let format = skin.buses.get(index)?.format;
     let rates = match format {
         Format::Fd => rates,
         Format::Classic => BitRates::classic(rates.nominal_rate()).ok()?,
     };
-    Some(AssessedBus::assess(&BusCase::from_skin(skin, index, format, rates, COMPUTATION_NS)?))
+    Some(AssessedBus::assess(&BusCase::from_skin(skin, index, format, rates, PAPER_COMPUTATION_NS)?))
 }
 
 /// The fit of all cells of a skin, if they are spread evenly over several buses.
@@ -180,13 +180,14 @@ pub struct SpreadFit {
 #[must_use]
 pub fn spread_over_buses(skin: &Skin, buses: &[BusFit]) -> Option<SkinFit> {
     let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
-    let fullest = fullest(buses.iter())?;
-    let need = need(skin, buses);
-    let most = if chains_with_cells(skin).count() > 1 { 0 } else { need.buses().unwrap_or(1) };
+    let fullest = most_loaded_bus(buses.iter())?;
+    let need = needed_buses(skin, buses);
+    let most = if chains_with_cells(skin).count() > 1 { 0 } else { need.required_buses().unwrap_or(1) };
     let numbers = 1..=most;
     // Show only informative numbers: all below the required one are too small.
-    let is_shown =
-        |buses: &u32| *buses <= 6 || Some(*buses) == need.buses_for_timing() || Some(*buses) == need.buses();
+    let is_shown = |buses: &u32| {
+        *buses <= 6 || Some(*buses) == need.buses_for_timing() || Some(*buses) == need.required_buses()
+    };
     let spread = numbers
         .filter(is_shown)
         .map(|buses| (buses, fullest.rated.case.with_cells(cells.div_ceil(buses))))
@@ -206,13 +207,13 @@ fn chains_with_cells(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
 
 /// Returns the number of buses that all cells of a skin need. A bus carries one chain, so each chain needs buses of its
 /// own, like its bus with the highest load.
-fn need(skin: &Skin, buses: &[BusFit]) -> NeededBuses {
+fn needed_buses(skin: &Skin, buses: &[BusFit]) -> NeededBuses {
     let of_chain = |(chain, cells)| {
         let chain_of = |bus: &&BusFit| {
-            let index = skin.bus_named(&bus.name)?;
+            let index = skin.bus_index(&bus.name)?;
             skin.buses.get(index).map(|bus| bus.chain)
         };
-        let fullest = fullest(buses.iter().filter(|bus| chain_of(bus) == Some(chain)))?;
+        let fullest = most_loaded_bus(buses.iter().filter(|bus| chain_of(bus) == Some(chain)))?;
         Some(NeededBuses::for_cells(&fullest.most, cells))
     };
     let none = NeededBuses { bandwidth: Some(0), deadline: Some(0), nodes: Some(0) };
@@ -230,22 +231,22 @@ pub struct RatesRow {
 
 /// Computes the fit of the bus with the highest load at each of the common bit rates, of all formats or of one.
 #[must_use]
-pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<RatesRow> {
+pub fn rates_table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<RatesRow> {
     let rows = COMMON_RATES.iter().filter(|it| format.is_none_or(|format| format == it.0));
     let row = |common: &CommonRates| {
         let rates = common.rates()?;
         let buses =
             (0..skin.buses.len()).map(|index| assess_bus(skin, index, common.0, rates, computation_ns));
         let buses: Vec<_> = buses.flatten().collect();
-        let fullest = fullest(buses.iter())?.clone();
-        Some(RatesRow { fullest, need: need(skin, &buses) })
+        let fullest = most_loaded_bus(buses.iter())?.clone();
+        Some(RatesRow { fullest, need: needed_buses(skin, &buses) })
     };
     rows.filter_map(row).collect()
 }
 
 /// Returns the bus with the highest load.
 #[must_use]
-pub fn fullest<'a>(buses: impl Iterator<Item = &'a BusFit>) -> Option<&'a BusFit> {
+pub fn most_loaded_bus<'a>(buses: impl Iterator<Item = &'a BusFit>) -> Option<&'a BusFit> {
     buses.max_by(|one, other| one.rated.load.total().total_cmp(&other.rated.load.total()))
 }
 

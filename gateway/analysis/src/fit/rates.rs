@@ -5,9 +5,9 @@ use protocol::skin::SkinBus;
 use protocol::wire_time::{BitRates, BitRatesError};
 
 /// The default nominal bit rate, in bit/s.
-const DEFAULT_NOMINAL: u32 = 1_000_000;
+const DEFAULT_NOMINAL_BIT_RATE: u32 = 1_000_000;
 /// The default data bit rate of FD frames, in bit/s.
-const DEFAULT_DATA: u32 = 5_000_000;
+const DEFAULT_DATA_BIT_RATE: u32 = 5_000_000;
 
 /// Bit rates that the caller requests for all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -33,8 +33,8 @@ impl RequestedRates {
     /// # Errors
     /// Returns [`BitRatesError`] if CAN does not allow these rates.
     pub fn rates(&self) -> Result<BitRates, BitRatesError> {
-        let nominal = self.nominal.unwrap_or(DEFAULT_NOMINAL);
-        BitRates::new(nominal, self.data.unwrap_or_else(|| nominal.max(DEFAULT_DATA)))
+        let nominal = self.nominal.unwrap_or(DEFAULT_NOMINAL_BIT_RATE);
+        BitRates::new(nominal, self.data.unwrap_or_else(|| nominal.max(DEFAULT_DATA_BIT_RATE)))
     }
 
     /// Returns the rates of a bus of a skin.
@@ -50,7 +50,7 @@ impl RequestedRates {
                 let data = data.or(bus.data_bitrate);
                 match bus.format {
                     Format::Fd => Self { nominal, data }.rates()?,
-                    Format::Classic => BitRates::classic(nominal.unwrap_or(DEFAULT_NOMINAL))?,
+                    Format::Classic => BitRates::classic(nominal.unwrap_or(DEFAULT_NOMINAL_BIT_RATE))?,
                 }
             }
         };

@@ -18,7 +18,7 @@ const MAX_BUSY_PERIOD_NS: u64 = 60_000_000_000;
 
 /// Periodic frames of one priority class.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Stream {
+pub struct FrameStream {
     /// Number of streams with these figures; each has its own priority, and they follow each other.
     pub count: u32,
     /// The minimum time between releases in ns, above 0, without the jitter.
@@ -29,7 +29,7 @@ pub struct Stream {
     pub frame_ns: u64,
 }
 
-impl Stream {
+impl FrameStream {
     /// Returns the share of the bus's time that the frames of all these streams take.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a share, to fifteen digits")]
@@ -46,7 +46,7 @@ impl Stream {
 
 /// The worst-case response time of a stream.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Response {
+pub struct ResponseTime {
     /// Time in ns from the event that releases a frame (jitter included) to the end of the frame's intermission.
     pub worst_ns: u64,
     /// The index in the busy period of the frame with that time, from 0.
@@ -62,12 +62,12 @@ pub struct Response {
 /// Returns `None` if there is no such stream, or no bound: streams of the same or a higher priority fill the bus, or
 /// the busy period exceeds a minute.
 #[must_use]
-pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> {
+pub fn response_time(streams: &[FrameStream], at: usize, bit_ns: u64) -> Option<ResponseTime> {
     let (before, rest) = streams.split_at_checked(at)?;
     let (own, lower) = rest.split_first()?;
     let others = own.count.checked_sub(1)?;
     let blocking_ns = lower.iter().filter(|it| it.count > 0).map(|it| it.frame_ns).max().unwrap_or(0);
-    let load: f64 = before.iter().map(Stream::load).sum::<f64>() + own.load();
+    let load: f64 = before.iter().map(FrameStream::load).sum::<f64>() + own.load();
     if load >= 1.0 {
         return None;
     }
@@ -75,22 +75,22 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
         let sum = before.iter().map(|it| it.demand_ns(it.count, window_ns)).fold(0, u64::saturating_add);
         sum.saturating_add(own.demand_ns(others, window_ns))
     };
-    let busy_ns = fixed_point(own.frame_ns, |busy_ns| {
+    let busy_ns = lowest_fixed_point(own.frame_ns, |busy_ns| {
         blocking_ns.saturating_add(higher_ns(busy_ns)).saturating_add(own.demand_ns(1, busy_ns))
     })?;
     let instances = busy_ns.saturating_add(own.jitter_ns).div_ceil(own.period_ns);
-    let mut worst = Response { worst_ns: 0, instance: 0, instances };
+    let mut worst = ResponseTime { worst_ns: 0, instance: 0, instances };
     let mut wait_ns = blocking_ns;
     for instance in 0..instances {
         let own_ns = instance.saturating_mul(own.frame_ns);
-        wait_ns = fixed_point(wait_ns.max(blocking_ns.saturating_add(own_ns)), |wait_ns| {
+        wait_ns = lowest_fixed_point(wait_ns.max(blocking_ns.saturating_add(own_ns)), |wait_ns| {
             let higher_ns = higher_ns(wait_ns.saturating_add(bit_ns));
             blocking_ns.saturating_add(own_ns).saturating_add(higher_ns)
         })?;
         let end_ns = own.jitter_ns.saturating_add(wait_ns).saturating_add(own.frame_ns);
         let took_ns = end_ns.saturating_sub(instance.saturating_mul(own.period_ns));
         if took_ns > worst.worst_ns {
-            worst = Response { worst_ns: took_ns, instance, instances };
+            worst = ResponseTime { worst_ns: took_ns, instance, instances };
         }
     }
     Some(worst)
@@ -98,7 +98,7 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
 
 /// Returns the lowest fixed point of an increasing function, found by iterating from below; `None` if it exceeds
 /// [`HORIZON_NS`].
-fn fixed_point(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
+fn lowest_fixed_point(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
     let mut at_ns = from_ns;
     while at_ns <= MAX_BUSY_PERIOD_NS {
         let next_ns = next_ns(at_ns);
@@ -118,15 +118,15 @@ mod tests {
 
     const MS: u64 = 1_000_000;
 
-    const fn stream(count: u32, period_ns: u64, jitter_ns: u64, frame_ns: u64) -> Stream {
-        Stream { count, period_ns, jitter_ns, frame_ns }
+    const fn stream(count: u32, period_ns: u64, jitter_ns: u64, frame_ns: u64) -> FrameStream {
+        FrameStream { count, period_ns, jitter_ns, frame_ns }
     }
 
-    fn responses(streams: &[Stream], bit_ns: u64) -> Vec<Option<Response>> {
-        (0..streams.len()).map(|at| response(streams, at, bit_ns)).collect()
+    fn responses(streams: &[FrameStream], bit_ns: u64) -> Vec<Option<ResponseTime>> {
+        (0..streams.len()).map(|at| response_time(streams, at, bit_ns)).collect()
     }
 
-    fn worst(streams: &[Stream], bit_ns: u64) -> Vec<Option<u64>> {
+    fn worst(streams: &[FrameStream], bit_ns: u64) -> Vec<Option<u64>> {
         responses(streams, bit_ns).into_iter().map(|it| it.map(|it| it.worst_ns)).collect()
     }
 
@@ -138,7 +138,7 @@ mod tests {
         let responses = responses(&streams, 8_000);
         assert_eq!(responses[0].unwrap().worst_ns, 2 * MS);
         assert_eq!(responses[1].unwrap().worst_ns, 3 * MS);
-        let third = Response { worst_ns: 7 * MS / 2, instance: 1, instances: 2 };
+        let third = ResponseTime { worst_ns: 7 * MS / 2, instance: 1, instances: 2 };
         assert_eq!(responses[2], Some(third));
     }
     #[test]
@@ -175,7 +175,7 @@ mod tests {
     }
 
     /// Returns the longest time from release to end for each stream, if it releases its first frame at the given phase.
-    fn simulated(streams: &[Stream], phases: &[u64], until_ns: u64) -> Vec<u64> {
+    fn simulated(streams: &[FrameStream], phases: &[u64], until_ns: u64) -> Vec<u64> {
         let mut releases: Vec<(u64, usize)> = Vec::new();
         for (priority, (stream, phase)) in streams.iter().zip(phases).enumerate() {
             let periods = (0..).map(|it| phase + it * stream.period_ns);
@@ -216,7 +216,7 @@ mod tests {
         ) {
             let streams: Vec<_> =
                 sets.iter().map(|&(period, frame)| stream(1, period * 100, 0, frame * 100)).collect();
-            prop_assume!(streams.iter().map(Stream::load).sum::<f64>() < 1.0);
+            prop_assume!(streams.iter().map(FrameStream::load).sum::<f64>() < 1.0);
             for at in 0..streams.len() {
                 let (higher, lower) = streams.split_at(at + 1);
                 // A blocked frame starts that much earlier than computed: one that is released at this very time is too

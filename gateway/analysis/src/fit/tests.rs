@@ -9,8 +9,10 @@ use protocol::wire_time::BitRates;
 use super::case::{AnswerPlan, BusCase};
 use super::limits::{Limit, MaxCells};
 use super::verdict::FitVerdict;
-use super::{BusFit, COMPUTATION_NS, assess_bus, fullest, json, spread_over_buses, table};
-use model::generate::{Reply, SkinRequest, generate};
+use super::{
+    BusFit, PAPER_COMPUTATION_NS, assess_bus, fit_json, most_loaded_bus, rates_table, spread_over_buses,
+};
+use model::generate::{ReplyMode, SkinRequest, generate};
 
 fn text(target: &SkinRequest) -> String {
     generate(target).unwrap()
@@ -25,7 +27,7 @@ fn fit(skin: &Skin, rates: &str) -> BusFit {
         Some(rates) => (Format::Classic, rates),
         None => (Format::Fd, rates),
     };
-    assess_bus(skin, 0, format, rates.parse().unwrap(), COMPUTATION_NS).unwrap()
+    assess_bus(skin, 0, format, rates.parse().unwrap(), PAPER_COMPUTATION_NS).unwrap()
 }
 
 #[test]
@@ -41,7 +43,7 @@ fn packets_take_what_is_known_of_them() {
         ("classic 1M", 266.0),
         ("classic 500k", 532.0),
     ] {
-        let packet_us = fit(&skin, rates).rated.case.packet_ns() as f64 / 1e3;
+        let packet_us = fit(&skin, rates).rated.case.longest_packet_ns() as f64 / 1e3;
         assert!((packet_us - us).abs() < 1e-9, "{rates}: {packet_us}");
     }
 }
@@ -59,7 +61,7 @@ fn the_whole_arm_is_too_much_for_one_bus_at_1m_5m_and_three_are_needed_electrica
     assert_eq!(fit.rated.times.heartbeat_ns, None);
     // 212 * 70.4 * 1.064 + 70.4 = 15 950 of 16 000 us; 223 * 70.4 + 3 * 70.4 + 68.5 = 15 979 us.
     assert_eq!(fit.most, MaxCells { bandwidth: 212, deadline: 223, nodes: 109 });
-    assert_eq!((fit.need.buses_for_timing(), fit.need.buses()), (Some(2), Some(3)));
+    assert_eq!((fit.need.buses_for_timing(), fit.need.required_buses()), (Some(2), Some(3)));
     assert_eq!(fit.need.binding_limits(), [Limit::Nodes]);
 }
 
@@ -93,7 +95,7 @@ fn the_most_cells_fit_and_one_more_does_not_at_all_rates_and_with_sensors() {
     let format = "format = \"fd\"";
     for sensing in ["", "\nsensing = \"event\"", "\nsensing = \"continuous\"\nsensing_hz = 62.5"] {
         let skin = skin(&text.replace(format, &format!("{format}{sensing}")));
-        for row in table(&skin, None, COMPUTATION_NS) {
+        for row in rates_table(&skin, None, PAPER_COMPUTATION_NS) {
             let (case, most) = (&row.fullest.rated.case, row.fullest.most);
             for (limit, cells) in [(Limit::Bandwidth, most.bandwidth), (Limit::Deadline, most.deadline)] {
                 let exceeded = |cells| super::exceeded_limits(&case.with_cells(cells)).contains(&limit);
@@ -143,9 +145,9 @@ fn every_hint_does_in_a_description_what_it_says() {
         };
         let skin = skin(&other);
         let buses = (0..skin.buses.len())
-            .filter_map(|index| assess_bus(&skin, index, Format::Fd, rates, COMPUTATION_NS));
+            .filter_map(|index| assess_bus(&skin, index, Format::Fd, rates, PAPER_COMPUTATION_NS));
         let buses: Vec<_> = buses.collect();
-        let after = fullest(buses.iter()).unwrap().rated.clone();
+        let after = most_loaded_bus(buses.iter()).unwrap().rated.clone();
         assert_eq!(after, hint.after, "{}", hint.change);
     }
 }
@@ -168,10 +170,10 @@ fn sums_of_all_cells_save_no_frame_and_those_of_roots_all_others() {
 
 #[test]
 fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
-    let skin = skin(&text(&SkinRequest { cells: 60, reply: Reply::Sum, ..SkinRequest::default() }));
+    let skin = skin(&text(&SkinRequest { cells: 60, reply: ReplyMode::Sum, ..SkinRequest::default() }));
     let fit = fit(&skin, "1M/5M");
     let AnswerPlan::Sums { by_depth, slot_ns, shared } = &fit.rated.case.answers else { panic!("{fit:?}") };
-    let depths = skin.wires(0).depths();
+    let depths = skin.wires(0).cell_depths();
     let deepest = depths.iter().flatten().max().copied().unwrap();
     assert_eq!((by_depth.iter().sum::<u32>(), by_depth.len()), (60, usize::from(deepest) + 1));
     assert!(*shared && by_depth[0] == 1);
@@ -192,7 +194,7 @@ fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
 fn json_has_the_same_figures_and_null_where_there_is_no_bound() {
     let skin = skin(&text(&SkinRequest::default()));
     let fits = [fit(&skin, "1M/5M")];
-    let json = json(&skin, &fits, spread_over_buses(&skin, &fits).as_ref(), &[]);
+    let json = fit_json(&skin, &fits, spread_over_buses(&skin, &fits).as_ref(), &[]);
     let bus = &json["buses"][0];
     assert_eq!((bus["bus"].as_str(), bus["name"].as_str()), (Some("vcan0"), Some("1M/5M")));
     assert_eq!((bus["nominal"].as_u64(), bus["data"].as_u64()), (Some(1_000_000), Some(5_000_000)));

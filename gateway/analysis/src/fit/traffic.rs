@@ -11,7 +11,7 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 use model::decode::wire_message;
-use model::packets::{NoPacket, PacketReader};
+use model::packets::{NoPacketReason, PacketReader};
 
 /// The kinds of frames that only a bench sends, and a real robot does not.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -41,7 +41,7 @@ pub struct BenchFrames {
 
 impl BenchFrames {
     /// Adds a number of frames of one kind.
-    pub const fn count(&mut self, what: BenchFrame, frames: u64) {
+    pub const fn count_frames(&mut self, what: BenchFrame, frames: u64) {
         match what {
             BenchFrame::Stimulus => self.stimuli += frames,
             BenchFrame::Sync => self.syncs += frames,
@@ -89,7 +89,7 @@ pub struct ClassifiedFrame {
 }
 
 impl ClassifiedFrame {
-    const OTHER: Self = Self { says: RunEvent::Other, bench: None, from: None, ends_pair: false };
+    const OTHER_FRAME: Self = Self { says: RunEvent::Other, bench: None, from: None, ends_pair: false };
 }
 
 /// Classifies the frames of one bus in order, with bounded memory.
@@ -116,7 +116,7 @@ impl TrafficClassifier {
     /// Returns true if most of the frames that may be packets are packets of this protocol; a random frame is one with
     /// probability 1/65 536.
     #[must_use]
-    pub const fn is_ours(&self) -> bool {
+    pub const fn is_skin_traffic(&self) -> bool {
         self.ours > self.others
     }
 
@@ -125,29 +125,31 @@ impl TrafficClassifier {
         let received = self.packets.read(Micros(nanos / 1_000), frame);
         let packet = match received.packet {
             Ok((packet, _)) => packet,
-            Err(NoPacket::NotData) => {
+            Err(NoPacketReason::NotData) => {
                 let bench = wire_message(frame).map(|_| BenchFrame::Wire);
-                return ClassifiedFrame { bench, ..ClassifiedFrame::OTHER };
+                return ClassifiedFrame { bench, ..ClassifiedFrame::OTHER_FRAME };
             }
-            Err(NoPacket::Segment(_)) => return ClassifiedFrame::OTHER,
-            Err(NoPacket::AfterLost(_) | NoPacket::Damaged(..)) => {
+            Err(NoPacketReason::Segment(_)) => return ClassifiedFrame::OTHER_FRAME,
+            Err(NoPacketReason::AfterLost(_) | NoPacketReason::Damaged(..)) => {
                 self.others += 1;
-                return ClassifiedFrame::OTHER;
+                return ClassifiedFrame::OTHER_FRAME;
             }
         };
         let is_classic = frame.format() == Format::Classic;
         self.ours += if is_classic { packet.words.length().segments() as u64 } else { 1 };
         match received.message() {
-            Some(message) if self.is_ours() => {
-                ClassifiedFrame { ends_pair: is_classic, from: packet.id.sender(), ..self.message(message) }
-            }
-            _ => ClassifiedFrame::OTHER,
+            Some(message) if self.is_skin_traffic() => ClassifiedFrame {
+                ends_pair: is_classic,
+                from: packet.id.sender(),
+                ..self.classify_message(message)
+            },
+            _ => ClassifiedFrame::OTHER_FRAME,
         }
     }
 
-    fn message(&mut self, message: &Message) -> ClassifiedFrame {
-        let says = |says| ClassifiedFrame { says, ..ClassifiedFrame::OTHER };
-        let bench = |bench| ClassifiedFrame { bench: Some(bench), ..ClassifiedFrame::OTHER };
+    fn classify_message(&mut self, message: &Message) -> ClassifiedFrame {
+        let says = |says| ClassifiedFrame { says, ..ClassifiedFrame::OTHER_FRAME };
+        let bench = |bench| ClassifiedFrame { bench: Some(bench), ..ClassifiedFrame::OTHER_FRAME };
         match message {
             Message::Joints { epoch, .. } => says(RunEvent::Joints(*epoch)),
             Message::Torque { epoch, .. } | Message::Sum { epoch, .. } => says(RunEvent::Answer(*epoch)),
@@ -156,7 +158,7 @@ impl TrafficClassifier {
             Message::Configure { .. } | Message::Configured { .. } => says(RunEvent::Preparation),
             Message::Stimulus { .. } => bench(BenchFrame::Stimulus),
             Message::Sync => {
-                self.cells().iter_mut().for_each(|owed| owed.heartbeat = true);
+                self.pending_by_cell().iter_mut().for_each(|owed| owed.heartbeat = true);
                 bench(BenchFrame::Sync)
             }
             Message::Report => ClassifiedFrame { says: RunEvent::Preparation, ..bench(BenchFrame::Report) },
@@ -168,23 +170,23 @@ impl TrafficClassifier {
                     is_owed
                 })
             }
-            Message::Sensors { .. } => ClassifiedFrame::OTHER,
+            Message::Sensors { .. } => ClassifiedFrame::OTHER_FRAME,
             Message::Network { from, page, .. } => {
-                let Node::Cell(from) = *from else { return ClassifiedFrame::OTHER };
+                let Node::Cell(from) = *from else { return ClassifiedFrame::OTHER_FRAME };
                 if let NetworkPage::Heartbeat(heartbeat) = page {
-                    let owed = self.take_pending(from);
+                    let owed = self.take_pending_replies(from);
                     // A starting cell leaves sync and report unanswered.
-                    if heartbeat.state.has(State::CLAIMING) {
+                    if heartbeat.state.has(State::CLAIMING_NODE_ID) {
                         says(RunEvent::Preparation)
                     } else if owed.heartbeat {
                         bench(BenchFrame::Sync)
                     } else {
-                        ClassifiedFrame::OTHER
+                        ClassifiedFrame::OTHER_FRAME
                     }
-                } else if page.is_only_reported() {
+                } else if page.is_sent_only_on_request() {
                     // The pages that are also sent at other times follow the counters.
                     if let (NetworkPage::Received(_) | NetworkPage::Rejected(_), Some(owed)) =
-                        (page, self.cells().get_mut(from.index()))
+                        (page, self.pending_by_cell().get_mut(from.index()))
                     {
                         (owed.sensors, owed.tree) = (u8::MAX, true);
                     }
@@ -202,16 +204,16 @@ impl TrafficClassifier {
         from: CellId,
         take: impl FnOnce(&mut PendingReplies) -> bool,
     ) -> ClassifiedFrame {
-        let is_owed = self.cells().get_mut(from.index()).is_some_and(take);
-        ClassifiedFrame { bench: is_owed.then_some(BenchFrame::Report), ..ClassifiedFrame::OTHER }
+        let is_owed = self.pending_by_cell().get_mut(from.index()).is_some_and(take);
+        ClassifiedFrame { bench: is_owed.then_some(BenchFrame::Report), ..ClassifiedFrame::OTHER_FRAME }
     }
 
     /// Returns the answers that a cell still owes, and clears them.
-    fn take_pending(&mut self, from: CellId) -> PendingReplies {
-        self.cells().get_mut(from.index()).map(std::mem::take).unwrap_or_default()
+    fn take_pending_replies(&mut self, from: CellId) -> PendingReplies {
+        self.pending_by_cell().get_mut(from.index()).map(std::mem::take).unwrap_or_default()
     }
 
-    fn cells(&mut self) -> &mut [PendingReplies] {
+    fn pending_by_cell(&mut self) -> &mut [PendingReplies] {
         self.owed.resize(CellId::COUNT, PendingReplies::default());
         &mut self.owed
     }
@@ -249,7 +251,7 @@ mod tests {
                 (heartbeat(1, State::CONFIGURED), page(1, NetworkPage::Tree(TreePage::default())));
             assert_eq!([last(&alive), last(&skin(1)), last(&tree)], [None; 3]);
             assert_eq!(last(&Message::Sync), Some(BenchFrame::Sync));
-            assert_eq!(last(&heartbeat(2, State::CLAIMING)), None, "it leaves sync unanswered");
+            assert_eq!(last(&heartbeat(2, State::CLAIMING_NODE_ID)), None, "it leaves sync unanswered");
             assert_eq!([last(&alive), last(&alive)], [Some(BenchFrame::Sync), None]);
             assert_eq!(last(&heartbeat(2, State::CONFIGURED)), None);
             assert_eq!(last(&Message::Report), Some(BenchFrame::Report));
@@ -293,7 +295,7 @@ mod tests {
             let mut traffic = TrafficClassifier::default();
             // The first frame alone would be accepted with probability 1/65 536.
             let unknown_node = Frame::classic(0x700, &[1]).unwrap();
-            (0..4).for_each(|_| assert_eq!(traffic.classify(0, &unknown_node), ClassifiedFrame::OTHER));
+            (0..4).for_each(|_| assert_eq!(traffic.classify(0, &unknown_node), ClassifiedFrame::OTHER_FRAME));
             for (id, data, is_fd) in frames {
                 let frame = if is_fd {
                     Frame::with_data(id, Format::Fd, protocol::can::FD_FORMAT, &data)

@@ -5,7 +5,7 @@ use std::fmt::{self, Display, Formatter};
 use serde::{Serialize, Serializer};
 
 use super::AssessedBus;
-use super::limits::{ByLimit, Limit, MAX_NODES};
+use super::limits::{ByLimit, Limit, MAX_NODES_PER_BUS};
 
 /// The verdict on a bus: it fits, or the limit that it exceeds.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -146,7 +146,8 @@ impl FitSummary {
     #[must_use]
     pub fn for_run(load: f64, late: u64, rates: String, cells: AnsweringCells) -> Self {
         let on_the_bus = cells.cells_on_bus();
-        let holds = ByLimit { bandwidth: load <= 1.0, deadline: late == 0, nodes: on_the_bus < MAX_NODES };
+        let holds =
+            ByLimit { bandwidth: load <= 1.0, deadline: late == 0, nodes: on_the_bus < MAX_NODES_PER_BUS };
         Self { load, rates, cells, verdict: FitVerdict::from_limits(&holds.exceeded(), on_the_bus) }
     }
 
@@ -163,20 +164,20 @@ impl FitSummary {
     /// Formats load and verdict for a row of a table.
     #[must_use]
     pub fn table_value(&self) -> String {
-        format!("{}: {}", percent(self.load), self.verdict)
+        format!("{}: {}", format_percent(self.load), self.verdict)
     }
 }
 
 impl Display for FitSummary {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let (load, rates) = (percent(self.load), &self.rates);
+        let (load, rates) = (format_percent(self.load), &self.rates);
         write!(f, "{}: {load} of {rates}: {} ({})", self.case_name(), self.verdict, self.cells)
     }
 }
 
 /// Formats a share in %, with one decimal.
 #[must_use]
-pub fn percent(share: f64) -> String {
+pub fn format_percent(share: f64) -> String {
     format!("{:.1} %", 100.0 * share)
 }
 

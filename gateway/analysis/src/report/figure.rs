@@ -5,8 +5,8 @@ use std::fmt;
 use serde::Serialize;
 
 pub use super::finding::{Finding, FindingVerdict, Quantity};
-pub use super::number::{number, quantity};
-pub use super::skin::{CellMap, CellStrip, Drawing, Legend, MapCell, Panel, StripGroup, StripRow};
+pub use super::number::{format_number, format_quantity};
+pub use super::skin::{CellMap, CellStrip, ColourLegend, Drawing, LinkPanel, MapCell, StripGroup, StripRow};
 
 /// The contents of an HTML page: a title, facts, and sections with figures and tables.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -50,35 +50,35 @@ impl Section {
 
     /// Adds a paragraph.
     #[must_use]
-    pub fn text(mut self, paragraph: impl Into<String>) -> Self {
+    pub fn with_paragraph(mut self, paragraph: impl Into<String>) -> Self {
         self.text.push(paragraph.into());
         self
     }
 
     /// Adds drawings of cells.
     #[must_use]
-    pub fn drawings(mut self, drawings: impl IntoIterator<Item = Drawing>) -> Self {
+    pub fn with_drawings(mut self, drawings: impl IntoIterator<Item = Drawing>) -> Self {
         self.drawings.extend(drawings);
         self
     }
 
     /// Adds figures.
     #[must_use]
-    pub fn figures(mut self, figures: impl IntoIterator<Item = Figure>) -> Self {
+    pub fn with_figures(mut self, figures: impl IntoIterator<Item = Figure>) -> Self {
         self.figures.extend(figures);
         self
     }
 
     /// Adds findings.
     #[must_use]
-    pub fn findings(mut self, findings: impl IntoIterator<Item = Finding>) -> Self {
+    pub fn with_findings(mut self, findings: impl IntoIterator<Item = Finding>) -> Self {
         self.findings.extend(findings);
         self
     }
 
     /// Adds tables.
     #[must_use]
-    pub fn tables(mut self, tables: impl IntoIterator<Item = Table>) -> Self {
+    pub fn with_tables(mut self, tables: impl IntoIterator<Item = Table>) -> Self {
         self.tables.extend(tables);
         self
     }
@@ -129,28 +129,33 @@ impl Figure {
 
     /// Makes the figure half as wide as the page.
     #[must_use]
-    pub const fn half_width(mut self) -> Self {
+    pub const fn with_half_width(mut self) -> Self {
         self.size = FigureWidth::Half;
         self
     }
 
     /// Adds one series; see [`Series`].
     #[must_use]
-    pub fn draw(mut self, caption: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
+    pub fn draw_series(
+        mut self,
+        caption: impl Into<String>,
+        shape: SeriesShape,
+        points: Vec<(f64, f64)>,
+    ) -> Self {
         self.series.push(Series::new(caption, shape, points));
         self
     }
 
     /// Adds series.
     #[must_use]
-    pub fn series(mut self, series: impl IntoIterator<Item = Series>) -> Self {
+    pub fn with_series(mut self, series: impl IntoIterator<Item = Series>) -> Self {
         self.series.extend(series);
         self
     }
 
     /// Adds lines across the diagram.
     #[must_use]
-    pub fn marks(mut self, marks: impl IntoIterator<Item = MarkLine>) -> Self {
+    pub fn with_marks(mut self, marks: impl IntoIterator<Item = MarkLine>) -> Self {
         self.marks.extend(marks);
         self
     }
@@ -203,7 +208,7 @@ impl Axis {
 
     /// Makes the axis logarithmic.
     #[must_use]
-    pub const fn log(mut self) -> Self {
+    pub const fn with_log_scale(mut self) -> Self {
         self.scale = Scale::Log;
         self
     }
@@ -235,7 +240,7 @@ pub struct Series {
     /// Name of the series in the legend; empty to omit it there.
     pub caption: String,
     /// Form in which the series is drawn.
-    pub shape: Shape,
+    pub shape: SeriesShape,
     /// The points x and y. For all shapes except points and bands, x increases. Values that are not finite make a gap.
     pub points: Vec<(f64, f64)>,
 }
@@ -243,14 +248,14 @@ pub struct Series {
 impl Series {
     /// Creates a series.
     #[must_use]
-    pub fn new(caption: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
+    pub fn new(caption: impl Into<String>, shape: SeriesShape, points: Vec<(f64, f64)>) -> Self {
         Self { caption: caption.into(), shape, points }
     }
 }
 
 /// The form in which a series is drawn.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub enum Shape {
+pub enum SeriesShape {
     /// Straight lines between the points.
     #[default]
     Line,

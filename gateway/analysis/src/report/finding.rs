@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::number::{format_interval, quantity};
+use super::number::{format_interval, format_quantity};
 
 /// A result compared with the paper's number or with a limit.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -94,7 +94,7 @@ impl Finding {
     #[must_use]
     pub fn at_most(self, limit: f64) -> Self {
         let kept = self.ours.value <= limit;
-        let bar = format!("at most {}", quantity(limit, &self.ours.unit));
+        let bar = format!("at most {}", format_quantity(limit, &self.ours.unit));
         self.with_requirement(bar, kept)
     }
 
@@ -168,7 +168,7 @@ impl Quantity {
 
     /// Sets half the width of the value's 95 % confidence interval.
     #[must_use]
-    pub const fn plus_minus(mut self, half: f64) -> Self {
+    pub const fn with_half_interval(mut self, half: f64) -> Self {
         self.plus_minus = Some(half);
         self
     }

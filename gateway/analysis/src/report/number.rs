@@ -2,11 +2,12 @@
 //! prefix that leaves 1 to 999. Counts are whole numbers.
 
 /// SI prefixes with their powers of a thousand.
-const PREFIXES: [(i32, &str); 7] = [(-4, "p"), (-3, "n"), (-2, "µ"), (-1, "m"), (0, ""), (1, "k"), (2, "M")];
+const SI_PREFIXES: [(i32, &str); 7] =
+    [(-4, "p"), (-3, "n"), (-2, "µ"), (-1, "m"), (0, ""), (1, "k"), (2, "M")];
 
 /// Units that take prefixes: name, size in the base unit, base unit, and the highest power of a thousand that is in
 /// use.
-const UNITS: [(&str, f64, &str, i32); 8] = [
+const PREFIXABLE_UNITS: [(&str, f64, &str, i32); 8] = [
     ("Nm", 1.0, "Nm", 1),
     ("N", 1.0, "N", 1),
     ("Hz", 1.0, "Hz", 2),
@@ -28,24 +29,24 @@ pub(super) struct PrefixedUnit {
 
 /// Returns the unit as a static text if it takes prefixes.
 pub(super) fn prefixable_unit(unit: &str) -> Option<&'static str> {
-    UNITS.iter().find(|(name, ..)| *name == unit).map(|(name, ..)| *name)
+    PREFIXABLE_UNITS.iter().find(|(name, ..)| *name == unit).map(|(name, ..)| *name)
 }
 
 /// Returns the unit with the prefix by which a value of this size becomes 1 to 999; `None` for a unit without prefixes.
-pub(super) fn prefixed(size: f64, unit: &str) -> Option<PrefixedUnit> {
-    let (_, scale, base, most) = *UNITS.iter().find(|(name, ..)| *name == unit)?;
-    let size = to_three_digits(size.abs() * scale);
-    let prefixes = PREFIXES.iter().filter(|(power, _)| *power <= most);
+pub(super) fn prefixed_unit(size: f64, unit: &str) -> Option<PrefixedUnit> {
+    let (_, scale, base, most) = *PREFIXABLE_UNITS.iter().find(|(name, ..)| *name == unit)?;
+    let size = round_to_three_digits(size.abs() * scale);
+    let prefixes = SI_PREFIXES.iter().filter(|(power, _)| *power <= most);
     let fits = |(power, _): &&(i32, &str)| size >= 1_000_f64.powi(*power) * 0.999_999;
     let (power, prefix) = match size {
         0.0 => (0, ""),
-        _ => *prefixes.rev().find(fits).or(PREFIXES.first())?,
+        _ => *prefixes.rev().find(fits).or(SI_PREFIXES.first())?,
     };
     Some(PrefixedUnit { factor: scale / 1_000_f64.powi(power), unit: format!("{prefix}{base}") })
 }
 
 /// Rounds a value to three significant digits, as its text shows it.
-fn to_three_digits(value: f64) -> f64 {
+fn round_to_three_digits(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
 
@@ -60,7 +61,7 @@ fn to_three_digits(value: f64) -> f64 {
 /// assert_eq!(quantity(0.25, "rad"), "0.25\u{a0}rad");
 /// ```
 #[must_use]
-pub fn quantity(value: f64, unit: &str) -> String {
+pub fn format_quantity(value: f64, unit: &str) -> String {
     format_interval(value, None, unit)
 }
 
@@ -72,15 +73,17 @@ pub(super) fn format_interval(value: f64, half: Option<f64>, unit: &str) -> Stri
         return format_unitless(value);
     }
     let PrefixedUnit { factor, unit } =
-        prefixed(size, unit).unwrap_or_else(|| PrefixedUnit { factor: 1.0, unit: unit.to_owned() });
+        prefixed_unit(size, unit).unwrap_or_else(|| PrefixedUnit { factor: 1.0, unit: unit.to_owned() });
     let value = value * factor;
     let of_half =
         half.map(|half| half * factor).and_then(|half| Some((half, decimals_for_two_digits(half)?)));
     let (value, half) = match of_half {
-        Some((half, digits)) => (with_decimals(value, digits), format!(" ± {}", with_decimals(half, digits))),
+        Some((half, digits)) => {
+            (format_with_decimals(value, digits), format!(" ± {}", format_with_decimals(half, digits)))
+        }
         None => {
-            let half = half.map_or_else(String::new, |half| format!(" ± {}", number(half * factor)));
-            (number(value), half)
+            let half = half.map_or_else(String::new, |half| format!(" ± {}", format_number(half * factor)));
+            (format_number(value), half)
         }
     };
     if unit.is_empty() { format!("{value}{half}") } else { format!("{value}{half}\u{a0}{unit}") }
@@ -96,7 +99,7 @@ fn decimals_for_two_digits(value: f64) -> Option<usize> {
 }
 
 /// Formats a number with at most this number of decimals, without trailing zeros.
-fn with_decimals(value: f64, digits: usize) -> String {
+fn format_with_decimals(value: f64, digits: usize) -> String {
     let text = format!("{:.digits$}", value + 0.0);
     if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
 }
@@ -106,8 +109,8 @@ fn with_decimals(value: f64, digits: usize) -> String {
 fn format_unitless(value: f64) -> String {
     let digits = (4..=6).find(|digits| 1.0 - value >= 10_f64.powi(-digits));
     match digits.and_then(|digits| usize::try_from(digits).ok()) {
-        Some(digits) if value > 0.999 && value < 1.0 => with_decimals(value, digits),
-        _ => number(value),
+        Some(digits) if value > 0.999 && value < 1.0 => format_with_decimals(value, digits),
+        _ => format_number(value),
     }
 }
 
@@ -122,7 +125,7 @@ fn format_unitless(value: f64) -> String {
 /// assert_eq!(number(1_919.4), "1919");
 /// ```
 #[must_use]
-pub fn number(value: f64) -> String {
+pub fn format_number(value: f64) -> String {
     let size = value.abs();
     if !value.is_finite() {
         return "–".to_owned();
@@ -137,7 +140,7 @@ pub fn number(value: f64) -> String {
     }
     let digits = [(100.0, 0), (10.0, 1), (1.0, 2), (0.1, 3), (0.01, 4), (0.001, 5)];
     let digits = digits.iter().find(|(from, _)| size >= *from).map_or(6, |(_, digits)| *digits);
-    with_decimals(value, digits)
+    format_with_decimals(value, digits)
 }
 
 #[cfg(test)]
@@ -160,7 +163,7 @@ mod tests {
             (5e-5, "5e-5"),
             (f64::NAN, "–"),
         ] {
-            assert_eq!(number(value), text);
+            assert_eq!(format_number(value), text);
         }
     }
 
@@ -179,7 +182,7 @@ mod tests {
             (48.2, "%", "48.2 %"),
             (f64::NAN, "Nm", "–"),
         ] {
-            assert_eq!(quantity(value, unit).replace('\u{a0}', " "), text);
+            assert_eq!(format_quantity(value, unit).replace('\u{a0}', " "), text);
         }
         assert_eq!(format_interval(0.25, Some(0.5), "Nm"), "250 ± 500\u{a0}mNm");
         assert_eq!(format_interval(0.25, Some(0.5), ""), "0.25 ± 0.5");
@@ -210,17 +213,17 @@ mod tests {
     fn nearly_all_is_not_written_as_all() {
         let written = [1.0, 0.9995, 0.939, 0.999_96, 0.999_999_4, 1.0 - 1e-9, 0.998_9, 1.000_4, f64::NAN];
         let texts = ["1", "0.9995", "0.939", "0.99996", "1", "1", "0.999", "1", "–"];
-        assert_eq!(written.map(|value| quantity(value, "")), texts);
+        assert_eq!(written.map(|value| format_quantity(value, "")), texts);
     }
 
     proptest! {
         #[test]
         fn what_is_written_is_the_value_to_three_digits(digits in 1.0..10.0_f64, power in -11..3_i32, below: bool) {
             let value = digits * 10_f64.powi(power) * if below { -1.0 } else { 1.0 };
-            let text = quantity(value, "Nm");
+            let text = format_quantity(value, "Nm");
             let (number, unit) = text.split_once('\u{a0}').unwrap();
             let prefix = unit.strip_suffix("Nm").unwrap();
-            let (power, _) = PREFIXES.iter().find(|(_, name)| *name == prefix).unwrap();
+            let (power, _) = SI_PREFIXES.iter().find(|(_, name)| *name == prefix).unwrap();
             let number: f64 = number.parse().unwrap();
             prop_assert!(number.abs() < 1_000.0 && number.abs() >= 1.0, "{text}");
             prop_assert!((number * 1_000_f64.powi(*power) / value - 1.0).abs() < 0.006, "{text} {value}");

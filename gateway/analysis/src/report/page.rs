@@ -8,11 +8,11 @@ use super::figure::{Figure, FigureWidth, Finding, FindingVerdict, Page, Section,
 use super::svg;
 
 /// The style of all pages: light, dark on dark screens, and black on white for paper.
-const STYLE: &str = include_str!("page.css");
+const PAGE_CSS: &str = include_str!("page.css");
 
 /// Renders a page, from its title to its last section, as the text of an HTML file.
 #[must_use]
-pub fn html(page: &Page) -> String {
+pub fn page_html(page: &Page) -> String {
     let mut out = String::new();
     let title = escaped(&page.title);
     let _ = write!(
@@ -20,8 +20,8 @@ pub fn html(page: &Page) -> String {
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\n\
          <meta name=\"color-scheme\" content=\"light dark\"/>\n<title>{title}</title>\n\
-         <style>\n{STYLE}{}\n</style>\n</head>\n<body>\n<header>\n<h1>{title}</h1>\n",
-        svg::dark_rules()
+         <style>\n{PAGE_CSS}{}\n</style>\n</head>\n<body>\n<header>\n<h1>{title}</h1>\n",
+        svg::dark_css_rules()
     );
     write_paragraph(&mut out, &page.intro);
     out.push_str("</header>\n");
@@ -99,14 +99,20 @@ fn write_figure(out: &mut String, figure: &Figure) {
 }
 
 /// The attribute of right-aligned cells.
-const NUMBER_CLASS: &str = " class=\"n\"";
+const NUMBER_CLASS_ATTRIBUTE: &str = " class=\"n\"";
 
 fn write_findings(out: &mut String, findings: &[Finding]) {
     let paper = findings.iter().any(|finding| finding.paper.is_some());
     let limit = findings.iter().any(|finding| finding.bar.is_some() || finding.against.is_some());
     let shown = [true, paper, true, limit, paper || limit];
     out.push_str("<div class=\"scroll\"><table class=\"findings\">\n<thead>");
-    let head = [("figure", ""), ("paper", NUMBER_CLASS), ("here", NUMBER_CLASS), ("limit", ""), ("", "")];
+    let head = [
+        ("figure", ""),
+        ("paper", NUMBER_CLASS_ATTRIBUTE),
+        ("here", NUMBER_CLASS_ATTRIBUTE),
+        ("limit", ""),
+        ("", ""),
+    ];
     write_row(out, "th", shown_cells(head, shown));
     out.push_str("</thead>\n<tbody>\n");
     for finding in findings {
@@ -145,8 +151,9 @@ fn write_table(out: &mut String, table: &Table) {
     }
     out.push_str("<div class=\"scroll\"><table>\n");
     let columns = 0..table.head.len();
-    let classes: Vec<_> =
-        columns.map(|column| if is_number_column(table, column) { NUMBER_CLASS } else { "" }).collect();
+    let classes: Vec<_> = columns
+        .map(|column| if is_number_column(table, column) { NUMBER_CLASS_ATTRIBUTE } else { "" })
+        .collect();
     let classes = || classes.iter().copied().chain(std::iter::repeat(""));
     out.push_str("<thead>");
     write_row(out, "th", table.head.iter().map(String::as_str).zip(classes()));
@@ -203,11 +210,11 @@ fn is_number_column(table: &Table, column: usize) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::figure::{Axis, Quantity, Series, Shape};
+    use crate::report::figure::{Axis, Quantity, Series, SeriesShape};
     use roxmltree::{Document, ParsingOptions};
 
     fn whole() -> Page {
-        let series = vec![Series::new("line", Shape::Line, vec![(0.0, 1.0), (1.0, 2.0)])];
+        let series = vec![Series::new("line", SeriesShape::Line, vec![(0.0, 1.0), (1.0, 2.0)])];
         let figure = |name: &str, size| Figure {
             name: name.to_owned(),
             title: format!("{name} <&>"),
@@ -229,7 +236,7 @@ mod tests {
             findings: vec![
                 Finding::less_is_better("error", 0.0054, nm(6.3e-5))
                     .with_command(Some("look <here>".to_owned())),
-                Finding::new_unrated("slope", nm(0.25).plus_minus(0.5))
+                Finding::new_unrated("slope", nm(0.25).with_half_interval(0.5))
                     .with_requirement("below 1 Nm", false)
                     .with_origin("--limit"),
             ],
@@ -267,7 +274,7 @@ mod tests {
 
     #[test]
     fn a_page_is_well_formed_whole_and_needs_nothing_else() {
-        let html = html(&whole());
+        let html = page_html(&whole());
         let document = Document::parse_with_options(
             &html,
             ParsingOptions { allow_dtd: true, ..ParsingOptions::default() },

@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 
-use super::figure::{Axis, Scale, quantity};
-use super::number::{PrefixedUnit, prefixable_unit, prefixed};
+use super::figure::{Axis, Scale, format_quantity};
+use super::number::{PrefixedUnit, prefixable_unit, prefixed_unit};
 
 /// The range of an axis, with its mapping and unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,7 +36,7 @@ impl AxisSpan {
     /// Returns the unit of a linear axis with the SI prefix that fits its ends.
     fn prefixed_unit(&self) -> Option<PrefixedUnit> {
         let unit = self.unit.filter(|_| self.scale == Scale::Linear)?;
-        prefixed(self.from.abs().max(self.to.abs()), unit)
+        prefixed_unit(self.from.abs().max(self.to.abs()), unit)
     }
 
     /// Returns the axis title: the quantity and its unit, unless each tick shows the unit.
@@ -59,7 +59,7 @@ impl AxisSpan {
     }
 
     /// Returns the value at a position from 0 to 1.
-    pub(crate) fn value(&self, place: f64) -> f64 {
+    pub(crate) fn value_at(&self, place: f64) -> f64 {
         match self.scale {
             Scale::Linear => self.from + place * (self.to - self.from),
             Scale::Log => self.from * (self.to / self.from).powf(place),
@@ -75,15 +75,19 @@ impl AxisSpan {
     }
 
     /// Formats the number at a tick, with enough digits to differ from its neighbours.
-    pub(crate) fn caption(&self, tick: f64, most: usize) -> String {
+    pub(crate) fn tick_caption(&self, tick: f64, most: usize) -> String {
         let factor = self.prefixed_unit().map_or(1.0, |fitted| fitted.factor);
         let size = self.from.abs().max(self.to.abs()) * factor;
         match self.scale {
-            Scale::Log if (0.01..1e5).contains(&tick) && self.unit.is_none() => format!("{}", round(tick)),
-            Scale::Log => self.unit.map_or_else(|| power_of_ten_text(tick), |unit| quantity(tick, unit)),
+            Scale::Log if (0.01..1e5).contains(&tick) && self.unit.is_none() => {
+                format!("{}", round_tick(tick))
+            }
+            Scale::Log => {
+                self.unit.map_or_else(|| power_of_ten_text(tick), |unit| format_quantity(tick, unit))
+            }
             Scale::Linear if !(1e-3..1e6).contains(&size) => power_of_ten_text(tick * factor),
             Scale::Linear => {
-                let step = step(self.from, self.to, most) * factor;
+                let step = tick_step(self.from, self.to, most) * factor;
                 let digits = (0..9).find(|digits| step * 10_f64.powi(*digits) > 0.999).unwrap_or(9);
                 format!("{:.*}", usize::try_from(digits).unwrap_or(0), tick * factor + 0.0)
             }
@@ -138,7 +142,7 @@ fn with_margin((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
 }
 
 /// Returns the smallest step of 1, 2 or 5 times a power of ten that needs at most `most` ticks.
-fn step(from: f64, to: f64, most: usize) -> f64 {
+fn tick_step(from: f64, to: f64, most: usize) -> f64 {
     let most = u32::try_from(most.max(1)).unwrap_or(u32::MAX);
     let min = (to - from) / f64::from(most);
     let power = 10_f64.powf(min.log10().floor());
@@ -147,7 +151,7 @@ fn step(from: f64, to: f64, most: usize) -> f64 {
 }
 
 fn linear_ticks(from: f64, to: f64, most: usize) -> Vec<f64> {
-    let step = step(from, to, most);
+    let step = tick_step(from, to, most);
     let little = 1e-9 * (to - from);
     let first = ((from - little) / step).ceil();
     (0_u32..1000).map(|n| (first + f64::from(n)) * step).take_while(|tick| *tick <= to + little).collect()
@@ -177,7 +181,7 @@ fn log_ticks(from: f64, to: f64, most: usize) -> Vec<f64> {
 }
 
 /// Removes the last digits of a tick, which are rounding errors.
-fn round(tick: f64) -> f64 {
+fn round_tick(tick: f64) -> f64 {
     format!("{tick:.9}").parse().unwrap_or(tick)
 }
 
@@ -211,10 +215,13 @@ mod tests {
     fn an_axis_has_the_prefix_that_fits_its_ends_or_the_unit_at_each_tick() {
         let axis = Axis::new("error", "Nm").with_ends(-2e-4, 3e-4);
         let span = AxisSpan::new(&axis, [].into_iter(), 0.0);
-        assert_eq!((span.title(&axis), span.caption(1e-4, 5)), ("error (µNm)".to_owned(), "100".to_owned()));
-        let axis = Axis::new("time", "µs").with_ends(5.0, 2_000.0).log();
+        assert_eq!(
+            (span.title(&axis), span.tick_caption(1e-4, 5)),
+            ("error (µNm)".to_owned(), "100".to_owned())
+        );
+        let axis = Axis::new("time", "µs").with_ends(5.0, 2_000.0).with_log_scale();
         let span = AxisSpan::new(&axis, [].into_iter(), 0.0);
-        let words = [5.0, 1_000.0].map(|tick| span.caption(tick, 5));
+        let words = [5.0, 1_000.0].map(|tick| span.tick_caption(tick, 5));
         assert_eq!(
             (span.title(&axis), words),
             ("time".to_owned(), ["5\u{a0}µs", "1\u{a0}ms"].map(str::to_owned))
@@ -231,7 +238,11 @@ mod tests {
     fn ticks_stand_at_round_numbers_and_are_written_with_the_digits_that_tell_them_apart() {
         let captions = |from, to, scale, most| {
             let span = span(from, to, scale);
-            span.ticks(most).into_iter().map(|tick| span.caption(tick, most)).collect::<Vec<_>>().join(" ")
+            span.ticks(most)
+                .into_iter()
+                .map(|tick| span.tick_caption(tick, most))
+                .collect::<Vec<_>>()
+                .join(" ")
         };
         assert_eq!(captions(0.0, 12.0, Scale::Linear, 8), "0 2 4 6 8 10 12");
         assert_eq!(captions(-1.3, 0.4, Scale::Linear, 9), "-1.2 -1.0 -0.8 -0.6 -0.4 -0.2 0.0 0.2 0.4");
@@ -270,7 +281,7 @@ mod tests {
         #[test]
         fn a_place_comes_back_as_its_value(from in 1e-3..1e3_f64, width in 1e-2..1e3_f64, place in 0.0..1.0_f64, log: bool) {
             let span = span(from, from + width, if log { Scale::Log } else { Scale::Linear });
-            prop_assert!((span.position(span.value(place)) - place).abs() < 1e-9);
+            prop_assert!((span.position(span.value_at(place)) - place).abs() < 1e-9);
         }
     }
 }

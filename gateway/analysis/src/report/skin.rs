@@ -41,7 +41,7 @@ pub struct CellStrip {
     /// The ends of the time axis in s.
     pub seconds: (f64, f64),
     /// The legend of the colours.
-    pub legend: Legend,
+    pub legend: ColourLegend,
     /// Groups of rows, such as the cells of a link.
     pub groups: Vec<StripGroup>,
 }
@@ -72,14 +72,14 @@ pub struct CellMap {
     /// Caption of the drawing.
     pub title: String,
     /// The legend of the colours.
-    pub legend: Legend,
+    pub legend: ColourLegend,
     /// The links, each with its cells.
-    pub panels: Vec<Panel>,
+    pub panels: Vec<LinkPanel>,
 }
 
 /// One link on a map: its cells, mapped to a plane.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Panel {
+pub struct LinkPanel {
     /// Name of the link.
     pub title: String,
     /// The radius in m of the unrolled cylinder; `None` for a plate.
@@ -101,7 +101,7 @@ pub struct MapCell {
 
 /// The legend of colours, from 0 to a maximum.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Legend {
+pub struct ColourLegend {
     /// The quantity that the colours show.
     pub caption: String,
     /// Unit of the quantity; empty for counts.
@@ -110,7 +110,7 @@ pub struct Legend {
     pub max: f64,
 }
 
-impl Legend {
+impl ColourLegend {
     /// Creates a legend from 0 to the largest of these values.
     #[must_use]
     pub fn for_values(caption: &str, unit: &str, values: impl Iterator<Item = f64>) -> Self {

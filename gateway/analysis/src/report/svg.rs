@@ -1,12 +1,12 @@
 //! Draws a figure as SVG.
 //!
 //! The drawing contains the colours for paper, so that every program can show it. Each colour also has a class, with
-//! which [`dark_rules()`] replaces it on a dark_rules screen.
+//! which [`dark_css_rules()`] replaces it on a dark_css_rules screen.
 
 mod cells;
 mod colour;
 
-pub use cells::{draw as draw_cells, draw_inline as inline_cells};
+pub use cells::{draw_cells, draw_inline as inline_cells};
 
 use std::fmt::Write as _;
 
@@ -20,7 +20,7 @@ use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use plotters_svg::SVGBackend;
 use protocol::xml::escaped;
 
-use super::figure::{Axis, Figure, FigureWidth, MarkAxis, MarkLine, Series, Shape};
+use super::figure::{Axis, Figure, FigureWidth, MarkAxis, MarkLine, Series, SeriesShape};
 use super::scale::AxisSpan;
 use super::thin::thin_points;
 
@@ -29,21 +29,21 @@ const UNITS_PER_PIXEL: i32 = 8;
 /// Height of a diagram below another one, in pixels.
 const LOWER_DIAGRAM_HEIGHT: u32 = 170;
 /// Size of letters, in pixels.
-const LETTER_SIZE: f64 = 13.0;
+const LETTER_SIZE_PX: f64 = 13.0;
 /// Widths of lines in drawing units. The plotting library would draw each dash as a line of its own, of which a noisy
 /// curve has thousands. So dashed lines have unique widths, by which they are found and given a dash attribute.
 const LINE_WIDTH: u32 = 13;
-const DASHED_WIDTH: u32 = 14;
-const DOTTED_WIDTH: u32 = 9;
-const DASHES: [(u32, &str); 2] = [(DASHED_WIDTH, "56 36"), (DOTTED_WIDTH, "16 24")];
+const DASHED_LINE_WIDTH: u32 = 14;
+const DOTTED_LINE_WIDTH: u32 = 9;
+const DASH_PATTERNS: [(u32, &str); 2] = [(DASHED_LINE_WIDTH, "56 36"), (DOTTED_LINE_WIDTH, "16 24")];
 
 /// Colour on paper, CSS class, and colour on a dark screen: for text, faint text, the grid, and each series. The series
 /// have Okabe and Ito's colours, which colour-blind readers can distinguish; their yellow is omitted because it is
 /// invisible on white.
-const CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOUR_COUNT] = [
-    (INK, "ink", "#E4E4E4"),
-    (FAINT, "faint", "#A6A6A6"),
-    (GRID, "grid", "#3A3D42"),
+const COLOUR_CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOUR_COUNT] = [
+    (TEXT_COLOUR, "ink", "#E4E4E4"),
+    (FAINT_TEXT_COLOUR, "faint", "#A6A6A6"),
+    (GRID_COLOUR, "grid", "#3A3D42"),
     (RGBColor(0x00, 0x72, 0xB2), "c0", "#5AB4F0"),
     (RGBColor(0xD5, 0x5E, 0x00), "c1", "#FF8A3D"),
     (RGBColor(0x00, 0x9E, 0x73), "c2", "#35C79A"),
@@ -52,20 +52,20 @@ const CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOUR_COUNT] = [
     (RGBColor(0x56, 0xB4, 0xE9), "c5", "#A8DCFF"),
     (RGBColor(0x33, 0x33, 0x33), "c6", "#DDDDDD"),
 ];
-const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
-const FAINT: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
-const GRID: RGBColor = RGBColor(0xDD, 0xDD, 0xDD);
+const TEXT_COLOUR: RGBColor = RGBColor(0x22, 0x22, 0x22);
+const FAINT_TEXT_COLOUR: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
+const GRID_COLOUR: RGBColor = RGBColor(0xDD, 0xDD, 0xDD);
 
 /// Returns the colours of the series in order, repeated without end.
-fn colours() -> impl Iterator<Item = RGBColor> {
-    CLASSES.iter().skip(3).cycle().map(|(colour, ..)| *colour)
+fn series_colours() -> impl Iterator<Item = RGBColor> {
+    COLOUR_CLASSES.iter().skip(3).cycle().map(|(colour, ..)| *colour)
 }
 
 /// Returns the CSS rules with the colours for dark screens.
 #[must_use]
-pub fn dark_rules() -> String {
+pub fn dark_css_rules() -> String {
     let mut rules = "@media screen and (prefers-color-scheme:dark){".to_owned();
-    for (_, class, colour) in CLASSES {
+    for (_, class, colour) in COLOUR_CLASSES {
         let _ = write!(rules, ".{class}-f{{fill:{colour}}}.{class}-s{{stroke:{colour}}}");
     }
     colour::add_dark_rules(&mut rules);
@@ -91,21 +91,21 @@ pub(crate) const fn figure_size(figure: &Figure, size: FigureWidth) -> (u32, u32
 
 /// Draws a standalone SVG file, for a paper or a document.
 #[must_use]
-pub fn draw(figure: &Figure) -> String {
+pub fn draw_figure(figure: &Figure) -> String {
     let (width, height) = figure_size(figure, figure.size);
-    let style = format!("<style>{}</style>\n", dark_rules());
+    let style = format!("<style>{}</style>\n", dark_css_rules());
     let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
-    document(figure, (width, height), &attributes, &style)
+    svg_document(figure, (width, height), &attributes, &style)
 }
 
-/// Draws a figure as an element of a page that contains the CSS rules of [`dark_rules()`]; `size` is the size in pixels
+/// Draws a figure as an element of a page that contains the CSS rules of [`dark_css_rules()`]; `size` is the size in pixels
 /// before scaling.
 #[must_use]
 pub fn draw_inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
-    document(figure, size, &format!("class=\"{class}\""), "")
+    svg_document(figure, size, &format!("class=\"{class}\""), "")
 }
 
-fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, style: &str) -> String {
+fn svg_document(figure: &Figure, (width, height): (u32, u32), attributes: &str, style: &str) -> String {
     let unit = UNITS_PER_PIXEL.unsigned_abs();
     let mut drawing = String::new();
     let area = SVGBackend::with_string(&mut drawing, (width * unit, height * unit)).into_drawing_area();
@@ -113,7 +113,7 @@ fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, styl
     let drawn = draw_diagrams(figure, &area).and_then(|()| area.present());
     drop(area);
     let body = drawing.split_once(">\n").map_or("", |(_, body)| body);
-    let body = if drawn.is_ok() { with_classes(body) } else { "</svg>\n".to_owned() };
+    let body = if drawn.is_ok() { add_css_classes(body) } else { "</svg>\n".to_owned() };
     let title = escaped(&figure.title);
     format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {} {}\" role=\"img\" {attributes} \
@@ -124,23 +124,23 @@ fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, styl
 }
 
 /// Adds the CSS class to every colour of an SVG text.
-fn with_classes(body: &str) -> String {
+fn add_css_classes(body: &str) -> String {
     let mut body = body.replace(" opacity=\"1\"", "").replace(" font-family=\"sans-serif\"", "");
-    for (RGBColor(r, g, b), class, _) in CLASSES {
+    for (RGBColor(r, g, b), class, _) in COLOUR_CLASSES {
         for (attribute, kind) in [("fill", 'f'), ("stroke", 's')] {
             let colour = format!("{attribute}=\"#{r:02X}{g:02X}{b:02X}\"");
             body = body.replace(&colour, &format!("class=\"{class}-{kind}\" {colour}"));
         }
     }
-    for (width, dashes) in DASHES {
+    for (width, dashes) in DASH_PATTERNS {
         let width = format!("stroke-width=\"{width}\"");
         body = body.replace(&width, &format!("{width} stroke-dasharray=\"{dashes}\""));
     }
     body
 }
 
-type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-type Chart<'a, 'b> = ChartContext<'b, SVGBackend<'a>, Cartesian2d<AxisSpan, AxisSpan>>;
+type SvgArea<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type SvgChart<'a, 'b> = ChartContext<'b, SVGBackend<'a>, Cartesian2d<AxisSpan, AxisSpan>>;
 type DrawResult = Result<(), DrawingAreaErrorKind<std::io::Error>>;
 
 /// One of the diagrams of a figure.
@@ -186,11 +186,11 @@ impl<'a> Diagram<'a> {
     fn longest_label_letters(&self, height: u32) -> usize {
         let most = Self::max_ticks(height);
         let ticks = self.y.ticks(most).into_iter();
-        ticks.map(|tick| self.y.caption(tick, most).chars().count()).max().unwrap_or(1)
+        ticks.map(|tick| self.y.tick_caption(tick, most).chars().count()).max().unwrap_or(1)
     }
 }
 
-fn draw_diagrams(figure: &Figure, area: &Area<'_>) -> DrawResult {
+fn draw_diagrams(figure: &Figure, area: &SvgArea<'_>) -> DrawResult {
     let diagrams = Diagram::from_figure(figure);
     let (_, height) = area.dim_in_pixel();
     let (upper, lower) = match figure.below {
@@ -204,15 +204,15 @@ fn draw_diagrams(figure: &Figure, area: &Area<'_>) -> DrawResult {
         .map(|(diagram, area)| diagram.longest_label_letters(area.dim_in_pixel().1));
     // Both diagrams have the same left edge.
     let left = pixels_to_units(34)
-        + pixels_to_signed_units(0.62 * LETTER_SIZE * digits.max().unwrap_or(1) as f64).unsigned_abs();
+        + pixels_to_signed_units(0.62 * LETTER_SIZE_PX * digits.max().unwrap_or(1) as f64).unsigned_abs();
     diagrams.iter().zip(&areas).try_for_each(|(diagram, area)| draw_diagram(diagram, area, left))
 }
 
-fn draw_diagram(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> DrawResult {
+fn draw_diagram(diagram: &Diagram<'_>, area: &SvgArea<'_>, left: u32) -> DrawResult {
     let Diagram { axes, x, y, series, marks, is_lowest } = *diagram;
     let (width, height) = area.dim_in_pixel();
     let (x_most, y_most) = ((width / pixels_to_units(80)) as usize, Diagram::max_ticks(height));
-    let rows = legend(series, width);
+    let rows = legend_rows(series, width);
     let top = pixels_to_units(8) + pixels_to_units(20) * u32::try_from(rows.len()).unwrap_or(0);
     let (above, below) = area.split_vertically(top);
     let mut chart = ChartBuilder::on(&below)
@@ -226,20 +226,20 @@ fn draw_diagram(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> DrawResult
         .x_labels(x_most)
         .y_labels(y_most)
         .max_light_lines(1)
-        .light_line_style(GRID.mix(0.0))
-        .bold_line_style(GRID.stroke_width(pixels_to_units(1)))
-        .axis_style(FAINT.stroke_width(pixels_to_units(1)))
-        .label_style(text_style(&INK, LETTER_SIZE))
-        .axis_desc_style(text_style(&INK, LETTER_SIZE))
+        .light_line_style(GRID_COLOUR.mix(0.0))
+        .bold_line_style(GRID_COLOUR.stroke_width(pixels_to_units(1)))
+        .axis_style(FAINT_TEXT_COLOUR.stroke_width(pixels_to_units(1)))
+        .label_style(text_style(&TEXT_COLOUR, LETTER_SIZE_PX))
+        .axis_desc_style(text_style(&TEXT_COLOUR, LETTER_SIZE_PX))
         .set_all_tick_mark_size(pixels_to_units(5))
-        .x_label_formatter(&|tick| if is_lowest { x.caption(*tick, x_most) } else { String::new() })
-        .y_label_formatter(&|tick| y.caption(*tick, y_most))
+        .x_label_formatter(&|tick| if is_lowest { x.tick_caption(*tick, x_most) } else { String::new() })
+        .y_label_formatter(&|tick| y.tick_caption(*tick, y_most))
         .x_desc(if is_lowest { x.title(axes.0) } else { String::new() })
         .y_desc(y.title(axes.1))
         .draw()?;
     let (columns, lines) = chart.plotting_area().dim_in_pixel();
     let grain = (columns / UNITS_PER_PIXEL.unsigned_abs(), lines / UNITS_PER_PIXEL.unsigned_abs());
-    for (series, colour) in series.iter().zip(colours()) {
+    for (series, colour) in series.iter().zip(series_colours()) {
         draw_series(&mut chart, series, colour, (&x, &y), grain)?;
     }
     for mark in marks {
@@ -254,29 +254,30 @@ fn draw_diagram(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> DrawResult
 }
 
 fn draw_series(
-    chart: &mut Chart<'_, '_>,
+    chart: &mut SvgChart<'_, '_>,
     series: &Series,
     colour: RGBColor,
     (x, y): (&AxisSpan, &AxisSpan),
     (columns, lines): (u32, u32),
 ) -> DrawResult {
     let placed = series.points.iter().map(|point| (x.position(point.0), y.position(point.1)));
-    let style = colour.stroke_width(if series.shape == Shape::Dashed { DASHED_WIDTH } else { LINE_WIDTH });
+    let style =
+        colour.stroke_width(if series.shape == SeriesShape::Dashed { DASHED_LINE_WIDTH } else { LINE_WIDTH });
     let back = |points: Vec<(f64, f64)>| -> Vec<(f64, f64)> {
-        points.into_iter().map(|(across, up)| (x.value(across), y.value(up))).collect()
+        points.into_iter().map(|(across, up)| (x.value_at(across), y.value_at(up))).collect()
     };
     match series.shape {
-        Shape::Line | Shape::Dashed | Shape::Steps => {
+        SeriesShape::Line | SeriesShape::Dashed | SeriesShape::Steps => {
             for run in line_pieces(&placed.collect::<Vec<_>>()) {
                 let run = thin_points(run, columns);
-                let run = if series.shape == Shape::Steps { stairs(&run) } else { run };
+                let run = if series.shape == SeriesShape::Steps { stair_points(&run) } else { run };
                 for piece in clip_line(&run) {
                     let points = back(piece);
                     chart.draw_series([PathElement::new(points, style)])?;
                 }
             }
         }
-        Shape::Points => {
+        SeriesShape::Points => {
             let mut points: Vec<_> = placed.filter(is_inside).collect();
             // Dots that cover each other are drawn once.
             let cell = |point: &(f64, f64)| {
@@ -292,7 +293,7 @@ fn draw_series(
                 back(points).into_iter().map(|point| Circle::new(point, radius, colour.filled())),
             )?;
         }
-        Shape::Band => {
+        SeriesShape::Band => {
             let points = placed
                 .filter(is_finite)
                 .map(|point| (point.0.clamp(0.0, 1.0), point.1.clamp(0.0, 1.0)))
@@ -318,7 +319,7 @@ fn line_pieces(points: &[(f64, f64)]) -> impl Iterator<Item = &[(f64, f64)]> {
 }
 
 /// Returns the points of a line that holds each value until the next one, in steps.
-pub(crate) fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+pub(crate) fn stair_points(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let mut stairs = Vec::with_capacity(points.len() * 2);
     for point in points {
         if let Some(&(_, held)) = stairs.last() {
@@ -364,15 +365,16 @@ fn clip_line(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
     pieces
 }
 
-fn draw_mark(chart: &mut Chart<'_, '_>, mark: &MarkLine, (x, y): (&AxisSpan, &AxisSpan)) -> DrawResult {
+fn draw_mark(chart: &mut SvgChart<'_, '_>, mark: &MarkLine, (x, y): (&AxisSpan, &AxisSpan)) -> DrawResult {
     let place = if mark.on == MarkAxis::X { x.position(mark.at) } else { y.position(mark.at) };
     if !(0.0..=1.0).contains(&place) {
         return Ok(());
     }
     let ends =
         if mark.on == MarkAxis::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
-    let line = ends.map(|(across, up)| (x.value(across), y.value(up)));
-    chart.draw_series([PathElement::new(line.to_vec(), FAINT.stroke_width(DOTTED_WIDTH))])?;
+    let line = ends.map(|(across, up)| (x.value_at(across), y.value_at(up)));
+    chart
+        .draw_series([PathElement::new(line.to_vec(), FAINT_TEXT_COLOUR.stroke_width(DOTTED_LINE_WIDTH))])?;
     // Put the text on the side with room.
     let (across, up, side, end) = match mark.on {
         MarkAxis::X if place > 0.6 => (place, 1.0, HPos::Right, VPos::Top),
@@ -381,19 +383,20 @@ fn draw_mark(chart: &mut Chart<'_, '_>, mark: &MarkLine, (x, y): (&AxisSpan, &Ax
         MarkAxis::Y => (1.0, place, HPos::Right, VPos::Bottom),
     };
     let gap = if matches!(side, HPos::Left) { 0.006 } else { -0.006 };
-    let style = text_style(&FAINT, LETTER_SIZE - 1.0).pos(Pos::new(side, end));
-    let at = (x.value(across + gap), y.value(up - if mark.on == MarkAxis::X { 0.02 } else { 0.0 }));
+    let style = text_style(&FAINT_TEXT_COLOUR, LETTER_SIZE_PX - 1.0).pos(Pos::new(side, end));
+    let at = (x.value_at(across + gap), y.value_at(up - if mark.on == MarkAxis::X { 0.02 } else { 0.0 }));
     chart.draw_series([Text::new(mark.caption.clone(), at, style)])?;
     Ok(())
 }
 
 /// Returns the rows of the legend. Each entry has its horizontal start, its series, and the colour of the series.
-fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
-    let named = series.iter().zip(colours()).filter(|(series, _)| !series.caption.is_empty());
+fn legend_rows(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
+    let named = series.iter().zip(series_colours()).filter(|(series, _)| !series.caption.is_empty());
     let mut rows: Vec<Vec<_>> = Vec::new();
     let mut at = i32::MAX;
     for (series, colour) in named {
-        let room = pixels_to_signed_units(48.0 + 0.56 * LETTER_SIZE * series.caption.chars().count() as f64);
+        let room =
+            pixels_to_signed_units(48.0 + 0.56 * LETTER_SIZE_PX * series.caption.chars().count() as f64);
         if at.saturating_add(room) > i32::try_from(width).unwrap_or(i32::MAX) {
             rows.push(Vec::new());
             at = pixels_to_signed_units(12.0);
@@ -407,7 +410,7 @@ fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
 }
 
 fn draw_legend_entry(
-    area: &Area<'_>,
+    area: &SvgArea<'_>,
     series: &Series,
     colour: RGBColor,
     (at, row): (i32, i32),
@@ -416,8 +419,10 @@ fn draw_legend_entry(
     let end = at + pixels_to_signed_units(22.0);
     let style: ShapeStyle = colour.stroke_width(pixels_to_units(2));
     match series.shape {
-        Shape::Line | Shape::Steps => area.draw(&PathElement::new([(at, middle), (end, middle)], style))?,
-        Shape::Dashed => {
+        SeriesShape::Line | SeriesShape::Steps => {
+            area.draw(&PathElement::new([(at, middle), (end, middle)], style))?
+        }
+        SeriesShape::Dashed => {
             for from in [at, at + pixels_to_signed_units(13.0)] {
                 area.draw(&PathElement::new(
                     [(from, middle), (from + pixels_to_signed_units(9.0), middle)],
@@ -425,20 +430,20 @@ fn draw_legend_entry(
                 ))?;
             }
         }
-        Shape::Points => {
+        SeriesShape::Points => {
             area.draw(&Circle::new(
                 (at + pixels_to_signed_units(11.0), middle),
                 pixels_to_signed_units(3.0),
                 colour.filled(),
             ))?;
         }
-        Shape::Band => {
+        SeriesShape::Band => {
             let half = pixels_to_signed_units(5.0);
             let corners = [(at, middle - half), (end, middle + half)];
             area.draw(&Rectangle::new(corners, colour.mix(0.25).filled()))?;
         }
     }
-    let style = text_style(&INK, LETTER_SIZE).pos(Pos::new(HPos::Left, VPos::Center));
+    let style = text_style(&TEXT_COLOUR, LETTER_SIZE_PX).pos(Pos::new(HPos::Left, VPos::Center));
     area.draw(&Text::new(series.caption.clone(), (end + pixels_to_signed_units(6.0), middle), style))
 }
 

@@ -4,14 +4,14 @@
 
 /// The first, minimum, maximum and last point of a column of a picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Column {
+struct PointColumn {
     first: (f64, f64),
     min: (f64, f64),
     max: (f64, f64),
     last: (f64, f64),
 }
 
-impl Column {
+impl PointColumn {
     const fn new(point: (f64, f64)) -> Self {
         Self { first: point, min: point, max: point, last: point }
     }
@@ -44,7 +44,7 @@ pub struct ThinnedLine {
     /// Start of the first column, in units of x.
     from: Option<f64>,
     /// Columns by their index, each with true if the line has a gap before it.
-    columns: Vec<(u64, bool, Column)>,
+    columns: Vec<(u64, bool, PointColumn)>,
     /// Number of points that were added, without gaps.
     count: u64,
     /// True if a gap follows the last point.
@@ -67,7 +67,7 @@ impl ThinnedLine {
 
     /// Returns the number of points so far.
     #[must_use]
-    pub const fn count(&self) -> u64 {
+    pub const fn point_count(&self) -> u64 {
         self.count
     }
 
@@ -87,10 +87,10 @@ impl ThinnedLine {
         while self.columns.len() >= self.most && self.columns.last().is_some_and(|(last, ..)| *last != at)
             || self.columns.first().is_some_and(|(first, ..)| at - first >= 2 * self.most as u64)
         {
-            self.merge();
+            self.merge_column_pairs();
             at = self.column_index(x - from);
         }
-        let (gap, new) = (std::mem::take(&mut self.gap), Column::new((x, y)));
+        let (gap, new) = (std::mem::take(&mut self.gap), PointColumn::new((x, y)));
         append_or_merge(&mut self.columns, (at, gap, new));
     }
 
@@ -104,7 +104,7 @@ impl ThinnedLine {
     }
 
     /// Merges pairs of columns.
-    fn merge(&mut self) {
+    fn merge_column_pairs(&mut self) {
         self.width *= 2.0;
         let mut merged = Vec::with_capacity(self.columns.len());
         self.columns
@@ -128,7 +128,7 @@ impl ThinnedLine {
 
 /// Appends a column, or merges it into the last one if it is not to the right of it: a late point counts to the newest
 /// column.
-fn append_or_merge(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, Column)) {
+fn append_or_merge(columns: &mut Vec<(u64, bool, PointColumn)>, (at, gap, column): (u64, bool, PointColumn)) {
     match columns.last_mut() {
         Some((last, before, joined)) if *last >= at => {
             *before |= gap;
@@ -148,7 +148,7 @@ pub fn thin_points(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
     points
         .chunk_by(|a, b| (place(a.0) - place(b.0)).abs() < 0.5)
         .filter_map(|points| {
-            points.iter().map(|point| Column::new(*point)).reduce(|mut sum, next| {
+            points.iter().map(|point| PointColumn::new(*point)).reduce(|mut sum, next| {
                 sum.merge_later(&next);
                 sum
             })
@@ -206,14 +206,14 @@ impl BinnedSums {
 
     /// Returns the present width of a bin, in units of x.
     #[must_use]
-    pub const fn width(&self) -> f64 {
+    pub const fn bin_width(&self) -> f64 {
         self.width
     }
 
     /// Returns the start of each bin, and the sum in it divided by its width. The last bin may be incomplete, and is
     /// omitted unless it is the only one.
     #[must_use]
-    pub fn rates(&self) -> Vec<(f64, f64)> {
+    pub fn bin_rates(&self) -> Vec<(f64, f64)> {
         let from = self.from.unwrap_or(0.0);
         let whole = self.bins.len().saturating_sub(1).max(1);
         let bins = self.bins.iter().take(whole).enumerate();
@@ -241,7 +241,7 @@ mod tests {
         }
         let points = line.points();
         assert!((500..=2_000).contains(&points.len()), "{}", points.len());
-        assert_eq!(line.count(), 1_000_000);
+        assert_eq!(line.point_count(), 1_000_000);
         assert!(points.contains(&(654_321.0 * 0.002, 99.0)));
         assert_eq!(points.first(), Some(&(0.0, 0.0)));
         assert_eq!(points.last(), Some(&(999_999.0 * 0.002, f64::from(999_999 % 7))));
@@ -268,8 +268,8 @@ mod tests {
         for n in 0..1_000_u32 {
             bins.add(5.0 + f64::from(n) * 0.01, 2.0);
         }
-        assert!((bins.width() - 1.6).abs() < 1e-12, "10 s in at most 10 bins: {}", bins.width());
-        let rates = bins.rates();
+        assert!((bins.bin_width() - 1.6).abs() < 1e-12, "10 s in at most 10 bins: {}", bins.bin_width());
+        let rates = bins.bin_rates();
         assert_eq!(rates.len(), 6, "the last is not full");
         for (at, (x, rate)) in (0_u32..).zip(&rates) {
             assert!((x - 5.0 - f64::from(at) * 1.6).abs() < 1e-9, "{x}");

@@ -6,11 +6,11 @@ use protocol::can::{Format, Frame};
 use protocol::packet::Epoch;
 use protocol::wire_time::{BitRates, FrameBits};
 
-use super::epochs::Epochs;
-use super::phase::{ByPhase, Phase, PhaseFigures, Phases};
-use super::report::{BusShadow, BusyStretches, Counts, Delays, Loads, Peak};
+use super::epochs::EpochTracker;
+use super::phase::{BusPhase, ByPhase, PhaseFigures, PhaseTracker};
+use super::report::{BusShadow, BusyStretches, DelayQuantiles, FrameCounts, Loads, Peak};
 use super::reported::FrameTimings;
-use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
+use super::{MAX_WAITING_FRAMES, REORDER_WINDOW_NS, SATURATED_NS};
 use crate::fit;
 use crate::fit::traffic::{ClassifiedFrame, RunEvent, TrafficClassifier};
 use crate::fit::verdict::{AnsweringCells, FitSummary};
@@ -18,7 +18,7 @@ use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 
 /// Maximum number of frames that wait to be sent on a bus: some minutes of a bus at full load. Further frames are
 /// refused, as a full transmit queue would.
-pub const MAX_QUEUE: usize = 1 << 22;
+pub const MAX_QUEUED_FRAMES: usize = 1 << 22;
 /// The number of identifiers of 11 bits.
 const IDENTIFIER_COUNT: usize = 0x800;
 
@@ -29,7 +29,7 @@ struct FrameTag {
     place: u64,
     /// Identifier of the frame; `None` for one of 29 bits.
     id: Option<u16>,
-    phase: Phase,
+    phase: BusPhase,
     /// The epoch that the frame answers, and true if later joints had been sent before it; `None` for other frames.
     answer: Option<(Epoch, bool)>,
 }
@@ -62,7 +62,7 @@ pub(super) struct BusProperties {
 #[derive(Debug)]
 pub(super) struct BusTiming {
     pub(super) name: String,
-    pub(super) counts: Counts,
+    pub(super) counts: FrameCounts,
     known: BusProperties,
     model: BusModel<FrameTag>,
     pending: VecDeque<PendingFrame>,
@@ -75,9 +75,9 @@ pub(super) struct BusTiming {
     wire_end: u64,
     traffic: TrafficClassifier,
     has_fd: bool,
-    phases: Phases,
+    phases: PhaseTracker,
     figures: ByPhase<PhaseFigures>,
-    epochs: Epochs,
+    epochs: EpochTracker,
     queued: Vec<u32>,
 }
 
@@ -86,7 +86,7 @@ impl BusTiming {
         let model = BusModel::new(known.rates);
         Self {
             name: name.to_owned(),
-            counts: Counts { bench_omitted: !known.bench_traffic, ..Counts::default() },
+            counts: FrameCounts { bench_omitted: !known.bench_traffic, ..FrameCounts::default() },
             known,
             model: errors.into_iter().fold(model, BusModel::with_errors),
             pending: VecDeque::new(),
@@ -96,9 +96,9 @@ impl BusTiming {
             wire_end: 0,
             traffic: TrafficClassifier::default(),
             has_fd: false,
-            phases: Phases::default(),
+            phases: PhaseTracker::default(),
             figures: ByPhase::default(),
-            epochs: Epochs::default(),
+            epochs: EpochTracker::default(),
             queued: vec![0; IDENTIFIER_COUNT],
         }
     }
@@ -107,7 +107,7 @@ impl BusTiming {
     pub(super) fn receive_latched(&mut self, nanos: u64, frame: &Frame) {
         match self.traffic.classify(nanos, frame).says {
             RunEvent::Joints(_) => self.phases.beginning.is_mid_run = true,
-            says @ (RunEvent::Halt | RunEvent::Resume) => _ = self.epochs.receive(nanos, says, None),
+            says @ (RunEvent::Halt | RunEvent::Resume) => _ = self.epochs.record_event(nanos, says, None),
             RunEvent::Answer(_) | RunEvent::Preparation | RunEvent::Other => {}
         }
     }
@@ -120,7 +120,7 @@ impl BusTiming {
     }
 
     /// Handles a frame that a real CAN bus could carry.
-    pub(super) fn receive(
+    pub(super) fn receive_frame(
         &mut self,
         nanos: u64,
         frame: &Frame,
@@ -136,7 +136,7 @@ impl BusTiming {
             let first = self.pending.iter_mut().rev().find(|it| it.id == id);
             first.into_iter().for_each(|first| first.sorted.bench = sorted.bench);
         }
-        self.phases.beginning.record(nanos, sorted.says);
+        self.phases.beginning.record_event(nanos, sorted.says);
         let pending =
             PendingFrame { at: nanos, priority: Priority::from_frame(frame), bits, place, id, sorted };
         match self.pending.back() {
@@ -151,8 +151,9 @@ impl BusTiming {
             }
         }
         let newest = self.pending.back().map_or(nanos, |last| last.at);
-        let waits =
-            |first: &PendingFrame, count: usize| newest - first.at <= WINDOW_NS && count <= WINDOW_FRAMES;
+        let waits = |first: &PendingFrame, count: usize| {
+            newest - first.at <= REORDER_WINDOW_NS && count <= MAX_WAITING_FRAMES
+        };
         let mut reported = reported;
         while let Some(first) =
             self.pending.front().filter(|first| !waits(first, self.pending.len())).copied()
@@ -168,7 +169,7 @@ impl BusTiming {
             self.request_frame(first, reported.as_deref_mut());
         }
         self.model.finish();
-        self.collect_sent(reported);
+        self.collect_sent_frames(reported);
     }
 
     /// Passes the next frame in order of time to the model, which requests its transmission.
@@ -176,7 +177,7 @@ impl BusTiming {
         let PendingFrame { at, priority, bits, place, id, sorted } = pending;
         let ClassifiedFrame { says, bench, from, .. } = sorted;
         if let Some(bench) = bench {
-            self.counts.bench.count(bench, 1);
+            self.counts.bench.count_frames(bench, 1);
             if !self.known.bench_traffic {
                 reported.into_iter().for_each(|reported| reported.mark_omitted(place));
                 return;
@@ -186,13 +187,13 @@ impl BusTiming {
         let at = at.max(self.released);
         self.released = at;
         self.model.run_until(at);
-        self.collect_sent(reported.as_deref_mut());
-        let phase = self.phases.phase_at(at, says, self.traffic.is_ours());
-        let answer = self.epochs.receive(at, says, from);
+        self.collect_sent_frames(reported.as_deref_mut());
+        let phase = self.phases.phase_at(at, says, self.traffic.is_skin_traffic());
+        let answer = self.epochs.record_event(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
         let figures = self.figures.get_mut(phase);
         figures.record_request(at, took);
-        if self.model.waiting() >= MAX_QUEUE {
+        if self.model.waiting() >= MAX_QUEUED_FRAMES {
             self.counts.no_room += 1;
             reported.into_iter().for_each(|reported| reported.record_sent(place, None));
             return;
@@ -208,11 +209,15 @@ impl BusTiming {
     }
 
     /// Takes completed transmissions from the model and records them.
-    fn collect_sent(&mut self, mut reported: Option<&mut FrameTimings>) {
+    fn collect_sent_frames(&mut self, mut reported: Option<&mut FrameTimings>) {
         while let Some(attempt) = self.model.poll() {
             let Attempt { tag: FrameTag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
             self.wire_end = end;
-            self.figures.get_mut(self.phases.now()).busy.record(start, end, SATURATED_NS);
+            self.figures.get_mut(self.phases.current_phase()).busy.record_transmission(
+                start,
+                end,
+                SATURATED_NS,
+            );
             if is_damaged {
                 self.counts.damaged += 1;
                 continue;
@@ -231,7 +236,7 @@ impl BusTiming {
     }
 
     /// Returns the format and the bit rates of the bus as text. The format is the skin's, or else that of the frames.
-    fn named_rates(&self) -> String {
+    fn rates_text(&self) -> String {
         if let Some(worst) = &self.known.worst_case {
             return worst.rates.clone();
         }
@@ -242,9 +247,9 @@ impl BusTiming {
         }
     }
 
-    pub(super) fn report(&self, has_times: bool) -> BusShadow {
+    pub(super) fn to_bus_shadow(&self, has_times: bool) -> BusShadow {
         let (first, last) = self.span.unwrap_or_default();
-        let timed = self.timed_report(first, last);
+        let timed = self.timed_bus_shadow(first, last);
         if has_times && first < last {
             return timed;
         }
@@ -254,7 +259,7 @@ impl BusTiming {
             start_up: None,
             load: Loads::default(),
             stretches: BusyStretches::default(),
-            delay_us: Delays::default(),
+            delay_us: DelayQuantiles::default(),
             kinds: Vec::new(),
             replies: None,
             queue: Peak::default(),
@@ -264,22 +269,22 @@ impl BusTiming {
         }
     }
 
-    fn timed_report(&self, first: u64, last: u64) -> BusShadow {
+    fn timed_bus_shadow(&self, first: u64, last: u64) -> BusShadow {
         let ByPhase { start_up, operation } = &self.figures;
         let span = self.phases.spans.operation;
         let overrun = self.wire_end.saturating_sub(self.released);
         let load = operation.loads(span, overrun);
-        let is_ours = self.traffic.is_ours();
-        let answering = self.epochs.answering(self.known.cells);
+        let is_ours = self.traffic.is_skin_traffic();
+        let answering = self.epochs.answering_counts(self.known.cells);
         let replies = self.epochs.replies();
         let this_run = (operation.frames > 0).then(|| {
             let who = if is_ours { answering.cells() } else { AnsweringCells::Foreign };
             let late = replies.late - replies.late_when_ready;
-            FitSummary::for_run(load.worst_1_s.value, late, self.named_rates(), who)
+            FitSummary::for_run(load.worst_1_s.value, late, self.rates_text(), who)
         });
         BusShadow {
             bus: self.name.clone(),
-            name: self.named_rates(),
+            name: self.rates_text(),
             rates: self.known.rates,
             frames: self.frames,
             first_ns: first,
@@ -293,8 +298,8 @@ impl BusTiming {
             counts: self.counts,
             load,
             stretches: operation.busy.stretches(SATURATED_NS),
-            delay_us: Delays::from_times(&operation.all),
-            kinds: if is_ours { operation.kinds() } else { Vec::new() },
+            delay_us: DelayQuantiles::from_times(&operation.all),
+            kinds: if is_ours { operation.kind_delays() } else { Vec::new() },
             replies: Some(replies).filter(|replies| is_ours && replies.count > 0),
             queue: operation.queue,
             queue_of_one: operation.queue_of_one,

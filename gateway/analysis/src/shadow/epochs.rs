@@ -4,7 +4,7 @@ use model::quantiles::TimeHistogram;
 use protocol::id::CellId;
 use protocol::packet::Epoch;
 
-use super::report::{Answering, Delays, Replies};
+use super::report::{AnsweringCounts, DelayQuantiles, ReplyStatistics};
 use crate::fit::traffic::RunEvent;
 
 /// A set of cells of a bus.
@@ -33,7 +33,7 @@ struct EpochAnswers {
 
 /// Follows joints and the answers to them, in bounded memory.
 #[derive(Debug, Default)]
-pub(super) struct Epochs {
+pub(super) struct EpochTracker {
     senders: CellSet,
     /// The newest joints of each epoch number.
     numbered: Vec<EpochAnswers>,
@@ -41,7 +41,7 @@ pub(super) struct Epochs {
     halted: bool,
     closed: EpochTotals,
     epochs_halted: u64,
-    replies: Replies,
+    replies: ReplyStatistics,
     after_joints: TimeHistogram,
 }
 
@@ -61,10 +61,15 @@ impl EpochTotals {
     }
 }
 
-impl Epochs {
+impl EpochTracker {
     /// Records the role of a frame at the time `at` in ns. For an answer, returns the epoch that it answers, and true
     /// if later joints have been sent before it.
-    pub(super) fn receive(&mut self, at: u64, says: RunEvent, from: Option<CellId>) -> Option<(Epoch, bool)> {
+    pub(super) fn record_event(
+        &mut self,
+        at: u64,
+        says: RunEvent,
+        from: Option<CellId>,
+    ) -> Option<(Epoch, bool)> {
         from.into_iter().for_each(|cell| self.senders.insert(cell));
         match says {
             RunEvent::Joints(epoch) => self.receive_joints(at, epoch),
@@ -120,16 +125,16 @@ impl Epochs {
     }
 
     /// Returns the counts and times of the answers to joints.
-    pub(super) fn replies(&self) -> Replies {
-        Replies { after_joints_us: Delays::from_times(&self.after_joints), ..self.replies }
+    pub(super) fn replies(&self) -> ReplyStatistics {
+        ReplyStatistics { after_joints_us: DelayQuantiles::from_times(&self.after_joints), ..self.replies }
     }
 
     /// Returns the numbers of cells that answered, over all epochs. The number of cells on the bus is the skin's if
     /// given, else that of the cells that sent something.
-    pub(super) fn answering(&self, described: Option<u32>) -> Answering {
+    pub(super) fn answering_counts(&self, described: Option<u32>) -> AnsweringCounts {
         let mut all = self.closed;
         self.numbered.iter().filter_map(|it| it.answered).for_each(|answered| all.add_epoch(answered));
-        Answering {
+        AnsweringCounts {
             epochs: all.epochs,
             epochs_halted: self.epochs_halted,
             mean: (all.epochs > 0).then(|| all.answers as f64 / all.epochs as f64),
@@ -150,11 +155,12 @@ mod tests {
 
     #[test]
     fn each_cell_counts_once_an_epoch_however_late_and_halted_epochs_not_at_all() {
-        let mut epochs = Epochs::default();
-        let answer = |epochs: &mut Epochs, node, epoch| {
-            epochs.receive(0, RunEvent::Answer(Epoch(epoch)), Some(cell(node)));
+        let mut epochs = EpochTracker::default();
+        let answer = |epochs: &mut EpochTracker, node, epoch| {
+            epochs.record_event(0, RunEvent::Answer(Epoch(epoch)), Some(cell(node)));
         };
-        let joints = |epochs: &mut Epochs, epoch| epochs.receive(0, RunEvent::Joints(Epoch(epoch)), None);
+        let joints =
+            |epochs: &mut EpochTracker, epoch| epochs.record_event(0, RunEvent::Joints(Epoch(epoch)), None);
         answer(&mut epochs, 9, 255);
         for epoch in 0..=255 {
             joints(&mut epochs, epoch);
@@ -166,15 +172,15 @@ mod tests {
         answer(&mut epochs, 3, 254);
         joints(&mut epochs, 0);
         answer(&mut epochs, 1, 0);
-        epochs.receive(0, RunEvent::Halt, None);
+        epochs.record_event(0, RunEvent::Halt, None);
         joints(&mut epochs, 1);
         answer(&mut epochs, 1, 1);
-        let report = epochs.answering(None);
+        let report = epochs.answering_counts(None);
         assert_eq!((report.epochs, report.epochs_halted, report.most), (257, 1, 254));
         assert_eq!((report.cells, report.described), (254, false));
         let answers = 256.0 * 2.0 + 252.0 + 1.0 + 1.0;
         assert!((report.mean.unwrap() - answers / 257.0).abs() < 1e-12, "{report:?}");
-        assert_eq!(epochs.answering(Some(300)).cells, 300);
-        assert_eq!(Epochs::default().answering(None).mean, None);
+        assert_eq!(epochs.answering_counts(Some(300)).cells, 300);
+        assert_eq!(EpochTracker::default().answering_counts(None).mean, None);
     }
 }

@@ -9,7 +9,7 @@ const MAX_WINDOW_TIMES: usize = 1 << 16;
 
 /// Finds the highest load in any window of `SPAN` ns, wherever it starts.
 #[derive(Debug, Default)]
-pub(super) struct Window<const SPAN: u64> {
+pub(super) struct LoadWindow<const SPAN: u64> {
     /// Time in ns of each request within the window, and the transmission time in ns that it requests.
     requested: VecDeque<(u64, u64)>,
     sum: u64,
@@ -17,7 +17,7 @@ pub(super) struct Window<const SPAN: u64> {
     pub(super) most: Peak,
 }
 
-impl<const SPAN: u64> Window<SPAN> {
+impl<const SPAN: u64> LoadWindow<SPAN> {
     /// Records a request at `at` for `nanos` ns of transmission; times never decrease.
     pub(super) fn record_request(&mut self, at: u64, nanos: u64) {
         while let Some(&(then, gone)) = self.requested.front().filter(|(then, _)| then + SPAN <= at) {
@@ -32,7 +32,7 @@ impl<const SPAN: u64> Window<SPAN> {
         }
         self.sum += nanos;
         self.most
-            .raise(self.sum as f64 / SPAN as f64, self.requested.front().map_or(at, |(first, _)| *first));
+            .raise_to(self.sum as f64 / SPAN as f64, self.requested.front().map_or(at, |(first, _)| *first));
     }
 }
 
@@ -49,29 +49,29 @@ pub(super) struct BusyTime {
 impl BusyTime {
     /// Records a transmission from `start` to `end`, in order of time. A stretch of at least `saturated` ns counts as
     /// saturated.
-    pub(super) fn record(&mut self, start: u64, end: u64, saturated: u64) {
+    pub(super) fn record_transmission(&mut self, start: u64, end: u64, saturated: u64) {
         self.total += end - start;
         if start > self.end {
-            self.close_stretch(saturated);
+            self.close_busy_stretch(saturated);
             self.begin = start;
         }
         self.end = end;
     }
 
-    fn close_stretch(&mut self, saturated: u64) {
+    fn close_busy_stretch(&mut self, saturated: u64) {
         let length = self.end - self.begin;
         if length >= saturated {
             self.stretches.count += 1;
             self.stretches.total_s += length as f64 / 1e9;
         }
-        self.stretches.longest_s.raise(length as f64 / 1e9, self.begin);
+        self.stretches.longest_s.raise_to(length as f64 / 1e9, self.begin);
     }
 
     /// Returns the number, total and longest of the stretches. Those of at least `saturated` ns count as saturated.
     pub(super) fn stretches(&self, saturated: u64) -> BusyStretches {
         let mut last = Self { stretches: self.stretches, ..Self::default() };
         (last.begin, last.end) = (self.begin, self.end);
-        last.close_stretch(saturated);
+        last.close_busy_stretch(saturated);
         last.stretches
     }
 }
@@ -84,7 +84,7 @@ mod tests {
     proptest! {
         #[test]
         fn the_most_is_that_of_every_span_that_ends_with_a_request(steps in proptest::collection::vec((0..30_u64, 1..9_u64), 1..80)) {
-            let mut window = Window::<50>::default();
+            let mut window = LoadWindow::<50>::default();
             let mut now = 0;
             let requested: Vec<_> = steps.into_iter().map(|(step, nanos)| { now += step; (now, nanos) }).collect();
             requested.iter().for_each(|&(at, nanos)| window.record_request(at, nanos));
@@ -98,7 +98,7 @@ mod tests {
     fn stretches_end_where_the_wire_is_free() {
         let mut busy = BusyTime::default();
         for (start, end) in [(10, 20), (20, 45), (50, 55), (60, 90), (90, 100)] {
-            busy.record(start, end, 30);
+            busy.record_transmission(start, end, 30);
         }
         let stretches = busy.stretches(30);
         assert_eq!((busy.total, stretches.count, stretches.longest_s.at_ns), (80, 2, 60));

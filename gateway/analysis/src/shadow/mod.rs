@@ -8,7 +8,7 @@
 //!
 //! A frame's time stamp is taken as the time of its sender's request, which is correct on a bus without bit rate (vcan,
 //! the embedded bus). Each sender has a transmit buffer for each of its identifiers. Memory is bounded: frames out of
-//! order are sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and at most [`MAX_QUEUE`] frames wait on a bus.
+//! order are sorted within [`REORDER_WINDOW_NS`] and [`MAX_WAITING_FRAMES`], and at most [`MAX_QUEUED_FRAMES`] frames wait on a bus.
 
 mod bus_timing;
 mod epochs;
@@ -31,14 +31,14 @@ use bus_model::{BitErrors, BitErrorsError};
 use bus_timing::{BusProperties, BusTiming};
 use reported::FrameTimings;
 
-pub use bus_timing::MAX_QUEUE;
-pub use phase::PAUSE_NS;
+pub use bus_timing::MAX_QUEUED_FRAMES;
+pub use phase::OPERATION_PAUSE_NS;
 pub use report::{
-    Answering, BusShadow, BusyStretches, Counts, Delays, KindDelays, Loads, Peak, Replies, ShadowReport,
-    StartUp,
+    AnsweringCounts, BusShadow, BusyStretches, DelayQuantiles, FrameCounts, KindDelays, Loads, Peak,
+    ReplyStatistics, ShadowReport, StartUpFigures,
 };
 pub use reported::FrameTiming;
-pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
+pub use trace::order::{MAX_WAITING_FRAMES, REORDER_WINDOW_NS};
 
 /// Duration without a pause from which a bus counts as saturated, in ns: the most common period of joints.
 pub const SATURATED_NS: u64 = 16_000_000;
@@ -86,10 +86,10 @@ impl ShadowOptions {
     fn bus_properties(&self, bus: &str) -> BusProperties {
         let named = self.rates_by_bus.iter().find(|(name, _)| name == bus);
         let rates = named.map_or(self.rates, |(_, rates)| *rates);
-        let described = self.skin.as_ref().and_then(|skin| Some((skin, skin.bus_named(bus)?)));
+        let described = self.skin.as_ref().and_then(|skin| Some((skin, skin.bus_index(bus)?)));
         let cells =
             described.map(|(skin, bus)| u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX));
-        let worst_case = described.and_then(|(skin, bus)| fit::worst_case(skin, bus, rates));
+        let worst_case = described.and_then(|(skin, bus)| fit::assess_worst_case(skin, bus, rates));
         let worst_case = worst_case.as_ref().map(FitSummary::worst_case);
         BusProperties { rates, cells, worst_case, bench_traffic: self.bench_traffic }
     }
@@ -131,7 +131,7 @@ impl Shadow {
         if let Some(reported) = &mut self.reported {
             let (id, extended) =
                 (frame.id() | frame.raw_id() & ERROR, frame.is_extended() || frame.is_error());
-            reported.add(FrameTiming { nanos, bus: bus_timing, id, extended, bits, sent: None });
+            reported.add_frame(FrameTiming { nanos, bus: bus_timing, id, extended, bits, sent: None });
         }
         let Some(bus_timing) = bus_timing.and_then(|bus_timing| self.bus_timings.get_mut(bus_timing)) else {
             self.further += 1;
@@ -139,7 +139,7 @@ impl Shadow {
         };
         bus_timing.count_frame(nanos);
         match bits {
-            Some(bits) => bus_timing.receive(nanos, frame, bits, place, self.reported.as_mut()),
+            Some(bits) => bus_timing.receive_frame(nanos, frame, bits, place, self.reported.as_mut()),
             None => bus_timing.counts.error_frames += 1,
         }
     }
@@ -172,7 +172,7 @@ impl Shadow {
 
     /// Returns the next frame in input order, once its transmission is known.
     pub fn poll(&mut self) -> Option<FrameTiming> {
-        self.reported.as_mut()?.poll()
+        self.reported.as_mut()?.poll_frame()
     }
 
     /// Returns the name of a bus, given its number in [`FrameTiming::bus`].
@@ -189,7 +189,7 @@ impl Shadow {
             frames_of_other_buses: self.further,
             bit_error_rate: self.options.bit_errors,
             has_times: self.has_times,
-            buses: self.bus_timings.iter().map(|bus| bus.report(self.has_times)).collect(),
+            buses: self.bus_timings.iter().map(|bus| bus.to_bus_shadow(self.has_times)).collect(),
         }
     }
 

@@ -3,20 +3,20 @@
 use model::quantiles::TimeHistogram;
 use protocol::id::{Id, Kind};
 
-use super::load::{BusyTime, Window};
-use super::report::{Delays, KindDelays, Loads, Peak, StartUp};
+use super::load::{BusyTime, LoadWindow};
+use super::report::{DelayQuantiles, KindDelays, Loads, Peak, StartUpFigures};
 use super::{SATURATED_NS, SECOND_NS};
 use crate::fit::traffic::RunEvent;
 
 /// Time without joints after which operation ends, in ns.
-pub const PAUSE_NS: u64 = SECOND_NS;
+pub const OPERATION_PAUSE_NS: u64 = SECOND_NS;
 /// Maximum time to the first joints of a capture that begins in the middle of a run, in ns: some periods of joints, and
 /// less than cells need to start.
 const MAX_FIRST_JOINTS_NS: u64 = 100_000_000;
 
 /// The phase in which a bus is.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Phase {
+pub(super) enum BusPhase {
     /// Cells claim node ids, are configured and build the tree. This phase lasts until the first joints, and begins
     /// again when no joints were sent for [`PAUSE_NS`].
     StartUp,
@@ -32,10 +32,10 @@ pub(super) struct ByPhase<T> {
 }
 
 impl<T> ByPhase<T> {
-    pub(super) const fn get_mut(&mut self, phase: Phase) -> &mut T {
+    pub(super) const fn get_mut(&mut self, phase: BusPhase) -> &mut T {
         match phase {
-            Phase::StartUp => &mut self.start_up,
-            Phase::Operation => &mut self.operation,
+            BusPhase::StartUp => &mut self.start_up,
+            BusPhase::Operation => &mut self.operation,
         }
     }
 }
@@ -52,7 +52,7 @@ pub(super) struct CaptureStart {
 }
 
 impl CaptureStart {
-    pub(super) fn record(&mut self, at: u64, says: RunEvent) {
+    pub(super) fn record_event(&mut self, at: u64, says: RunEvent) {
         let first = self.first.unwrap_or(at).min(at);
         self.first = Some(first);
         if self.joints.is_some() {
@@ -66,19 +66,19 @@ impl CaptureStart {
         }
     }
 
-    fn phase(&self, is_ours: bool) -> Phase {
+    fn phase(&self, is_ours: bool) -> BusPhase {
         let soon =
             self.joints.zip(self.first).is_some_and(|(joints, first)| joints - first < MAX_FIRST_JOINTS_NS);
         let in_the_middle = self.is_mid_run || self.is_answered || soon && !self.is_prepared;
-        if in_the_middle || !is_ours { Phase::Operation } else { Phase::StartUp }
+        if in_the_middle || !is_ours { BusPhase::Operation } else { BusPhase::StartUp }
     }
 }
 
 /// The present phase of a bus, and the duration of each phase so far.
 #[derive(Debug, Default)]
-pub(super) struct Phases {
+pub(super) struct PhaseTracker {
     pub(super) beginning: CaptureStart,
-    now: Option<Phase>,
+    now: Option<BusPhase>,
     /// The time in ns up to which the durations are counted.
     until: u64,
     joints: Option<u64>,
@@ -86,34 +86,35 @@ pub(super) struct Phases {
     pub(super) spans: ByPhase<u64>,
 }
 
-impl Phases {
+impl PhaseTracker {
     /// Returns the phase to which a frame belongs; `says` is the role of the frame in the run. Times never decrease.
-    pub(super) fn phase_at(&mut self, at: u64, says: RunEvent, is_ours: bool) -> Phase {
+    pub(super) fn phase_at(&mut self, at: u64, says: RunEvent, is_ours: bool) -> BusPhase {
         let mut now = *self.now.get_or_insert_with(|| {
             self.until = at;
             self.beginning.phase(is_ours)
         });
-        let over = self.joints.map(|joints| joints.saturating_add(PAUSE_NS)).filter(|&over| over < at);
-        if let (Phase::Operation, Some(over)) = (now, over) {
+        let over =
+            self.joints.map(|joints| joints.saturating_add(OPERATION_PAUSE_NS)).filter(|&over| over < at);
+        if let (BusPhase::Operation, Some(over)) = (now, over) {
             self.count_duration(now, over.max(self.until));
-            now = Phase::StartUp;
+            now = BusPhase::StartUp;
         }
         self.count_duration(now, at);
         if matches!(says, RunEvent::Joints(_)) {
-            now = Phase::Operation;
+            now = BusPhase::Operation;
             self.joints = Some(at);
         }
         self.now = Some(now);
         now
     }
 
-    fn count_duration(&mut self, phase: Phase, at: u64) {
+    fn count_duration(&mut self, phase: BusPhase, at: u64) {
         *self.spans.get_mut(phase) += at - self.until;
         self.until = at;
     }
 
-    pub(super) fn now(&self) -> Phase {
-        self.now.unwrap_or(Phase::StartUp)
+    pub(super) fn current_phase(&self) -> BusPhase {
+        self.now.unwrap_or(BusPhase::StartUp)
     }
 }
 
@@ -122,8 +123,8 @@ impl Phases {
 pub(super) struct PhaseFigures {
     pub(super) frames: u64,
     requested: u64,
-    in_16_ms: Window<SATURATED_NS>,
-    in_1_s: Window<SECOND_NS>,
+    in_16_ms: LoadWindow<SATURATED_NS>,
+    in_1_s: LoadWindow<SECOND_NS>,
     pub(super) busy: BusyTime,
     pub(super) all: TimeHistogram,
     kinds: [TimeHistogram; 8],
@@ -144,10 +145,10 @@ impl PhaseFigures {
 
     /// Records the number of frames that wait at `at`, in all and of one identifier.
     pub(super) fn record_queue(&mut self, at: u64, waiting: usize, of_one: Option<(u32, u16)>) {
-        self.queue.raise(waiting as f64, at);
+        self.queue.raise_to(waiting as f64, at);
         if let Some((queued, id)) = of_one.filter(|(queued, _)| f64::from(*queued) > self.queue_of_one.value)
         {
-            self.queue_of_one.raise(f64::from(queued), at);
+            self.queue_of_one.raise_to(f64::from(queued), at);
             self.queue_of_one_id = id;
         }
     }
@@ -159,10 +160,13 @@ impl PhaseFigures {
         kind.into_iter().for_each(|kind| kind.record(nanos));
     }
 
-    pub(super) fn kinds(&self) -> Vec<KindDelays> {
+    pub(super) fn kind_delays(&self) -> Vec<KindDelays> {
         let kinds = Kind::ALL.into_iter().zip(&self.kinds).filter(|(_, delay)| !delay.histogram().is_empty());
         kinds
-            .map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: Delays::from_times(delay) })
+            .map(|(kind, delay)| KindDelays {
+                kind: kind.name(),
+                delay_us: DelayQuantiles::from_times(delay),
+            })
             .collect()
     }
 
@@ -185,13 +189,13 @@ impl PhaseFigures {
     }
 
     /// Returns the figures of the start-up, which lasted `span` ns; `None` if it had no frames.
-    pub(super) fn start_up(&self, span: u64) -> Option<StartUp> {
-        (self.frames > 0).then(|| StartUp {
+    pub(super) fn start_up(&self, span: u64) -> Option<StartUpFigures> {
+        (self.frames > 0).then(|| StartUpFigures {
             frames: self.frames,
             duration_s: span as f64 / 1e9,
             load: self.loads(span, 0),
             stretches: self.busy.stretches(SATURATED_NS),
-            delay_us: Delays::from_times(&self.all),
+            delay_us: DelayQuantiles::from_times(&self.all),
         })
     }
 }

@@ -48,22 +48,22 @@ pub struct BusShadow {
     /// Load and verdict of the captured traffic; `None` without operation.
     pub this_run: Option<FitSummary>,
     /// The numbers of cells that answered, if the bus carries this project's protocol.
-    pub answering: Option<Answering>,
+    pub answering: Option<AnsweringCounts>,
     /// The figures of the start-up: the traffic before the first joints, and after a second without joints.
-    pub start_up: Option<StartUp>,
+    pub start_up: Option<StartUpFigures>,
     /// The counts of frames.
     #[serde(flatten)]
-    pub counts: Counts,
+    pub counts: FrameCounts,
     /// The requested load of the bus.
     pub load: Loads,
     /// Stretches in which the bus carries frames without a pause.
     pub stretches: BusyStretches,
     /// Delays from the request of a frame to the end of its intermission, in µs, over all frames.
-    pub delay_us: Delays,
+    pub delay_us: DelayQuantiles,
     /// Delays by kind; empty if the bus carries another protocol.
     pub kinds: Vec<KindDelays>,
     /// Counts and times of answers to joints, if the bus carries this project's protocol.
-    pub replies: Option<Replies>,
+    pub replies: Option<ReplyStatistics>,
     /// The largest number of frames that waited to be sent.
     pub queue: Peak,
     /// The largest number of frames of one 11-bit identifier that waited to be sent.
@@ -74,7 +74,7 @@ pub struct BusShadow {
 
 /// Counts of the frames of a bus.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Counts {
+pub struct FrameCounts {
     /// Frames that were sent in the model.
     pub sent: u64,
     /// Frames that only a bench sends, by kind.
@@ -97,7 +97,7 @@ pub struct Counts {
 
 /// The figures of a bus's start-up, in which cells claim node ids, are configured and build the tree.
 #[derive(Clone, Copy, Debug, Serialize)]
-pub struct StartUp {
+pub struct StartUpFigures {
     /// Number of frames in the start-up.
     pub frames: u64,
     /// Duration of the start-up in s.
@@ -107,7 +107,7 @@ pub struct StartUp {
     /// Stretches in which the bus carries frames without a pause.
     pub stretches: BusyStretches,
     /// Delays from the request of a frame to the end of its intermission, in µs.
-    pub delay_us: Delays,
+    pub delay_us: DelayQuantiles,
 }
 
 /// The shares of the bus's time that frames request, including stuff bits and intermissions. A bus cannot carry a load
@@ -135,7 +135,7 @@ pub struct Peak {
 
 impl Peak {
     /// Replaces the maximum if a value exceeds it.
-    pub(super) fn raise(&mut self, value: f64, at_ns: u64) {
+    pub(super) fn raise_to(&mut self, value: f64, at_ns: u64) {
         if value > self.value {
             *self = Self { value, at_ns };
         }
@@ -155,7 +155,7 @@ pub struct BusyStretches {
 
 /// Quantiles of a duration, in µs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Delays {
+pub struct DelayQuantiles {
     /// Number of values.
     pub count: u64,
     /// Median.
@@ -172,12 +172,12 @@ pub struct KindDelays {
     /// Name of the kind.
     pub kind: &'static str,
     /// Delays of its frames from request to end, in µs.
-    pub delay_us: Delays,
+    pub delay_us: DelayQuantiles,
 }
 
 /// The number of cells that answered joints, over all epochs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Answering {
+pub struct AnsweringCounts {
     /// Number of joints that were sent while cells were not halted.
     pub epochs: u64,
     /// Number of joints that were sent while cells were halted.
@@ -192,7 +192,7 @@ pub struct Answering {
     pub described: bool,
 }
 
-impl Answering {
+impl AnsweringCounts {
     /// Returns the numbers in the form that a verdict uses.
     #[must_use]
     pub const fn cells(&self) -> AnsweringCells {
@@ -202,7 +202,7 @@ impl Answering {
 
 /// Counts and times of answers to joints.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct Replies {
+pub struct ReplyStatistics {
     /// Number of answers.
     pub count: u64,
     /// Answers that came after the next joints in the recording itself.
@@ -213,12 +213,12 @@ pub struct Replies {
     /// Late answers that cells began to send only in the last eighth of the period, so that the bus is not the cause.
     pub late_when_ready: u64,
     /// Times from the request of joints to the end of each answer, in µs.
-    pub after_joints_us: Delays,
+    pub after_joints_us: DelayQuantiles,
 }
 
-impl Delays {
+impl DelayQuantiles {
     pub(super) fn from_times(times: &TimeHistogram) -> Self {
-        let (histogram, most) = (times.histogram(), times.longest());
+        let (histogram, most) = (times.histogram(), times.longest_ns());
         let micros = |nanos: u64| nanos as f64 / 1e3;
         let quantile = |share| micros(histogram.value_at_quantile(share).min(most));
         Self { count: histogram.len(), p50: quantile(0.5), p99: quantile(0.99), max: micros(most) }

@@ -24,7 +24,7 @@ pub struct FrameTiming {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Entry {
+struct FrameEntry {
     shaded: FrameTiming,
     is_open: bool,
 }
@@ -32,28 +32,28 @@ struct Entry {
 /// Frames whose transmission, or that of an earlier frame, is still unknown.
 #[derive(Debug, Default)]
 pub(super) struct FrameTimings {
-    entries: VecDeque<Entry>,
+    entries: VecDeque<FrameEntry>,
     /// Index in the input of the first entry.
     first: u64,
 }
 
 impl FrameTimings {
     /// Adds a frame. If it has bits, its transmission is still unknown.
-    pub(super) fn add(&mut self, shaded: FrameTiming) {
-        self.entries.push_back(Entry { shaded, is_open: shaded.bits.is_some() });
+    pub(super) fn add_frame(&mut self, shaded: FrameTiming) {
+        self.entries.push_back(FrameEntry { shaded, is_open: shaded.bits.is_some() });
     }
 
     /// Marks a frame as one that a real bus does not carry.
     pub(super) fn mark_omitted(&mut self, place: u64) {
-        self.settle_frame(place, |shaded| shaded.bits = None);
+        self.complete_frame(place, |shaded| shaded.bits = None);
     }
 
     /// Records when a frame was sent; `None` if it was not sent.
     pub(super) fn record_sent(&mut self, place: u64, sent: Option<(u64, u64)>) {
-        self.settle_frame(place, |shaded| shaded.sent = sent);
+        self.complete_frame(place, |shaded| shaded.sent = sent);
     }
 
-    fn settle_frame(&mut self, place: u64, change: impl FnOnce(&mut FrameTiming)) {
+    fn complete_frame(&mut self, place: u64, change: impl FnOnce(&mut FrameTiming)) {
         let index = usize::try_from(place - self.first).ok();
         if let Some(entry) = index.and_then(|index| self.entries.get_mut(index)) {
             change(&mut entry.shaded);
@@ -65,7 +65,7 @@ impl FrameTimings {
         self.entries.iter_mut().for_each(|entry| entry.is_open = false);
     }
 
-    pub(super) fn poll(&mut self) -> Option<FrameTiming> {
+    pub(super) fn poll_frame(&mut self) -> Option<FrameTiming> {
         let shaded = self.entries.front().filter(|entry| !entry.is_open)?.shaded;
         self.entries.pop_front();
         self.first += 1;

@@ -6,12 +6,12 @@ use std::collections::BTreeMap;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
 use serde::Serialize;
 
-use super::{TimedCount, seconds};
+use super::{TimedCount, nanos_to_seconds};
 use model::decode::ForeignReason;
-use protocol::packet::{Length, Lengths, PacketError, data_id};
+use protocol::packet::{Length, Lengths, PacketError, data_frame_id};
 
 /// Maximum number of identifiers of a bus that are counted separately. Frames with further identifiers share one count.
-const MAX_IDENTIFIERS: usize = 4096;
+const MAX_COUNTED_IDENTIFIERS: usize = 4096;
 
 /// The type of a foreign frame.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
@@ -100,14 +100,14 @@ impl ForeignCounter {
         let wrong_crc = u64::from(matches!(why, ForeignReason::Data(PacketError::Crc { .. })));
         self.checked_groups += match why {
             ForeignReason::Data(PacketError::Crc { .. }) => 1,
-            ForeignReason::Data(PacketError::Incomplete) => completed_lengths(frame),
+            ForeignReason::Data(PacketError::Incomplete) => completed_length_count(frame),
             ForeignReason::Data(_)
             | ForeignReason::Extended
             | ForeignReason::Remote
             | ForeignReason::Error(_) => 0,
         };
         let key = (of, frame.raw_id());
-        if self.identifiers.len() == MAX_IDENTIFIERS && !self.identifiers.contains_key(&key) {
+        if self.identifiers.len() == MAX_COUNTED_IDENTIFIERS && !self.identifiers.contains_key(&key) {
             self.others += 1;
             return;
         }
@@ -148,15 +148,15 @@ impl ForeignCounter {
 }
 
 /// Returns the number of different packet lengths that a classic frame can be the last segment of.
-fn completed_lengths(frame: &Frame) -> u64 {
-    let ends = |length: &Length| length.last_segment() == frame.data().len();
-    data_id(frame).map_or(0, |id| Lengths::for_id(id).iter().filter(ends).count() as u64)
+fn completed_length_count(frame: &Frame) -> u64 {
+    let ends = |length: &Length| length.last_segment_bytes() == frame.data().len();
+    data_frame_id(frame).map_or(0, |id| Lengths::for_id(id).iter().filter(ends).count() as u64)
 }
 
 impl IdentifierCounts {
     fn report(&self, of: FrameType, raw_id: u32, earliest: u64) -> ForeignId {
         let Self { count, bytes, wrong_crc } = *self;
-        let since = |nanos: u64| seconds(nanos.saturating_sub(earliest));
+        let since = |nanos: u64| nanos_to_seconds(nanos.saturating_sub(earliest));
         ForeignId {
             id: match of {
                 FrameType::Error => format!("{:08X}", raw_id & (ERROR | EXTENDED_MASK)),

@@ -9,7 +9,7 @@ use protocol::port;
 /// A capture under construction.
 #[derive(Default)]
 struct Tape {
-    stats: Stats,
+    stats: CaptureStats,
     settler: Option<OrderedDecoder<(u64, String, Frame)>>,
     ms: u64,
 }
@@ -73,7 +73,7 @@ fn joints_that_are_missing_or_come_again_are_counted_around_the_corner() {
     for epoch in [254, 255, 1, 1, 4, 0] {
         tape.joints(epoch);
     }
-    let expected = Epochs { first: Some(254), last: Some(0), missing: 1 + 2, repeated: 1, jumps: 1 };
+    let expected = EpochStatistics { first: Some(254), last: Some(0), missing: 1 + 2, repeated: 1, jumps: 1 };
     assert_eq!(tape.bus().epochs, expected);
     let joints = KindReport { kind: "joints", packets: 6, packets_per_s: Some(1_000.0), span_s: 0.005 };
     assert_eq!(tape.bus().kinds, [joints]);
@@ -130,11 +130,11 @@ fn what_a_cell_counts_and_is_not_here_is_lost() {
     tape.torque(1, 7);
     tape.heartbeat(1, 0, State::CONFIGURED);
     assert_eq!(tape.cell().lost, 0);
-    tape.heartbeat(1, 4, State::CONFIGURED.with(State::ACTIVE, true));
+    tape.heartbeat(1, 4, State::CONFIGURED.with_flags(State::ACTIVE, true));
     let cell = tape.cell();
     assert_eq!((cell.lost, cell.heartbeats, cell.refused, cell.restarts), (3, 3, Some(3), 0));
     assert_eq!(cell.state, ["configured", "active"]);
-    tape.heartbeat(1, 0, State::CLAIMING);
+    tape.heartbeat(1, 0, State::CLAIMING_NODE_ID);
     tape.heartbeat(1, 1, State::CONFIGURED);
     let cell = tape.cell();
     assert_eq!((cell.lost, cell.restarts), (3, 1));
@@ -226,7 +226,7 @@ fn memory_is_bounded_whatever_buses_a_capture_names() {
 
 #[test]
 fn a_rate_needs_two_times_of_its_own_bus() {
-    let mut stats = Stats::default();
+    let mut stats = CaptureStats::default();
     let frame = Frame::classic(0x7F0, &[1]).unwrap();
     for (bus, nanos) in [("a", 5), ("b", 7), ("a", 5), ("a", 5), ("b", 1_000_000_007)] {
         let mut settler = OrderedDecoder::new(None);
@@ -236,7 +236,7 @@ fn a_rate_needs_two_times_of_its_own_bus() {
         let time = Timestamp::with_nine_digits(nanos);
         stats.record(&Record { time, interface: bus, frame, direction: None }, &decoded);
     }
-    let rates = |stats: &Stats| {
+    let rates = |stats: &CaptureStats| {
         let rate =
             |bus: &BusReport| (bus.frames_per_s.is_some(), bus.foreign.identifiers[0].frames_per_s.is_some());
         stats.report().buses.iter().map(rate).collect::<Vec<_>>()
@@ -281,7 +281,7 @@ fn a_claim_of_an_owned_node_id_is_no_restart_and_no_loss() {
         tape.joints(1);
         tape.torque(1, 7);
         if intruded {
-            tape.page(Heartbeat { serial: 9, state: State::CLAIMING, ..Heartbeat::default() });
+            tape.page(Heartbeat { serial: 9, state: State::CLAIMING_NODE_ID, ..Heartbeat::default() });
         }
         tape.joints(2);
         tape.joints(3);
@@ -302,7 +302,7 @@ fn a_claim_of_an_owned_node_id_is_no_restart_and_no_loss() {
 #[test]
 fn a_claim_before_the_first_packet_of_the_owner_is_no_restart() {
     let mut tape = Tape::default();
-    tape.page(Heartbeat { serial: 9, state: State::CLAIMING, ..Heartbeat::default() });
+    tape.page(Heartbeat { serial: 9, state: State::CLAIMING_NODE_ID, ..Heartbeat::default() });
     for sent in [40, 41] {
         tape.page(Heartbeat { serial: 7, sent, ..Heartbeat::default() });
     }

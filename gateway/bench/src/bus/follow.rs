@@ -24,7 +24,7 @@ use protocol::id::CellId;
 use super::roots::RootWires;
 
 /// Pause while an interface is down.
-const DOWN_PAUSE: Duration = Duration::from_millis(50);
+const INTERFACE_DOWN_PAUSE: Duration = Duration::from_millis(50);
 /// Interval between attempts to reopen a bus that is gone.
 const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -42,9 +42,9 @@ pub trait BusSource {
 
 /// A source that never reopens its bus: its follower ends when the bus is gone.
 #[derive(Debug)]
-pub struct OpenedOnce<'a>(pub &'a Bus);
+pub struct NeverReopenedBus<'a>(pub &'a Bus);
 
-impl BusSource for OpenedOnce<'_> {
+impl BusSource for NeverReopenedBus<'_> {
     fn bus(&self) -> Option<&Bus> {
         Some(self.0)
     }
@@ -135,11 +135,11 @@ impl Follower {
         };
         let mut timeout = wait;
         if let Some(roots) = &mut self.roots {
-            roots.send_due(bus);
-            timeout = wait.min(roots.timeout());
+            roots.send_due_messages(bus);
+            timeout = wait.min(roots.next_message_timeout());
         }
         if matches!(self.state, FollowState::Draining) {
-            return self.drain(|inbox| bus.receive(inbox));
+            return self.drain_frames(|inbox| bus.receive(inbox));
         }
         // A full inbox has more frames behind it: do not wait.
         if (1..MAX_BATCH_DATAGRAMS).contains(&self.inbox.frames().len()) {
@@ -169,8 +169,8 @@ impl Follower {
 
     /// Number of frames that all sockets of this bus dropped because they were not read in time.
     #[must_use]
-    pub fn dropped(&self) -> u64 {
-        self.dropped_before + u64::from(self.inbox.dropped())
+    pub fn dropped_frames(&self) -> u64 {
+        self.dropped_before + u64::from(self.inbox.dropped_count())
     }
 
     /// Returns true if the bus has failed and has neither been reopened nor delivered a frame since.
@@ -186,9 +186,9 @@ impl Follower {
                 self.state = FollowState::Working;
                 FollowStep::Frames(count)
             }
-            Err(error) if !error.is_temporary() => self.enter_gone(error),
+            Err(error) if !error.is_temporary() => self.enter_gone_state(error),
             Err(_) if matches!(self.state, FollowState::Lost) => {
-                thread::sleep(DOWN_PAUSE);
+                thread::sleep(INTERFACE_DOWN_PAUSE);
                 FollowStep::Nothing
             }
             Err(error) => {
@@ -200,16 +200,16 @@ impl Follower {
     }
 
     /// Reads frames that were received before the loss of the bus. They do not show that the bus works again.
-    fn drain(&mut self, receive: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> FollowStep {
+    fn drain_frames(&mut self, receive: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> FollowStep {
         // Pause before the first read, so that frames that are under way arrive.
         if self.inbox.frames().len() == 0 {
-            thread::sleep(DOWN_PAUSE);
+            thread::sleep(INTERFACE_DOWN_PAUSE);
         }
         self.inbox.clear();
         match receive(&mut self.inbox) {
             Ok(count @ 1..) => FollowStep::Leftover(count),
             // An interface goes down before it is removed; both events are reported once.
-            Err(error) if !error.is_temporary() => self.enter_gone(error),
+            Err(error) if !error.is_temporary() => self.enter_gone_state(error),
             Ok(0) | Err(_) => {
                 self.state = FollowState::Lost;
                 FollowStep::Drained
@@ -217,7 +217,7 @@ impl Follower {
         }
     }
 
-    fn enter_gone(&mut self, error: BusError) -> FollowStep {
+    fn enter_gone_state(&mut self, error: BusError) -> FollowStep {
         self.inbox.clear();
         self.last_refusal.clear();
         self.state = FollowState::Gone { retry: None };
@@ -235,7 +235,7 @@ impl Follower {
         }
         match source.reopen() {
             Ok(()) => {
-                self.dropped_before += u64::from(self.inbox.dropped());
+                self.dropped_before += u64::from(self.inbox.dropped_count());
                 self.inbox = Inbox::new();
                 self.state = FollowState::Working;
                 FollowStep::Nothing
@@ -243,7 +243,7 @@ impl Follower {
             Err(error) => {
                 self.state = FollowState::Gone { retry: Some(now + REOPEN_INTERVAL) };
                 let why = error.to_string();
-                let is_new = !is_absent(&error) && self.last_refusal != why;
+                let is_new = !is_bus_absent(&error) && self.last_refusal != why;
                 self.last_refusal = why;
                 if is_new { FollowStep::Refused(error) } else { FollowStep::Nothing }
             }
@@ -252,7 +252,7 @@ impl Follower {
 }
 
 /// Returns true if the error means that the bus does not exist, false if it exists and does not open.
-const fn is_absent(error: &BusError) -> bool {
+const fn is_bus_absent(error: &BusError) -> bool {
     matches!(
         error,
         BusError::NoInterface { .. }
@@ -297,9 +297,9 @@ mod tests {
         assert!(matches!(follower.receive(|_| Ok(3)), FollowStep::Frames(3)));
         assert!(!follower.is_lost());
         assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Down(_)));
-        assert!(matches!(follower.drain(|_| Ok(2)), FollowStep::Leftover(2)));
+        assert!(matches!(follower.drain_frames(|_| Ok(2)), FollowStep::Leftover(2)));
         assert!(follower.is_lost());
-        assert!(matches!(follower.drain(|_| Ok(0)), FollowStep::Drained));
+        assert!(matches!(follower.drain_frames(|_| Ok(0)), FollowStep::Drained));
         assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Nothing), "it was reported");
         assert!(matches!(follower.receive(|_| Ok(0)), FollowStep::Nothing));
         assert!(follower.is_lost(), "silence is no sign that it works");
@@ -312,10 +312,10 @@ mod tests {
     fn an_interface_that_is_removed_goes_down_before() {
         let mut follower = Follower::default();
         assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Down(_)));
-        assert!(matches!(follower.drain(|_| Err(gone())), FollowStep::Gone(_)));
+        assert!(matches!(follower.drain_frames(|_| Err(gone())), FollowStep::Gone(_)));
         let mut follower = Follower::default();
         assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Down(_)));
-        assert!(matches!(follower.drain(|_| Err(down())), FollowStep::Drained));
+        assert!(matches!(follower.drain_frames(|_| Err(down())), FollowStep::Drained));
         assert!(matches!(follower.receive(|_| Err(gone())), FollowStep::Gone(_)), "after it is down as well");
     }
 

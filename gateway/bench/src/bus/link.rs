@@ -53,7 +53,7 @@ impl SharedBus {
         let link = Arc::new(Self {
             name: bus.name().to_owned(),
             kind: bus.kind(),
-            receive_buffer: bus.receive_buffer(),
+            receive_buffer: bus.receive_buffer_bytes(),
             state: Arc::default(),
             target,
             bus: Mutex::new(Arc::clone(&bus)),
@@ -135,7 +135,7 @@ pub struct Outages {
 
 impl Outages {
     /// Starts an outage at `now`, unless one has started already.
-    pub fn begin(&mut self, now: Instant) {
+    pub fn begin_outage(&mut self, now: Instant) {
         if self.lost_since.is_none() {
             self.count += 1;
             self.lost_since = Some(now);
@@ -143,16 +143,16 @@ impl Outages {
     }
 
     /// Ends the present outage at `now`.
-    pub fn end(&mut self, now: Instant) {
+    pub fn end_outage(&mut self, now: Instant) {
         self.past_losses +=
             self.lost_since.take().map_or(Duration::ZERO, |since| now.saturating_duration_since(since));
     }
 
     /// Total lost time up to `now`, including the present outage.
     #[must_use]
-    pub fn total_lost(&self, now: Instant) -> Duration {
+    pub fn total_lost_time(&self, now: Instant) -> Duration {
         let mut until_now = *self;
-        until_now.end(now);
+        until_now.end_outage(now);
         until_now.past_losses
     }
 
@@ -171,17 +171,17 @@ mod tests {
     fn outages_are_counted_and_added_up_including_the_present_one() {
         let (start, second) = (Instant::now(), Duration::from_secs(1));
         let mut outages = Outages::default();
-        outages.end(start);
+        outages.end_outage(start);
         assert_eq!(outages, Outages::default());
-        outages.begin(start);
-        outages.begin(start + second);
-        outages.end(start + 2 * second);
-        outages.begin(start + 5 * second);
+        outages.begin_outage(start);
+        outages.begin_outage(start + second);
+        outages.end_outage(start + 2 * second);
+        outages.begin_outage(start + 5 * second);
         assert_eq!(
-            (outages.count, outages.total_lost(start + 6 * second), outages.is_ongoing()),
+            (outages.count, outages.total_lost_time(start + 6 * second), outages.is_ongoing()),
             (2, 3 * second, true)
         );
-        outages.end(start + 9 * second);
-        assert_eq!((outages.total_lost(start + 99 * second), outages.is_ongoing()), (6 * second, false));
+        outages.end_outage(start + 9 * second);
+        assert_eq!((outages.total_lost_time(start + 99 * second), outages.is_ongoing()), (6 * second, false));
     }
 }

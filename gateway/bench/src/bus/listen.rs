@@ -16,7 +16,7 @@ use super::realtime::wall_clock_ns;
 ///
 /// # Errors
 /// Returns [`BusError`] if the bus cannot be opened.
-pub fn open(
+pub fn open_bus(
     name: &str,
     kind: KindChoice,
     format: Option<Format>,
@@ -41,7 +41,7 @@ pub fn now() -> Micros {
 ///
 /// # Errors
 /// Returns [`BusError`] if the bus refuses the frames.
-pub fn send(bus: &Bus, message: &Message, format: Format) -> Result<(), BusError> {
+pub fn send_message(bus: &Bus, message: &Message, format: Format) -> Result<(), BusError> {
     let frames: Vec<Frame> = message.encode().frames(format).collect();
     bus.send(&frames).map_err(BusError::from)
 }
@@ -69,8 +69,8 @@ impl Listener {
 
     /// Number of frames lost because they arrived faster than this program read them.
     #[must_use]
-    pub const fn dropped(&self) -> u32 {
-        self.inbox.dropped()
+    pub const fn dropped_frames(&self) -> u32 {
+        self.inbox.dropped_count()
     }
 
     /// Receives the frames that are waiting or arrive within `wait`. Returns true if there are any.
@@ -87,7 +87,7 @@ impl Listener {
     }
 
     /// The frames received last, decoded.
-    pub fn decoded(&mut self) -> impl Iterator<Item = (ReceivedFrame, Decoded)> + '_ {
+    pub fn decoded_frames(&mut self) -> impl Iterator<Item = (ReceivedFrame, Decoded)> + '_ {
         let Self { bus, inbox, decoder } = self;
         inbox.frames().map(|received| {
             let at = Micros(received.at_nanos / 1_000);
@@ -101,7 +101,10 @@ impl Listener {
 ///
 /// # Errors
 /// Returns all other errors.
-pub fn tolerate_transient<T>(done: Result<T, BusError>, pause: Duration) -> Result<Option<T>, BusError> {
+pub fn tolerate_transient_error<T>(
+    done: Result<T, BusError>,
+    pause: Duration,
+) -> Result<Option<T>, BusError> {
     match done {
         Ok(done) => Ok(Some(done)),
         Err(error) if error.is_temporary() => {

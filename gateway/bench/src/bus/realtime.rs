@@ -22,7 +22,7 @@ const CONTROL_LOOP_PRIORITY: i32 = 40;
 const RECEIVER_PRIORITY: i32 = 30;
 
 /// Number of wake-ups measured on the idle machine.
-const IDLE_WAKEUPS: u32 = 100;
+const MEASURED_IDLE_WAKEUPS: u32 = 100;
 
 /// Privileges that the machine granted to a thread.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -52,7 +52,7 @@ pub(crate) fn prepare_receiver() {
 
 /// Monotonic clock in ns.
 #[must_use]
-pub fn now() -> u64 {
+pub fn monotonic_ns() -> u64 {
     let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Monotonic);
     u64::try_from(tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(tv_nsec).unwrap_or(0)
 }
@@ -78,12 +78,12 @@ pub(crate) fn sleep_until(deadline: u64) {
 pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
     let measure = move || {
         request_realtime();
-        let (mut histogram, mut deadline) = (histogram(), now());
-        for _ in 0..IDLE_WAKEUPS {
+        let (mut histogram, mut deadline) = (histogram(), monotonic_ns());
+        for _ in 0..MEASURED_IDLE_WAKEUPS {
             deadline += period_ns;
             sleep_until(deadline);
             // The histogram resizes itself, so recording cannot fail.
-            let _ = histogram.record(now().saturating_sub(deadline));
+            let _ = histogram.record(monotonic_ns().saturating_sub(deadline));
         }
         histogram
     };
@@ -92,23 +92,23 @@ pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
 }
 
 /// Runs `ticks` ticks, or fewer if the loop is stopped. Skips whole periods that were missed; never resets the phase.
-pub fn run(
+pub fn run_ticks(
     turn: &mut TickDriver,
     shared: &SharedRunState,
     period_ns: u64,
     ticks: u64,
     mut send: impl FnMut(usize, &[Frame]) -> bool,
 ) {
-    let start = now() + period_ns;
+    let start = monotonic_ns() + period_ns;
     let mut number = 0;
     while number < ticks && !shared.stop_loop.load(Ordering::Relaxed) {
         let mut due = start + number * period_ns;
         sleep_until(due);
-        let skipped = now().saturating_sub(due) / period_ns;
+        let skipped = monotonic_ns().saturating_sub(due) / period_ns;
         number += skipped;
         due += skipped * period_ns;
         let tick = Tick { number, time: Micros((due - start) / 1_000) };
-        turn.run_tick(tick, skipped, due, now, &mut send);
+        turn.run_tick(tick, skipped, due, monotonic_ns, &mut send);
         number += 1;
     }
 }

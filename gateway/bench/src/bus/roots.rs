@@ -28,7 +28,7 @@ pub struct RootWires {
 /// their own torques.
 fn root_links(skin: &Skin, bus: usize) -> Vec<(CellId, LinkId)> {
     let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != SkinReply::Torque);
-    if sums { skin.wires(bus).roots().collect() } else { Vec::new() }
+    if sums { skin.wires(bus).roots_with_link_ids().collect() } else { Vec::new() }
 }
 
 /// Selection of the frames that a gateway receives from a bus.
@@ -100,22 +100,22 @@ impl RootWires {
     pub fn uplink_changes(&mut self) -> impl Iterator<Item = (CellId, bool)> {
         let uplinks = &self.uplinks;
         self.roots.iter_mut().enumerate().filter_map(|(place, (root, _, feeds))| {
-            let now = uplinks.is_child(place);
+            let now = uplinks.is_gateway_child(place);
             (core::mem::replace(feeds, now) != now).then_some((*root, now))
         })
     }
 
     fn now(&self) -> Micros {
-        Micros::since_start(self.began.elapsed())
+        Micros::from_elapsed(self.began.elapsed())
     }
 
     /// Handles a frame from the bus. Returns true if it was a wire frame, which only this type handles.
     pub fn handle_frame(&mut self, frame: &Frame) -> bool {
         let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
-            if let Ok(Id { kind: Kind::Network, node }) = packet::data_id(frame)
+            if let Ok(Id { kind: Kind::Network, node }) = packet::data_frame_id(frame)
                 && let Node::Cell(cell) = Node::from_byte(node)
             {
-                self.uplinks.mark_used(cell);
+                self.uplinks.mark_node_id_used(cell);
             }
             return false;
         };
@@ -130,7 +130,7 @@ impl RootWires {
     }
 
     /// Sends the messages that are due on the wires to the roots.
-    pub fn send_due(&mut self, bus: &Bus) {
+    pub fn send_due_messages(&mut self, bus: &Bus) {
         if !self.is_sending {
             return;
         }
@@ -146,7 +146,7 @@ impl RootWires {
 
     /// Returns the time in which the next message on the wires becomes due, if no frame arrives before.
     #[must_use]
-    pub fn timeout(&self) -> Duration {
+    pub fn next_message_timeout(&self) -> Duration {
         if !self.is_sending {
             return Duration::MAX;
         }
@@ -163,7 +163,7 @@ mod tests {
     use protocol::port::{Hello, TreeRank};
 
     fn skin(reply: &str) -> Skin {
-        let head = model::testing::SKIN.replace("reply = \"torque\"", reply);
+        let head = model::testing::ONE_CELL_SKIN_TOML.replace("reply = \"torque\"", reply);
         let (head, cell) = head.split_at(head.find("[[cell]]").unwrap());
         let second = cell.replace("node = 1", "node = 2\nneighbors = [1, 0, 0, 0]");
         let first = cell.replace("node = 1", "node = 1\nroot = true\nneighbors = [2, 0, 0, 0]");

@@ -7,7 +7,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use protocol::bus::{Bus, BusError, BusOptions, KindChoice};
 use thiserror::Error;
 
-use crate::processes::{LaunchError, isolate, program_path, spawn, wait_or_kill};
+use crate::processes::{LaunchError, isolate_process_group, program_path, spawn, wait_or_kill};
 
 /// An embedded bus in a process of its own, which removes its socket even if the gateway is killed.
 #[derive(Debug)]
@@ -31,7 +31,7 @@ impl ServedBus {
     fn spawn_server(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
         let mut command = Command::new(program);
         command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
-        isolate(&mut command, directory);
+        isolate_process_group(&mut command, directory);
         Ok(Self { bus: bus.to_owned(), child: spawn(&mut command)? })
     }
 
@@ -56,7 +56,7 @@ impl ServedBus {
 
     /// Name under which the bus is served: [`protocol::bus::BusKind::served_name`].
     #[must_use]
-    pub fn bus(&self) -> &str {
+    pub fn bus_name(&self) -> &str {
         &self.bus
     }
 
@@ -90,7 +90,7 @@ pub type BusTarget<'a> = (&'a str, KindChoice, BusOptions);
 
 /// Action for a bus that exists neither as an interface nor as an embedded bus, if its kind is [`KindChoice::Auto`].
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum IfAbsent {
+pub enum AbsentBusAction {
     /// Serve a new embedded bus, because this program starts all its cells.
     Create,
     /// Return an error, because the cells are expected on a bus that exists already.
@@ -105,7 +105,7 @@ pub fn open_or_serve(
     name: &str,
     kind: KindChoice,
     target: &BusOptions,
-    absent: IfAbsent,
+    absent: AbsentBusAction,
 ) -> Result<(Bus, Option<ServedBus>), ServeError> {
     let (opened, mut served) = open_or_serve_all(&[(name, kind, target.clone())], absent)?;
     let bus = opened.into_iter().next().ok_or_else(|| BusError::Name(name.to_owned()))?;
@@ -118,13 +118,13 @@ pub fn open_or_serve(
 /// Returns [`ServeError`] if a bus does not open or cannot be served.
 pub fn open_or_serve_all(
     buses: &[BusTarget<'_>],
-    absent: IfAbsent,
+    absent: AbsentBusAction,
 ) -> Result<(Vec<Bus>, Vec<ServedBus>), ServeError> {
     let mut begun = Vec::with_capacity(buses.len());
     for (name, kind, target) in buses {
         let opened = Bus::open(name, *kind, target);
         let is_served = matches!(opened, Err(BusError::NotServed { .. }))
-            || (absent == IfAbsent::Create && matches!(opened, Err(BusError::Absent { .. })));
+            || (absent == AbsentBusAction::Create && matches!(opened, Err(BusError::Absent { .. })));
         begun.push(match opened {
             Err(_) if is_served => {
                 let program = program_path("vcan-setup")?;

@@ -8,7 +8,7 @@ use protocol::input;
 use thiserror::Error;
 
 /// Address range of the emulated microcontroller's flash.
-const FLASH: std::ops::Range<u64> = 0..256 << 10;
+const FLASH_ADDRESSES: std::ops::Range<u64> = 0..256 << 10;
 
 /// Size limit of a firmware file in bytes; a firmware with full debug information has 4 MB.
 const MAX_FILE_BYTES: u64 = 64 << 20;
@@ -76,7 +76,7 @@ impl Firmware {
         let Some(section) = elf.section_by_name(factory::SECTION) else {
             return Err(FirmwareError::NoCell { path });
         };
-        if !FLASH.contains(&section.address()) {
+        if !FLASH_ADDRESSES.contains(&section.address()) {
             return Err(FirmwareError::OtherBoard { path });
         }
         let record = section.file_range().filter(|(_, len)| *len == factory::RECORD_BYTES as u64);

@@ -32,7 +32,7 @@ pub(super) struct PlannedSlcanLines {
 
 impl PlannedSlcanLines {
     /// Adds a line to a bus: its socket and the filters of its cell.
-    pub(super) fn add(&mut self, bus: &str, kind: KindChoice, socket: PathBuf, filters: Vec<Filter>) {
+    pub(super) fn add_line(&mut self, bus: &str, kind: KindChoice, socket: PathBuf, filters: Vec<Filter>) {
         let line = LineOptions { filters, ..LineOptions::new(LineAddress::Unix(socket)) };
         self.by_bus.entry(bus.to_owned()).or_insert((kind, Vec::new())).1.push(line);
     }

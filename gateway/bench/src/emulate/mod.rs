@@ -177,19 +177,19 @@ impl<'a> Emulator<'a> {
         let mut planned = PlannedSlcanLines::default();
         for cell in self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell)) {
             let place = CellFiles::for_cell(bench, files.path(), cell)?;
-            let factory = factory(bench.skin, cell);
+            let factory = factory_record(bench.skin, cell);
             fs::write(&place.program, self.firmware.image_for_cell(&factory)).map_err(EmulateError::Files)?;
             let log = File::create(&place.log).map_err(EmulateError::Files)?;
             let name = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
-            processes.emulate(cell, name, self.command(&place, log), &place.log)?;
-            planned.add(name, bench.kinds.kind_of(name), place.socket, filters(cell, &factory));
+            processes.start_emulator(cell, name, self.emulator_command(&place, log), &place.log)?;
+            planned.add_line(name, bench.kinds.kind_of(name), place.socket, cell_filters(cell, &factory));
         }
         let _lines = planned.connect_to_buses(bench.directory)?;
         Ok(Emulation { _lines, _files: files, _flash })
     }
 
     /// Returns the command that starts an emulator. The emulator then waits for its slcan line.
-    fn command(&self, place: &CellFiles, log: File) -> Command {
+    fn emulator_command(&self, place: &CellFiles, log: File) -> Command {
         let mut command = Command::new(&self.qemu);
         command.args(["-M", "microbit", "-display", "none", "-monitor", "none", "-serial", "chardev:line"]);
         let socket = place.socket.display();
@@ -225,7 +225,7 @@ impl<'a> Emulator<'a> {
         let (mut ended, mut timeout, mut is_over) = (None, Timeout::new(START_TIMEOUT), false);
         let wish = CommissionOptions { dry_run: false, verify: false };
         let done = commission::commission(benches, &skin, wish, &stop, |far| {
-            ended = ended.take().or_else(|| processes.ended().into_iter().next());
+            ended = ended.take().or_else(|| processes.take_ended().into_iter().next());
             // The timeout also ends the commissioning of a cell that restarts again and again.
             is_over |= timeout.has_stalled(far.iter().map(|far| far.found + far.done).sum());
             if ended.is_some() || is_over || signalled.load(Ordering::Relaxed) {
@@ -296,7 +296,7 @@ fn lock_directory(directory: &Path) -> Result<File, EmulateError> {
 }
 
 /// The record that the factory would write into a cell.
-fn factory(skin: &Skin, cell: &Cell) -> FactoryRecord {
+fn factory_record(skin: &Skin, cell: &Cell) -> FactoryRecord {
     let bus = skin.buses.get(cell.bus);
     let sums = bus.is_some_and(|bus| bus.reply != SkinReply::Torque);
     FactoryRecord {
@@ -310,8 +310,8 @@ fn factory(skin: &Skin, cell: &Cell) -> FactoryRecord {
 
 /// The filters of a cell's CAN controller: its own identifiers, frames on its simulated wires, and the sums of the
 /// cells at their other ends.
-fn filters(cell: &Cell, &FactoryRecord { link_ids, .. }: &FactoryRecord) -> Vec<Filter> {
-    let mut filters: Vec<_> = Id::received_by_cell(cell.node).map(Filter::exact).into();
+fn cell_filters(cell: &Cell, &FactoryRecord { link_ids, .. }: &FactoryRecord) -> Vec<Filter> {
+    let mut filters: Vec<_> = Id::ids_received_by_cell(cell.node).map(Filter::exact).into();
     if link_ids.iter().any(Option::is_some) {
         filters.extend(link_ids.into_iter().flatten().map(|link_id| Filter::for_link(link_id.reversed())));
         let sums = cell.neighbors.iter().flatten().map(|neighbor| Id::new(Kind::Sum, Node::Cell(*neighbor)));

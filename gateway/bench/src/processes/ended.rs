@@ -8,9 +8,9 @@ use super::EndedProcess;
 use crate::summary::{CellError, ErrorCells};
 
 /// Time within which processes must end to be reported in the same note.
-const GROUPING_TIME: Duration = Duration::from_millis(50);
+const END_GROUPING_TIME: Duration = Duration::from_millis(50);
 /// Maximum number of processes named in one note.
-const MAX_NAMED: usize = 6;
+const MAX_NAMED_PROCESSES: usize = 6;
 
 /// The processes that ended so far.
 #[derive(Debug, Default)]
@@ -32,7 +32,7 @@ impl EndedProcesses {
             self.pending.extend(ended);
         }
         if self.pending.is_empty()
-            || (!last && self.last_found_at.is_some_and(|found| found.elapsed() < GROUPING_TIME))
+            || (!last && self.last_found_at.is_some_and(|found| found.elapsed() < END_GROUPING_TIME))
         {
             return Vec::new();
         }
@@ -46,7 +46,7 @@ impl EndedProcesses {
     /// Returns the note on processes of one bus that ended in the same way. A reason that an earlier note gave is not
     /// repeated.
     fn format_note(&mut self, (bus, how): (&str, &str), group: &[EndedProcess]) -> String {
-        let error = group.first().and_then(|ended| Some((ended.status, ended.error()?)));
+        let error = group.first().and_then(|ended| Some((ended.status, ended.failure_reason()?)));
         let how = error.map_or_else(
             || how.to_owned(),
             |(status, why)| {
@@ -60,8 +60,8 @@ impl EndedProcesses {
             [one] => format!("the process of {one} ended ({how})"),
             many => {
                 let named: Vec<_> =
-                    many.iter().take(MAX_NAMED).map(|ended| ended.cells().to_string()).collect();
-                let more = if many.len() > MAX_NAMED { ", ..." } else { "" };
+                    many.iter().take(MAX_NAMED_PROCESSES).map(|ended| ended.cells().to_string()).collect();
+                let more = if many.len() > MAX_NAMED_PROCESSES { ", ..." } else { "" };
                 let named = named.join(", ");
                 format!("{} processes of cells on {bus} ended ({how}): {named}{more}", many.len())
             }

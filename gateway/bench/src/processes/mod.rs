@@ -23,7 +23,7 @@ use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
 use thiserror::Error;
 
-use self::standard_error::StandardError;
+use self::standard_error::StandardErrorPipe;
 use crate::remote::{Phase, ProcessState};
 use crate::system_calls::end_with_parent;
 use model::scenario::ProcessAction;
@@ -35,7 +35,7 @@ pub const START_TIMEOUT: Duration = Duration::from_secs(15);
 /// Number of files that a gateway or a bus server opens besides its buses and clients.
 const OTHER_OPEN_FILES: usize = 26;
 /// Number of files that a gateway opens for each bus.
-const FILES_OF_A_BUS: usize = 4;
+const OPEN_FILES_PER_BUS: usize = 4;
 /// Time that processes have to end after SIGTERM.
 const TERM_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -91,15 +91,15 @@ pub enum LaunchError {
 /// The error of a system that grants no file in memory.
 #[derive(Debug, Error)]
 #[error("cannot create a file in memory: {0}")]
-pub struct MemoryError(#[source] std::io::Error);
+pub struct MemoryFileError(#[source] std::io::Error);
 
 /// Raises the limit of open files for this process and all processes that it starts, so that a gateway can use `buses`
 /// buses and a bus server can serve `clients` clients.
 ///
 /// # Errors
 /// Returns [`LaunchError::Files`] if the system forbids it.
-pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
-    let needed = (OTHER_OPEN_FILES + FILES_OF_A_BUS * buses + clients) as u64;
+pub fn raise_open_file_limit(buses: usize, clients: usize) -> Result<(), LaunchError> {
+    let needed = (OTHER_OPEN_FILES + OPEN_FILES_PER_BUS * buses + clients) as u64;
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     let Some(limit) = current.filter(|limit| *limit < needed) else { return Ok(()) };
     setrlimit(Resource::Nofile, Rlimit { current: Some(needed), maximum })
@@ -127,13 +127,13 @@ pub fn program_path(name: &'static str) -> Result<PathBuf, LaunchError> {
 /// long as this program holds it open.
 ///
 /// # Errors
-/// Returns [`MemoryError`] if the system grants no file in memory.
-pub fn memory_file(bytes: &[u8]) -> Result<(File, PathBuf), MemoryError> {
+/// Returns [`MemoryFileError`] if the system grants no file in memory.
+pub fn create_memory_file(bytes: &[u8]) -> Result<(File, PathBuf), MemoryFileError> {
     let memory = || {
         let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
         file.write_all(bytes).map(|()| file)
     };
-    let file = memory().map_err(MemoryError)?;
+    let file = memory().map_err(MemoryFileError)?;
     let path = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
     Ok((file, path))
 }
@@ -181,7 +181,7 @@ impl EndedProcess {
 
     /// Reason of the error, if the process failed by itself: neither by a signal nor with exit code 0.
     #[must_use]
-    pub fn error(&self) -> Option<String> {
+    pub fn failure_reason(&self) -> Option<String> {
         let code = self.status.code().filter(|&code| code != 0)?;
         Some(self.reason.clone().unwrap_or_else(|| format!("exit code {code}, and no reason was given")))
     }
@@ -200,7 +200,7 @@ pub struct Processes {
     /// Flag that SIGCHLD sets, so that hundreds of processes are polled only after one of them has changed.
     changed: Arc<AtomicBool>,
     /// Standard error of the processes; `None` before the first start.
-    error: Option<StandardError>,
+    error: Option<StandardErrorPipe>,
     /// Processes that had already ended by themselves when they were to be restarted.
     ended_at_restart: Vec<EndedProcess>,
 }
@@ -231,7 +231,7 @@ impl Processes {
     /// Returns [`LaunchError`] if SIGCHLD cannot be caught.
     pub fn new() -> Result<Self, LaunchError> {
         let mut processes = Self::default();
-        processes.error = Some(StandardError::new().map_err(LaunchError::Pipe)?);
+        processes.error = Some(StandardErrorPipe::new().map_err(LaunchError::Pipe)?);
         let changed = Arc::clone(&processes.changed);
         signal_hook::flag::register(signal_hook::consts::SIGCHLD, changed).map_err(LaunchError::Signal)?;
         Ok(processes)
@@ -246,8 +246,8 @@ impl Processes {
             let mut nodes: Vec<u8> = plan.skin.cells_on_bus(bus).map(|cell| cell.node.get()).collect();
             nodes.retain(|&node| !self.has_process(bus, node));
             nodes.sort_unstable();
-            for nodes in groups(&nodes, plan.per_process) {
-                let mut command = plan.command(&described.name, nodes);
+            for nodes in group_consecutive(&nodes, plan.per_process) {
+                let mut command = plan.cell_command(&described.name, nodes);
                 let child = spawn_cells(&mut command, self.error.as_ref())?;
                 let (phase, bus_name) = (Phase::Running, described.name.clone());
                 self.all.push(Process { command, bus, bus_name, nodes, child, phase, log: None });
@@ -261,7 +261,7 @@ impl Processes {
     ///
     /// # Errors
     /// Returns [`LaunchError`] if the emulator does not start.
-    pub fn emulate(
+    pub fn start_emulator(
         &mut self,
         cell: &Cell,
         bus_name: &str,
@@ -295,8 +295,8 @@ impl Processes {
 
     /// Returns the processes that have ended since the last call. Prints what the other processes have written to their
     /// standard error.
-    pub fn ended(&mut self) -> Vec<EndedProcess> {
-        self.error.iter_mut().for_each(StandardError::read);
+    pub fn take_ended(&mut self) -> Vec<EndedProcess> {
+        self.error.iter_mut().for_each(StandardErrorPipe::read_available);
         let mut ended = std::mem::take(&mut self.ended_at_restart);
         if !self.changed.swap(false, Ordering::Relaxed) {
             return ended;
@@ -304,7 +304,7 @@ impl Processes {
         for process in self.all.iter_mut().filter(|process| process.is_running()) {
             if let Ok(Some(status)) = process.child.try_wait() {
                 process.phase = Phase::Ended;
-                ended.push(process.end_record(status, self.error.as_mut()));
+                ended.push(process.create_end_record(status, self.error.as_mut()));
             }
         }
         ended
@@ -314,20 +314,20 @@ impl Processes {
     ///
     /// # Errors
     /// Returns [`LaunchError`] if a restarted process does not start.
-    pub fn apply(&mut self, bus: usize, node: u8, action: ProcessAction) -> Result<bool, LaunchError> {
+    pub fn apply_action(&mut self, bus: usize, node: u8, action: ProcessAction) -> Result<bool, LaunchError> {
         let holds = |process: &&mut Process| process.state().runs_cell(bus, node);
         let Some(process) = self.all.iter_mut().find(holds) else { return Ok(false) };
         match action {
-            ProcessAction::Kill => process.signal(Signal::KILL, Phase::Running),
-            ProcessAction::Stop => process.signal(Signal::STOP, Phase::Stopped),
-            ProcessAction::Continue => process.signal(Signal::CONT, Phase::Running),
+            ProcessAction::Kill => process.send_signal(Signal::KILL, Phase::Running),
+            ProcessAction::Stop => process.send_signal(Signal::STOP, Phase::Stopped),
+            ProcessAction::Continue => process.send_signal(Signal::CONT, Phase::Running),
             ProcessAction::Restart => {
                 let lived = process.is_running();
-                process.signal(Signal::KILL, Phase::Ended);
+                process.send_signal(Signal::KILL, Phase::Ended);
                 // A process with an exit code had ended by itself before; a killed one has a signal status.
                 let status = process.child.wait().ok().filter(|status| lived && status.signal().is_none());
                 self.ended_at_restart
-                    .extend(status.map(|status| process.end_record(status, self.error.as_mut())));
+                    .extend(status.map(|status| process.create_end_record(status, self.error.as_mut())));
                 process.child = match &process.log {
                     Some(_) => spawn(&mut process.command)?,
                     None => spawn_cells(&mut process.command, self.error.as_ref())?,
@@ -349,13 +349,13 @@ impl Process {
     }
 
     /// Creates the record of a process that ended with `status`.
-    fn end_record(&self, status: ExitStatus, error: Option<&mut StandardError>) -> EndedProcess {
+    fn create_end_record(&self, status: ExitStatus, error: Option<&mut StandardErrorPipe>) -> EndedProcess {
         let said = match (&self.log, error) {
-            (Some(log), _) => last_line(log),
+            (Some(log), _) => last_emulator_message(log),
             (None, Some(error)) => {
                 // The process has ended, so it has written everything.
-                error.read();
-                error.take_reason(&self.bus_name, self.nodes)
+                error.read_available();
+                error.take_exit_reason(&self.bus_name, self.nodes)
             }
             (None, None) => None,
         };
@@ -363,7 +363,7 @@ impl Process {
     }
 
     /// Sends a signal and enters `phase`. Ended processes are left alone.
-    fn signal(&mut self, signal: Signal, phase: Phase) {
+    fn send_signal(&mut self, signal: Signal, phase: Phase) {
         if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()).filter(|_| self.is_running()) {
             let _ = kill_process(pid, signal);
             self.phase = phase;
@@ -375,8 +375,8 @@ impl Drop for Processes {
     fn drop(&mut self) {
         for process in &mut self.all {
             // A stopped process would not handle SIGTERM.
-            process.signal(Signal::CONT, Phase::Running);
-            process.signal(Signal::TERM, Phase::Running);
+            process.send_signal(Signal::CONT, Phase::Running);
+            process.send_signal(Signal::TERM, Phase::Running);
         }
         let mut children: Vec<_> = self
             .all
@@ -389,7 +389,7 @@ impl Drop for Processes {
 }
 
 impl CellLaunch<'_> {
-    fn command(&self, bus: &str, (first, last): (u8, u8)) -> Command {
+    fn cell_command(&self, bus: &str, (first, last): (u8, u8)) -> Command {
         let mut command = Command::new(self.program);
         command.args(["--bus", bus]);
         if first == last {
@@ -405,7 +405,7 @@ impl CellLaunch<'_> {
             command.arg("--flash").arg(flash);
         }
         command.stdin(Stdio::null()).stdout(Stdio::null());
-        isolate(&mut command, self.directory);
+        isolate_process_group(&mut command, self.directory);
         command
     }
 }
@@ -415,7 +415,7 @@ pub(crate) fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
 }
 
 /// Starts a process of cells with its standard error connected to the pipe.
-fn spawn_cells(command: &mut Command, error: Option<&StandardError>) -> Result<Child, LaunchError> {
+fn spawn_cells(command: &mut Command, error: Option<&StandardErrorPipe>) -> Result<Child, LaunchError> {
     if let Some(error) = error {
         error.attach_to(command).map_err(LaunchError::Pipe)?;
     }
@@ -426,7 +426,7 @@ fn spawn_cells(command: &mut Command, error: Option<&StandardError>) -> Result<C
 }
 
 /// Last message of an emulator that is not mere information.
-fn last_line(log: &Path) -> Option<String> {
+fn last_emulator_message(log: &Path) -> Option<String> {
     let text = std::fs::read_to_string(log).ok()?;
     // Register values follow a fault message.
     let is_message = |line: &&str| line.starts_with("qemu") && !line.contains(": info: ");
@@ -435,7 +435,7 @@ fn last_line(log: &Path) -> Option<String> {
 
 /// Puts a process into its own group: Ctrl-C on a terminal signals the whole group but is meant for the gateway alone,
 /// because cells and buses must live until the final reports. `directory` is where the process finds embedded buses.
-pub(crate) fn isolate(command: &mut Command, directory: Option<&Path>) {
+pub(crate) fn isolate_process_group(command: &mut Command, directory: Option<&Path>) {
     command.process_group(0);
     if let Some(directory) = directory {
         command.env("SKINBUS_DIR", directory);
@@ -444,7 +444,7 @@ pub(crate) fn isolate(command: &mut Command, directory: Option<&Path>) {
 
 /// Groups consecutive numbers into ranges of at most `size`.
 #[must_use]
-pub fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
+pub fn group_consecutive(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
     let mut groups: Vec<(u8, u8)> = Vec::new();
     for &node in nodes {
         match groups.last_mut() {
@@ -482,9 +482,9 @@ mod tests {
 
     #[test]
     fn cells_are_grouped_in_runs_of_consecutive_numbers() {
-        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 1).len(), 6);
-        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 2), [(1, 2), (3, 3), (5, 6), (254, 254)]);
-        assert_eq!(groups(&[1, 2, 3, 5, 6, 254], 64), [(1, 3), (5, 6), (254, 254)]);
+        assert_eq!(group_consecutive(&[1, 2, 3, 5, 6, 254], 1).len(), 6);
+        assert_eq!(group_consecutive(&[1, 2, 3, 5, 6, 254], 2), [(1, 2), (3, 3), (5, 6), (254, 254)]);
+        assert_eq!(group_consecutive(&[1, 2, 3, 5, 6, 254], 64), [(1, 3), (5, 6), (254, 254)]);
     }
 
     #[test]

@@ -18,7 +18,7 @@ const MAX_LINE_BYTES: usize = 1 << 16;
 
 /// Standard error of the cells' processes.
 #[derive(Debug)]
-pub(super) struct StandardError {
+pub(super) struct StandardErrorPipe {
     read: PipeReader,
     write: PipeWriter,
     /// Beginning of a line whose end has not arrived.
@@ -27,7 +27,7 @@ pub(super) struct StandardError {
     words: Vec<ExitReason>,
 }
 
-impl StandardError {
+impl StandardErrorPipe {
     /// Creates the pipe.
     ///
     /// # Errors
@@ -48,7 +48,7 @@ impl StandardError {
     }
 
     /// Reads all that has arrived. Keeps reasons; passes other lines on to the standard error of this program.
-    pub(super) fn read(&mut self) {
+    pub(super) fn read_available(&mut self) {
         let mut chunk = [0; 4_096];
         loop {
             match self.read.read(&mut chunk) {
@@ -75,16 +75,16 @@ impl StandardError {
     }
 
     /// Removes the reason that a process of cells gave, and returns it.
-    pub(super) fn take_reason(&mut self, bus: &str, (first, last): (u8, u8)) -> Option<String> {
+    pub(super) fn take_exit_reason(&mut self, bus: &str, (first, last): (u8, u8)) -> Option<String> {
         let cells = CellRange(first, last);
         let at = self.words.iter().position(|words| words.cells == cells && words.bus == bus)?;
         Some(self.words.remove(at).why)
     }
 }
 
-impl Drop for StandardError {
+impl Drop for StandardErrorPipe {
     fn drop(&mut self) {
-        self.read();
+        self.read_available();
         if !self.unread.is_empty() {
             eprint_line(&String::from_utf8_lossy(&self.unread));
         }
@@ -98,17 +98,17 @@ mod tests {
 
     #[test]
     fn last_words_are_kept_by_process_and_come_in_any_pieces() {
-        let mut error = StandardError::new().unwrap();
+        let mut error = StandardErrorPipe::new().unwrap();
         error.write.write_all(b"cell-node: cell 3 on vcan0 ends: no ").unwrap();
-        error.read();
-        assert_eq!(error.take_reason("vcan0", (3, 3)), None);
+        error.read_available();
+        assert_eq!(error.take_exit_reason("vcan0", (3, 3)), None);
         error.write.write_all(b"memory\ncell-node: cells 1 to 4 on vcan1 end: other\n").unwrap();
         error.write.write_all(b"cell-node: cell 3 on vcan0 ends: again\n").unwrap();
-        error.read();
-        assert_eq!(error.take_reason("vcan1", (3, 3)), None);
-        let two = [error.take_reason("vcan0", (3, 3)), error.take_reason("vcan0", (3, 3))];
+        error.read_available();
+        assert_eq!(error.take_exit_reason("vcan1", (3, 3)), None);
+        let two = [error.take_exit_reason("vcan0", (3, 3)), error.take_exit_reason("vcan0", (3, 3))];
         assert_eq!(two, [Some("no memory".to_owned()), Some("again".to_owned())]);
-        assert_eq!(error.take_reason("vcan1", (1, 4)), Some("other".to_owned()));
+        assert_eq!(error.take_exit_reason("vcan1", (1, 4)), Some("other".to_owned()));
         assert!(error.words.is_empty() && error.unread.is_empty());
     }
 }

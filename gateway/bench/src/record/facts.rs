@@ -18,7 +18,7 @@ pub type Metadata = BTreeMap<String, String>;
 /// Metadata of the program and its command line.
 #[must_use]
 pub fn program_metadata(command_line: &[String], began_nanos: u64) -> Metadata {
-    metadata([
+    to_metadata([
         ("program", format!("skinbus {}", env!("CARGO_PKG_VERSION"))),
         ("git_revision", env!("SKINBUS_GIT_REVISION").to_owned()),
         ("command_line", command_line.join(" ")),
@@ -35,7 +35,7 @@ pub fn machine_metadata(idle: &Quantiles) -> Metadata {
     let read = |name: &str| {
         fs::read_to_string(name).map_or_else(|_| "unknown".to_owned(), |text| text.trim().to_owned())
     };
-    metadata([
+    to_metadata([
         ("sysname", text(about.sysname())),
         ("release", text(about.release())),
         ("version", text(about.version())),
@@ -69,8 +69,8 @@ pub fn realtime_minus_monotonic() -> i64 {
 
 /// Metadata of the skin and its effective timing, together with the metadata in `run`.
 #[must_use]
-pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Metadata {
-    let mut all = metadata([
+pub fn configuration_metadata(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Metadata {
+    let mut all = to_metadata([
         ("skin", skin.name.clone()),
         ("robot", skin.robot.name.clone()),
         ("joints", skin.robot.joints.len().to_string()),
@@ -93,7 +93,7 @@ pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)
 
 /// Expected configuration hash of each cell, by bus and node id.
 #[must_use]
-pub fn hashes(skin: &Skin) -> Metadata {
+pub fn configuration_hashes(skin: &Skin) -> Metadata {
     let of_cell = |cell: &protocol::skin::Cell| {
         let bus = skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
         (format!("{bus}/{}", cell.node), format!("{:04X}", skin.parameters(cell).hash()))
@@ -101,6 +101,6 @@ pub fn hashes(skin: &Skin) -> Metadata {
     skin.cells.iter().map(of_cell).collect()
 }
 
-fn metadata<const N: usize>(facts: [(&str, String); N]) -> Metadata {
+fn to_metadata<const N: usize>(facts: [(&str, String); N]) -> Metadata {
     facts.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }

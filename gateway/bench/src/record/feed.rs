@@ -13,20 +13,20 @@ use trace::capture::BusNote;
 
 /// Queue length in frames for a bus. The queues of many buses together have at most four times this length, which
 /// limits memory. The queue of each bus has at least [`FRAMES_OF_MANY`] frames, more than a second of a full bus.
-const FRAME_QUEUE: usize = 65_536;
+const FRAME_QUEUE_LENGTH: usize = 65_536;
 /// Minimum queue length in frames for a bus, if there are many buses.
-const MIN_FRAME_QUEUE: usize = 16_384;
+const MIN_FRAME_QUEUE_LENGTH: usize = 16_384;
 
 /// Returns the queue length in frames for each of `buses` buses.
 #[must_use]
 pub fn frame_queue_length(buses: usize) -> usize {
-    (4 * FRAME_QUEUE / buses.max(1)).clamp(MIN_FRAME_QUEUE, FRAME_QUEUE)
+    (4 * FRAME_QUEUE_LENGTH / buses.max(1)).clamp(MIN_FRAME_QUEUE_LENGTH, FRAME_QUEUE_LENGTH)
 }
 
 /// Queue length in ticks: more than a second of the control loop.
-pub const TICK_QUEUE: usize = 1_024;
+pub const TICK_QUEUE_LENGTH: usize = 1_024;
 /// Queue length in epochs for a bus: more than a second of broadcasts.
-pub const EPOCH_QUEUE: usize = 128;
+pub const EPOCH_QUEUE_LENGTH: usize = 128;
 
 /// An item from the receiver of a bus, in order of arrival.
 #[derive(Clone, Copy, Debug)]
@@ -103,12 +103,12 @@ impl RecorderSender {
 
     /// Returns the number of frames for which the queue has room.
     #[must_use]
-    pub fn free_slots(&self) -> usize {
+    pub fn free_frame_slots(&self) -> usize {
         self.frames.slots()
     }
 
     /// Queues a report that the bus dropped frames.
-    pub fn push_dropped(&mut self, at_nanos: u64, frames: u64) {
+    pub fn push_dropped_frames(&mut self, at_nanos: u64, frames: u64) {
         // The queue counts frames that do not fit, which is reported separately.
         let _ = self.frames.push(CapturedItem::Dropped { at_nanos, frames });
     }
@@ -146,7 +146,7 @@ impl RecorderSender {
 
     /// Returns the numbers of items that did not fit into the queues.
     #[must_use]
-    pub const fn unrecorded(&self) -> UnrecordedCounts {
+    pub const fn unrecorded_counts(&self) -> UnrecordedCounts {
         UnrecordedCounts { frames: self.unrecorded, epochs: self.unrecorded_epochs }
     }
 }
@@ -172,7 +172,7 @@ pub fn bus_feed(
     state: Arc<BusState>,
 ) -> (RecorderSender, BusFeed) {
     let (frames, taken) = rtrb::RingBuffer::new(frame_queue_length(buses));
-    let (touched, states) = all.then(|| rtrb::RingBuffer::new(EPOCH_QUEUE)).unzip();
+    let (touched, states) = all.then(|| rtrb::RingBuffer::new(EPOCH_QUEUE_LENGTH)).unzip();
     let outlet = RecorderSender { frames, touched, unrecorded: 0, unreported: 0, unrecorded_epochs: 0 };
     (outlet, BusFeed { frames: taken, touched: states, view, state })
 }
@@ -203,9 +203,9 @@ mod tests {
     fn what_does_not_fit_is_reported_where_it_is_missing() {
         let (mut outlet, mut bus_feed) = bus_feed(1, false, Arc::default(), Arc::default());
         let frame = |at_nanos| LatchedFrame { at_nanos, from_gateway: false, frame: Frame::EMPTY };
-        let all = FRAME_QUEUE as u64;
+        let all = FRAME_QUEUE_LENGTH as u64;
         (0..all + 7).for_each(|at| outlet.push_frame(frame(at)));
-        assert_eq!(outlet.unrecorded(), UnrecordedCounts { frames: 7, epochs: 0 });
+        assert_eq!(outlet.unrecorded_counts(), UnrecordedCounts { frames: 7, epochs: 0 });
         let mut taken = 0;
         while let Ok(CapturedItem::Frame(seen)) = bus_feed.frames.pop() {
             assert_eq!(seen.at_nanos, taken);
@@ -219,6 +219,6 @@ mod tests {
         assert!(
             matches!(bus_feed.frames.pop().unwrap(), CapturedItem::Frame(seen) if seen.at_nanos == 1_000_000)
         );
-        assert_eq!(outlet.unrecorded().frames, 7);
+        assert_eq!(outlet.unrecorded_counts().frames, 7);
     }
 }

@@ -34,22 +34,22 @@ use trace::recording::series::{AttachedFile, FileHead, SplitLimits, SplitRecordi
 
 use crate::bus::realtime::wall_clock_ns;
 use crate::threads::{ThreadError, spawn};
-use trace::files::check_regular;
+use trace::files::check_writable_regular_file;
 
 /// Outputs of a recording.
 #[derive(Clone, Debug, Default)]
 pub struct RecordOptions {
     /// Output of frames as candump text.
-    pub candump: Option<Candump>,
+    pub candump: Option<CandumpOutput>,
     /// Output of all data as MCAP.
-    pub mcap: Option<Mcap>,
+    pub mcap: Option<McapOutput>,
     /// True if existing files are overwritten.
     pub force: bool,
 }
 
 /// An output of frames as candump text.
 #[derive(Clone, Debug)]
-pub struct Candump {
+pub struct CandumpOutput {
     /// Path of the log.
     pub path: PathBuf,
     /// True if a number is added to the file's name when the file exists.
@@ -58,7 +58,7 @@ pub struct Candump {
 
 /// An output of all data as MCAP.
 #[derive(Clone, Debug)]
-pub struct Mcap {
+pub struct McapOutput {
     /// Path of the first file.
     pub path: PathBuf,
     /// Limits at which a new file is started.
@@ -98,12 +98,12 @@ pub enum OutputError {
 
 /// Output files that are open but contain no data yet.
 #[derive(Debug)]
-pub struct Outputs {
+pub struct RecordingOutputs {
     text: Option<CandumpWriter>,
     series: Option<SplitRecording<Topics>>,
 }
 
-impl Outputs {
+impl RecordingOutputs {
     /// Opens the outputs, so that errors show up before the run starts. Repairs unfinished files of killed runs beside
     /// them and reports each repair. Waits for a FIFO's reader, or until `stopped`.
     ///
@@ -119,12 +119,12 @@ impl Outputs {
             CandumpWriter::create(candump, options.force, stopped).map_err(failed)
         });
         let text = text.transpose()?;
-        let series = options.mcap.as_ref().map(|Mcap { path, split, .. }| {
+        let series = options.mcap.as_ref().map(|McapOutput { path, split, .. }| {
             let failed = |source| OutputError::Mcap { path: path.clone(), source };
             if path.extension().is_none_or(|extension| extension != "mcap") {
                 return Err(OutputError::Name(path.clone()));
             }
-            check_regular(path, options.force).map_err(failed)?;
+            check_writable_regular_file(path, options.force).map_err(failed)?;
             repair::repair_orphans(path, say);
             SplitRecording::claim(path, options.force, *split).map_err(failed)
         });
@@ -189,7 +189,7 @@ impl Recorder {
     }
 
     /// Adds a note about an intervention to the recording; a candump log holds frames only.
-    pub fn note(&self, text: &str) {
+    pub fn add_note(&self, text: &str) {
         // After the thread has ended, notes are lost.
         let _ = self.notes.send((wall_clock_ns(), text.to_owned()));
     }

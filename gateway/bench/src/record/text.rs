@@ -8,16 +8,16 @@ use std::time::{Duration, Instant};
 
 use protocol::candump::{Record, Timestamp, write_record};
 
-use super::Candump;
+use super::CandumpOutput;
 use model::latched::LatchedFrame;
 use trace::files::LogFile;
 use trace::recording::account::WrittenFile;
 
 /// Number of bytes written at once.
-const WRITE_BYTES: usize = 64 << 10;
+const WRITE_CHUNK_BYTES: usize = 64 << 10;
 
 /// Interval between checks that the log still has its name.
-const CHECK_INTERVAL: Duration = Duration::from_secs(1);
+const NAME_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A log that is being written. The first write error ends it after its last whole line.
 #[derive(Debug)]
@@ -43,13 +43,13 @@ impl CandumpWriter {
     ///
     /// # Errors
     /// Returns [`io::Error`] if the log cannot be written.
-    pub fn create(target: &Candump, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
+    pub fn create(target: &CandumpOutput, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
         let log = if target.numbered && !force {
             LogFile::create_numbered(&target.path, stopped)?
         } else {
             LogFile::create(&target.path, force, stopped)?
         };
-        let lines = String::with_capacity(WRITE_BYTES + 256);
+        let lines = String::with_capacity(WRITE_CHUNK_BYTES + 256);
         let (failed, moved, looked) = (false, false, Instant::now());
         Ok(Self { log, failed, moved, checked_at: looked, lines, waiting: 0, frames: 0, lost: 0 })
     }
@@ -81,7 +81,7 @@ impl CandumpWriter {
     ///
     /// # Errors
     /// Returns [`io::Error`] once if the log cannot be written.
-    pub fn note(&mut self, text: &str) -> io::Result<()> {
+    pub fn add_note_line(&mut self, text: &str) -> io::Result<()> {
         if self.failed {
             return Ok(());
         }
@@ -91,12 +91,12 @@ impl CandumpWriter {
 
     fn end_line(&mut self) -> io::Result<()> {
         self.lines.push('\n');
-        if self.lines.len() < WRITE_BYTES { Ok(()) } else { self.flush() }
+        if self.lines.len() < WRITE_CHUNK_BYTES { Ok(()) } else { self.flush() }
     }
 
     /// Returns true if the log has ended after an error.
     #[must_use]
-    pub const fn is_over(&self) -> bool {
+    pub const fn has_ended(&self) -> bool {
         self.failed
     }
 
@@ -105,15 +105,15 @@ impl CandumpWriter {
     /// # Errors
     /// Returns [`io::Error`] once if the log cannot be written or was moved or changed.
     pub fn flush(&mut self) -> io::Result<()> {
-        self.write()?;
-        if self.checked_at.elapsed() < CHECK_INTERVAL {
+        self.write_waiting_lines()?;
+        if self.checked_at.elapsed() < NAME_CHECK_INTERVAL {
             return Ok(());
         }
         self.checked_at = Instant::now();
-        self.check_name()
+        self.check_log_name()
     }
 
-    fn check_name(&mut self) -> io::Result<()> {
+    fn check_log_name(&mut self) -> io::Result<()> {
         if self.moved || self.failed {
             return Ok(());
         }
@@ -122,7 +122,7 @@ impl CandumpWriter {
         looked
     }
 
-    fn write(&mut self) -> io::Result<()> {
+    fn write_waiting_lines(&mut self) -> io::Result<()> {
         let put = self.log.append(&self.lines);
         if put.is_ok() {
             self.frames += self.waiting;
@@ -138,7 +138,7 @@ impl CandumpWriter {
     /// Ends the log, also after an error. Returns the file if it still has its name, the number of frames missing in
     /// it, and the first error.
     pub fn finish(mut self) -> (Option<WrittenFile>, u64, io::Result<()>) {
-        let (put, looked) = (self.write(), self.check_name());
+        let (put, looked) = (self.write_waiting_lines(), self.check_log_name());
         let there =
             if self.moved { self.log.count_lines_with_prefix("(").ok().flatten() } else { Some(self.frames) };
         let Self { log, frames: written, lost, .. } = self;
@@ -171,7 +171,7 @@ mod tests {
     use protocol::can::Frame;
 
     fn text(path: &Path) -> CandumpWriter {
-        let target = Candump { path: path.to_owned(), numbered: false };
+        let target = CandumpOutput { path: path.to_owned(), numbered: false };
         CandumpWriter::create(&target, false, &AtomicBool::new(false)).unwrap()
     }
 
@@ -186,7 +186,7 @@ mod tests {
         let path = folder.path().join("run.log");
         let mut text = text(&path);
         text.add_frame("vcan0", &seen(1)).unwrap();
-        text.note("DROPCOUNT: dropped 3 CAN frames on 'vcan0' socket (total drops 3)").unwrap();
+        text.add_note_line("DROPCOUNT: dropped 3 CAN frames on 'vcan0' socket (total drops 3)").unwrap();
         text.add_frame("vcan0", &seen(2)).unwrap();
         let (written, lost, finished) = text.finish();
         finished.unwrap();
@@ -216,14 +216,14 @@ mod tests {
         let mut frames = |log: &mut CandumpWriter, count| {
             for at in 0..count {
                 log.add_frame("vcan0", &seen(at)).unwrap();
-                log.checked_at = Instant::now().checked_sub(CHECK_INTERVAL).unwrap();
+                log.checked_at = Instant::now().checked_sub(NAME_CHECK_INTERVAL).unwrap();
                 said.extend(log.flush().err());
             }
         };
         frames(&mut log, 5);
         disturb(&path);
         frames(&mut log, 3);
-        assert!(!log.is_over());
+        assert!(!log.has_ended());
         let (written, lost, finished) = log.finish();
         said.extend(finished.err());
         let is_there = written.as_ref().map(|file| (file.path.clone(), file.bytes));

@@ -14,24 +14,24 @@ use super::backlog;
 use super::facts::realtime_minus_monotonic;
 use super::feed::{BusFeed, CapturedItem, RecorderFeed, frame_queue_length};
 use super::text::CandumpWriter;
-use super::topics::{ROBOT_MESSAGES, Topics};
-use super::{Outputs, StopRequest};
+use super::topics::{ROBOT_MESSAGE_COUNT, Topics};
+use super::{RecordingOutputs, StopRequest};
 use crate::bus::realtime::wall_clock_ns;
 use model::latched::LatchedPackets;
 use trace::capture::{CaptureNote, NoteKind, RUN_METADATA, run_metadata};
 use trace::recording::account::{MessageCount, RecordingAccount};
 use trace::recording::layout::Layout;
 use trace::recording::series::{FileHead, RecordingEvent, SplitRecording};
-use trace::recording::window::{ReorderWindow, WINDOW_NS};
+use trace::recording::window::{REORDER_WINDOW_NS, ReorderWindow};
 use trace::ros2::skin::ContactState;
 use trace::ros2::standard::{Diagnosis, DiagnosisLevel, Point};
 
 /// Pause between rounds of the thread.
-const ROUND_PAUSE: Duration = Duration::from_millis(10);
+const DRAIN_PAUSE: Duration = Duration::from_millis(10);
 /// Interval between flushes: a killed run may lose the data of this time plus one [`LOOK`].
 const FLUSH_INTERVAL: Duration = Duration::from_millis(40);
 /// Interval between readings of the kernel's backlog drops.
-const BACKLOG_INTERVAL: Duration = Duration::from_millis(100);
+const BACKLOG_READ_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval between diagnostics messages.
 const DIAGNOSTICS_INTERVAL: Duration = Duration::from_millis(500);
 
@@ -81,9 +81,9 @@ pub(super) struct RecorderThread {
 }
 
 /// A period, and the time at which it was over the last time.
-struct Interval(Duration, Instant);
+struct PeriodicTimer(Duration, Instant);
 
-impl Interval {
+impl PeriodicTimer {
     fn new(period: Duration) -> Self {
         Self(period, Instant::now())
     }
@@ -99,12 +99,12 @@ impl Interval {
 
 impl RecorderThread {
     pub(super) fn new(
-        outputs: Outputs,
+        outputs: RecordingOutputs,
         feed: RecorderFeed,
         layout: Layout,
         (noted, tell): (Receiver<(u64, String)>, Sender<String>),
     ) -> Self {
-        let Outputs { text, series } = outputs;
+        let RecordingOutputs { text, series } = outputs;
         let buses = feed.bus_feeds.iter().map(|_| BusRecord::default()).collect();
         Self {
             files: OutputFiles { text, series, errors: Vec::new() },
@@ -128,13 +128,13 @@ impl RecorderThread {
     pub(super) fn run(mut self, head: FileHead, stop: &StopRequest) -> RecordingAccount {
         if let Some(series) = &mut self.files.series {
             let nanos = head.nanos;
-            series.begin(head, |writer| Topics::new(writer, &self.layout));
+            series.begin_first_file(head, |writer| Topics::new(writer, &self.layout));
             write_robot(series, &self.layout, nanos);
         }
         let (mut flush, mut request, mut diagnose) = (
-            Interval::new(FLUSH_INTERVAL),
-            Interval::new(BACKLOG_INTERVAL),
-            Interval::new(DIAGNOSTICS_INTERVAL),
+            PeriodicTimer::new(FLUSH_INTERVAL),
+            PeriodicTimer::new(BACKLOG_READ_INTERVAL),
+            PeriodicTimer::new(DIAGNOSTICS_INTERVAL),
         );
         let many = frame_queue_length(self.feed.bus_feeds.len()) / 8;
         loop {
@@ -147,7 +147,7 @@ impl RecorderThread {
                 self.record_backlog();
             }
             if diagnose.is_due() || ended {
-                self.diagnose();
+                self.record_diagnostics();
             }
             if flush.is_due() {
                 self.flush();
@@ -157,7 +157,7 @@ impl RecorderThread {
                 break;
             }
             if taken < many {
-                thread::sleep(ROUND_PAUSE);
+                thread::sleep(DRAIN_PAUSE);
             }
         }
         self.finish()
@@ -176,7 +176,7 @@ impl RecorderThread {
             self.drain_contacts(bus);
         }
         for (nanos, text) in self.notes.try_iter() {
-            self.files.note(nanos, None, NoteKind::Text, &text);
+            self.files.write_note(nanos, None, NoteKind::Text, &text);
         }
         most
     }
@@ -197,8 +197,8 @@ impl RecorderThread {
                     seen.frames += 1;
                     seen.latched.receive(frame);
                     seen.missing += u64::from(self.files.is_between_files());
-                    self.files.write_text(|text| text.add_frame(name, &frame));
-                    self.files.put(MessageCount::ONE_FRAME, |window, topics| {
+                    self.files.write_candump(|text| text.add_frame(name, &frame));
+                    self.files.write_mcap(MessageCount::ONE_FRAME, |window, topics| {
                         topics.write_frame(window, bus, name, &frame)
                     });
                 }
@@ -209,8 +209,8 @@ impl RecorderThread {
                 }
                 CapturedItem::Bus { at_nanos, what } => {
                     let line = what.text(name);
-                    self.files.write_text(|text| text.note(&format!("# {line}")));
-                    self.files.note(at_nanos, Some((bus, name)), NoteKind::Text, &line);
+                    self.files.write_candump(|text| text.add_note_line(&format!("# {line}")));
+                    self.files.write_note(at_nanos, Some((bus, name)), NoteKind::Text, &line);
                 }
                 CapturedItem::Unrecorded { at_nanos, frames } => {
                     seen.unrecorded += frames;
@@ -244,7 +244,7 @@ impl RecorderThread {
                 series.add_metadata(RUN_METADATA, run_metadata(nanos.saturating_sub(since)));
             }
             let messages = 4 + u64::from(layout.records_poses_at(timed.record.tick.number));
-            self.files.put(MessageCount::other_messages(messages), |window, topics| {
+            self.files.write_mcap(MessageCount::other_messages(messages), |window, topics| {
                 topics.write_tick(window, layout, nanos, &timed)
             });
         }
@@ -262,7 +262,7 @@ impl RecorderThread {
             let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
             for (place, _) in patches {
                 let messages = if q.is_some() { 2 } else { 1 };
-                self.files.put(MessageCount::other_messages(messages), |window, topics| {
+                self.files.write_mcap(MessageCount::other_messages(messages), |window, topics| {
                     topics.write_patch(window, &self.layout, place, &touched, q, &mut self.scratch)
                 });
             }
@@ -280,7 +280,7 @@ impl RecorderThread {
         }
     }
 
-    fn diagnose(&mut self) {
+    fn record_diagnostics(&mut self) {
         let Some(series) = &mut self.files.series else { return };
         let mut parts = vec![Diagnosis {
             level: if self.ticks_skipped > 0 { DiagnosisLevel::Warn } else { DiagnosisLevel::Ok },
@@ -294,7 +294,7 @@ impl RecorderThread {
         }];
         let buses = self.feed.bus_feeds.iter().zip(&self.layout.buses).zip(&self.buses);
         parts.extend(buses.map(|((bus_feed, name), seen)| diagnose_bus(bus_feed, name, seen)));
-        let lost = series.lost();
+        let lost = series.lost_messages();
         let unrecorded: u64 = self.buses.iter().map(|bus| bus.unrecorded).sum();
         let all_well = lost.frames + lost.others + unrecorded == 0;
         parts.push(Diagnosis {
@@ -316,17 +316,18 @@ impl RecorderThread {
     }
 
     fn flush(&mut self) {
-        self.files.write_text(CandumpWriter::flush);
+        self.files.write_candump(CandumpWriter::flush);
         let Some(series) = &mut self.files.series else { return };
         // Both segments of a packet to the cells must be in one file.
         let now = wall_clock_ns();
         let holds = self.buses.iter().any(|bus| bus.latched.is_within_a_packet(now));
-        if !series.flush(holds) || !series.begin_next(|writer| Topics::new(writer, &self.layout)) {
+        if !series.flush_due_messages(holds) || !series.begin_next(|writer| Topics::new(writer, &self.layout))
+        {
             return;
         }
         // Each file must be readable without the one before it, so it begins with these frames. Items queued before
         // went into the former file.
-        let began = now.saturating_sub(WINDOW_NS);
+        let began = now.saturating_sub(REORDER_WINDOW_NS);
         write_robot(series, &self.layout, began);
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.latched.frames() {
@@ -342,7 +343,7 @@ impl RecorderThread {
                 let place = format!("CAN frames on '{name}' while nothing could be written");
                 // The log contains these frames.
                 let line = dropped_frames_line(frames, &place, frames);
-                self.files.note(wall_clock_ns(), Some((bus, name)), NoteKind::Dropped(frames), &line);
+                self.files.write_note(wall_clock_ns(), Some((bus, name)), NoteKind::Dropped(frames), &line);
             }
         }
     }
@@ -413,12 +414,12 @@ impl OutputFiles {
     }
 
     /// Writes to the candump log, if there is one.
-    fn write_text(&mut self, write: impl FnOnce(&mut CandumpWriter) -> io::Result<()>) {
+    fn write_candump(&mut self, write: impl FnOnce(&mut CandumpWriter) -> io::Result<()>) {
         if let Some(text) = &mut self.text
             && let Err(error) = write(text)
         {
             let what = format!("{}: {error}", text.path().display());
-            self.errors.push(if text.is_over() {
+            self.errors.push(if text.has_ended() {
                 RecordingEvent::BrokeOff(what)
             } else {
                 RecordingEvent::Other(what)
@@ -427,7 +428,7 @@ impl OutputFiles {
     }
 
     /// Writes to the MCAP recording, if there is one.
-    fn put(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut Topics)) {
+    fn write_mcap(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut Topics)) {
         if let Some(series) = &mut self.series {
             series.add_messages(count, write);
         }
@@ -444,23 +445,24 @@ impl OutputFiles {
         total: u64,
     ) {
         let line = dropped_frames_line(frames, place, total);
-        self.write_text(|text| text.note(&line));
-        self.note(nanos, bus, NoteKind::Dropped(frames), &line);
+        self.write_candump(|text| text.add_note_line(&line));
+        self.write_note(nanos, bus, NoteKind::Dropped(frames), &line);
     }
 
     /// Adds a note to the MCAP recording only.
-    fn note(&mut self, nanos: u64, bus: Option<(usize, &str)>, kind: NoteKind, line: &str) {
+    fn write_note(&mut self, nanos: u64, bus: Option<(usize, &str)>, kind: NoteKind, line: &str) {
         let (bus, interface) = bus.unzip();
         let interface = interface.unwrap_or_default();
         let note = CaptureNote { kind, nanos, interface, line: 0, text: line.as_bytes() };
-        self.put(MessageCount::other_messages(1), |window, topics| topics.write_note(window, bus, &note));
+        let one = MessageCount::other_messages(1);
+        self.write_mcap(one, |window, topics| topics.write_note(window, bus, &note));
     }
 }
 
 /// Writes the robot's description, once per file.
 fn write_robot(series: &mut SplitRecording<Topics>, layout: &Layout, nanos: u64) {
     if layout.robot.is_some() {
-        series.add_messages(MessageCount::other_messages(ROBOT_MESSAGES), |window, topics| {
+        series.add_messages(MessageCount::other_messages(ROBOT_MESSAGE_COUNT), |window, topics| {
             topics.write_robot(window, layout, nanos)
         });
     }

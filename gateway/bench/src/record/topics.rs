@@ -29,14 +29,14 @@ const LATCHED_QOS: (&str, &str) = (
      liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n  \
      avoid_ros_namespace_conventions: false\n",
 );
-const TIMING: &str = "/gateway/timing";
-const DIAGNOSTICS: &str = "/diagnostics";
-const TF: &str = "/tf";
-const TF_STATIC: &str = "/tf_static";
-const DESCRIPTION: &str = "/robot_description";
+const TIMING_TOPIC: &str = "/gateway/timing";
+const DIAGNOSTICS_TOPIC: &str = "/diagnostics";
+const TF_TOPIC: &str = "/tf";
+const TF_STATIC_TOPIC: &str = "/tf_static";
+const ROBOT_DESCRIPTION_TOPIC: &str = "/robot_description";
 
 /// Number of messages that [`Topics::write_robot`] writes.
-pub const ROBOT_MESSAGES: u64 = 2;
+pub const ROBOT_MESSAGE_COUNT: u64 = 2;
 
 /// Channels of one file.
 #[derive(Debug)]
@@ -64,7 +64,15 @@ impl Topics {
         let digits = [("time_digits", "9")];
         let of_arm = ["joint_states", "joint_commands", "torques"];
         let of_arm = of_arm.map(|topic| format!("/{}/{topic}", layout.arm));
-        let fixed = [NOTES_TOPIC, TIMING, DIAGNOSTICS, TF, TF_STATIC, DESCRIPTION].map(str::to_owned);
+        let fixed = [
+            NOTES_TOPIC,
+            TIMING_TOPIC,
+            DIAGNOSTICS_TOPIC,
+            TF_TOPIC,
+            TF_STATIC_TOPIC,
+            ROBOT_DESCRIPTION_TOPIC,
+        ]
+        .map(str::to_owned);
         let others = fixed.into_iter().chain(of_arm.iter().cloned());
         let [can, state] = layout.bus_topics(others).map(|topics| -> io::Result<Vec<Channel>> {
             topics.iter().map(|topic| writer.channel::<Record<'_>>(topic, &digits)).collect()
@@ -77,12 +85,12 @@ impl Topics {
         let patches = patches.collect::<io::Result<_>>()?;
         let [states, commands, torques] = &of_arm;
         let robot = layout.robot.is_some().then(|| {
-            let moving = writer.channel::<Transforms<'_>>(TF, &[])?;
-            let still = writer.channel::<Transforms<'_>>(TF_STATIC, &[LATCHED_QOS])?;
+            let moving = writer.channel::<Transforms<'_>>(TF_TOPIC, &[])?;
+            let still = writer.channel::<Transforms<'_>>(TF_STATIC_TOPIC, &[LATCHED_QOS])?;
             Ok::<_, io::Error>([
                 moving,
                 still,
-                writer.channel::<StringMessage<'_>>(DESCRIPTION, &[LATCHED_QOS])?,
+                writer.channel::<StringMessage<'_>>(ROBOT_DESCRIPTION_TOPIC, &[LATCHED_QOS])?,
             ])
         });
         Ok(Self {
@@ -92,8 +100,8 @@ impl Topics {
             joint_states: writer.channel::<JointState<'_>>(states, &[])?,
             joint_commands: writer.channel::<JointState<'_>>(commands, &[])?,
             torques: writer.channel::<Torques<'_>>(torques, &[])?,
-            timing: writer.channel::<LoopTiming>(TIMING, &[])?,
-            diagnostics: writer.channel::<Diagnostics<'_>>(DIAGNOSTICS, &[])?,
+            timing: writer.channel::<LoopTiming>(TIMING_TOPIC, &[])?,
+            diagnostics: writer.channel::<Diagnostics<'_>>(DIAGNOSTICS_TOPIC, &[])?,
             robot: robot.transpose()?,
             patches,
         })
@@ -123,7 +131,7 @@ impl Topics {
         seen: &LatchedFrame,
     ) {
         if let Some(channel) = self.state.get_mut(bus) {
-            window.write_at(channel, nanos, seen.at_nanos, &frame_record(name, seen));
+            window.write_sorted_at(channel, nanos, seen.at_nanos, &frame_record(name, seen));
         }
     }
 
@@ -131,7 +139,7 @@ impl Topics {
     pub fn write_note(&mut self, window: &mut ReorderWindow, bus: Option<usize>, note: &CaptureNote<'_>) {
         let channel = bus.and_then(|bus| self.can.get(bus));
         let heard = channel.map(|channel| window.latest_ns(channel)).filter(|heard| *heard > 0);
-        window.write_at(&mut self.notes, heard.unwrap_or(note.nanos), note.nanos, note);
+        window.write_sorted_at(&mut self.notes, heard.unwrap_or(note.nanos), note.nanos, note);
     }
 
     /// Writes a control tick that was due at `nanos`.
@@ -159,7 +167,7 @@ impl Topics {
             None => (&[][..], 0),
         };
         window.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active });
-        window.write(&mut self.timing, nanos, &timing(nanos, timed));
+        window.write(&mut self.timing, nanos, &loop_timing(nanos, timed));
         if layout.records_poses_at(record.tick.number)
             && let (Some(robot), Some([moving, ..])) = (&layout.robot, &mut self.robot)
         {
@@ -192,7 +200,7 @@ impl Topics {
             let (sensors, status) = touched.cells.get(cell).copied().unwrap_or((None, CellStatus::Unknown));
             #[expect(clippy::cast_possible_truncation, reason = "words of 16 bits")]
             let (force, proximity) = sensors.map_or((f32::NAN, f32::NAN), |sensors| {
-                (central.force(cell, &sensors) as f32, sensors.proximity.to_f64() as f32)
+                (central.cell_force(cell, &sensors) as f32, sensors.proximity.to_f64() as f32)
             });
             ContactState { node, force, proximity, status: status.number() }
         }));
@@ -204,10 +212,10 @@ impl Topics {
         cloud.clear();
         cloud.extend(cells.iter().zip(&patch.cells).map(|(state, &(cell, _))| {
             #[expect(clippy::cast_possible_truncation, reason = "metres with 7 digits")]
-            let position = central.position(cell, &frames).map(|metres| metres as f32);
+            let position = central.cell_position(cell, &frames).map(|metres| metres as f32);
             Point { position, force: state.force }
         }));
-        window.write(points, nanos, &PointCloud { nanos, frame_id: layout.base(), points: cloud });
+        window.write(points, nanos, &PointCloud { nanos, frame_id: layout.base_frame_name(), points: cloud });
     }
 
     /// Writes the diagnostics.
@@ -222,7 +230,7 @@ fn frame_record<'a>(interface: &'a str, seen: &LatchedFrame) -> Record<'a> {
     Record { time, interface, frame: seen.frame, direction }
 }
 
-fn timing(nanos: u64, timed: &TimedRecord) -> LoopTiming {
+fn loop_timing(nanos: u64, timed: &TimedRecord) -> LoopTiming {
     let record = &timed.record;
     #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
     let micros = |nanos: u64| nanos as f64 * 1e-3;

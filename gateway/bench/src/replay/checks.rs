@@ -7,17 +7,17 @@ use protocol::message::State;
 
 use super::ReplayOptions;
 use super::comparator::Comparator;
-use super::error::Mismatch;
-use super::start::Routes;
-use super::survey::{KnownValue, Survey, SurveyedBus, SurveyedCell};
-use crate::setup::names;
+use super::error::CellMismatch;
+use super::start::BusRoutes;
+use super::survey::{InitialValue, Survey, SurveyedBus, SurveyedCell};
+use crate::setup::format_cells;
 
 /// Checks of the cells before a replay: the options, the survey of the capture and the routes of its buses.
 #[derive(Debug)]
 pub(super) struct CellChecks {
     pub(super) options: ReplayOptions,
     pub(super) survey: Survey,
-    pub(super) routes: Routes,
+    pub(super) routes: BusRoutes,
     /// Display name of the capture.
     pub(super) name: String,
 }
@@ -36,7 +36,7 @@ impl CellChecks {
 
     /// Returns the cells that sent on a bus in the replayed part of the recording.
     fn cells<'a>(&self, bus: &'a SurveyedBus) -> impl Iterator<Item = (CellId, &'a SurveyedCell)> + use<'a> {
-        bus.cells_in(self.survey.bounds())
+        bus.cells_active_in(self.survey.part_bounds_ns())
     }
 
     /// Returns the cells that sent on each bus in the replayed part of the recording.
@@ -52,17 +52,17 @@ impl CellChecks {
 
     /// Returns true if newly started cells are already in the state in which the replay begins.
     pub(super) fn are_cells_fresh(&self) -> bool {
-        self.options.spawn.is_some() && self.named_buses().all(|(_, bus)| bus.state.is_fresh())
+        self.options.spawn.is_some() && self.named_buses().all(|(_, bus)| bus.state.is_start_state())
     }
 
     /// Returns the number of cells whose recorded configuration is unknown.
-    pub(super) fn unknown_hashes(&self) -> u64 {
-        let unknown = |bus| self.cells(bus).filter(|(_, cell)| hash(cell).is_none()).count() as u64;
+    pub(super) fn unknown_hash_count(&self) -> u64 {
+        let unknown = |bus| self.cells(bus).filter(|(_, cell)| recorded_hash(cell).is_none()).count() as u64;
         self.named_buses().map(|(_, bus)| unknown(bus)).sum()
     }
 
     /// Checks that the cells are present with their recorded configuration.
-    pub(super) fn check_hashes(&self, comparator: &Comparator) -> Result<(), Mismatch> {
+    pub(super) fn check_hashes(&self, comparator: &Comparator) -> Result<(), CellMismatch> {
         if self.options.expect.is_none() {
             return Ok(());
         }
@@ -76,7 +76,7 @@ impl CellChecks {
             let (mut missing, mut differing) = (Vec::new(), Vec::new());
             for (cell, recorded) in self.cells(bus) {
                 count += 1;
-                match (hash(recorded), there.get(&cell)) {
+                match (recorded_hash(recorded), there.get(&cell)) {
                     (_, None) => missing.push(cell),
                     (Some(then), Some(&now)) if then != now => {
                         differing.push(format!("{cell} (recorded {then:04X}, now {now:04X})"));
@@ -85,7 +85,7 @@ impl CellChecks {
                 }
             }
             if !missing.is_empty() {
-                absent.push(format!("{} on {name}", names(&missing, "")));
+                absent.push(format!("{} on {name}", format_cells(&missing, "")));
             }
             if !differing.is_empty() {
                 others += differing.len();
@@ -96,15 +96,15 @@ impl CellChecks {
         }
         let (cells, spawned) = (other.join("; "), self.options.spawn.is_some());
         if count > 0 && others == count {
-            return Err(Mismatch::Skin { count, cells, spawned });
+            return Err(CellMismatch::Skin { count, cells, spawned });
         }
         if others > 0 {
-            return Err(Mismatch::Cells { cells, spawned });
+            return Err(CellMismatch::Cells { cells, spawned });
         }
         if !absent.is_empty() {
-            return Err(Mismatch::Absent(absent.join("; ")));
+            return Err(CellMismatch::Absent(absent.join("; ")));
         }
-        if equal == 0 { Err(Mismatch::Unknown) } else { Ok(()) }
+        if equal == 0 { Err(CellMismatch::Unknown) } else { Ok(()) }
     }
 
     /// Returns the cells of each bus that measure now, although they obeyed stimuli in the recording.
@@ -121,6 +121,6 @@ impl CellChecks {
 }
 
 /// Returns the hash of a cell's recorded configuration, if known.
-const fn hash(cell: &SurveyedCell) -> Option<u16> {
-    if let KnownValue::Value(hash) = cell.hash { Some(hash) } else { None }
+const fn recorded_hash(cell: &SurveyedCell) -> Option<u16> {
+    if let InitialValue::Value(hash) = cell.hash { Some(hash) } else { None }
 }

@@ -7,7 +7,7 @@ use protocol::id::{CellId, Id, Kind, Node};
 use protocol::message::{Answer, Message};
 use protocol::packet::{Epoch, Packet, Words};
 use protocol::parameters::MAX_JOINTS;
-use protocol::schema::Units;
+use protocol::schema::BusUnits;
 use protocol::skin::JointKind;
 use serde::Serialize;
 
@@ -48,7 +48,7 @@ pub enum SentValue {
 
 /// Position of joints in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct JointsPosition {
+pub struct RecordingPosition {
     /// Number of the joints among the replayed joints of the bus, from 0.
     pub joints: u64,
     /// Epoch of the joints.
@@ -68,7 +68,7 @@ pub struct Difference {
     pub cell: u8,
     /// Position of the joints that the reply answers, if it answers any.
     #[serde(flatten)]
-    pub when: Option<JointsPosition>,
+    pub when: Option<RecordingPosition>,
     /// Text for people, in several lines.
     pub text: String,
 }
@@ -78,9 +78,9 @@ impl Difference {
     #[must_use]
     pub fn new(
         how: DifferenceKind,
-        (bus, units): (&str, Units),
+        (bus, units): (&str, BusUnits),
         cell: CellId,
-        when: Option<JointsPosition>,
+        when: Option<RecordingPosition>,
         recorded: Option<&SentValue>,
         now: Option<&SentValue>,
     ) -> Self {
@@ -89,20 +89,21 @@ impl Difference {
             DifferenceKind::Missing => "missing reply",
             DifferenceKind::Extra => "extra reply",
         };
-        let joints = when.map_or_else(String::new, |JointsPosition { joints, epoch, at_s }| {
+        let joints = when.map_or_else(String::new, |RecordingPosition { joints, epoch, at_s }| {
             format!(", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")
         });
         let epoch = Epoch(when.map_or(0, |when| when.epoch));
         let shown = |said: Option<&SentValue>| {
-            said.map_or_else(|| "nothing".to_owned(), |said| said.text(cell, epoch, units))
+            said.map_or_else(|| "nothing".to_owned(), |said| said.value_text(cell, epoch, units))
         };
         let mut text = format!(
             "the first {what}: cell {cell} on {bus}{joints}\n  recorded  {}\n  now       {}",
             shown(recorded),
             shown(now)
         );
-        if let Some(((recorded, format), (now, _))) =
-            recorded.and_then(|said| said.steps(units)).zip(now.and_then(|said| said.steps(units)))
+        if let Some(((recorded, format), (now, _))) = recorded
+            .and_then(|said| said.torque_steps(units))
+            .zip(now.and_then(|said| said.torque_steps(units)))
         {
             text += &format!("\n  {}", StepDifferences { recorded, now, format, units });
         }
@@ -112,7 +113,7 @@ impl Difference {
 
 impl SentValue {
     /// Formats the value as the text of a message.
-    fn text(&self, cell: CellId, epoch: Epoch, units: Units) -> String {
+    fn value_text(&self, cell: CellId, epoch: Epoch, units: BusUnits) -> String {
         match self {
             &Self::Words(what, words) => {
                 let (kind, count) = match what {
@@ -131,7 +132,7 @@ impl SentValue {
     }
 
     /// Returns the torques in steps, with `None` for saturated words, and their format.
-    fn steps(&self, units: Units) -> Option<([Option<i32>; MAX_JOINTS], TorqueFormat)> {
+    fn torque_steps(&self, units: BusUnits) -> Option<([Option<i32>; MAX_JOINTS], TorqueFormat)> {
         match self {
             Self::Words(ReplyKind::Torque, words) => {
                 Some((words.padded().map(|word| Some(word.into())), units.torque_format()))
@@ -143,7 +144,7 @@ impl SentValue {
 }
 
 /// Formats a sum, the children whose sums it contains, and the cell's own contribution.
-fn sum_text(cell: CellId, epoch: Epoch, own: &OwnContribution, units: Units) -> String {
+fn sum_text(cell: CellId, epoch: Epoch, own: &OwnContribution, units: BusUnits) -> String {
     let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
     let less = match children.as_slice() {
@@ -167,7 +168,7 @@ fn sum_text(cell: CellId, epoch: Epoch, own: &OwnContribution, units: Units) -> 
 }
 
 /// Formats a message as text, without the verdict on its frame.
-fn message_text(message: Message, units: Units) -> String {
+fn message_text(message: Message, units: BusUnits) -> String {
     let text = Decoded::Message(message).in_units(units).to_string();
     text.split_once(' ').map_or(String::new(), |(_, text)| text.trim_start().to_owned())
 }
@@ -177,7 +178,7 @@ struct StepDifferences {
     recorded: [Option<i32>; MAX_JOINTS],
     now: [Option<i32>; MAX_JOINTS],
     format: TorqueFormat,
-    units: Units,
+    units: BusUnits,
 }
 
 impl Display for StepDifferences {
@@ -212,11 +213,11 @@ mod tests {
     fn a_different_torque_is_shown_word_by_word() {
         let torque = |words: [i16; 6]| SentValue::Words(ReplyKind::Torque, words.into());
         let (recorded, now) = (torque([-1075, 3195, 0, 0, 0, 0]), torque([-1074, 3193, 0, 0, 0, 0]));
-        let when = Some(JointsPosition { joints: 37, epoch: 7, at_s: 2.3842 });
+        let when = Some(RecordingPosition { joints: 37, epoch: 7, at_s: 2.3842 });
         let cell = CellId::new(12).unwrap();
         let difference = Difference::new(
             DifferenceKind::Different,
-            ("vcan0", Units::default()),
+            ("vcan0", BusUnits::default()),
             cell,
             when,
             Some(&recorded),
@@ -232,11 +233,12 @@ mod tests {
 
     #[test]
     fn a_reply_that_was_not_sent_is_nothing() {
-        let refused = SentValue::Answer(9, Answer::Refused { number: 127, reason: Answer::WRONG_HASH });
+        let refused =
+            SentValue::Answer(9, Answer::Refused { number: 127, reason: Answer::REFUSED_WRONG_HASH });
         let cell = CellId::new(3).unwrap();
         let text = Difference::new(
             DifferenceKind::Missing,
-            ("can1", Units::default()),
+            ("can1", BusUnits::default()),
             cell,
             None,
             Some(&refused),

@@ -12,7 +12,7 @@ use trace::capture::CaptureError;
 
 /// An error of cells that are not in the state of the recording.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
-pub enum Mismatch {
+pub enum CellMismatch {
     /// All cells differ.
     #[error(
         "the recording is of another skin: the configurations of all {count} cells differ, {cells}; {}",
@@ -161,7 +161,7 @@ pub enum ReplayError {
     NoCell(String),
     /// The cells are not in the state of the recording.
     #[error(transparent)]
-    Mismatch(#[from] Mismatch),
+    Mismatch(#[from] CellMismatch),
     /// Cells do not confirm that they are in test mode.
     #[error("cells do not enter test mode: {0}")]
     NoTestMode(String),

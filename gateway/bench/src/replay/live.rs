@@ -18,12 +18,12 @@ use super::shared_state::SharedState;
 use super::start::{ReplayBus, mode_message};
 use super::{ReplayError, ReplayOptions};
 use crate::bus::realtime;
-use crate::setup::names;
+use crate::setup::format_cells;
 
 /// Interval in ns between checks of the stop flag.
-const STOP_POLL_NS: u64 = 100_000_000;
+const STOP_POLL_INTERVAL_NS: u64 = 100_000_000;
 /// Pause while the queue of steps is empty.
-const STEP_PAUSE: Duration = Duration::from_micros(100);
+const EMPTY_QUEUE_PAUSE: Duration = Duration::from_micros(100);
 const BUS_DOWN_PAUSE: Duration = Duration::from_millis(50);
 /// Time without any answer after which cells are queried again, because a frame may have been lost. After [`TIMEOUT`]
 /// they are given up.
@@ -37,7 +37,7 @@ const MAX_RESENDS_AFTER_FAILURE: u32 = 2;
 /// Time to wait for answers to resent joints, before cells must also send a heartbeat.
 const FIRST_ANSWER_WAIT: Duration = Duration::from_millis(100);
 /// Maximum factor by which the wait for answers is extended from try to try.
-const MAX_WAIT_FACTOR: u32 = 4;
+const MAX_ANSWER_WAIT_FACTOR: u32 = 4;
 
 /// The player's stage in a real replay.
 #[derive(Debug)]
@@ -54,8 +54,8 @@ pub(super) struct LiveBackend {
 }
 
 impl PlayerBackend for LiveBackend {
-    fn now(&self) -> u64 {
-        realtime::now()
+    fn now_ns(&self) -> u64 {
+        realtime::monotonic_ns()
     }
 
     fn wait_until(&mut self, at: u64) {
@@ -63,26 +63,26 @@ impl PlayerBackend for LiveBackend {
             u64::try_from(self.shared_state.checks.options.spin.as_nanos()).unwrap_or(u64::MAX),
         );
         while !self.shared_state.is_over() {
-            let now = realtime::now();
+            let now = realtime::monotonic_ns();
             if now >= asleep {
                 break;
             }
-            realtime::sleep_until(asleep.min(now + STOP_POLL_NS));
+            realtime::sleep_until(asleep.min(now + STOP_POLL_INTERVAL_NS));
         }
-        while realtime::now() < at && !self.shared_state.is_over() {
+        while realtime::monotonic_ns() < at && !self.shared_state.is_over() {
             core::hint::spin_loop();
         }
     }
 
     fn pause(&mut self) {
-        std::thread::sleep(STEP_PAUSE);
+        std::thread::sleep(EMPTY_QUEUE_PAUSE);
     }
 
     fn is_over(&self) -> bool {
         self.shared_state.is_over()
     }
 
-    fn announce(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
+    fn announce_joints(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
         self.shared_state.comparator().announce_joints(bus_index, round, epoch);
     }
 
@@ -108,12 +108,12 @@ impl PlayerBackend for LiveBackend {
         sent
     }
 
-    fn mark_unsent(&mut self, bus_index: usize, round: u64) {
+    fn mark_round_unsent(&mut self, bus_index: usize, round: u64) {
         self.shared_state.comparator().mark_unsent(bus_index, round);
     }
 
     fn wait_for_answers(&mut self, bus_index: usize, open: &AwaitedJoints) {
-        self.wait_until_done(bus_index);
+        self.wait_until_processed(bus_index);
         let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else {
             return;
         };
@@ -126,7 +126,7 @@ impl PlayerBackend for LiveBackend {
             if self.shared_state.is_over() {
                 return;
             }
-            if self.shared_state.comparator().unanswered(bus_index, round) == 0 {
+            if self.shared_state.comparator().missing_reply_count(bus_index, round) == 0 {
                 if again > 0 {
                     self.resend_failed.remove(&bus_index);
                 }
@@ -143,27 +143,27 @@ impl PlayerBackend for LiveBackend {
             if self.send_messages(bus_index, &[joints]).is_err() {
                 return;
             }
-            let give_up = Instant::now() + FIRST_ANSWER_WAIT * (again + 1).min(MAX_WAIT_FACTOR);
+            let give_up = Instant::now() + FIRST_ANSWER_WAIT * (again + 1).min(MAX_ANSWER_WAIT_FACTOR);
             let mut comparator = self.shared_state.comparator();
-            while comparator.unanswered(bus_index, round) > 0
+            while comparator.missing_reply_count(bus_index, round) > 0
                 && Instant::now() < give_up
                 && !self.shared_state.is_over()
             {
-                comparator = self.shared_state.wait(comparator, Duration::from_millis(5));
+                comparator = self.shared_state.wait_for_message(comparator, Duration::from_millis(5));
             }
             drop(comparator);
             if self.send_messages(bus_index, &[Message::Sync]).is_err() {
                 return;
             }
-            self.wait_until_done(bus_index);
+            self.wait_until_processed(bus_index);
         }
     }
 
-    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
+    fn restore_latched_state(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
         for (bus_link, messages) in states {
-            self.finish(*bus_link, &[Message::Sync])?;
-            self.shared_state.comparator().mute(true);
-            let mut all = self.contact_resets(*bus_link);
+            self.send_and_wait(*bus_link, &[Message::Sync])?;
+            self.shared_state.comparator().set_muted(true);
+            let mut all = self.contact_reset_messages(*bus_link);
             all.extend_from_slice(messages);
             for message in &all {
                 if let Message::Joints { epoch, .. } = *message {
@@ -171,20 +171,20 @@ impl PlayerBackend for LiveBackend {
                 }
                 self.send_messages(*bus_link, core::slice::from_ref(message))?;
             }
-            self.finish(*bus_link, &[Message::Sync])?;
-            self.shared_state.comparator().mute(false);
+            self.send_and_wait(*bus_link, &[Message::Sync])?;
+            self.shared_state.comparator().set_muted(false);
         }
         Ok(self.shared_state.checks.check_hashes(&self.shared_state.comparator())?)
     }
 
-    fn show(&mut self, at: u64) {
+    fn show_position(&mut self, at: u64) {
         self.shared_state.at.store(at, Ordering::Relaxed);
     }
 }
 
 impl LiveBackend {
     /// Returns the messages that reset the contact state of those cells on a bus that are in test mode.
-    fn contact_resets(&self, bus_index: usize) -> Vec<Message> {
+    fn contact_reset_messages(&self, bus_index: usize) -> Vec<Message> {
         let comparator = self.shared_state.comparator();
         let obeying =
             comparator.settled_cells(bus_index).filter(|(_, cell)| cell.claim.has_state(Flags::TEST_MODE));
@@ -201,23 +201,23 @@ impl LiveBackend {
     }
 
     /// Sends `last` on a bus, and waits until its cells have processed all messages sent so far.
-    fn finish(&mut self, bus_index: usize, last: &[Message]) -> Result<(), BusError> {
+    fn send_and_wait(&mut self, bus_index: usize, last: &[Message]) -> Result<(), BusError> {
         self.shared_state.comparator().announce_sync(bus_index);
         self.send_messages(bus_index, last)?;
-        self.wait_until_done(bus_index);
+        self.wait_until_processed(bus_index);
         Ok(())
     }
 
     /// Requests the counters of the cells on a bus, and waits for them.
-    pub(super) fn report(&mut self, bus_index: usize) -> Result<(), BusError> {
-        self.finish(bus_index, &[Message::Report, Message::Sync])
+    pub(super) fn request_counters(&mut self, bus_index: usize) -> Result<(), BusError> {
+        self.send_and_wait(bus_index, &[Message::Report, Message::Sync])
     }
 
-    fn wait_until_done(&mut self, bus_index: usize) {
+    fn wait_until_processed(&mut self, bus_index: usize) {
         let (mut done, mut progress, mut reminded) = (0, Instant::now(), Instant::now());
         let mut comparator = self.shared_state.comparator();
-        while !comparator.is_done(bus_index) && !self.shared_state.is_over() {
-            let now = comparator.done_count(bus_index);
+        while !comparator.are_joints_processed(bus_index) && !self.shared_state.is_over() {
+            let now = comparator.processed_cell_count(bus_index);
             if now != done {
                 (done, progress, reminded) = (now, Instant::now(), Instant::now());
             }
@@ -233,12 +233,12 @@ impl LiveBackend {
                 let (plural, verb) = if late.len() == 1 { ("", "does") } else { ("s", "do") };
                 self.notify(format!(
                     "cell{plural} {} on {name} {verb} not answer within {} s: the replay continues",
-                    names(&late, ""),
+                    format_cells(&late, ""),
                     ANSWER_TIMEOUT.as_secs()
                 ));
                 return;
             }
-            comparator = self.shared_state.wait(comparator, Duration::from_millis(20));
+            comparator = self.shared_state.wait_for_message(comparator, Duration::from_millis(20));
         }
     }
 }

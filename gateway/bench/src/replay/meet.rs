@@ -11,11 +11,11 @@ use protocol::message::{Message, State};
 
 use super::ReplayError;
 use super::comparator::Comparator;
-use super::session::Session;
+use super::session::ReplaySession;
 use super::start::{SpawnSkin, mode_message};
 use crate::error::RunError;
 use crate::processes::START_TIMEOUT;
-use crate::setup::{Timeout, names};
+use crate::setup::{Timeout, format_cells};
 
 /// Time within which each running cell sends at least one heartbeat.
 const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(1);
@@ -25,16 +25,16 @@ const ROUTE_TIMEOUT: Duration = Duration::from_secs(2);
 /// Interval between polls.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
-impl Session {
+impl ReplaySession {
     /// Queries the cells and checks that they fit the recording.
     pub(super) fn check_cells(&mut self, skin_override: Option<&SpawnSkin>) -> Result<(), ReplayError> {
         let shared_state = Arc::clone(&self.shared_state);
         let (checks, options) = (&shared_state.checks, &shared_state.checks.options);
-        if !options.receives() {
+        if !options.receives_cell_messages() {
             return Ok(());
         }
         let cells_of_bus = |skin: &protocol::skin::Skin, name: &str| -> BTreeSet<CellId> {
-            let bus = skin.bus_named(name);
+            let bus = skin.bus_index(name);
             bus.into_iter().flat_map(|bus| skin.cells_on_bus(bus)).map(|cell| cell.node).collect()
         };
         let required = match skin_override {
@@ -67,11 +67,11 @@ impl Session {
             self.measuring = measuring;
             return Ok(());
         }
-        let error = ReplayError::Measuring(names(&all, ""));
+        let error = ReplayError::Measuring(format_cells(&all, ""));
         if options.expect.is_some() {
             return Err(error);
         }
-        self.progress.note(&error.to_string());
+        self.progress.print_note(&error.to_string());
         Ok(())
     }
 
@@ -105,11 +105,11 @@ impl Session {
             if session.is_interrupted() {
                 return Err(RunError::Interrupted.into());
             }
-            if let Some(ended) = session.buses.processes.ended().into_iter().next() {
+            if let Some(ended) = session.buses.processes.take_ended().into_iter().next() {
                 let cells = ended.to_string();
                 return Err(ReplayError::Ended { cells, status: ended.status, said: ended.reason });
             }
-            if let Some(bus_link) = comparator.other_gateway() {
+            if let Some(bus_link) = comparator.other_gateway_bus() {
                 return Err(ReplayError::OtherGateway(
                     session.shared_state.checks.bus_name(bus_link).to_owned(),
                 ));
@@ -131,15 +131,15 @@ impl Session {
         self.poll_until(|session, comparator| {
             let wired = session.buses.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.wired);
             let without: Vec<_> =
-                wired.map(|(index, bus_link)| (bus_link, comparator.unreachable(index))).collect();
+                wired.map(|(index, bus_link)| (bus_link, comparator.unreachable_cells(index))).collect();
             let count: usize = without.iter().map(|(_, cells)| cells.len()).sum();
             if count == 0 || session.is_interrupted() {
                 return Ok(true);
             }
             let is_over = timeout.has_stalled(usize::MAX - count);
             for (bus_link, cells) in without.iter().filter(|(_, cells)| is_over && !cells.is_empty()) {
-                let (name, cells) = (bus_link.bus.name(), names(cells, ""));
-                session.progress.note(&format!(
+                let (name, cells) = (bus_link.bus.name(), format_cells(cells, ""));
+                session.progress.print_note(&format!(
                     "cells on {name} are unreachable, without a route to the gateway: {cells}"
                 ));
             }
@@ -159,7 +159,7 @@ impl Session {
             };
             let all_obey = measuring.iter().enumerate().all(obeys);
             if !all_obey && Instant::now() > give_up {
-                return Err(ReplayError::NoTestMode(names(&measuring.concat(), "")));
+                return Err(ReplayError::NoTestMode(format_cells(&measuring.concat(), "")));
             }
             Ok(all_obey)
         })

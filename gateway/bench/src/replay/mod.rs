@@ -40,19 +40,19 @@ use protocol::input::is_standard_input;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::checks::CellChecks;
-pub use self::error::Mismatch;
+pub use self::error::CellMismatch;
 pub use self::error::ReplayError;
 use self::player::ReplaySpeed;
 use self::replay_plan::SenderFilter;
 use self::report::Summary;
-use self::session::Session;
+use self::session::ReplaySession;
 use self::shared_state::SharedState;
-use self::start::Routes;
+use self::start::BusRoutes;
 use self::survey::{Survey, TimeRange};
 use crate::bus::realtime::idle_lateness;
 use crate::processes::ended::EndedProcesses;
 use crate::progress::Progress;
-use crate::setup::names;
+use crate::setup::format_cells;
 use crate::signals::catch_signals;
 use model::decode::MAX_BUSES;
 use trace::capture::{CaptureEntry, CaptureError, NoteKind, Reader, RecordingExtras, seconds_since};
@@ -60,7 +60,7 @@ use trace::capture::{CaptureEntry, CaptureError, NoteKind, Reader, RecordingExtr
 /// Period in ns of the wake-ups whose lateness is measured.
 const WAKEUP_PERIOD_NS: u64 = 2_000_000;
 /// Maximum number of unreadable lines that are named.
-const MAX_NAMED_LINES: u64 = 5;
+const MAX_LISTED_UNREADABLE_LINES: u64 = 5;
 
 /// Cells to start for a replay.
 #[derive(Clone, Debug)]
@@ -116,7 +116,7 @@ pub struct ReplayOptions {
 pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     let progress = Progress::notes_only(options.quiet);
     let (survey, extras, name) = survey_capture(options, &progress)?;
-    let routes = Routes::new(options, &survey, &name)?;
+    let routes = BusRoutes::new(options, &survey, &name)?;
     let skin_override = options.spawn.as_ref().map(|spawn| start::spawn_skin(spawn, &routes, &extras, &name));
     let skin_override = skin_override.transpose()?;
     // Until here, a signal may end the program, because there is nothing to clean up.
@@ -125,9 +125,9 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     let timed = matches!(options.pace, ReplaySpeed::Timed(_)) && !options.lockstep;
     let idle = timed.then(|| idle_lateness(WAKEUP_PERIOD_NS));
     let recorded = start::recorded_skin(&extras);
-    let mut buses = start::open(options, &survey, &routes, skin_override.as_ref(), recorded.as_ref())?;
+    let mut buses = start::open_buses(options, &survey, &routes, skin_override.as_ref(), recorded.as_ref())?;
     for bus_link in buses.bus_links.iter() {
-        progress.note(&format!("{} is {}", bus_link.bus.name(), bus_link.bus.kind()));
+        progress.print_note(&format!("{} is {}", bus_link.bus.name(), bus_link.bus.kind()));
     }
     let sends_joints = options.only != SenderFilter::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
     let present = if sends_joints { buses.find_cells()? } else { Vec::new() };
@@ -139,7 +139,7 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     }
     let shared_state = Arc::new(SharedState::new(checks));
     let (measuring, ended) = (Vec::new(), EndedProcesses::default());
-    Session { shared_state, buses, signalled, progress, measuring, ended }
+    ReplaySession { shared_state, buses, signalled, progress, measuring, ended }
         .run(idle.as_ref(), skin_override.as_ref())
 }
 
@@ -160,12 +160,12 @@ fn survey_capture(
     let mut survey = Survey::new(options.part);
     let check_bus_count =
         |buses| if buses > MAX_BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
-    let note = |text: String| progress.note(&format!("{name}: {text}"));
+    let note = |text: String| progress.print_note(&format!("{name}: {text}"));
     // Latched frames are stored before the first frame, and are known once the capture is open.
     let latched = &reader.extras().latched;
     let buses: BTreeSet<_> = latched.iter().map(|frame| frame.bus.as_str()).collect();
     check_bus_count(buses.len())?;
-    survey.add_latched(latched);
+    survey.add_latched_frames(latched);
     survey.run_began = reader.extras().run_began();
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(ReplayError::Read)? {
@@ -182,8 +182,8 @@ fn survey_capture(
                 NoteKind::Unreadable(why) => {
                     let line = format!("{name}:{}: {why}", note.line);
                     unreadable += 1;
-                    if unreadable <= MAX_NAMED_LINES {
-                        progress.note(&line);
+                    if unreadable <= MAX_LISTED_UNREADABLE_LINES {
+                        progress.print_note(&line);
                     }
                 }
                 NoteKind::Text => survey.add_note(&note),
@@ -204,7 +204,7 @@ fn survey_capture(
     for remark in reader.remarks_except_order() {
         note(remark);
     }
-    if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::WINDOW_NS) {
+    if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::REORDER_WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
         note(format!(
             "times run backwards, first at frame {frame} by {back:.3} s: a frame older than one already \
@@ -217,9 +217,9 @@ fn survey_capture(
             None => ReplayError::Empty(name),
         });
     }
-    let (from, to) = survey.bounds();
+    let (from, to) = survey.part_bounds_ns();
     if from > survey.last || from >= to {
-        let ends_s = seconds_since(survey.time_origin(), survey.last);
+        let ends_s = seconds_since(survey.time_origin_ns(), survey.last);
         return Err(ReplayError::NothingLeft { name, ends_s });
     }
     Ok((survey, reader.extras().clone(), name))
@@ -230,9 +230,9 @@ fn warn_of_duplicates(checks: &CellChecks, heard: &[BTreeSet<CellId>], progress:
     for ((name, bus), heard) in checks.named_buses().zip(heard) {
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();
         if !both.is_empty() {
-            progress.note(&format!(
+            progress.print_note(&format!(
                 "cells on {name} will receive copies of their own frames from the capture: {}; --only inputs leaves these frames out",
-                names(&both, "")
+                format_cells(&both, "")
             ));
         }
     }

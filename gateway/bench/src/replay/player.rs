@@ -19,12 +19,12 @@ use super::replay_plan::{AwaitedJoints, DueFrame, FrameRole, PlayerStep};
 use model::quantiles::histogram;
 
 /// Time in ns from the decision to start to the first frame.
-const LEAD_NS: u64 = 1_000_000;
+const START_DELAY_NS: u64 = 1_000_000;
 
 /// Interface of a player to its clock, its buses and its output.
 pub trait PlayerBackend {
     /// Monotonic clock in ns.
-    fn now(&self) -> u64;
+    fn now_ns(&self) -> u64;
     /// Waits until the clock reads `at`, or the replay is stopped.
     fn wait_until(&mut self, at: u64);
     /// Pauses briefly, because the queue of steps is empty and more steps will come.
@@ -32,23 +32,23 @@ pub trait PlayerBackend {
     /// Returns true if the replay was stopped.
     fn is_over(&self) -> bool;
     /// Tells the comparison that joints are about to be sent.
-    fn announce(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch);
+    fn announce_joints(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch);
     /// Sends frames; waits for room up to the timeout.
     ///
     /// # Errors
     /// Returns [`SendError`] if the bus stays full, is down or has ended.
     fn send(&mut self, bus_index: usize, frames: &[Frame]) -> Result<(), SendError>;
     /// Tells the comparison that a bus refused the joints of a round.
-    fn mark_unsent(&mut self, bus_index: usize, round: u64);
+    fn mark_round_unsent(&mut self, bus_index: usize, round: u64);
     /// Waits until the cells of a bus have answered.
     fn wait_for_answers(&mut self, bus_link: usize, open: &AwaitedJoints);
     /// Restores a latched state on each bus.
     ///
     /// # Errors
     /// Returns [`ReplayError`] if the cells then differ from the recording, or a bus has ended.
-    fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError>;
+    fn restore_latched_state(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError>;
     /// Shows the position of the replay, in ns after its first frame.
-    fn show(&mut self, at: u64);
+    fn show_position(&mut self, at: u64);
 }
 
 /// Speed at which a capture is replayed.
@@ -144,7 +144,7 @@ impl Player {
                 Ok(PlayerStep::Restore(_)) => {
                     self.wait_for_all(stage);
                     if let Ok(PlayerStep::Restore(states)) = steps.pop() {
-                        self.played.failure = stage.restore(&states).err();
+                        self.played.failure = stage.restore_latched_state(&states).err();
                         self.origin = None;
                     }
                 }
@@ -176,12 +176,12 @@ impl Player {
         clippy::cast_precision_loss,
         reason = "times far below 2^53 ns"
     )]
-    fn deadline(&mut self, due: &DueFrame, now: u64) -> Option<u64> {
+    fn send_time_ns(&mut self, due: &DueFrame, now: u64) -> Option<u64> {
         let ReplaySpeed::Timed(speed) = self.pace else { return None };
         if due.is_late {
             return None;
         }
-        let (clock, at) = *self.origin.get_or_insert((now + LEAD_NS, due.at));
+        let (clock, at) = *self.origin.get_or_insert((now + START_DELAY_NS, due.at));
         Some(clock + (due.at.saturating_sub(at) as f64 / speed) as u64)
     }
 
@@ -193,28 +193,28 @@ impl Player {
         stage: &mut impl PlayerBackend,
     ) {
         let bus_link = first.bus_index;
-        if self.syncs.is_some() && is_joints(first) {
+        if self.syncs.is_some() && is_joints_frame(first) {
             self.wait_for_answers(bus_link, stage);
         }
         self.batch.clear();
         self.rounds.clear();
-        let deadline = self.deadline(first, stage.now());
+        let deadline = self.send_time_ns(first, stage.now_ns());
         // Announce the joints before they are sent, because the answers may arrive before the send call returns.
         let mut open = self.add_to_batch(first, stage);
         let _ = steps.pop();
         if let Some(deadline) = deadline {
             stage.wait_until(deadline);
         }
-        let now = stage.now();
+        let now = stage.now_ns();
         self.record_lateness(deadline, now);
-        stage.show(first.at);
+        stage.show_position(first.at);
         // In lockstep, joints end a batch: the next frame must wait, or belongs to the next joints.
         while self.batch.len() < MAX_BATCH_DATAGRAMS && !(self.syncs.is_some() && open.is_some()) {
             let Ok(&PlayerStep::Frame(next)) = steps.peek() else { break };
             let waits = self.syncs.is_some()
-                && is_joints(&next)
+                && is_joints_frame(&next)
                 && self.open.get(bus_link).is_some_and(Option::is_some);
-            let deadline = self.deadline(&next, now);
+            let deadline = self.send_time_ns(&next, now);
             if next.bus_index != bus_link || waits || deadline.is_some_and(|deadline| deadline > now) {
                 break;
             }
@@ -226,7 +226,7 @@ impl Player {
         let sync = self.syncs.as_ref().and_then(|syncs| syncs.get(bus_link)).filter(|_| open.is_some());
         self.batch.extend(sync.into_iter().flatten());
         let sent = stage.send(bus_link, &self.batch);
-        self.count_sent(bus_link, frames, sent, stage);
+        self.count_sent_frames(bus_link, frames, sent, stage);
         let is_down = self.down.get(bus_link).copied().unwrap_or(false);
         if let Some(place) = self.open.get_mut(bus_link).filter(|_| self.syncs.is_some() && !is_down) {
             *place = open.or(*place);
@@ -236,7 +236,7 @@ impl Player {
     fn add_to_batch(&mut self, due: &DueFrame, stage: &mut impl PlayerBackend) -> Option<AwaitedJoints> {
         self.batch.push(due.frame);
         let FrameRole::Joints(open) = due.role else { return None };
-        stage.announce(due.bus_index, open.round, open.epoch);
+        stage.announce_joints(due.bus_index, open.round, open.epoch);
         self.rounds.extend(open.round.map(|round| (self.batch.len(), round)));
         Some(open)
     }
@@ -248,7 +248,7 @@ impl Player {
         }
     }
 
-    fn count_sent(
+    fn count_sent_frames(
         &mut self,
         bus_index: usize,
         frames: usize,
@@ -275,14 +275,14 @@ impl Player {
         *down = is_down;
         for (behind, round) in &self.rounds {
             if *behind > taken {
-                stage.mark_unsent(bus_index, *round);
+                stage.mark_round_unsent(bus_index, *round);
             }
         }
         self.played.failure = cause.filter(|cause| !cause.is_temporary()).map(ReplayError::from);
     }
 }
 
-const fn is_joints(due: &DueFrame) -> bool {
+const fn is_joints_frame(due: &DueFrame) -> bool {
     matches!(due.role, FrameRole::Joints(_) | FrameRole::SegmentOfJoints)
 }
 

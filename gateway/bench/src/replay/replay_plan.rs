@@ -12,20 +12,20 @@ use protocol::can::Frame;
 use protocol::candump::Record;
 use protocol::id::Id;
 use protocol::message::{Joints, Message};
-use protocol::packet::{Epoch, PacketError, data_id};
+use protocol::packet::{Epoch, PacketError, data_frame_id};
 use protocol::time::Micros;
 
 use super::comparator::Comparator;
-use super::survey::{Survey, is_input, is_joints};
+use super::survey::{Survey, is_from_gateway_side, is_joints};
 use model::decode::Decoded;
 use model::decode::settle::OrderedDecoder;
 use trace::order::{BusMerger, ReleasedFrame};
 
 /// Time in ns after the end of the replayed part during which recorded replies are still read, because they answer
 /// joints in the part.
-const LATE_REPLIES_NS: u64 = 1_000_000_000;
+const LATE_REPLY_WINDOW_NS: u64 = 1_000_000_000;
 /// Minimum time in ns between two passes.
-const MIN_GAP_NS: u64 = 1_000_000;
+const MIN_PASS_GAP_NS: u64 = 1_000_000;
 
 /// Filter of the sent frames by sender.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -144,7 +144,7 @@ impl<'a> ReplayPlan<'a> {
     /// part.
     pub fn add_frame(&mut self, record: &Record<'_>, comparator: &mut Comparator) -> ControlFlow<()> {
         let Some(bus) = self.survey.bus_named(record.interface) else {
-            self.skip(reason::NEW_BUS);
+            self.count_skipped(reason::BUS_ADDED_LATER);
             return ControlFlow::Continue(());
         };
         self.order.push(bus, record.time.nanos, (bus, record.frame));
@@ -177,7 +177,7 @@ impl<'a> ReplayPlan<'a> {
 
     /// Notes the end of the capture or of the part. Another pass may follow.
     pub fn end_pass(&mut self, comparator: &mut Comparator) {
-        while let Some(next) = self.order.pop_last() {
+        while let Some(next) = self.order.pop_without_waiting() {
             self.push_to_decoder(next);
         }
         self.settler.finish();
@@ -187,7 +187,7 @@ impl<'a> ReplayPlan<'a> {
         if let Some((first, last)) = self.sent.take() {
             let (frames, joints) = self.counts;
             let steps = if joints > 1 { joints } else { frames }.saturating_sub(1).max(1);
-            let gap = ((last - first).checked_div(steps)).unwrap_or(0).max(MIN_GAP_NS);
+            let gap = ((last - first).checked_div(steps)).unwrap_or(0).max(MIN_PASS_GAP_NS);
             self.offset += last - first + gap;
         }
         self.counts = (0, 0);
@@ -196,9 +196,9 @@ impl<'a> ReplayPlan<'a> {
     /// Returns the step that restores the state at the start of the replayed part.
     #[must_use]
     pub fn restore_step(&self) -> PlayerStep {
-        let bounds = self.survey.bounds();
+        let bounds = self.survey.part_bounds_ns();
         let of = |(bus, bus_link): (&super::survey::SurveyedBus, &Option<usize>)| {
-            let there: Vec<_> = bus.cells_in(bounds).map(|(cell, _)| cell).collect();
+            let there: Vec<_> = bus.cells_active_in(bounds).map(|(cell, _)| cell).collect();
             Some(((*bus_link)?, bus.state.restoring_messages(|cell| there.contains(&cell), bus.first_joints)))
         };
         PlayerStep::Restore(
@@ -213,7 +213,7 @@ impl<'a> ReplayPlan<'a> {
     }
 
     /// Counts a frame or note that is not sent.
-    pub fn skip(&mut self, reason: &'static str) {
+    pub fn count_skipped(&mut self, reason: &'static str) {
         *self.plan_summary.skipped.entry(reason).or_default() += 1;
     }
 
@@ -224,8 +224,8 @@ impl<'a> ReplayPlan<'a> {
         decoded: &Decoded,
         comparator: &mut Comparator,
     ) -> ControlFlow<()> {
-        let (from, to) = self.survey.bounds();
-        if next.send_nanos >= to.saturating_add(LATE_REPLIES_NS) {
+        let (from, to) = self.survey.part_bounds_ns();
+        if next.send_nanos >= to.saturating_add(LATE_REPLY_WINDOW_NS) {
             return ControlFlow::Break(());
         }
         let (bus, frame) = next.item;
@@ -236,13 +236,13 @@ impl<'a> ReplayPlan<'a> {
         } else {
             self.skip_reason(bus, &frame, decoded)
         };
-        let bus_link = self.destination(bus);
+        let bus_link = self.destination_bus(bus);
         let role = bus_link.filter(|_| self.selection.reads).map_or(FrameRole::Plain, |bus_link| {
             let is_in_part = (from..to).contains(&next.nanos);
-            classify(bus_link, next.nanos, decoded, unwanted.is_none(), is_in_part, comparator)
+            classify_frame(bus_link, next.nanos, decoded, unwanted.is_none(), is_in_part, comparator)
         });
         if let Some(reason) = unwanted {
-            self.skip(reason);
+            self.count_skipped(reason);
             return ControlFlow::Continue(());
         }
         let Some(bus_link) = bus_link else { return ControlFlow::Continue(()) };
@@ -263,24 +263,24 @@ impl<'a> ReplayPlan<'a> {
     }
 
     /// Returns the index of the bus that receives the frames of a bus of the capture, if any.
-    fn destination(&self, bus: usize) -> Option<usize> {
+    fn destination_bus(&self, bus: usize) -> Option<usize> {
         self.selection.destinations.get(bus).copied().flatten()
     }
 
     /// Returns the reason why a frame in the replayed part is not sent, or `None` if it is sent.
     fn skip_reason(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
-        let picked = self.destination(bus).is_some();
+        let picked = self.destination_bus(bus).is_some();
         if frame.is_error() {
-            return Some(reason::ERROR);
+            return Some(reason::ERROR_FRAME);
         }
         if matches!(decoded, Decoded::Wire(..)) {
             return Some(reason::SIMULATED_WIRE);
         }
         // Damaged frames are sent too, because the cells received them in the recording.
-        let id = data_id(frame).ok().filter(|_| !matches!(decoded, Decoded::Foreign(_)));
+        let id = data_frame_id(frame).ok().filter(|_| !matches!(decoded, Decoded::Foreign(_)));
         match self.selection.only {
-            _ if !picked => Some(reason::NOT_PICKED),
-            SenderFilter::Inputs if !id.is_some_and(is_input) => Some(reason::NO_INPUT),
+            _ if !picked => Some(reason::BUS_NOT_SELECTED),
+            SenderFilter::Inputs if !id.is_some_and(is_from_gateway_side) => Some(reason::NO_INPUT),
             SenderFilter::Replies if id.and_then(Id::sender).is_none() => Some(reason::NO_REPLY),
             SenderFilter::All | SenderFilter::Inputs | SenderFilter::Replies => None,
         }
@@ -288,7 +288,7 @@ impl<'a> ReplayPlan<'a> {
 }
 
 /// Determines the role of a frame, and passes its message to the comparator.
-fn classify(
+fn classify_frame(
     bus_index: usize,
     nanos: u64,
     decoded: &Decoded,
@@ -328,19 +328,19 @@ pub mod reason {
     /// Frame at `--to` or after it.
     pub const AFTER_PART: &str = "after --to";
     /// Frame of a bus that is not replayed (`--bus`).
-    pub const NOT_PICKED: &str = "not picked";
+    pub const BUS_NOT_SELECTED: &str = "not picked";
     /// Frame that is neither a command nor configuration nor a stimulus.
     pub const NO_INPUT: &str = "no input";
     /// Frame that was not sent by a cell.
     pub const NO_REPLY: &str = "no reply";
     /// Error frame: a message of a driver, never on a bus.
-    pub const ERROR: &str = "error frame";
+    pub const ERROR_FRAME: &str = "error frame";
     /// Frame of a simulated wire: cells send their own wire messages now, and real buses have no wire frames.
     pub const SIMULATED_WIRE: &str = "simulated wire";
     /// Frame of a bus that the capture did not have when it was first read.
-    pub const NEW_BUS: &str = "bus came later";
+    pub const BUS_ADDED_LATER: &str = "bus came later";
     /// Note between frames.
-    pub const NOTE: &str = "note";
+    pub const NOTE_BETWEEN_FRAMES: &str = "note";
 }
 
 #[cfg(test)]

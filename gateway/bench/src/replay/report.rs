@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::comparator::{Tally, UncomparedReplies};
+use super::comparator::{ReplyTally, UncomparedReplies};
 use super::difference::Difference;
 use super::player::BusTally;
 use crate::summary::{CellError, cells_in_error, count_noun};
@@ -85,7 +85,7 @@ pub struct ReplyComparison {
     pub tolerance: u16,
     /// Counts of the comparison.
     #[serde(flatten)]
-    pub tally: Tally,
+    pub tally: ReplyTally,
     /// Number of joints that cells processed too late to reply, by their own counters.
     pub joints_skipped: u64,
     /// Number of frames that the recorder reported as lost. Inputs among them cannot be sent.
@@ -99,8 +99,8 @@ pub struct ReplyComparison {
 impl UncomparedReplies {
     /// Returns the reasons why replies lack a recorded counterpart, with their counts, without zeros.
     #[must_use]
-    pub fn reasons(&self) -> Vec<(&'static str, u64)> {
-        nonzero([
+    pub fn reason_counts(&self) -> Vec<(&'static str, u64)> {
+        nonzero_counts([
             ("the cell was silent", self.silent),
             ("the cell had not received the joints", self.untaken),
             ("the reply was not recorded", self.unrecorded),
@@ -121,7 +121,7 @@ impl UncomparedReplies {
 }
 
 /// Returns the counts other than 0.
-fn nonzero<const N: usize>(counts: [(&'static str, u64); N]) -> Vec<(&'static str, u64)> {
+fn nonzero_counts<const N: usize>(counts: [(&'static str, u64); N]) -> Vec<(&'static str, u64)> {
     counts.into_iter().filter(|(_, count)| *count > 0).collect()
 }
 
@@ -129,14 +129,14 @@ impl Summary {
     /// Returns the reason why the replay failed, in one line, or `None` for success. Reasons that processes gave for
     /// errors of cells are repeated only if `quiet`, because they have been printed otherwise.
     #[must_use]
-    pub fn verdict(&self, quiet: bool) -> Option<String> {
+    pub fn failure_reason(&self, quiet: bool) -> Option<String> {
         if let Some(failure) = &self.failure {
             return Some(failure.clone());
         }
         let mut wrong: Vec<_> = cells_in_error(&self.cell_errors, quiet).into_iter().collect();
         if let Some(expect) = self.expect.as_ref().filter(|expect| !expect.tally.has_only_equal_replies()) {
-            let Tally { different, missing, extra, not_requested, .. } = expect.tally;
-            let counts = nonzero([
+            let ReplyTally { different, missing, extra, not_requested, .. } = expect.tally;
+            let counts = nonzero_counts([
                 ("different", different),
                 ("missing", missing),
                 ("extra", extra),
@@ -152,7 +152,7 @@ impl Summary {
                 };
                 wrong.push(format!("replies differ from the recorded ones: {}{by}", counts.join(", ")));
             }
-            if expect.tally.lacks_the_tree() {
+            if expect.tally.lacks_known_trees() {
                 wrong.push(
                     "no sum could be compared: cells have not reported their parents, then or now".to_owned(),
                 );
@@ -183,10 +183,10 @@ impl Summary {
     /// Returns the result in one line, and true if everything was sent, everything was compared, and all replies are
     /// equal.
     #[must_use]
-    pub fn first_line(&self) -> (bool, String) {
+    pub fn result_line(&self) -> (bool, String) {
         let until = if self.interrupted { " until it was interrupted" } else { "" };
         let sent = format!("{} sent", count_noun(self.sent, "frame", "frames"));
-        match (self.verdict(true), &self.expect) {
+        match (self.failure_reason(true), &self.expect) {
             (Some(why), _) => (false, format!("look at: {why}")),
             (None, None) => {
                 (false, format!("all sent{until}: {sent}; no reply was compared; use --expect for that"))
@@ -196,7 +196,8 @@ impl Summary {
             }
             (None, Some(expect)) => {
                 let equal = format!("{} as recorded", count_noun(expect.tally.equal, "reply", "replies"));
-                let lacking = expect.tally.lacking.reasons().iter().map(|(_, count)| count).sum::<u64>();
+                let lacking =
+                    expect.tally.lacking.reason_counts().iter().map(|(_, count)| count).sum::<u64>();
                 let unread = self.buses.iter().map(|bus| bus.unheard).sum();
                 let unchecked = [
                     (lacking, count_noun(lacking, "reply not compared", "replies not compared")),
@@ -253,7 +254,7 @@ mod tests {
             lockstep: None,
             expect: Some(ReplyComparison {
                 tolerance: 0,
-                tally: Tally { equal: 40, ..Tally::default() },
+                tally: ReplyTally { equal: 40, ..ReplyTally::default() },
                 joints_skipped: 0,
                 recording_dropped: 0,
                 unchecked_cells: 0,
@@ -271,7 +272,7 @@ mod tests {
             let mut expect = summary.expect.take().unwrap();
             change(&mut summary, &mut expect);
             summary.expect = Some(expect);
-            summary.first_line()
+            summary.result_line()
         };
         assert_eq!(line(|_, _| {}), (true, "all well: 100 frames sent, 40 replies as recorded".to_owned()));
         let interrupted = line(|it, _| it.interrupted = true);
@@ -294,7 +295,7 @@ mod tests {
             let (is_well, text) = line(change);
             assert!(!is_well && text.starts_with(begin), "{text}");
         }
-        let sent = Summary { expect: None, ..well() }.first_line();
+        let sent = Summary { expect: None, ..well() }.result_line();
         assert_eq!(
             sent,
             (false, "all sent: 100 frames sent; no reply was compared; use --expect for that".to_owned())
@@ -320,6 +321,6 @@ mod tests {
             tree_unknown: 1,
             sums_not_taken: 1,
         };
-        assert_eq!(all.reasons().len(), size_of::<UncomparedReplies>() / size_of::<u64>());
+        assert_eq!(all.reason_counts().len(), size_of::<UncomparedReplies>() / size_of::<u64>());
     }
 }

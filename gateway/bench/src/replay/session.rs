@@ -18,7 +18,7 @@ use super::player::{BusTally, Player, PlayerResult};
 use super::replay_plan::PlanSummary;
 use super::report::{BusSummary, LockstepResult, ReplyComparison, Summary};
 use super::shared_state::SharedState;
-use super::source::{self, STEP_QUEUE};
+use super::source::{self, STEP_QUEUE_LENGTH};
 use super::start::{Buses, SpawnSkin};
 use super::survey::SurveyedBus;
 use crate::bus::realtime::{self, GrantedPrivileges};
@@ -29,10 +29,10 @@ use crate::threads::spawn;
 use model::quantiles::Quantiles;
 
 /// Interval between two checks of the main thread.
-const ROUND_PAUSE: Duration = Duration::from_millis(20);
+const CHECK_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A replay that is ready to start.
-pub(super) struct Session {
+pub(super) struct ReplaySession {
     pub(super) shared_state: Arc<SharedState>,
     pub(super) buses: Buses,
     pub(super) signalled: Arc<AtomicBool>,
@@ -43,7 +43,7 @@ pub(super) struct Session {
     pub(super) ended: EndedProcesses,
 }
 
-impl Session {
+impl ReplaySession {
     /// Runs the replay. `idle` is the wake-up lateness of the idle machine; `skin_override` is the skin of the started
     /// cells.
     pub(super) fn run(
@@ -52,20 +52,22 @@ impl Session {
         skin_override: Option<&SpawnSkin>,
     ) -> Result<Summary, ReplayError> {
         let mut receivers = Vec::new();
-        if self.shared_state.checks.options.receives() {
+        if self.shared_state.checks.options.receives_cell_messages() {
             let roots = std::mem::take(&mut self.buses.roots);
             for ((index, bus_link), roots) in self.buses.bus_links.iter().enumerate().zip(roots) {
                 let (bus_links, shared_state) =
                     (Arc::clone(&self.buses.bus_links), Arc::clone(&self.shared_state));
                 let receive = move || {
-                    bus_links.get(index).map_or(0, |bus_link| shared_state.receive(index, bus_link, roots))
+                    bus_links
+                        .get(index)
+                        .map_or(0, |bus_link| shared_state.receive_until_end(index, bus_link, roots))
                 };
                 receivers.push(spawn(&format!("rx {}", bus_link.bus.name()), receive)?);
             }
         }
-        let mut outcome = self.check_cells(skin_override).and_then(|()| self.play(idle));
+        let mut outcome = self.check_cells(skin_override).and_then(|()| self.send_all_steps(idle));
         if let Err(error) = self.restore_mode() {
-            self.progress.note(&error.to_string());
+            self.progress.print_note(&error.to_string());
         }
         self.shared_state.stop_receiving.store(true, Ordering::Relaxed);
         for (bus_link, receiver) in receivers.into_iter().enumerate() {
@@ -74,13 +76,13 @@ impl Session {
                 bus.unheard = unheard;
             }
         }
-        self.progress.clear();
+        self.progress.clear_line();
         outcome
     }
 
     /// Sends all steps. The returned summary lacks the number of unread frames, which the receivers report later.
-    fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
-        let (queue, mut steps) = rtrb::RingBuffer::new(STEP_QUEUE);
+    fn send_all_steps(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
+        let (queue, mut steps) = rtrb::RingBuffer::new(STEP_QUEUE_LENGTH);
         let shared_state = Arc::clone(&self.shared_state);
         let reader = spawn("reader", move || source::read_capture(&shared_state, queue))?;
         while !self.shared_state.ready.load(Ordering::Relaxed) && !reader.is_finished() {
@@ -88,10 +90,11 @@ impl Session {
         }
 
         let options = &self.shared_state.checks.options;
-        let hears = options.receives();
+        let hears = options.receives_cell_messages();
         let (log_sender, said) = mpsc::channel();
         let bus_links = Arc::clone(&self.buses.bus_links);
-        let sync = || bus_links.iter().map(|bus_link| bus_link.frames(&Message::Sync).collect()).collect();
+        let sync =
+            || bus_links.iter().map(|bus_link| bus_link.encode_frames(&Message::Sync).collect()).collect();
         let player = Player::new(bus_links.len(), options.pace, options.lockstep.then(sync));
         let mut live = LiveBackend {
             shared_state: Arc::clone(&self.shared_state),
@@ -107,9 +110,9 @@ impl Session {
             if hears {
                 for bus_link in 0..live.bus_links.len() {
                     // Request the initial values of the counters. If the bus is down, the first frame reports it.
-                    let _ = live.report(bus_link);
+                    let _ = live.request_counters(bus_link);
                 }
-                live.shared_state.comparator().mute(false);
+                live.shared_state.comparator().set_muted(false);
             }
             let played = player.play(&mut steps, &mut live);
             (played, live, granted)
@@ -123,13 +126,14 @@ impl Session {
         self.shared_state.stop_sending.store(false, Ordering::Relaxed);
         let bus_links = self.shared_state.checks.named_buses().enumerate();
         for (bus_link, (name, _)) in bus_links.filter(|_| hears && played.failure.is_none()) {
-            if let Err(why) = live.report(bus_link) {
-                self.progress.note(&format!("{name}: its cells were not asked for a final report: {why}"));
+            if let Err(why) = live.request_counters(bus_link) {
+                self.progress
+                    .print_note(&format!("{name}: its cells were not asked for a final report: {why}"));
             }
         }
         self.shared_state.comparator().finish(!played.was_stopped && played.failure.is_none());
         for line in said.try_iter() {
-            self.progress.note(&line);
+            self.progress.print_note(&line);
         }
         self.note_ended_processes(true);
         let plan_summary = plan_summary.unwrap_or_else(|error| {
@@ -141,9 +145,9 @@ impl Session {
 
     /// Shows notes about processes that have ended; with `last`, all pending notes.
     fn note_ended_processes(&mut self, last: bool) {
-        let ended = self.buses.processes.ended();
+        let ended = self.buses.processes.take_ended();
         for note in self.ended.add_ended(ended, last) {
-            self.progress.note(&note);
+            self.progress.print_note(&note);
         }
     }
 
@@ -153,18 +157,18 @@ impl Session {
         said: &mpsc::Receiver<String>,
         is_over: impl Fn() -> bool,
     ) -> Option<ReplayError> {
-        let bar = self.progress.bar(self.length_ms());
+        let bar = self.progress.start_bar(self.capture_length_ms());
         let mut other_gateway = None;
         while !is_over() {
-            thread::sleep(ROUND_PAUSE);
+            thread::sleep(CHECK_INTERVAL);
             bar.set_position(self.shared_state.at.load(Ordering::Relaxed) / 1_000_000);
             bar.set_message(self.shared_state.sent.load(Ordering::Relaxed).to_string());
             for line in said.try_iter() {
-                self.progress.note(&line);
+                self.progress.print_note(&line);
             }
             self.note_ended_processes(false);
-            if self.shared_state.checks.options.receives() && other_gateway.is_none() {
-                let bus_link = self.shared_state.comparator().other_gateway();
+            if self.shared_state.checks.options.receives_cell_messages() && other_gateway.is_none() {
+                let bus_link = self.shared_state.comparator().other_gateway_bus();
                 other_gateway = bus_link.map(|bus_link| {
                     ReplayError::OtherGateway(self.shared_state.checks.bus_name(bus_link).to_owned())
                 });
@@ -179,9 +183,9 @@ impl Session {
     }
 
     /// Returns the length of the capture in ms, or `None` if the replay has no end.
-    fn length_ms(&self) -> Option<u64> {
+    fn capture_length_ms(&self) -> Option<u64> {
         let CellChecks { survey, options, .. } = &self.shared_state.checks;
-        let (from, to) = survey.bounds();
+        let (from, to) = survey.part_bounds_ns();
         let from = from.max(survey.first.unwrap_or(0));
         let one = to.min(survey.last).saturating_sub(from) / 1_000_000;
         options.passes.map(|passes| one * u64::from(passes))
@@ -244,8 +248,8 @@ impl Session {
             tally: *comparator.tally(),
             joints_skipped: late.sum(),
             recording_dropped: checks.survey.dropped,
-            unchecked_cells: checks.unknown_hashes(),
-            first: comparator.first().cloned(),
+            unchecked_cells: checks.unknown_hash_count(),
+            first: comparator.first_difference().cloned(),
         }
     }
 }

@@ -9,7 +9,7 @@ use protocol::time::Micros;
 use super::checks::CellChecks;
 use super::comparator::Comparator;
 use super::start::ReplayBus;
-use crate::bus::follow::{FollowStep, FollowedItem, Follower, OpenedOnce};
+use crate::bus::follow::{FollowStep, FollowedItem, Follower, NeverReopenedBus};
 use crate::bus::realtime;
 use crate::bus::roots::RootWires;
 use model::decode::{Decoded, Decoder};
@@ -62,7 +62,7 @@ impl SharedState {
     }
 
     /// Waits until a message arrives, at most for `time`.
-    pub(super) fn wait<'a>(
+    pub(super) fn wait_for_message<'a>(
         &self,
         comparator: MutexGuard<'a, Comparator>,
         time: Duration,
@@ -83,12 +83,17 @@ impl SharedState {
 
     /// Receives on a bus until the end of the replay, and acts as the gateway's side of the wires to the roots. Returns
     /// the number of frames lost because they arrived faster than they were read.
-    pub(super) fn receive(&self, index: usize, bus_link: &ReplayBus, mut roots: Option<RootWires>) -> u64 {
+    pub(super) fn receive_until_end(
+        &self,
+        index: usize,
+        bus_link: &ReplayBus,
+        mut roots: Option<RootWires>,
+    ) -> u64 {
         realtime::prepare_receiver();
         let mut decoder = Decoder::new(Some(bus_link.format));
         // Start the wires at once: the cells may be present already, and cells that start build their tree at once.
         roots.iter_mut().for_each(RootWires::start_sending);
-        let (mut follower, mut end) = (Follower::new(roots, Duration::ZERO), OpenedOnce(&bus_link.bus));
+        let (mut follower, mut end) = (Follower::new(roots, Duration::ZERO), NeverReopenedBus(&bus_link.bus));
         while !self.stop_receiving.load(Ordering::Relaxed) {
             match follower.step(&mut end, POLL_INTERVAL) {
                 FollowStep::Nothing | FollowStep::Drained | FollowStep::Refused(_) => continue,
@@ -111,12 +116,12 @@ impl SharedState {
                     && let Decoded::Message(message) =
                         decoder.decode(at, bus_link.bus.name(), &received.frame)
                 {
-                    comparator.observe(index, &message);
+                    comparator.observe_message(index, &message);
                 }
             });
             drop(comparator);
             self.notify_waiting();
         }
-        follower.dropped()
+        follower.dropped_frames()
     }
 }

@@ -9,7 +9,7 @@ use super::shared_state::SharedState;
 use trace::capture::{CaptureEntry, CaptureError, Reader};
 
 /// Number of steps read ahead: some tenths of a second of traffic on a full bus.
-pub(super) const STEP_QUEUE: usize = 16_384;
+pub(super) const STEP_QUEUE_LENGTH: usize = 16_384;
 /// Pause while the queue is full. The steps in the queue last much longer than the pause.
 const FULL_QUEUE_PAUSE: Duration = Duration::from_millis(2);
 
@@ -26,16 +26,16 @@ pub(super) fn read_capture(
     queue: rtrb::Producer<PlayerStep>,
 ) -> Result<PlanSummary, CaptureError> {
     let CellChecks { options, survey, routes, .. } = &shared_state.checks;
-    let (bus_links, hears) = (routes.destinations.clone(), options.receives());
+    let (bus_links, hears) = (routes.destinations.clone(), options.receives_cell_messages());
     let selection = FrameSelection { only: options.only, destinations: bus_links, reads: hears };
     let mut source = CaptureReader { shared_state, replay_plan: ReplayPlan::new(survey, &selection), queue };
     let mut pass = 0_u32;
     while options.passes.is_none_or(|passes| pass < passes) && !source.is_over() {
         if hears && (pass > 0 || !shared_state.checks.are_cells_fresh()) {
-            source.push(source.replay_plan.restore_step());
+            source.queue_step(source.replay_plan.restore_step());
         }
         let mut comparator = shared_state.comparator();
-        comparator.expect_restart();
+        comparator.expect_next_pass();
         for (bus, bus_link) in survey.buses.iter().zip(&routes.destinations) {
             let Some(bus_link) = *bus_link else { continue };
             bus.latched.iter().for_each(|message| comparator.expect_message(bus_link, message, false));
@@ -54,7 +54,7 @@ impl CaptureReader<'_> {
         let mut reader = Reader::open_all(&self.shared_state.checks.options.files)?;
         while let Some(entry) = reader.next()? {
             let CaptureEntry::Frame(record) = entry else {
-                self.replay_plan.skip(reason::NOTE);
+                self.replay_plan.count_skipped(reason::NOTE_BETWEEN_FRAMES);
                 continue;
             };
             let flow = self.replay_plan.add_frame(&record, &mut self.shared_state.comparator());
@@ -70,11 +70,11 @@ impl CaptureReader<'_> {
 
     fn push_steps(&mut self) {
         while let Some(step) = self.replay_plan.next_step() {
-            self.push(step);
+            self.queue_step(step);
         }
     }
 
-    fn push(&mut self, mut step: PlayerStep) {
+    fn queue_step(&mut self, mut step: PlayerStep) {
         while let Err(rtrb::PushError::Full(back)) = self.queue.push(step) {
             self.shared_state.ready.store(true, Ordering::Relaxed);
             if self.is_over() {

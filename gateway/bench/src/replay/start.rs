@@ -18,9 +18,9 @@ use super::survey::Survey;
 use super::{ReplayError, ReplayOptions, SpawnOptions};
 use crate::bus::listen::{self, Listener};
 use crate::bus::roots::{ReceiveFilter, RootWires};
-use crate::bus::served::{IfAbsent, ServedBus, open_or_serve};
-use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, Processes, memory_file, program_path};
-use crate::setup::names;
+use crate::bus::served::{AbsentBusAction, ServedBus, open_or_serve};
+use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, Processes, create_memory_file, program_path};
+use crate::setup::format_cells;
 use model::decode::Decoded;
 use trace::capture::{RecordingExtras, SKIN_ATTACHMENT};
 
@@ -29,18 +29,18 @@ const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Destinations of the capture's buses.
 #[derive(Clone, Debug)]
-pub(super) struct Routes {
+pub(super) struct BusRoutes {
     /// Destination index of each bus of the capture; `None` if it is not replayed.
     pub(super) destinations: Vec<Option<usize>>,
     /// Index of each destination's bus in the capture, and name of the destination in this replay.
     pub(super) names: Vec<(usize, String)>,
 }
 
-impl Routes {
+impl BusRoutes {
     /// Evaluates `--bus` and `--map`.
     pub(super) fn new(options: &ReplayOptions, survey: &Survey, capture: &str) -> Result<Self, ReplayError> {
         let known = |name: &str, option: String| {
-            let (capture, buses) = (capture.to_owned(), survey.names());
+            let (capture, buses) = (capture.to_owned(), survey.bus_names());
             let bus = name.to_owned();
             survey.bus_named(name).ok_or(ReplayError::NoBus { option, capture, bus, buses })
         };
@@ -70,7 +70,7 @@ impl Routes {
         let names = routes.names.iter().map(|(_, name)| name.as_str());
         options.kinds.clone().restrict_to(names)?;
         let distinct: BTreeSet<_> = routes.names.iter().map(|(_, name)| name).collect();
-        if options.receives() && distinct.len() < routes.names.len() {
+        if options.receives_cell_messages() && distinct.len() < routes.names.len() {
             return Err(ReplayError::Merged);
         }
         Ok(routes)
@@ -89,13 +89,13 @@ pub(super) struct ReplayBus {
 }
 
 impl ReplayBus {
-    pub(super) fn frames(&self, message: &Message) -> impl Iterator<Item = Frame> + use<> {
+    pub(super) fn encode_frames(&self, message: &Message) -> impl Iterator<Item = Frame> + use<> {
         message.encode().frames(self.format)
     }
 
     /// Sends messages of this replay itself, which are not from the capture.
     pub(super) fn send(&self, messages: &[Message]) -> Result<(), BusError> {
-        let frames: Vec<_> = messages.iter().flat_map(|message| self.frames(message)).collect();
+        let frames: Vec<_> = messages.iter().flat_map(|message| self.encode_frames(message)).collect();
         Ok(self.bus.send(&frames)?)
     }
 }
@@ -123,7 +123,7 @@ pub(super) struct SpawnSkin {
 /// Returns the skin of the cells to start: the skin of the options, or else that of the recording.
 pub(super) fn spawn_skin(
     spawn: &SpawnOptions,
-    routes: &Routes,
+    routes: &BusRoutes,
     extras: &RecordingExtras,
     file: &str,
 ) -> Result<SpawnSkin, ReplayError> {
@@ -136,11 +136,11 @@ pub(super) fn spawn_skin(
         };
         let text = String::from_utf8_lossy(bytes);
         let skin = Skin::parse_recorded(&format!("the skin in {file}"), &text)?;
-        let (memory, file) = memory_file(bytes)?;
+        let (memory, file) = create_memory_file(bytes)?;
         SpawnSkin { skin, file, _memory: Some(memory) }
     };
     for (_, name) in &routes.names {
-        if skin_override.skin.bus_named(name).is_none() {
+        if skin_override.skin.bus_index(name).is_none() {
             let buses =
                 skin_override.skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
             let (bus, skin) = (name.clone(), skin_override.skin.name);
@@ -161,10 +161,10 @@ pub(super) fn recorded_skin(extras: &RecordingExtras) -> Option<Skin> {
 }
 
 /// Opens all buses. `recorded` is the skin of cells that are already on the buses, if known.
-pub(super) fn open(
+pub(super) fn open_buses(
     options: &ReplayOptions,
     survey: &Survey,
-    routes: &Routes,
+    routes: &BusRoutes,
     skin_override: Option<&SpawnSkin>,
     recorded: Option<&Skin>,
 ) -> Result<Buses, ReplayError> {
@@ -177,18 +177,20 @@ pub(super) fn open(
         let bus_skin = skin_override
             .map(|skin_override| (&skin_override.skin, name))
             .or_else(|| Some((recorded?, &surveyed.name)));
-        let spawned_skin = bus_skin.and_then(|(skin, name)| Some((skin, skin.bus_named(name)?)));
+        let spawned_skin = bus_skin.and_then(|(skin, name)| Some((skin, skin.bus_index(name)?)));
         let receive_filter = spawned_skin
             .map_or_else(|| vec![Filter::ALL], |(skin, bus)| ReceiveFilter::for_bus(skin, bus, true).filters);
         let bus_options = BusOptions {
             fd: surveyed.has_fd || format == Some(Format::Fd),
-            filters: if options.receives() { receive_filter } else { Vec::new() },
+            filters: if options.receives_cell_messages() { receive_filter } else { Vec::new() },
             receive_buffer: options.receive_buffer,
             send_timeout: options.timeout,
             ..BusOptions::default()
         };
         let (bus, served_here) = match skin_override {
-            Some(_) => open_or_serve(name, options.kinds.kind_of(name), &bus_options, IfAbsent::Create)?,
+            Some(_) => {
+                open_or_serve(name, options.kinds.kind_of(name), &bus_options, AbsentBusAction::Create)?
+            }
             None => match Bus::open(name, options.kinds.kind_of(name), &bus_options) {
                 Err(error) if options.expect.is_some() && error.may_open_later() => {
                     return Err(ReplayError::BusAbsent(error));
@@ -197,7 +199,8 @@ pub(super) fn open(
             },
         };
         // Real buses have real wires.
-        let has_wires = options.receives() && (!bus.kind().is_interface() || bus.is_virtual()?);
+        let has_wires =
+            options.receives_cell_messages() && (!bus.kind().is_interface() || bus.is_virtual()?);
         let root = spawned_skin.filter(|_| has_wires).and_then(|(skin, bus)| RootWires::for_bus(skin, bus));
         let (own, wired) = (served_here.is_some(), root.is_some());
         roots.push(root);
@@ -216,7 +219,7 @@ impl Buses {
         let again = |(index, bus_link): (usize, &ReplayBus)| {
             let options = BusOptions { filters: filters.clone(), ..BusOptions::default() };
             let kind = KindChoice::Only(bus_link.bus.kind());
-            let bus = listen::open(bus_link.bus.name(), kind, Some(bus_link.format), options)?;
+            let bus = listen::open_bus(bus_link.bus.name(), kind, Some(bus_link.format), options)?;
             Ok((index, Listener::new(bus, None)))
         };
         let others = self.bus_links.iter().enumerate().filter(|(_, bus_link)| !bus_link.own);
@@ -227,7 +230,7 @@ impl Buses {
             for (index, listener) in &mut open {
                 listener.receive(Duration::ZERO)?;
                 let speakers: Vec<_> =
-                    listener.decoded().filter_map(|(_, decoded)| sender(&decoded)).collect();
+                    listener.decoded_frames().filter_map(|(_, decoded)| sender_node(&decoded)).collect();
                 for speaker in speakers {
                     match (speaker, found.get_mut(*index)) {
                         (Node::Gateway, _) => {
@@ -251,7 +254,7 @@ impl Buses {
     ) -> Result<(), ReplayError> {
         let there = self.bus_links.iter().zip(heard).find(|(_, cells)| !cells.is_empty());
         if let Some((bus_link, cells)) = there {
-            let cells = names(&cells.iter().copied().collect::<Vec<_>>(), "");
+            let cells = format_cells(&cells.iter().copied().collect::<Vec<_>>(), "");
             return Err(ReplayError::CellsPresent { bus: bus_link.bus.name().to_owned(), cells });
         }
         let kinds = KindChoices::from_kinds(
@@ -272,7 +275,7 @@ impl Buses {
 }
 
 /// Returns the sender if it is a gateway or a cell.
-const fn sender(decoded: &Decoded) -> Option<Node> {
+const fn sender_node(decoded: &Decoded) -> Option<Node> {
     if let Decoded::Message(Message::Network { from, .. }) = decoded {
         Some(*from)
     } else if let Decoded::Message(Message::Joints { .. }) = decoded {
@@ -284,7 +287,7 @@ const fn sender(decoded: &Decoded) -> Option<Node> {
 
 impl ReplayOptions {
     /// Returns true if the replay receives messages of cells.
-    pub(super) fn receives(&self) -> bool {
+    pub(super) fn receives_cell_messages(&self) -> bool {
         self.expect.is_some() || self.lockstep || self.only == SenderFilter::Inputs
     }
 }

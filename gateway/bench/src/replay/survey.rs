@@ -10,7 +10,7 @@ use protocol::id::{CellId, Command, Id, Node};
 use protocol::message::{
     Answer, Heartbeat, Joints, Message, NetworkPage, ReceivedCounts, Request, State as Flags,
 };
-use protocol::packet::{Epoch, data_id};
+use protocol::packet::{Epoch, data_frame_id};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
@@ -19,13 +19,13 @@ use model::latched::LatchedState;
 use trace::capture::{BusNote, CaptureNote, LatchedFrame};
 
 /// Silence in ns after which a cell counts as absent.
-const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
+const ABSENCE_TIMEOUT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
 /// Maximum time in ns from the first joints after a cell's start to the cell's first heartbeat.
-const MAX_START_NS: u64 = 100_000_000;
+const MAX_CELL_START_NS: u64 = 100_000_000;
 
 /// Maximum number of joint broadcasts between the sending and the recording of a page of counters.
-const MAX_COUNTER_DELAY: usize = 64;
+const MAX_COUNTER_DELAY_BROADCASTS: usize = 64;
 
 /// A part of a capture. Bounds are in ns since the start of the run or, if the capture has no run, since its first
 /// frame.
@@ -70,7 +70,7 @@ pub struct SurveyedBus {
     /// Number of joint broadcasts.
     pub joints: u64,
     /// Latest joint broadcasts, oldest first.
-    recent_joints: VecDeque<Broadcast>,
+    recent_joints: VecDeque<JointsBroadcast>,
     /// True if a cell reported its counters, or a message was latched at the start of the capture. A part of a
     /// recording, or a truncated one, may lack messages that the counters account for.
     is_accounted: bool,
@@ -85,12 +85,12 @@ pub struct SurveyedBus {
     /// Cells of the bus.
     pub cells: BTreeMap<CellId, SurveyedCell>,
     /// State of cells according to messages from before the capture.
-    before: BTreeMap<CellId, EarlierCell>,
+    before: BTreeMap<CellId, CellBeforeCapture>,
 }
 
 /// A broadcast of joints.
 #[derive(Clone, Copy, Debug)]
-struct Broadcast {
+struct JointsBroadcast {
     epoch: Epoch,
     /// Number of joint broadcasts up to and including this one.
     number: u64,
@@ -100,11 +100,11 @@ struct Broadcast {
 
 /// State of a cell from before the capture.
 #[derive(Clone, Debug, Default)]
-struct EarlierCell {
+struct CellBeforeCapture {
     tracked: CellTracker,
     /// Time of the cell's last message in ns since 1970.
     last_seen: u64,
-    hash: KnownValue<u16>,
+    hash: InitialValue<u16>,
     measures: bool,
 }
 
@@ -112,7 +112,7 @@ struct EarlierCell {
 #[derive(Clone, Debug)]
 pub struct SurveyedCell {
     /// Hash of the cell's configuration where the replayed part begins, if known.
-    pub hash: KnownValue<u16>,
+    pub hash: InitialValue<u16>,
     /// True if the cell measured in the replayed part, so that its torques cannot be reproduced.
     pub measured: bool,
     /// Times of the cell's first and last message in ns since 1970.
@@ -141,7 +141,7 @@ pub struct SurveyedCell {
 
 /// Position of a frame relative to the replayed part.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum PartPosition {
+enum ReplayPartPosition {
     /// Before the part.
     Before,
     In,
@@ -150,7 +150,7 @@ enum PartPosition {
 
 /// A value at the start of the replayed part. It is known if a cell reports it later, before the value changes.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum KnownValue<T> {
+pub enum InitialValue<T> {
     /// The value has not been reported.
     #[default]
     No,
@@ -178,14 +178,14 @@ impl Survey {
     }
 
     /// Adds the frames that are latched at the start of the capture; call it before the first frame.
-    pub fn add_latched(&mut self, latched: &[LatchedFrame]) {
+    pub fn add_latched_frames(&mut self, latched: &[LatchedFrame]) {
         let mut decoder = Decoder::new(None);
         for LatchedFrame { bus, frame, nanos, .. } in latched {
             if let Decoded::Message(message) = decoder.decode(Micros(nanos / 1_000), bus, frame) {
                 let bus = self.bus(bus);
                 bus.is_accounted = true;
-                bus.state.apply(&message);
-                bus.add_latched(&message, *nanos);
+                bus.state.apply_message(&message);
+                bus.add_latched_message(&message, *nanos);
                 bus.latched.push(message);
             }
         }
@@ -197,23 +197,23 @@ impl Survey {
         self.first.get_or_insert(nanos);
         self.last = self.last.max(nanos);
         self.frames += 1;
-        let (begins, ends) = self.bounds();
+        let (begins, ends) = self.part_bounds_ns();
         let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
         let bus = self.bus(record.interface);
         bus.frames += 1;
         bus.has_fd |= record.frame.format() == Format::Fd;
-        let from = data_id(&record.frame).ok().and_then(Id::sender);
+        let from = data_frame_id(&record.frame).ok().and_then(Id::sender);
         if let (Some(cell), Decoded::Message(_) | Decoded::Meaningless { .. }) = (from, &decoded) {
             bus.mark_seen(cell, nanos);
         }
         if let Decoded::Message(message) = decoded {
             bus.format.get_or_insert_with(|| record.frame.format());
             let place = if nanos < begins {
-                PartPosition::Before
+                ReplayPartPosition::Before
             } else if nanos < ends {
-                PartPosition::In
+                ReplayPartPosition::In
             } else {
-                PartPosition::After
+                ReplayPartPosition::After
             };
             bus.add_message(&message, from, nanos, place);
         }
@@ -246,16 +246,16 @@ impl Survey {
 
     /// Returns the time in ns since 1970 from which seconds count: the start of the run, or the first frame.
     #[must_use]
-    pub fn time_origin(&self) -> u64 {
+    pub fn time_origin_ns(&self) -> u64 {
         self.run_began.or(self.first).unwrap_or(0)
     }
 
     /// Returns the bounds of the replayed part in ns since 1970, end exclusive. If the part has no start, it includes
     /// frames older than the first one.
     #[must_use]
-    pub fn bounds(&self) -> (u64, u64) {
-        let end = self.part.to.map_or(u64::MAX, |to| self.time_origin().saturating_add(to));
-        (self.part.from.map_or(0, |from| self.time_origin().saturating_add(from)), end)
+    pub fn part_bounds_ns(&self) -> (u64, u64) {
+        let end = self.part.to.map_or(u64::MAX, |to| self.time_origin_ns().saturating_add(to));
+        (self.part.from.map_or(0, |from| self.time_origin_ns().saturating_add(from)), end)
     }
 
     /// Returns the index of a bus, by its name in the capture.
@@ -266,7 +266,7 @@ impl Survey {
 
     /// Returns the names of the buses, joined for display.
     #[must_use]
-    pub fn names(&self) -> String {
+    pub fn bus_names(&self) -> String {
         self.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ")
     }
 
@@ -281,26 +281,26 @@ impl Survey {
 
 impl SurveyedBus {
     /// Handles a message from before the capture that is latched at its start.
-    fn add_latched(&mut self, message: &Message, nanos: u64) {
+    fn add_latched_message(&mut self, message: &Message, nanos: u64) {
         if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =
             *message
         {
-            let is_settled = !heartbeat.state.has(Flags::CLAIMING);
+            let is_settled = !heartbeat.state.has(Flags::CLAIMING_NODE_ID);
             let before = self.before.entry(from).or_default();
-            if before.tracked.receive(Micros(nanos / 1_000), message, None).word
+            if before.tracked.record_packet(Micros(nanos / 1_000), message, None).word
                 != Some(HeartbeatKind::Claimant)
             {
                 before.last_seen = nanos;
                 before.measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
                 before.hash =
-                    if is_settled { KnownValue::Value(heartbeat.configuration) } else { KnownValue::No };
+                    if is_settled { InitialValue::Value(heartbeat.configuration) } else { InitialValue::No };
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
-            for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.addresses(**cell)) {
+            for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.addresses_cell(**cell)) {
                 if number == Parameter::Mode.number() {
                     before.measures = words.first() != Some(&1);
                 } else if number == Parameter::Commit.number() {
-                    before.hash = KnownValue::No;
+                    before.hash = InitialValue::No;
                 }
             }
         }
@@ -311,9 +311,15 @@ impl SurveyedBus {
         self.cells.entry(cell).or_insert_with(|| SurveyedCell::new(nanos, before)).mark_seen(nanos);
     }
 
-    fn add_message(&mut self, message: &Message, from: Option<CellId>, nanos: u64, place: PartPosition) {
-        if place == PartPosition::Before {
-            self.state.apply(message);
+    fn add_message(
+        &mut self,
+        message: &Message,
+        from: Option<CellId>,
+        nanos: u64,
+        place: ReplayPartPosition,
+    ) {
+        if place == ReplayPartPosition::Before {
+            self.state.apply_message(message);
         }
         self.is_accounted |= matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
         self.sums += u64::from(matches!(message, Message::Sum { .. }));
@@ -321,33 +327,33 @@ impl SurveyedBus {
             cell.add_message(message, nanos, place, &self.recent_joints);
         } else if let Message::Joints { epoch, joints } = *message {
             self.joints += 1;
-            self.recent_joints.push_back(Broadcast { epoch, number: self.joints, nanos });
-            if self.recent_joints.len() > MAX_COUNTER_DELAY {
+            self.recent_joints.push_back(JointsBroadcast { epoch, number: self.joints, nanos });
+            if self.recent_joints.len() > MAX_COUNTER_DELAY_BROADCASTS {
                 self.recent_joints.pop_front();
             }
-            if place == PartPosition::In {
+            if place == ReplayPartPosition::In {
                 self.first_joints.get_or_insert((epoch, joints));
             }
         }
     }
 
     /// Returns the cells that send between two times, in ns since 1970.
-    pub fn cells_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &SurveyedCell)> {
+    pub fn cells_active_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &SurveyedCell)> {
         let speaks = move |cell: &SurveyedCell| cell.active.1 >= from && cell.active.0 < to;
         self.cells.iter().map(|(cell, it)| (*cell, it)).filter(move |(_, cell)| speaks(cell))
     }
 }
 
 impl SurveyedCell {
-    fn new(nanos: u64, before: Option<&EarlierCell>) -> Self {
+    fn new(nanos: u64, before: Option<&CellBeforeCapture>) -> Self {
         // A cell that sent just before the capture was present when it began.
-        let first =
-            before.map(|before| before.last_seen).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
+        let is_present = |last: &u64| nanos <= last.saturating_add(ABSENCE_TIMEOUT_NS);
+        let first = before.map(|before| before.last_seen).filter(is_present);
         let mut tracked = before.map(|before| before.tracked.clone()).unwrap_or_default();
         // It is not known that messages of the cell between the two times are lost.
         tracked.account = UplinkAccount::default();
         Self {
-            hash: before.map_or(KnownValue::No, |before| before.hash),
+            hash: before.map_or(InitialValue::No, |before| before.hash),
             measured: before.is_some_and(|before| before.measures),
             active: (first.map_or(nanos, |heard| heard.min(nanos)), nanos),
             silences: Vec::new(),
@@ -364,7 +370,7 @@ impl SurveyedCell {
 
     fn mark_seen(&mut self, nanos: u64) {
         let last = self.active.1;
-        if nanos > last.saturating_add(SILENT_NS) {
+        if nanos > last.saturating_add(ABSENCE_TIMEOUT_NS) {
             self.silences.push((last, nanos));
         }
         self.active.1 = last.max(nanos);
@@ -380,7 +386,7 @@ impl SurveyedCell {
             self.silences.push((away, u64::MAX));
         }
         let from = self.claims.unwrap_or(self.active.1);
-        if nanos > from.saturating_add(SILENT_NS) || self.claims.is_some() {
+        if nanos > from.saturating_add(ABSENCE_TIMEOUT_NS) || self.claims.is_some() {
             self.silences.push((from, u64::MAX));
         }
     }
@@ -390,10 +396,10 @@ impl SurveyedCell {
         &mut self,
         message: &Message,
         nanos: u64,
-        place: PartPosition,
-        joints: &VecDeque<Broadcast>,
+        place: ReplayPartPosition,
+        joints: &VecDeque<JointsBroadcast>,
     ) {
-        let word = self.tracked.receive(Micros(nanos / 1_000), message, None).word;
+        let word = self.tracked.record_packet(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
                 Some(HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken) | None => {
@@ -402,7 +408,8 @@ impl SurveyedCell {
                 // A restart sets the counters to 0. They then count joints from before this heartbeat.
                 Some(HeartbeatKind::Started { .. }) => {
                     let last = joints.back().map(|last| (last.number, last.nanos)).unwrap_or_default();
-                    let may_count = |joints: &&Broadcast| nanos <= joints.nanos.saturating_add(MAX_START_NS);
+                    let may_count =
+                        |joints: &&JointsBroadcast| nanos <= joints.nanos.saturating_add(MAX_CELL_START_NS);
                     let early = joints.iter().rev().take_while(may_count).count() as u64;
                     self.report = Some((ReceivedCounts::default(), last.0.saturating_sub(early), last.1));
                 }
@@ -419,26 +426,26 @@ impl SurveyedCell {
         {
             // The cell was configured again before its first heartbeat, so its former configuration is unknown.
             self.hash = match self.hash {
-                _ if place == PartPosition::Before => KnownValue::No,
-                KnownValue::No => KnownValue::TooLate,
-                known @ (KnownValue::TooLate | KnownValue::Value(_)) => known,
+                _ if place == ReplayPartPosition::Before => InitialValue::No,
+                InitialValue::No => InitialValue::TooLate,
+                known @ (InitialValue::TooLate | InitialValue::Value(_)) => known,
             };
         }
     }
 
-    fn add_heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: PartPosition) {
+    fn add_heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: ReplayPartPosition) {
         // A cell that claims its node id answers nothing.
-        if heartbeat.state.has(Flags::CLAIMING) {
+        if heartbeat.state.has(Flags::CLAIMING_NODE_ID) {
             self.claims.get_or_insert(nanos);
             return;
         }
         if let Some(since) = self.claims.take() {
             self.silences.push((since, nanos));
         }
-        if place == PartPosition::Before || self.hash == KnownValue::No {
-            self.hash = KnownValue::Value(heartbeat.configuration);
+        if place == ReplayPartPosition::Before || self.hash == InitialValue::No {
+            self.hash = InitialValue::Value(heartbeat.configuration);
         }
-        self.measured |= place == PartPosition::In && !heartbeat.state.has(Flags::TEST_MODE);
+        self.measured |= place == ReplayPartPosition::In && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
     /// Handles a report of counters. `at` is the number and time of the last joints that they cover; it is `None` if
@@ -451,7 +458,7 @@ impl SurveyedCell {
             let known = u64::from(taken) + u64::from(repeated);
             let between = joints.saturating_sub(joints_before);
             // A cell cannot receive more joints than were broadcast since its start, so it had not restarted.
-            if known <= between + MAX_COUNTER_DELAY as u64 {
+            if known <= between + MAX_COUNTER_DELAY_BROADCASTS as u64 {
                 self.untaken += between.saturating_sub(known);
                 match self.accounted.last_mut() {
                     Some((_, until)) if *until == from => *until = last,
@@ -466,7 +473,7 @@ impl SurveyedCell {
     /// before and after it. Also returns true if the capture contains no counters that account for any joints: they
     /// then explain no deviation.
     #[must_use]
-    pub fn is_counted_at(&self, nanos: u64) -> bool {
+    pub fn is_covered_by_counters(&self, nanos: u64) -> bool {
         !self.is_accounted || self.accounted.iter().any(|&(from, until)| from < nanos && nanos <= until)
     }
 
@@ -479,7 +486,7 @@ impl SurveyedCell {
 
 /// Returns true for frames from the gateway's side: a command, configuration or a stimulus.
 #[must_use]
-pub const fn is_input(id: Id) -> bool {
+pub const fn is_from_gateway_side(id: Id) -> bool {
     !id.kind.is_from_cells()
 }
 

@@ -55,7 +55,7 @@ impl Accelerations {
 
     /// Returns the stimuli of a future epoch for each bus, or an empty list if the motion is not known in advance.
     /// `now` is the time in s since the start of the loop.
-    pub(super) fn stimuli_ahead(
+    pub(super) fn stimuli_for_future_epoch(
         &self,
         options: &RunOptions,
         moved: Option<TickMotion>,
@@ -65,12 +65,15 @@ impl Accelerations {
             return Vec::new();
         }
         match (&options.planned, options.scenario.motion) {
-            (Some(planned), _) => {
-                self.stimuli(options, |seconds| planned.state_at(seconds), now, StimulusStart::Epoch(epoch))
-            }
+            (Some(planned), _) => self.acceleration_stimuli(
+                options,
+                |seconds| planned.state_at(seconds),
+                now,
+                StimulusStart::Epoch(epoch),
+            ),
             (None, motion) if motion.state_at(now).is_some() => {
                 let state = |seconds| motion.state_at(seconds).unwrap_or_default();
-                self.stimuli(options, state, now, StimulusStart::Epoch(epoch))
+                self.acceleration_stimuli(options, state, now, StimulusStart::Epoch(epoch))
             }
             (None, _) => Vec::new(),
         }
@@ -88,13 +91,18 @@ impl Accelerations {
         match moved {
             Some(moved) if self.broadcasts != broadcasts && (moved.is_halted || !is_known) => {
                 self.broadcasts = broadcasts;
-                self.stimuli(options, |seconds| moved.state_before(seconds), now, StimulusStart::Next)
+                self.acceleration_stimuli(
+                    options,
+                    |seconds| moved.state_before(seconds),
+                    now,
+                    StimulusStart::Next,
+                )
             }
             _ => Vec::new(),
         }
     }
 
-    fn stimuli(
+    fn acceleration_stimuli(
         &self,
         options: &RunOptions,
         state: impl Fn(f64) -> RobotState,

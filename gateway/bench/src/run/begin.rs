@@ -17,10 +17,10 @@ use super::bench::{Bench, POLL_INTERVAL};
 use super::receiver::BusEvent;
 use crate::error::RunError;
 use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, START_TIMEOUT, program_path};
-use crate::setup::{Timeout, names};
+use crate::setup::{Timeout, format_cells};
 use crate::view::BusView;
 use model::repeat::RepeatedRequests;
-use model::table::{Notice, Switch};
+use model::table::{Notice, SwitchTarget};
 
 /// Time within which running cells must send a heartbeat, and all cells must confirm their switches.
 pub(super) const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(2);
@@ -28,7 +28,7 @@ pub(super) const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(2);
 pub(super) const SWITCH_RETRY_INTERVAL: Span = Span::from_millis(250);
 
 /// Cells, by bus and node id, to which switches were sent, with the times.
-pub(super) type SentSwitches = RepeatedRequests<(usize, CellId)>;
+pub(super) type SentSwitchRequests = RepeatedRequests<(usize, CellId)>;
 
 impl Bench<'_> {
     /// Starts the cells, listens for another gateway, and waits until all cells are ready.
@@ -37,7 +37,7 @@ impl Bench<'_> {
         let listened = Instant::now() + GATEWAY_DETECTION_TIME;
         if options.spawn {
             if self.served.len() < self.bus_links.len() {
-                self.check_for_others(listened)?;
+                self.check_for_other_senders(listened)?;
             }
             let program = program_path("cell-node")?;
             self.processes.start(&CellLaunch {
@@ -53,17 +53,17 @@ impl Bench<'_> {
             })?;
         }
         let cells = options.skin.cells.len();
-        self.poll_until(self.timeout(), |bench, timeout| {
+        self.poll_until(self.progress_timeout(), |bench, timeout| {
             // Cells without parameters will not become ready.
-            let ready = bench.count(|cell| cell.ready || cell.unconfigured);
+            let ready = bench.count_cells(|cell| cell.ready || cell.unconfigured);
             let is_over = timeout.has_stalled(ready);
             // After a moment without processor time, ready cells may count as dead until they send again.
             Ok(Instant::now() >= listened && (ready == cells || is_over))
         })?;
         self.check_cells()?;
         self.resume_halted_cells()?;
-        self.continue_epochs();
-        self.switch_cells()?;
+        self.continue_former_epochs();
+        self.send_cell_switches()?;
         // Requests the counters, contact states and network positions of the cells.
         self.send_to_all(&Message::Report)?;
         if self.bus_links.iter().any(|bus_link| bus_link.network.is_some()) {
@@ -85,7 +85,7 @@ impl Bench<'_> {
     }
 
     /// Returns the maximum time without progress of the cells.
-    pub(super) const fn timeout(&self) -> Duration {
+    pub(super) const fn progress_timeout(&self) -> Duration {
         if self.options.spawn { START_TIMEOUT } else { DISCOVERY_TIMEOUT }
     }
 
@@ -106,7 +106,7 @@ impl Bench<'_> {
     /// Resumes cells that an earlier gateway has halted.
     fn resume_halted_cells(&mut self) -> Result<(), RunError> {
         self.send_to_all(&Message::Resume)?;
-        let halted = |bench: &Self| bench.count(|cell| cell.halted);
+        let halted = |bench: &Self| bench.count_cells(|cell| cell.halted);
         if halted(self) == 0 {
             return Ok(());
         }
@@ -117,14 +117,14 @@ impl Bench<'_> {
 
     /// Checks that a bus that existed before has neither a gateway nor cells with the same node ids. Listening disturbs
     /// neither of them.
-    fn check_for_others(&mut self, until: Instant) -> Result<(), RunError> {
+    fn check_for_other_senders(&mut self, until: Instant) -> Result<(), RunError> {
         self.poll_until(GATEWAY_DETECTION_TIME, |_, _| Ok(Instant::now() >= until))?;
         // Emulated cells are present already, and belong to this run.
         let others = self.bus_links.iter().enumerate().filter_map(|(bus, bus_link)| {
             let view = bus_link.view.lock().ok()?;
             let heard = view.cells.iter().filter(|cell| cell.seen).map(|cell| cell.node);
             let others: Vec<_> = heard.filter(|node| !self.processes.has_process(bus, node.get())).collect();
-            (!others.is_empty()).then(|| names(&others, &format!(" on {}", bus_link.link.name)))
+            (!others.is_empty()).then(|| format_cells(&others, &format!(" on {}", bus_link.link.name)))
         });
         let cells = others.collect::<Vec<_>>().join("; ");
         if cells.is_empty() {
@@ -136,36 +136,37 @@ impl Bench<'_> {
 
     /// Sets the first epoch to follow those of a former gateway, because cells that were running before have received
     /// its joints.
-    fn continue_epochs(&mut self) {
+    fn continue_former_epochs(&mut self) {
         if self.options.spawn {
             return;
         }
         let heard = |view: &BusView| -> Vec<_> {
             view.cells.iter().filter(|cell| cell.ready).map(|cell| cell.last_joints).collect()
         };
-        let last = last_epoch(&self.views().flat_map(|(_, view)| heard(&view)).collect::<Vec<_>>());
+        let last =
+            epoch_before_start(&self.bus_views().flat_map(|(_, view)| heard(&view)).collect::<Vec<_>>());
         self.first_epoch = last.next();
         if let Some(cycle) = &mut self.cycle {
-            cycle.start_after(last);
+            cycle.start_after_epoch(last);
         }
     }
 
     fn check_cells(&self) -> Result<(), RunError> {
         let spawned = self.options.spawn;
-        let silent = self.names(|cell| !cell.ready && !cell.unconfigured);
-        let unconfigured = self.names(|cell| cell.unconfigured);
-        let none = self.count(|cell| cell.ready) == 0;
+        let silent = self.selected_cell_names(|cell| !cell.ready && !cell.unconfigured);
+        let unconfigured = self.selected_cell_names(|cell| cell.unconfigured);
+        let none = self.count_cells(|cell| cell.ready) == 0;
         if !unconfigured.is_empty() && (none || spawned) {
             return Err(RunError::Unconfigured(unconfigured));
         }
         if none || (spawned && !silent.is_empty()) {
             return Err(RunError::NotReady { cells: silent, spawned });
         }
-        let cells = self.names(|cell| cell.ready && cell.other_configuration);
+        let cells = self.selected_cell_names(|cell| cell.ready && cell.other_configuration);
         if !cells.is_empty() {
             return Err(RunError::OtherSkin { skin: self.options.skin_file.clone(), cells });
         }
-        let measuring = self.names(|cell| cell.measures);
+        let measuring = self.selected_cell_names(|cell| cell.measures);
         for (what, who) in [
             ("do not answer; the run goes on without them", silent),
             ("have no parameters; the run goes on without them", unconfigured),
@@ -190,14 +191,14 @@ impl Bench<'_> {
         }
         for (bus, bus_event) in self.events.try_iter() {
             match bus_event {
-                BusEvent::Notice(Notice::OtherGateway) => return Err(self.other_gateway(bus)),
+                BusEvent::Notice(Notice::OtherGateway) => return Err(self.other_gateway_error(bus)),
                 BusEvent::Down(why) | BusEvent::Lost(why) | BusEvent::Refused(why) => {
                     return Err(RunError::Lost(why));
                 }
                 BusEvent::Notice(_) | BusEvent::Up => {}
             }
         }
-        match self.processes.ended().into_iter().next() {
+        match self.processes.take_ended().into_iter().next() {
             None => Ok(()),
             Some(ended) => {
                 Err(RunError::Ended { cells: ended.to_string(), status: ended.status, said: ended.reason })
@@ -206,7 +207,7 @@ impl Bench<'_> {
     }
 
     /// Returns the error of another gateway on a bus.
-    pub(super) fn other_gateway(&self, bus: usize) -> RunError {
+    pub(super) fn other_gateway_error(&self, bus: usize) -> RunError {
         let link = self.bus_links.get(bus).map(|bus_link| &bus_link.link);
         RunError::OtherGateway(link.map(|link| (link.name.clone(), link.kind)))
     }
@@ -222,8 +223,8 @@ impl Bench<'_> {
     }
 
     /// Sends all cells, before the first joints, the switches that a cell loses when it restarts.
-    fn switch_cells(&mut self) -> Result<(), RunError> {
-        let mut announced = SentSwitches::new(SWITCH_RETRY_INTERVAL);
+    fn send_cell_switches(&mut self) -> Result<(), RunError> {
+        let mut announced = SentSwitchRequests::new(SWITCH_RETRY_INTERVAL);
         let lacking = self.unconfirmed_switches();
         for (bus, (bus_link, described)) in self.bus_links.iter().zip(&self.options.skin.buses).enumerate() {
             // Cells that ran before may be in any mode; newly started cells are in the default mode.
@@ -236,7 +237,7 @@ impl Bench<'_> {
         }
         announced.mark_all_sent(self.now());
         self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| {
-            bench.repeat_switches(&mut announced)?;
+            bench.resend_cell_switches(&mut announced)?;
             // Cells that have not confirmed by then get their switches again while the loop runs.
             Ok(bench.unconfirmed_switches().is_empty() || timeout.has_stalled(0))
         })
@@ -244,7 +245,7 @@ impl Bench<'_> {
 
     /// Sends switches again to cells that have not confirmed them in time, because the cell restarted or a message was
     /// lost.
-    pub(super) fn repeat_switches(&self, announced: &mut SentSwitches) -> Result<(), RunError> {
+    pub(super) fn resend_cell_switches(&self, announced: &mut SentSwitchRequests) -> Result<(), RunError> {
         let lacking = self.unconfirmed_switches();
         let due = announced.due_requests(self.now(), lacking.iter().map(|(cell, _)| *cell));
         for ((bus, cell), switches) in lacking.into_iter().filter(|(cell, _)| due.contains(cell)) {
@@ -257,7 +258,7 @@ impl Bench<'_> {
     }
 
     /// Returns the reachable cells with unconfirmed switches, and those switches.
-    fn unconfirmed_switches(&self) -> Vec<((usize, CellId), Vec<Switch>)> {
+    fn unconfirmed_switches(&self) -> Vec<((usize, CellId), Vec<SwitchTarget>)> {
         let mut lacking = Vec::new();
         for (bus, bus_link) in
             self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_working())
@@ -277,7 +278,7 @@ impl Bench<'_> {
 /// Returns the epoch after which this run starts its own, such that no cell takes the first joints as repeated: the
 /// next epoch must not be one of `taken`, the last epochs that the cells received. The search starts at the first
 /// cell's epoch, because buses may have had different ones.
-fn last_epoch(taken: &[Epoch]) -> Epoch {
+fn epoch_before_start(taken: &[Epoch]) -> Epoch {
     let mut last = taken.first().copied().unwrap_or_default();
     for _ in 0..u8::MAX {
         if !taken.contains(&last.next()) {
@@ -294,7 +295,8 @@ mod tests {
 
     #[test]
     fn the_first_epoch_is_new_to_the_cells_of_all_buses() {
-        let first = |taken: &[u8]| last_epoch(&taken.iter().map(|&epoch| Epoch(epoch)).collect::<Vec<_>>()).0;
+        let first =
+            |taken: &[u8]| epoch_before_start(&taken.iter().map(|&epoch| Epoch(epoch)).collect::<Vec<_>>()).0;
         assert_eq!(first(&[]), 0);
         assert_eq!(first(&[7, 7, 7]), 7);
         assert_eq!(first(&[7, 7, 200, 200]), 7);

@@ -18,7 +18,7 @@ use protocol::time::Micros;
 
 use super::RunOptions;
 use super::commander::{RemoteControl, SwitchedBuses};
-use super::hosts::Hosts;
+use super::hosts::OtherHosts;
 use super::network::Network;
 use super::receiver::{BusEvent, ReceiverResult};
 use crate::bus::link::{BusSlot, SharedBus, is_recoverable};
@@ -27,17 +27,17 @@ use crate::emulate::Emulation;
 use crate::processes::Processes;
 use crate::processes::ended::EndedProcesses;
 use crate::record::Recorder;
-use crate::setup::names;
+use crate::setup::format_cells;
 use crate::view::{BusView, CellView};
-use control::cycle::Cycle;
+use control::cycle::ControlCycle;
 use control::cycle::turn::{BusPort, SharedRunState, TimedRecord};
-use model::table::Switch;
+use model::table::SwitchTarget;
 
 /// Interval between polls until the loop starts.
 pub(super) const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Tag of `configure` requests that set switches of cells.
-const SWITCH_TAG: u8 = 0x5E;
+const SWITCH_REQUEST_TAG: u8 = 0x5E;
 
 /// One bus of a bench.
 #[derive(Debug)]
@@ -51,7 +51,7 @@ pub(super) struct RunBus {
     /// Sends the receiver the cells that may have missed a message.
     pub(super) possibly_missed: Sender<BTreeSet<CellId>>,
     /// Other hosts connected to the bus.
-    pub(super) hosts: Hosts,
+    pub(super) hosts: OtherHosts,
     /// Network of its cells, if they answer with sums.
     pub(super) network: Option<Network>,
     pub(super) shared: Arc<SharedRunState>,
@@ -71,8 +71,12 @@ impl RunBus {
     }
 
     /// Sends a switch to one cell or to all cells. The caller repeats it for cells that do not confirm.
-    pub(super) fn send_switch(&self, to: Node, (number, words): Switch) -> Result<bool, BusError> {
-        self.send(&Message::Configure { to, tag: SWITCH_TAG, request: Request::Write { number, words } })
+    pub(super) fn send_switch(&self, to: Node, (number, words): SwitchTarget) -> Result<bool, BusError> {
+        self.send(&Message::Configure {
+            to,
+            tag: SWITCH_REQUEST_TAG,
+            request: Request::Write { number, words },
+        })
     }
 }
 
@@ -88,7 +92,7 @@ pub(super) struct Bench<'a> {
     pub(super) bus_links: Vec<RunBus>,
     pub(super) events: Inlet<(usize, BusEvent)>,
     pub(super) signalled: Arc<AtomicBool>,
-    pub(super) cycle: Option<Cycle>,
+    pub(super) cycle: Option<ControlCycle>,
     /// Epoch of the first broadcast.
     pub(super) first_epoch: Epoch,
     pub(super) recorder: Option<Recorder>,
@@ -112,16 +116,16 @@ pub(super) struct Bench<'a> {
 impl Bench<'_> {
     /// Time since the start of the bench.
     pub(super) fn now(&self) -> Micros {
-        Micros::since_start(self.began.elapsed())
+        Micros::from_elapsed(self.began.elapsed())
     }
 
     /// Returns the name of a bus of the skin.
-    pub(super) fn name(&self, bus: usize) -> &str {
+    pub(super) fn bus_name(&self, bus: usize) -> &str {
         self.options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str())
     }
 
     /// Returns each bus with the view that its receiver maintains.
-    pub(super) fn views(&self) -> impl Iterator<Item = (&RunBus, MutexGuard<'_, BusView>)> {
+    pub(super) fn bus_views(&self) -> impl Iterator<Item = (&RunBus, MutexGuard<'_, BusView>)> {
         self.bus_links.iter().filter_map(|bus_link| Some((bus_link, bus_link.view.lock().ok()?)))
     }
 
@@ -133,16 +137,16 @@ impl Bench<'_> {
     }
 
     /// Returns the number of cells that satisfy a predicate.
-    pub(super) fn count(&self, is: impl Fn(&CellView) -> bool) -> usize {
-        self.views().map(|(_, view)| view.cells.iter().filter(|cell| is(cell)).count()).sum()
+    pub(super) fn count_cells(&self, is: impl Fn(&CellView) -> bool) -> usize {
+        self.bus_views().map(|(_, view)| view.cells.iter().filter(|cell| is(cell)).count()).sum()
     }
 
     /// Returns the selected cells as text: `1, 2, 5 on vcan0`.
-    pub(super) fn names(&self, selects: impl Fn(&CellView) -> bool) -> String {
-        let names = self.views().filter_map(|(bus_link, view)| {
+    pub(super) fn selected_cell_names(&self, selects: impl Fn(&CellView) -> bool) -> String {
+        let names = self.bus_views().filter_map(|(bus_link, view)| {
             let nodes: Vec<_> =
                 view.cells.iter().filter(|cell| selects(cell)).map(|cell| cell.node).collect();
-            (!nodes.is_empty()).then(|| names(&nodes, &format!(" on {}", bus_link.link.name)))
+            (!nodes.is_empty()).then(|| format_cells(&nodes, &format!(" on {}", bus_link.link.name)))
         });
         names.collect::<Vec<_>>().join("; ")
     }

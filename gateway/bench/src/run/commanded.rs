@@ -14,20 +14,20 @@ use super::measured::LoopTotals;
 use crate::bus::served::ServedBus;
 use crate::processes::{LaunchError, program_path};
 use crate::progress::Progress;
-use crate::remote::{BenchCommand, BenchState, BusStatus, LinkDown, Phase, ProcessState};
+use crate::remote::{BenchCommand, BenchState, BusStatus, DownLink, Phase, ProcessState};
 use model::scenario::ProcessAction;
 
 /// Maximum number of commands carried out in one round, so that stimuli are not delayed.
 const MAX_COMMANDS_PER_ROUND: usize = 4;
 /// Interval between two states sent to the other side.
-const STATE_INTERVAL: Duration = Duration::from_millis(200);
+const STATE_SEND_INTERVAL: Duration = Duration::from_millis(200);
 
 impl Bench<'_> {
     /// Carries out received commands, and sends the state if the interval is over. If the other side has ended, ends
     /// the remote control and brings back the buses that it has taken down.
-    pub(super) fn handle_remote(&mut self, measured: &LoopTotals, progress: &Progress) {
+    pub(super) fn handle_remote_commands(&mut self, measured: &LoopTotals, progress: &Progress) {
         let links = &self.bus_links;
-        self.commanded.forget_working(|bus| {
+        self.commanded.forget_working_buses(|bus| {
             let link = &links.get(bus)?.link;
             (!link.is_gone()).then(|| link.state.commands.load(Ordering::Relaxed))
         });
@@ -36,7 +36,7 @@ impl Bench<'_> {
             self.commanded.release_down_buses(|bus| commands_sent(links, bus));
             // At the end of the run the other side may end first.
             if !self.signalled.load(Ordering::Relaxed) {
-                progress.error(
+                progress.print_error(
                     "--view: the process that served the page has ended; the run goes on without a page",
                 );
             }
@@ -45,11 +45,11 @@ impl Bench<'_> {
         for _ in 0..MAX_COMMANDS_PER_ROUND {
             let Some(command) = remote.lines.receive() else { break };
             let what = self.command_text(command);
-            match self.carry_out(command) {
+            match self.execute_command(command) {
                 Ok(()) => {
                     let note = format!("view: {what}");
-                    progress.note(&note);
-                    self.recorder.iter().for_each(|recorder| recorder.note(&note));
+                    progress.print_note(&note);
+                    self.recorder.iter().for_each(|recorder| recorder.add_note(&note));
                     remote.add_reply(true, what);
                 }
                 Err(why) => remote.add_reply(false, format!("{what}: {why}")),
@@ -57,8 +57,8 @@ impl Bench<'_> {
         }
         let now = Instant::now();
         if now >= remote.due {
-            remote.due = now + STATE_INTERVAL;
-            let state = self.state(&remote, measured);
+            remote.due = now + STATE_SEND_INTERVAL;
+            let state = self.bench_state(&remote, measured);
             remote.lines.send(&state);
         }
         self.remote = Some(remote);
@@ -69,8 +69,8 @@ impl Bench<'_> {
         let switched = |down: bool| if down { "down" } else { "up" };
         match command {
             BenchCommand::Process { action, bus, node } => {
-                let (action, name) = (action.name(), self.name(bus));
-                match self.process(bus, node).map(|process| process.nodes) {
+                let (action, name) = (action.name(), self.bus_name(bus));
+                match self.cell_process(bus, node).map(|process| process.nodes) {
                     Some((first, last)) if first != last => {
                         format!("{action} cells {first} to {last} on {name}")
                     }
@@ -78,33 +78,37 @@ impl Bench<'_> {
                 }
             }
             BenchCommand::Link { down, bus, nodes: [one, other] } => {
-                format!("link {} between cell {one} and cell {other} on {}", switched(down), self.name(bus))
+                format!(
+                    "link {} between cell {one} and cell {other} on {}",
+                    switched(down),
+                    self.bus_name(bus)
+                )
             }
-            BenchCommand::Bus { down, bus } => format!("bus {} {}", self.name(bus), switched(down)),
+            BenchCommand::Bus { down, bus } => format!("bus {} {}", self.bus_name(bus), switched(down)),
         }
     }
 
-    fn carry_out(&mut self, command: BenchCommand) -> Result<(), CommandError> {
+    fn execute_command(&mut self, command: BenchCommand) -> Result<(), CommandError> {
         match command {
             BenchCommand::Process { action, bus, node } => self.control_process(action, bus, node),
-            BenchCommand::Link { down, bus, nodes } => self.command_link(down, bus, nodes),
+            BenchCommand::Link { down, bus, nodes } => self.switch_wire_links(down, bus, nodes),
             BenchCommand::Bus { down, bus } => {
                 self.commanded.check_switch(down, bus)?;
                 self.switch_bus(down, bus)?;
-                self.commanded.note_switched(down, bus, commands_sent(&self.bus_links, bus));
+                self.commanded.note_bus_switched(down, bus, commands_sent(&self.bus_links, bus));
                 Ok(())
             }
         }
     }
 
     /// Returns the process of a cell, if it has one.
-    fn process(&self, bus: usize, node: u8) -> Option<ProcessState> {
+    fn cell_process(&self, bus: usize, node: u8) -> Option<ProcessState> {
         self.processes.states().find(|process| process.runs_cell(bus, node))
     }
 
     fn control_process(&mut self, action: ProcessAction, bus: usize, node: u8) -> Result<(), CommandError> {
         find_cell(&self.options.skin, bus, node)?;
-        let phase = self.process(bus, node).ok_or(CommandError::NoProcess)?.phase;
+        let phase = self.cell_process(bus, node).ok_or(CommandError::NoProcess)?.phase;
         match (action, phase) {
             (ProcessAction::Restart, _)
             | (ProcessAction::Kill, Phase::Running | Phase::Stopped)
@@ -112,11 +116,16 @@ impl Bench<'_> {
             | (ProcessAction::Continue, Phase::Stopped) => {}
             (_, phase) => return Err(CommandError::Phase(phase)),
         }
-        self.processes.apply(bus, node, action)?;
+        self.processes.apply_action(bus, node, action)?;
         Ok(())
     }
 
-    fn command_link(&mut self, down: bool, bus: usize, [one, other]: [u8; 2]) -> Result<(), CommandError> {
+    fn switch_wire_links(
+        &mut self,
+        down: bool,
+        bus: usize,
+        [one, other]: [u8; 2],
+    ) -> Result<(), CommandError> {
         let skin = &self.options.skin;
         let (one, other) = (find_cell(skin, bus, one)?, find_cell(skin, bus, other)?);
         if !one.neighbors.contains(&Some(other.node)) {
@@ -135,22 +144,22 @@ impl Bench<'_> {
             return switch_interface(&link.name, down);
         }
         let name = link.kind.served_name(&link.name);
-        let served = self.served.iter_mut().find(|served| served.bus() == name);
+        let served = self.served.iter_mut().find(|served| served.bus_name() == name);
         let served = served.ok_or(CommandError::NotServed)?;
         if down {
             served.stop();
         } else {
-            *served = serve(self.options, &name)?;
+            *served = start_bus_server(self.options, &name)?;
         }
         Ok(())
     }
 
-    fn state(&self, remote: &RemoteControl, measured: &LoopTotals) -> BenchState {
+    fn bench_state(&self, remote: &RemoteControl, measured: &LoopTotals) -> BenchState {
         let networks = self.bus_links.iter().enumerate();
         let networks = networks.filter_map(|(bus, bus_link)| Some((bus, bus_link.network.as_ref()?)));
         let links_down = networks.flat_map(|(bus, network)| {
             let pairs = network.links_down().into_iter();
-            pairs.map(move |[one, other]| LinkDown { bus, nodes: [one.get(), other.get()] })
+            pairs.map(move |[one, other]| DownLink { bus, nodes: [one.get(), other.get()] })
         });
         let buses = self.bus_links.iter().enumerate().map(|(bus, bus_link)| BusStatus {
             down: self.commanded.is_loss_expected(bus),
@@ -161,7 +170,7 @@ impl Bench<'_> {
             links_down: links_down.collect(),
             buses: buses.collect(),
             lateness: measured.lateness,
-            halted: measured.halts.present_reason().map(str::to_owned),
+            halted: measured.halts.present_halt_reason().map(str::to_owned),
             answers: remote.answers.clone(),
         }
     }
@@ -173,7 +182,7 @@ fn commands_sent(links: &[RunBus], bus: usize) -> u64 {
 }
 
 /// Starts a server for an embedded bus.
-pub(super) fn serve(options: &RunOptions, bus: &str) -> Result<ServedBus, LaunchError> {
+pub(super) fn start_bus_server(options: &RunOptions, bus: &str) -> Result<ServedBus, LaunchError> {
     let program = program_path("vcan-setup")?;
     ServedBus::start(&program, bus, options.directory.as_deref())
 }
@@ -196,7 +205,7 @@ fn switch_interface(name: &str, down: bool) -> Result<(), CommandError> {
     let interface = interface.ok_or(CommandError::NoInterface)?;
     match interface.kind {
         InterfaceKind::Vcan | InterfaceKind::Vxcan(_) => {
-            netlink.set_up(interface.index, !down).map_err(failed)
+            netlink.set_interface_up(interface.index, !down).map_err(failed)
         }
         InterfaceKind::Hardware(_) | InterfaceKind::Other(_) => Err(CommandError::NotVirtual),
     }
@@ -214,7 +223,7 @@ mod tests {
 
     #[test]
     fn cells_are_those_of_the_skin() {
-        let skin = Skin::parse("skin.toml", model::testing::SKIN).unwrap();
+        let skin = Skin::parse("skin.toml", model::testing::ONE_CELL_SKIN_TOML).unwrap();
         assert_eq!(find_cell(&skin, 0, 1).unwrap().node.get(), 1);
         assert!(matches!(find_cell(&skin, 0, 200), Err(CommandError::NoCell)));
         assert!(matches!(find_cell(&skin, usize::MAX, 1), Err(CommandError::NoBus)));

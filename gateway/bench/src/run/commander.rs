@@ -25,11 +25,11 @@ pub(super) struct RemoteControl {
 /// Buses that commands have taken down. They outlive the remote control, because only a bus itself shows that it works
 /// again.
 #[derive(Debug, Default)]
-pub(super) struct SwitchedBuses(BTreeMap<usize, SwitchState>);
+pub(super) struct SwitchedBuses(BTreeMap<usize, BusSwitchState>);
 
 /// State of a bus that a command has taken down.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum SwitchState {
+enum BusSwitchState {
     /// The bus was taken down and must stay down.
     Down,
     /// The bus was brought up, or released, after it had accepted `commands` commands of this run.
@@ -39,7 +39,7 @@ enum SwitchState {
 impl SwitchedBuses {
     /// Returns true if a bus is to stay down.
     pub(super) fn is_down(&self, bus: usize) -> bool {
-        self.0.get(&bus) == Some(&SwitchState::Down)
+        self.0.get(&bus) == Some(&BusSwitchState::Down)
     }
 
     /// Returns true if a command caused the loss of a bus: the bus is down, or has not worked since it was brought up.
@@ -55,33 +55,33 @@ impl SwitchedBuses {
     /// the last change.
     pub(super) fn check_switch(&self, down: bool, bus: usize) -> Result<(), CommandError> {
         match (down, self.0.get(&bus)) {
-            (true, Some(SwitchState::Down)) => Err(CommandError::Already("up")),
-            (false, Some(SwitchState::Up { .. })) => Err(CommandError::ComesUp),
+            (true, Some(BusSwitchState::Down)) => Err(CommandError::Already("up")),
+            (false, Some(BusSwitchState::Up { .. })) => Err(CommandError::ComesUp),
             (false, None) => Err(CommandError::Already("down")),
-            (true, Some(SwitchState::Up { .. }) | None) | (false, Some(SwitchState::Down)) => Ok(()),
+            (true, Some(BusSwitchState::Up { .. }) | None) | (false, Some(BusSwitchState::Down)) => Ok(()),
         }
     }
 
     /// Notes that a bus was taken down or brought up after it had accepted this number of commands.
-    pub(super) fn note_switched(&mut self, down: bool, bus: usize, commands: u64) {
-        self.0.insert(bus, if down { SwitchState::Down } else { SwitchState::Up { commands } });
+    pub(super) fn note_bus_switched(&mut self, down: bool, bus: usize, commands: u64) {
+        self.0.insert(bus, if down { BusSwitchState::Down } else { BusSwitchState::Up { commands } });
     }
 
     /// Releases the buses that are down, because no later command will bring them up. `commands` returns the number of
     /// commands that a bus has accepted.
     pub(super) fn release_down_buses(&mut self, commands: impl Fn(usize) -> u64) {
-        for (bus, switched) in self.0.iter_mut().filter(|(_, switched)| **switched == SwitchState::Down) {
-            *switched = SwitchState::Up { commands: commands(*bus) };
+        for (bus, switched) in self.0.iter_mut().filter(|(_, switched)| **switched == BusSwitchState::Down) {
+            *switched = BusSwitchState::Up { commands: commands(*bus) };
         }
     }
 
     /// Forgets the buses that work again, which have accepted a command since they were brought up. A bus accepts none
     /// until its receiver has noticed the loss and reopened it. `taken` returns the number of accepted commands, or
     /// `None` for a bus that is lost.
-    pub(super) fn forget_working(&mut self, taken: impl Fn(usize) -> Option<u64>) {
+    pub(super) fn forget_working_buses(&mut self, taken: impl Fn(usize) -> Option<u64>) {
         self.0.retain(|bus, switched| match switched {
-            SwitchState::Down => true,
-            SwitchState::Up { commands } => taken(*bus).is_none_or(|taken| taken <= *commands),
+            BusSwitchState::Down => true,
+            BusSwitchState::Up { commands } => taken(*bus).is_none_or(|taken| taken <= *commands),
         });
     }
 }
@@ -150,38 +150,38 @@ mod tests {
         let mut buses = SwitchedBuses::default();
         assert!(matches!(buses.check_switch(false, 0), Err(CommandError::Already("down"))));
         buses.check_switch(true, 0).unwrap();
-        buses.note_switched(true, 0, 100);
+        buses.note_bus_switched(true, 0, 100);
         assert!(matches!(buses.check_switch(true, 0), Err(CommandError::Already("up"))));
-        buses.forget_working(|_| Some(105));
+        buses.forget_working_buses(|_| Some(105));
         assert!(buses.is_down(0) && buses.is_loss_expected(0), "what works there is of before");
         // The bus was taken down and up at once, so that its receiver has not noticed the change.
         buses.check_switch(false, 0).unwrap();
-        buses.note_switched(false, 0, 105);
-        buses.forget_working(|_| Some(105));
+        buses.note_bus_switched(false, 0, 105);
+        buses.forget_working_buses(|_| Some(105));
         assert!(!buses.is_down(0) && buses.is_loss_expected(0));
         assert!(matches!(buses.check_switch(false, 0), Err(CommandError::ComesUp)));
-        buses.forget_working(|_| None);
+        buses.forget_working_buses(|_| None);
         assert!(buses.is_loss_expected(0), "the receiver has noticed it");
         // The bus was taken down again before it worked.
         buses.check_switch(true, 0).unwrap();
-        buses.note_switched(true, 0, 105);
-        buses.note_switched(false, 0, 105);
-        buses.forget_working(|_| Some(105));
+        buses.note_bus_switched(true, 0, 105);
+        buses.note_bus_switched(false, 0, 105);
+        buses.forget_working_buses(|_| Some(105));
         assert!(buses.is_loss_expected(0) && !buses.is_loss_expected(1));
-        buses.forget_working(|_| Some(106));
+        buses.forget_working_buses(|_| Some(106));
         assert!(!buses.is_loss_expected(0), "it works: its next loss is one");
     }
 
     #[test]
     fn buses_that_a_remote_had_down_come_back_without_it() {
         let mut buses = SwitchedBuses::default();
-        buses.note_switched(true, 0, 7);
-        buses.note_switched(false, 1, 7);
+        buses.note_bus_switched(true, 0, 7);
+        buses.note_bus_switched(false, 1, 7);
         buses.release_down_buses(|_| 9);
         assert!(!buses.is_down(0) && buses.is_loss_expected(0) && buses.is_loss_expected(1));
-        buses.forget_working(|_| Some(9));
+        buses.forget_working_buses(|_| Some(9));
         assert!(buses.is_loss_expected(0) && !buses.is_loss_expected(1));
-        buses.forget_working(|_| Some(10));
+        buses.forget_working_buses(|_| Some(10));
         assert!(!buses.is_loss_expected(0));
     }
 }

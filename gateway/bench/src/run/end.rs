@@ -12,14 +12,14 @@ use protocol::usage::eprint_line;
 use super::bench::{Bench, RunBus};
 use super::measured::LoopTotals;
 use super::receiver::ReceiverResult;
-use super::watch::ROUND_PAUSE;
+use super::watch::MAIN_THREAD_INTERVAL;
 use crate::error::RunError;
 use crate::record::feed::UnrecordedCounts;
 use crate::record::{Recorder, backlog};
 use crate::summary::{BusSummary, CellSummary, LoopSummary, NetworkSummary, OutagesSummary, Summary};
 use crate::view::BusView;
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, ResponseFlags};
+use model::table::{ResponseFlags, TorqueAccuracy};
 use trace::recording::account::RecordingAccount;
 
 /// Time that cells have to send their final reports; an overloaded machine needs it.
@@ -28,23 +28,23 @@ const FINAL_REPORT_TIMEOUT: Duration = Duration::from_secs(3);
 impl Bench<'_> {
     /// Runs the control loop to its end or to its failure. Returns the summary.
     pub(super) fn run_loop(mut self) -> Summary {
-        let mut summary = Summary::empty(&self.options.skin);
+        let mut summary = Summary::for_unstarted_run(&self.options.skin);
         let mut measured = LoopTotals::new();
         let failure = self.control_loop(&mut summary, &mut measured).err().map(|error| error.to_string());
         let received = self.stop_receivers();
         summary.recording = self.finish_recording(&received);
         if failure.is_some() {
-            self.report_kept_files(summary.recording.as_ref());
+            self.print_kept_files(summary.recording.as_ref());
         }
         self.summarise(summary, &measured, &received).with_verdict(failure)
     }
 
     /// Ends a bench whose loop never started.
     pub(super) fn end_without_loop(mut self, error: RunError) -> Result<Summary, RunError> {
-        let mut summary = Summary::empty(&self.options.skin);
+        let mut summary = Summary::for_unstarted_run(&self.options.skin);
         let received = self.stop_receivers();
         summary.recording = self.recorder.take().map(Recorder::discard);
-        self.report_kept_files(summary.recording.as_ref());
+        self.print_kept_files(summary.recording.as_ref());
         if error.exit_code() != 1 {
             return Err(error);
         }
@@ -52,7 +52,7 @@ impl Bench<'_> {
     }
 
     /// Prints the paths of the files that contain the frames received before a failure.
-    fn report_kept_files(&self, recording: Option<&RecordingAccount>) {
+    fn print_kept_files(&self, recording: Option<&RecordingAccount>) {
         if self.options.quiet {
             return;
         }
@@ -65,21 +65,25 @@ impl Bench<'_> {
     pub(super) fn request_final_reports(&self, interrupted: bool) -> Result<(), RunError> {
         let two_periods = Duration::try_from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz());
         thread::sleep(two_periods.unwrap_or_default());
-        self.wait_until(Self::has_caught_up);
+        self.wait_until(Self::have_receivers_caught_up);
         self.send_to_all(&Message::Report)?;
-        self.wait_until(|bench| bench.has_caught_up() && bench.all_cells_reported(|said| said.counters));
+        self.wait_until(|bench| {
+            bench.have_receivers_caught_up() && bench.all_cells_reported(|said| said.counters)
+        });
         if interrupted {
             self.send_to_all(&Message::Halt)?;
         }
         // Send the sync last, so that the count in each cell's heartbeat covers all other packets of the cell.
         self.send_to_all(&Message::Sync)?;
-        self.wait_until(|bench| bench.has_caught_up() && bench.all_cells_reported(|said| said.heartbeat));
+        self.wait_until(|bench| {
+            bench.have_receivers_caught_up() && bench.all_cells_reported(|said| said.heartbeat)
+        });
         Ok(())
     }
 
     /// Returns true if the receivers have read back all commands that this run has sent, and so all earlier frames.
     /// Lost buses are not considered.
-    fn has_caught_up(&self) -> bool {
+    fn have_receivers_caught_up(&self) -> bool {
         self.bus_links.iter().all(|bus_link| {
             let read = bus_link.view.lock().map_or(u64::MAX, |view| view.commands);
             !bus_link.link.state.is_working() || read >= bus_link.link.state.commands.load(Ordering::Relaxed)
@@ -99,7 +103,7 @@ impl Bench<'_> {
     fn wait_until(&self, done: impl Fn(&Self) -> bool) {
         let give_up = Instant::now() + FINAL_REPORT_TIMEOUT;
         while !done(self) && Instant::now() < give_up {
-            thread::sleep(ROUND_PAUSE);
+            thread::sleep(MAIN_THREAD_INTERVAL);
         }
     }
 
@@ -135,13 +139,13 @@ impl Bench<'_> {
         Summary {
             cells: self.cell_summaries(received),
             cell_errors: self.ended.errors(),
-            halted: measured.halts.present_reason().map(str::to_owned),
-            halts: measured.halts.all(),
+            halted: measured.halts.present_halt_reason().map(str::to_owned),
+            halts: measured.halts.halt_summaries(),
             further_halts: measured.halts.further,
-            before_halt: measured.halts.history(&self.options.skin),
+            before_halt: measured.halts.ticks_before_halt(&self.options.skin),
             first_broadcast_s: measured.first_broadcast_s.unwrap_or(f64::NAN),
             control: self.loop_summary(measured, summary.control),
-            accuracy: all.fold(Accuracy::default(), Accuracy::merged),
+            accuracy: all.fold(TorqueAccuracy::default(), TorqueAccuracy::merged),
             backlog_dropped,
             buses: self.bus_summaries(received, backlog_dropped, measured),
             ..summary
@@ -189,20 +193,21 @@ impl Bench<'_> {
                 tree_ready_s: network.tree_ready.map(protocol::time::Span::seconds),
                 deepest: network.max_slot_depth(),
                 differences: network.differences.iter().map(ToString::to_string).collect(),
-                unreachable: network.unreachable().collect(),
+                unreachable: network.unreachable_nodes().collect(),
                 longest_unreachable_s: network.longest_unreachable.seconds(),
-                parent_changes: table.parent_changes(),
+                parent_changes: table.parent_change_count(),
             });
             let outages = OutagesSummary {
                 times: outages.count,
-                lost_s: outages.total_lost(Instant::now()).as_secs_f64(),
+                lost_s: outages.total_lost_time(Instant::now()).as_secs_f64(),
                 at_end: outages.is_ongoing(),
                 ticks: measured.missing.get(index.min(31)).copied().unwrap_or(0),
             };
             let kind = link.kind.to_string();
             let summary = BusSummary::new(&link.name, &kind, link.receive_buffer, table, dropped, ended);
-            let mut summary = BusSummary { outages, network, hosts: bus_link.hosts.summary(), ..summary };
-            summary.uplink.attribute_to_hosts(bus_link.hosts.lost_frames());
+            let mut summary =
+                BusSummary { outages, network, hosts: bus_link.hosts.host_summaries(), ..summary };
+            summary.uplink.attribute_losses_to_hosts(bus_link.hosts.lost_frames());
             Some(summary)
         };
         let mut summaries: Vec<_> =
@@ -210,7 +215,7 @@ impl Bench<'_> {
         // The buses of the dropped packets are unknown.
         let mut backlog = backlog_dropped.unwrap_or(0);
         for summary in summaries.iter_mut().filter(|summary| summary.kind == BusKind::SocketCan.name()) {
-            backlog -= summary.uplink.attribute_to_backlog(backlog);
+            backlog -= summary.uplink.attribute_losses_to_backlog(backlog);
         }
         summaries
     }

@@ -9,17 +9,17 @@ use protocol::time::{Micros, Span};
 
 use crate::summary::{HaltSummary, TickSummary};
 use control::cycle::Halt;
-use control::cycle::carried::bit;
+use control::cycle::carried::bus_bit;
 use control::cycle::turn::TimedRecord;
 
 /// Number of kept ticks: 0.4 s at 500 Hz.
-const KEPT_TICKS: usize = 200;
+const HALT_HISTORY_TICKS: usize = 200;
 /// Maximum number of halts listed one by one.
 const MAX_LISTED_HALTS: usize = 100;
 
 /// Halts of a run.
 #[derive(Debug, Default)]
-pub(super) struct Halts {
+pub(super) struct HaltHistory {
     /// Latest ticks, at most [`TICKS`].
     ring: VecDeque<TimedRecord>,
     /// Ticks up to the last halt, at most [`TICKS`].
@@ -31,10 +31,10 @@ pub(super) struct Halts {
     lasting: Option<HaltSummary>,
 }
 
-impl Halts {
+impl HaltHistory {
     /// Adds the next tick, and the begin or end of a halt.
     pub(super) fn add_tick(&mut self, timed: &TimedRecord) {
-        if self.ring.len() == KEPT_TICKS {
+        if self.ring.len() == HALT_HISTORY_TICKS {
             self.ring.pop_front();
         }
         self.ring.push_back(*timed);
@@ -68,17 +68,17 @@ impl Halts {
     }
 
     /// Reason of the present halt, if any.
-    pub(super) fn present_reason(&self) -> Option<&str> {
+    pub(super) fn present_halt_reason(&self) -> Option<&str> {
         self.lasting.as_ref().map(|halted| halted.reason.as_str())
     }
 
     /// All listed halts, oldest first; a present halt is always included as the last.
-    pub(super) fn all(&self) -> Vec<HaltSummary> {
+    pub(super) fn halt_summaries(&self) -> Vec<HaltSummary> {
         self.halts.iter().chain(&self.lasting).cloned().collect()
     }
 
     /// Ticks up to the last halt, oldest first.
-    pub(super) fn history(&self, skin: &Skin) -> Vec<TickSummary> {
+    pub(super) fn ticks_before_halt(&self, skin: &Skin) -> Vec<TickSummary> {
         self.before.iter().map(|timed| tick_summary(timed, skin)).collect()
     }
 }
@@ -88,7 +88,7 @@ impl Halts {
 fn tick_summary(timed: &TimedRecord, skin: &Skin) -> TickSummary {
     let record = &timed.record;
     let joints = |all: &[f64]| all.iter().copied().take(skin.robot.joints.len()).collect();
-    let lost = skin.buses.iter().enumerate().filter(|(index, _)| record.missing & bit(*index) != 0);
+    let lost = skin.buses.iter().enumerate().filter(|(index, _)| record.missing & bus_bit(*index) != 0);
     TickSummary {
         tick: record.tick.number,
         time_s: seconds(record.tick.time),
@@ -127,11 +127,11 @@ mod tests {
     use super::*;
     use control::controller::{BadCycle, Controller, ControllerInput, ControllerOutput};
     use control::cycle::carried::BusInput;
-    use control::cycle::{Cycle, Tick};
+    use control::cycle::{ControlCycle, Tick};
     use control::robot::SimulatedArm;
     use model::table::BusTotals;
     use model::testing;
-    use protocol::packet::padded;
+    use protocol::packet::pad_with_defaults;
 
     /// A controller that moves until a tick, and gives no answer after that.
     struct Until(u64);
@@ -139,7 +139,7 @@ mod tests {
     impl Controller for Until {
         fn step(&mut self, input: &ControllerInput) -> ControllerOutput {
             if input.tick < self.0 {
-                ControllerOutput::Move(padded(&[0.25; 6]))
+                ControllerOutput::Move(pad_with_defaults(&[0.25; 6]))
             } else {
                 ControllerOutput::Bad(BadCycle::NoAnswer)
             }
@@ -148,18 +148,18 @@ mod tests {
 
     /// A control loop without a machine. Its records go to the code under test.
     struct Bench {
-        cycle: Cycle,
+        cycle: ControlCycle,
         sums: BusTotals,
-        halts: Halts,
+        halts: HaltHistory,
         tick: u64,
     }
 
     impl Bench {
         fn new(answers: u64) -> Self {
-            let skin = testing::skin();
-            let robot = SimulatedArm::new(&skin, padded(&[0.0; 6]));
-            let cycle = Cycle::new(&skin, Box::new(Until(answers)), Box::new(robot));
-            Self { cycle, sums: BusTotals::default(), halts: Halts::default(), tick: 0 }
+            let skin = testing::one_cell_skin();
+            let robot = SimulatedArm::new(&skin, pad_with_defaults(&[0.0; 6]));
+            let cycle = ControlCycle::new(&skin, Box::new(Until(answers)), Box::new(robot));
+            Self { cycle, sums: BusTotals::default(), halts: HaltHistory::default(), tick: 0 }
         }
 
         fn ticks(&mut self, ticks: u64) {
@@ -185,20 +185,20 @@ mod tests {
 
     #[test]
     fn the_ticks_before_a_halt_are_kept_after_it() {
-        let limit = u64::from(testing::skin().safety.bad_cycles);
+        let limit = u64::from(testing::one_cell_skin().safety.bad_cycles);
         let mut bench = Bench::new(1_000);
         bench.ticks(1_000 + limit - 1);
-        assert_eq!((bench.halts.present_reason(), bench.halts.all().len()), (None, 0));
+        assert_eq!((bench.halts.present_halt_reason(), bench.halts.halt_summaries().len()), (None, 0));
         bench.ticks(5_000);
-        let [halted] = bench.halts.all().try_into().unwrap();
+        let [halted] = bench.halts.halt_summaries().try_into().unwrap();
         let tick = 1_000 + limit - 1;
         let reason = "too many bad cycles in a row: the external controller's answer is missing";
         assert_eq!((halted.tick, halted.reason.as_str(), halted.until_s), (tick, reason, None));
-        assert_eq!(bench.halts.present_reason(), Some(reason));
+        assert_eq!(bench.halts.present_halt_reason(), Some(reason));
         assert!((halted.at_s - f64::from(u32::try_from(tick).unwrap()) * 0.002).abs() < 1e-9, "{halted:?}");
         assert_eq!(u64::from(halted.epoch), tick / 8 % 256, "of the last joints, as the bus has it");
 
-        let before = bench.halts.history(&testing::skin());
+        let before = bench.halts.ticks_before_halt(&testing::one_cell_skin());
         let ticks: Vec<_> = before.iter().map(|it| it.tick).collect();
         assert_eq!(ticks, (tick - 199..=tick).collect::<Vec<_>>());
         for it in &before {
@@ -217,12 +217,12 @@ mod tests {
         for _ in 0..150 {
             bench.sums.halts += 1;
             bench.ticks(3);
-            assert_eq!(bench.halts.present_reason(), Some("a halt frame was received"));
+            assert_eq!(bench.halts.present_halt_reason(), Some("a halt frame was received"));
             bench.sums.resumes += 1;
             bench.ticks(2);
-            assert_eq!(bench.halts.present_reason(), None);
+            assert_eq!(bench.halts.present_halt_reason(), None);
         }
-        let all = bench.halts.all();
+        let all = bench.halts.halt_summaries();
         assert_eq!((all.len(), bench.halts.further), (MAX_LISTED_HALTS, 50));
         for (number, halted) in (0_u64..).zip(&all) {
             assert_eq!(halted.tick, 10 + 5 * number);
@@ -231,12 +231,15 @@ mod tests {
         }
         bench.sums.halts += 1;
         bench.ticks(1);
-        let all = bench.halts.all();
+        let all = bench.halts.halt_summaries();
         assert_eq!(
             (all.len(), all.last().unwrap().until_s),
             (MAX_LISTED_HALTS + 1, None),
             "one that lasts is always there"
         );
-        assert_eq!(bench.halts.history(&testing::skin()).last().unwrap().tick, all.last().unwrap().tick);
+        assert_eq!(
+            bench.halts.ticks_before_halt(&testing::one_cell_skin()).last().unwrap().tick,
+            all.last().unwrap().tick
+        );
     }
 }

@@ -8,7 +8,7 @@ use protocol::id::CellId;
 use vcan_setup::hosts::report::{HostReport, LinkReport, ReportReader};
 
 use crate::bus::link::{Outages, SharedBus};
-use crate::setup::names;
+use crate::setup::format_cells;
 use crate::summary::HostSummary;
 
 /// Interval between attempts to connect to a link.
@@ -16,7 +16,7 @@ const RECONNECT_INTERVAL: Duration = Duration::from_millis(500);
 
 /// The other hosts of a bus, and the connection to its link.
 #[derive(Debug)]
-pub(super) struct Hosts {
+pub(super) struct OtherHosts {
     reports: Option<ReportReader>,
     reconnect_at: Instant,
     known: KnownHosts,
@@ -50,7 +50,7 @@ struct HostState {
     lost: [u64; 2],
 }
 
-impl Hosts {
+impl OtherHosts {
     pub(super) fn new() -> Self {
         Self { reports: None, reconnect_at: Instant::now(), known: KnownHosts::default() }
     }
@@ -79,7 +79,7 @@ impl Hosts {
 
     /// Returns true if a cell is on an unreachable host. Frames that still arrive from it were under way when the host
     /// was lost.
-    pub(super) fn is_away(&self, cell: CellId) -> bool {
+    pub(super) fn is_host_unreachable(&self, cell: CellId) -> bool {
         let mut away = self.known.hosts.values().filter(|of| !of.newest.is_there);
         away.any(|of| of.newest.nodes.contains(&cell.get()))
     }
@@ -90,12 +90,12 @@ impl Hosts {
     }
 
     /// Summary of each host; empty if no link joined the bus.
-    pub(super) fn summary(&self) -> Vec<HostSummary> {
+    pub(super) fn host_summaries(&self) -> Vec<HostSummary> {
         let summary = |(name, of): (&String, &HostState)| HostSummary {
             name: name.clone(),
             cells: of.newest.nodes.len(),
             gone: of.outages.count,
-            gone_s: of.outages.total_lost(Instant::now()).as_secs_f64(),
+            gone_s: of.outages.total_lost_time(Instant::now()).as_secs_f64(),
             at_end: of.newest.is_there,
             lost_from: of.lost[0],
             lost_to: of.lost[1],
@@ -111,8 +111,9 @@ impl KnownHosts {
             let known = self.hosts.entry(host.clone()).or_default();
             let before = std::mem::replace(&mut known.newest, newest);
             let newest = &known.newest;
-            let missing =
-                |host: &HostReport| [host.heard.missing(), host.ours.map_or(0, |ours| ours.missing())];
+            let missing = |host: &HostReport| {
+                [host.heard.missing_frame_count(), host.ours.map_or(0, |ours| ours.missing_frame_count())]
+            };
             let (was, is) = (missing(&before), missing(newest));
             if is_first {
                 // Losses from before the run do not belong to the run.
@@ -126,13 +127,13 @@ impl KnownHosts {
                 newest.nodes.iter().filter_map(|&node| CellId::new(node.into()).ok()).collect();
             if before.is_there != newest.is_there {
                 let how = if newest.is_there {
-                    known.outages.end(now);
+                    known.outages.end_outage(now);
                     if is_first || known.outages.count == 0 { "is linked" } else { "is reached again" }
                 } else {
-                    known.outages.begin(now);
+                    known.outages.begin_outage(now);
                     "is gone, or not reached"
                 };
-                let of_it = names(&cells, "");
+                let of_it = format_cells(&cells, "");
                 let of_it = if cells.is_empty() { String::new() } else { format!(" (cells {of_it})") };
                 changes.notes.push(format!("host '{host}' of {bus} {how}{of_it}"));
             }
@@ -156,7 +157,7 @@ impl KnownHosts {
             let nodes = std::mem::take(&mut known.newest).nodes;
             changes.possibly_missed.extend(nodes.iter().filter_map(|&node| CellId::new(node.into()).ok()));
             known.newest.nodes = nodes;
-            known.outages.begin(now);
+            known.outages.begin_outage(now);
         }
     }
 }
@@ -176,11 +177,11 @@ mod tests {
         LinkReport { host: "a".to_owned(), hosts: hosts.iter().map(host).collect(), ..LinkReport::default() }
     }
 
-    struct Fixture(Hosts, Instant, u64);
+    struct Fixture(OtherHosts, Instant, u64);
 
     impl Fixture {
         fn new() -> Self {
-            Self(Hosts::new(), Instant::now(), 0)
+            Self(OtherHosts::new(), Instant::now(), 0)
         }
 
         /// Handles a report one second after the last one. Returns the notes, and the numbers of cells in doubt and
@@ -206,7 +207,10 @@ mod tests {
         assert_eq!(of.0.lost_frames(), 0);
         assert_eq!(of.take(&[("b", true, 1, 53, 60)]), (vec![], 0, 0), "their own counts show it");
         assert_eq!(of.take(&[("b", true, 1, 53, 64)]), (vec![], 2, 2), "stimuli may be among them");
-        assert_eq!((of.0.lost_frames(), of.0.summary()[0].lost_from, of.0.summary()[0].lost_to), (7, 3, 4));
+        assert_eq!(
+            (of.0.lost_frames(), of.0.host_summaries()[0].lost_from, of.0.host_summaries()[0].lost_to),
+            (7, 3, 4)
+        );
     }
 
     #[test]
@@ -216,9 +220,12 @@ mod tests {
         let (notes, in_doubt, reached) = of.take(&[("b", false, 1, 0, 0), ("c", true, 1, 0, 0)]);
         assert_eq!(notes, ["host 'b' of vcan0 is gone, or not reached (cells 7, 9)"]);
         assert_eq!((in_doubt, reached), (2, 0));
-        assert!(of.0.is_away(CellId::new(7).unwrap()) && !of.0.is_away(CellId::new(8).unwrap()));
+        assert!(
+            of.0.is_host_unreachable(CellId::new(7).unwrap())
+                && !of.0.is_host_unreachable(CellId::new(8).unwrap())
+        );
         let (notes, in_doubt, reached) = of.take(&[("b", true, 2, 0, 0), ("c", true, 1, 0, 0)]);
-        assert!(!of.0.is_away(CellId::new(7).unwrap()));
+        assert!(!of.0.is_host_unreachable(CellId::new(7).unwrap()));
         assert_eq!(notes, ["host 'b' of vcan0 is reached again (cells 7, 9)"]);
         assert_eq!((in_doubt, reached), (2, 2));
         assert_eq!(
@@ -226,7 +233,7 @@ mod tests {
             2,
             "its link was killed and is back"
         );
-        let b = &of.0.summary()[0];
+        let b = &of.0.host_summaries()[0];
         assert_eq!((b.gone, b.gone_s, b.at_end, b.cells), (1, 1.0, true, 2));
     }
 
@@ -238,7 +245,10 @@ mod tests {
         let mut changes = HostChanges::default();
         of.0.known.end_link("vcan0", "end of file", of.1 + Duration::from_secs(3), &mut changes);
         assert_eq!((changes.possibly_missed.len(), changes.reached.len()), (2, 0));
-        assert!(of.0.is_away(CellId::new(9).unwrap()), "its heartbeats may still be on their way");
+        assert!(
+            of.0.is_host_unreachable(CellId::new(9).unwrap()),
+            "its heartbeats may still be on their way"
+        );
         let (notes, _, reached) = of.take(&[("b", true, 1, 2, 0)]);
         assert_eq!((notes.len(), reached), (1, 2));
         assert_eq!(of.0.lost_frames(), 7);

@@ -8,9 +8,9 @@ use protocol::skin::Skin;
 use protocol::time::Span;
 
 use super::accelerations::TickMotion;
-use super::halts::Halts;
+use super::halts::HaltHistory;
 use super::status_line::StatusLine;
-use crate::remote::Lateness;
+use crate::remote::TickLateness;
 use control::cycle::turn::TimedRecord;
 use model::accelerometer::RobotState;
 use model::quantiles::{Quantiles, histogram};
@@ -28,14 +28,14 @@ pub(super) struct LoopTotals {
     pub(super) bad: BTreeMap<String, u64>,
     /// Number of ticks without data from a bus, by the bus's bit in [`control::cycle::Record::missing`].
     pub(super) missing: [u64; 32],
-    pub(super) halts: Halts,
+    pub(super) halts: HaltHistory,
     last: Option<TimedRecord>,
     before: Option<TimedRecord>,
     /// Start of the interval for which `recent` holds values.
     since: Instant,
     recent: Histogram<u64>,
     /// Figures of the ticks' lateness, updated once a second.
-    pub(super) lateness: Lateness,
+    pub(super) lateness: TickLateness,
     pub(super) first_broadcast_s: Option<f64>,
 }
 
@@ -50,12 +50,12 @@ impl LoopTotals {
             skipped: 0,
             bad: BTreeMap::new(),
             missing: [0; 32],
-            halts: Halts::default(),
+            halts: HaltHistory::default(),
             last: None,
             before: None,
             since: Instant::now(),
             recent: histogram(),
-            lateness: Lateness::default(),
+            lateness: TickLateness::default(),
             first_broadcast_s: None,
         }
     }
@@ -67,12 +67,12 @@ impl LoopTotals {
             }
             self.ticks += 1;
             self.skipped += timed.record.skipped;
-            record(&mut self.late, timed.late_ns);
-            record(&mut self.recent, timed.late_ns);
-            record(&mut self.took, timed.took_ns);
+            record_value(&mut self.late, timed.late_ns);
+            record_value(&mut self.recent, timed.late_ns);
+            record_value(&mut self.took, timed.took_ns);
             match timed.central {
-                Some((nanos, _)) => record(&mut self.central, nanos),
-                None => record(&mut self.took_distributed, timed.took_ns),
+                Some((nanos, _)) => record_value(&mut self.central, nanos),
+                None => record_value(&mut self.took_distributed, timed.took_ns),
             }
             for (bus, ticks) in self.missing.iter_mut().enumerate() {
                 *ticks += u64::from(timed.record.missing >> bus & 1);
@@ -85,7 +85,7 @@ impl LoopTotals {
         }
         if self.since.elapsed() >= Duration::from_secs(1) {
             let [second, all] = [&self.recent, &self.late].map(|late| Quantiles::from_histogram(late, 1e-3));
-            self.lateness = Lateness { second, all, skipped: self.skipped };
+            self.lateness = TickLateness { second, all, skipped: self.skipped };
             self.since = Instant::now();
             self.recent.reset();
         }
@@ -117,7 +117,7 @@ impl LoopTotals {
             elapsed_s: elapsed.as_secs_f64(),
             duration_s: duration.seconds(),
             lost,
-            halted: self.halts.present_reason(),
+            halted: self.halts.present_halt_reason(),
             contributing: record.contributing,
             cells: skin.cells.len(),
             stale: record.stale,
@@ -131,6 +131,6 @@ impl LoopTotals {
 }
 
 /// A histogram without a bound resizes itself, so recording cannot fail.
-fn record(histogram: &mut Histogram<u64>, value: u64) {
+fn record_value(histogram: &mut Histogram<u64>, value: u64) {
     let _ = histogram.record(value);
 }

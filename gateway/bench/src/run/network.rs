@@ -6,14 +6,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use protocol::id::{CellId, Node};
 use protocol::message::{Message, Request};
 use protocol::packet::WORDS;
-use protocol::parameters::{LinksDown, Parameter, Reply as Words, SumSchedule};
+use protocol::parameters::{LinksDown, Parameter, ReplyKind as Words, SumSchedule};
 use protocol::port::PORTS;
-use protocol::skin::{Skin, SkinReply, Wires};
+use protocol::skin::{BusWires, Skin, SkinReply};
 use protocol::time::{Micros, Span};
 use thiserror::Error;
 
 use model::network::check::{self, Difference};
-use model::network::tree::{ReportedTree, tree_places};
+use model::network::tree::{ReportedTree, tree_from_reports};
 use model::repeat::RepeatedRequests;
 
 use crate::view::BusView;
@@ -27,7 +27,7 @@ const REROUTE_TIMEOUT: Span = Span::from_millis(300);
 #[derive(Debug)]
 pub(super) struct Network {
     name: String,
-    wires: Wires,
+    wires: BusWires,
     slots: SumSchedule,
     period_us: u16,
     /// Cells to which their slots were sent, with the times.
@@ -72,7 +72,7 @@ pub struct TreeTooDeep {
 
 /// Messages that result from a check of a network.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct NetworkCheck {
+pub(super) struct NetworkCheckResult {
     /// Messages that must be sent to cells.
     pub(super) messages: Vec<Message>,
     /// Messages for the user.
@@ -88,7 +88,7 @@ impl Network {
             name: described.name.clone(),
             wires: skin.wires(bus),
             slots: SumSchedule { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
-            period_us: skin.period_us().unwrap_or(u16::MAX),
+            period_us: skin.broadcast_period_us().unwrap_or(u16::MAX),
             announced: RepeatedRequests::new(RETRY_INTERVAL),
             ports_down: BTreeMap::new(),
             reported_links_down: RepeatedRequests::new(RETRY_INTERVAL),
@@ -112,12 +112,12 @@ impl Network {
     }
 
     /// Returns the cells that sent but were unreachable at the last check.
-    pub(super) fn unreachable(&self) -> impl Iterator<Item = u8> {
+    pub(super) fn unreachable_nodes(&self) -> impl Iterator<Item = u8> {
         self.without_route.keys().map(|cell| cell.get())
     }
 
-    fn places(view: &BusView) -> ReportedTree {
-        tree_places(
+    fn reported_tree(view: &BusView) -> ReportedTree {
+        tree_from_reports(
             view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)),
         )
     }
@@ -125,12 +125,12 @@ impl Network {
     /// Returns the number of cells with a route to a root, and true if all cells that send have one and their pages
     /// agree.
     pub(super) fn tree_progress(view: &BusView) -> (usize, bool) {
-        let places = Self::places(view);
+        let places = Self::reported_tree(view);
         (places.depths.len(), places.unreachable.is_empty() && places.agree)
     }
 
     /// Returns the differences between the present tree and the description.
-    pub(super) fn check(&self, view: &BusView) -> Vec<Difference> {
+    pub(super) fn description_differences(&self, view: &BusView) -> Vec<Difference> {
         check::differences(&self.wires, &view.network)
     }
 
@@ -139,7 +139,7 @@ impl Network {
     /// # Errors
     /// Returns [`TooDeep`] if the slots do not fit between two joint broadcasts. The error names values that would fit.
     pub(super) fn fit_slots(&mut self, view: &BusView) -> Result<(), TreeTooDeep> {
-        let deepest = Self::places(view).max_depth().unwrap_or(0);
+        let deepest = Self::reported_tree(view).max_depth().unwrap_or(0);
         let slots = u32::from(deepest) + 1;
         let (slot_us, period_us) = (u32::from(self.slots.slot_us), u32::from(self.period_us));
         if slots * slot_us > period_us {
@@ -159,21 +159,21 @@ impl Network {
     }
 
     /// Returns the message that sends the depth of the tree to all cells.
-    pub(super) fn announce(&mut self, now: Micros) -> Message {
+    pub(super) fn announce_slots(&mut self, now: Micros) -> Message {
         self.announced.mark_all_sent(now);
         self.reply_message(Node::Everyone)
     }
 
     /// Returns the ready cells that have not confirmed the slots of the present tree.
-    pub(super) fn unconfirmed(&self, view: &BusView) -> Vec<CellId> {
+    pub(super) fn cells_with_unconfirmed_slots(&self, view: &BusView) -> Vec<CellId> {
         let words = Some(self.reply_words());
         let unconfirmed = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
         unconfirmed.map(|cell| cell.node).collect()
     }
 
     /// Returns the messages for cells that have not answered in time.
-    pub(super) fn repeat_messages(&mut self, now: Micros, view: &BusView) -> Vec<Message> {
-        let due = self.announced.due_requests(now, self.unconfirmed(view));
+    pub(super) fn messages_to_repeat(&mut self, now: Micros, view: &BusView) -> Vec<Message> {
+        let due = self.announced.due_requests(now, self.cells_with_unconfirmed_slots(view));
         due.into_iter().map(|cell| self.reply_message(Node::Cell(cell))).collect()
     }
 
@@ -185,7 +185,7 @@ impl Network {
         let bits = ends.fold(0, |bits, (bit, _)| bits | 1 << bit);
         let deaf = self.ports_down.entry(to).or_default();
         *deaf = if link_down { *deaf | bits } else { *deaf & !bits };
-        self.reported_links_down.make_due(to);
+        self.reported_links_down.make_request_due(to);
     }
 
     /// Returns the links that must be down in one or both directions, each once, with the smaller node id first.
@@ -216,12 +216,12 @@ impl Network {
     }
 
     /// Checks the network while the loop runs.
-    pub(super) fn check_running(&mut self, now: Micros, view: &BusView) -> NetworkCheck {
-        let mut look = NetworkCheck::default();
-        let places = Self::places(view);
+    pub(super) fn check_running(&mut self, now: Micros, view: &BusView) -> NetworkCheckResult {
+        let mut look = NetworkCheckResult::default();
+        let places = Self::reported_tree(view);
         if places.max_depth().is_some_and(|deepest| deepest > self.slots.deepest) {
             match self.fit_slots(view) {
-                Ok(()) => look.messages.push(self.announce(now)),
+                Ok(()) => look.messages.push(self.announce_slots(now)),
                 Err(why) if !self.reported_too_deep => {
                     self.reported_too_deep = true;
                     look.notes.push(format!("{why}; deeper cells send too early, and their sums are late"));
@@ -229,7 +229,7 @@ impl Network {
                 Err(_) => {}
             }
         }
-        look.messages.extend(self.repeat_messages(now, view));
+        look.messages.extend(self.messages_to_repeat(now, view));
         look.messages.extend(self.report_links_down(now, view));
         let without: BTreeSet<_> = places.unreachable.into_iter().collect();
         self.without_route.retain(|cell, since| {
@@ -282,12 +282,13 @@ mod tests {
     use super::*;
     use crate::view::CellView;
     use model::network::check::ObservedCell;
-    use model::table::{ResponseFlags, SWITCHES};
+    use model::table::{ResponseFlags, SWITCH_COUNT};
     use protocol::message::TreePage;
     use protocol::packet::Epoch;
 
     fn network() -> Network {
-        let head = model::testing::SKIN.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 5000");
+        let head = model::testing::ONE_CELL_SKIN_TOML
+            .replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 5000");
         let (head, one) = head.split_at(head.find("[[cell]]").unwrap());
         let cell = |node: u8, root: bool, neighbors: &str| {
             one.replace("node = 1", &format!("node = {node}\nroot = {root}\nneighbors = {neighbors}"))
@@ -313,7 +314,7 @@ mod tests {
             responded: ResponseFlags::default(),
             reply,
             ports_down: 0,
-            unconfirmed_switches: [None; SWITCHES],
+            unconfirmed_switches: [None; SWITCH_COUNT],
             unclear: false,
         });
         let network = trees.iter().enumerate().map(|(at, tree)| ObservedCell {
@@ -339,18 +340,18 @@ mod tests {
         let at = |rounds: u64| Micros(rounds * RETRY_INTERVAL.0);
         let now = at(1);
         let words = Some(network.reply_words());
-        assert_eq!(network.check_running(now, &view(&flat, words)), NetworkCheck::default());
+        assert_eq!(network.check_running(now, &view(&flat, words)), NetworkCheckResult::default());
         let deep = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
         let look = network.check_running(now, &view(&deep, words));
         let everyone = |message: &Message| matches!(message, Message::Configure { to: Node::Everyone, .. });
         assert!(look.messages.iter().all(everyone) && look.messages.len() == 1, "{look:?}");
         assert_eq!(network.max_slot_depth(), 2);
         // A cell that has not answered gets its own message, after an interval.
-        assert_eq!(network.check_running(now, &view(&deep, words)), NetworkCheck::default());
+        assert_eq!(network.check_running(now, &view(&deep, words)), NetworkCheckResult::default());
         let look = network.check_running(at(2), &view(&deep, words));
         assert_eq!(look.messages.len(), 3, "{look:?}");
         let new = Some(network.reply_words());
-        assert_eq!(network.check_running(at(3), &view(&deep, new)), NetworkCheck::default());
+        assert_eq!(network.check_running(at(3), &view(&deep, new)), NetworkCheckResult::default());
         // A restarted cell has lost its slots.
         let look = network.check_running(at(4), &view(&deep, None));
         assert_eq!(look.messages.len(), 3, "{look:?}");
@@ -424,14 +425,14 @@ mod tests {
             ["cells 2, 3 on vcan0 are unreachable: no route to a root, and in no sum for 0.4 s"]
         );
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
-        assert_eq!(network.unreachable().collect::<Vec<_>>(), [2, 3]);
+        assert_eq!(network.unreachable_nodes().collect::<Vec<_>>(), [2, 3]);
         // One cell dies, which is reported elsewhere; the other has a route again.
         let partial = [Some((Some(0), 0)), None, Some((Some(1), 1))];
         assert_eq!(
             look(&mut network, &partial),
             ["cell 3 on vcan0 has a route to a root again, after 0.8 s"]
         );
-        assert_eq!(network.unreachable().count(), 0);
+        assert_eq!(network.unreachable_nodes().count(), 0);
         assert_eq!(look(&mut network, &whole), ["cell 2 on vcan0 has a route to a root again, after 1.0 s"]);
         assert_eq!(network.longest_unreachable, Span::from_millis(800));
     }

@@ -15,14 +15,14 @@ use crate::error::RunError;
 use crate::view::BusView;
 
 /// Time after which a difference from the description counts as real: hellos and heartbeats come four times a second.
-const SETTLING_TIME: Duration = Duration::from_millis(1_500);
+const TREE_SETTLING_TIME: Duration = Duration::from_millis(1_500);
 
 impl Bench<'_> {
     /// Waits until the cells that answer with sums form a tree, and sends them their slots.
     pub(super) fn organise_trees(&mut self) -> Result<(), RunError> {
         self.shared.sends_to_roots.store(true, Ordering::Relaxed);
         let began = self.now();
-        self.poll_until(self.timeout(), |bench, timeout| {
+        self.poll_until(self.progress_timeout(), |bench, timeout| {
             let (mut have_ways, mut whole, now) = (0, true, bench.now());
             for (network, view) in bench.networks() {
                 let (count, all) = Network::tree_progress(&view);
@@ -37,7 +37,7 @@ impl Bench<'_> {
         for (network, view) in self.networks() {
             network.fit_slots(&view)?;
         }
-        self.send_slots()?;
+        self.send_sum_slots()?;
         for network in self
             .bus_links
             .iter()
@@ -58,10 +58,10 @@ impl Bench<'_> {
         // Without a request, pages of ports come with heartbeats only.
         self.send_to_all(&Message::Report)?;
         let mut changes = 0;
-        self.poll_until(SETTLING_TIME, |bench, timeout| {
+        self.poll_until(TREE_SETTLING_TIME, |bench, timeout| {
             let mut none = true;
             for (network, view) in bench.networks() {
-                let differences = network.check(&view);
+                let differences = network.description_differences(&view);
                 none &= differences.is_empty();
                 changes += usize::from(differences != network.differences);
                 network.differences = differences;
@@ -84,19 +84,22 @@ impl Bench<'_> {
     }
 
     /// Sends all cells their slots, and waits for confirmations.
-    fn send_slots(&mut self) -> Result<(), RunError> {
-        self.send_to_networks(|network, now, _| vec![network.announce(now)])?;
+    fn send_sum_slots(&mut self) -> Result<(), RunError> {
+        self.send_to_networks(|network, now, _| vec![network.announce_slots(now)])?;
         let mut unconfirmed = Vec::new();
         self.poll_until(DISCOVERY_TIMEOUT, |bench, timeout| {
             unconfirmed.clear();
             for (network, view) in bench.networks() {
                 unconfirmed.extend(
-                    network.unconfirmed(&view).iter().map(|cell| format!("{cell} on {}", network.name())),
+                    network
+                        .cells_with_unconfirmed_slots(&view)
+                        .iter()
+                        .map(|cell| format!("{cell} on {}", network.name())),
                 );
             }
             let is_last = unconfirmed.is_empty() || timeout.has_stalled(0);
             if !is_last {
-                bench.send_to_networks(Network::repeat_messages)?;
+                bench.send_to_networks(Network::messages_to_repeat)?;
             }
             Ok(is_last)
         })?;

@@ -28,7 +28,7 @@ use trace::capture::BusNote;
 const CHECK_INTERVAL: Duration = Duration::from_millis(20);
 /// Maximum total number of cells for which the interval is [`LOOK`]. With more cells the interval grows proportionally,
 /// up to [`LONGEST_LOOK`].
-const CELLS_PER_INTERVAL: usize = 1_000;
+const CELLS_PER_CHECK_INTERVAL: usize = 1_000;
 /// Maximum interval between checks of timeouts; a cell counts as dead after 600 ms.
 const MAX_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -36,7 +36,7 @@ const MAX_CHECK_INTERVAL: Duration = Duration::from_millis(100);
 /// their number, so that the checks take the same share of time for all skins.
 #[must_use]
 pub fn check_interval(cells: usize) -> Duration {
-    let times = u32::try_from(cells / CELLS_PER_INTERVAL).unwrap_or(u32::MAX);
+    let times = u32::try_from(cells / CELLS_PER_CHECK_INTERVAL).unwrap_or(u32::MAX);
     CHECK_INTERVAL.saturating_mul(times.max(1)).min(MAX_CHECK_INTERVAL)
 }
 
@@ -103,7 +103,7 @@ pub struct ReceiverResult {
 
 /// State of a receiver's reports to the recorder and the main thread.
 #[derive(Debug, Default)]
-struct ReportedState {
+struct ReceiverReportState {
     /// Number of dropped frames that have been reported to the recorder.
     announced: u64,
     /// Number of the latest joints whose contact states have been recorded.
@@ -118,10 +118,10 @@ impl Receiver {
     #[must_use]
     pub fn run(mut self) -> ReceiverResult {
         crate::bus::realtime::prepare_receiver();
-        let mut account = ReportedState::default();
+        let mut account = ReceiverReportState::default();
         let mut looked = Instant::now();
         while !self.shared.stop.load(Ordering::Relaxed) {
-            let wait = self.present_interval();
+            let wait = self.present_check_interval();
             let step = self.follower.step(&mut self.receive_end, wait);
             self.handle_step(step, &mut account);
             for cells in self.possibly_missed.try_iter() {
@@ -132,56 +132,56 @@ impl Receiver {
                 self.follower.roots.iter_mut().for_each(RootWires::start_sending);
             }
             self.forward_to_recorder(&mut account);
-            if looked.elapsed() >= self.present_interval() {
+            if looked.elapsed() >= self.present_check_interval() {
                 looked = Instant::now();
                 self.refresh_view(&mut account);
             }
-            self.publish();
+            self.publish_snapshot();
         }
         let ended = Micros(wall_clock_ns() / 1_000);
         self.table.finish();
-        let unrecorded = self.outlet.as_mut().map_or_else(UnrecordedCounts::default, report_remaining);
-        let dropped = self.follower.dropped();
+        let unrecorded = self.outlet.as_mut().map_or_else(UnrecordedCounts::default, report_unrecorded_items);
+        let dropped = self.follower.dropped_frames();
         ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages, ended }
     }
 
     /// Returns the present interval between checks of timeouts. It is short until the loop starts, because the main
     /// thread waits for the cells.
-    fn present_interval(&self) -> Duration {
+    fn present_check_interval(&self) -> Duration {
         if self.shared.broadcasts.load(Ordering::Relaxed) == 0 { CHECK_INTERVAL } else { self.check_interval }
     }
 
     /// Handles an outcome of a step other than frames: a change of the bus's state.
-    fn handle_step(&mut self, step: FollowStep, account: &mut ReportedState) {
+    fn handle_step(&mut self, step: FollowStep, account: &mut ReceiverReportState) {
         match step {
             FollowStep::Frames(_) => {
                 if self.receive_end.mark_working() {
-                    account.outages.end(Instant::now());
-                    self.note(BusNote::Back);
+                    account.outages.end_outage(Instant::now());
+                    self.record_bus_note(BusNote::Back);
                     self.send_event(BusEvent::Up);
                 }
             }
             FollowStep::Nothing | FollowStep::Leftover(_) => {}
-            FollowStep::Down(error) => self.report_loss(false, BusEvent::Down(error), account),
+            FollowStep::Down(error) => self.report_bus_loss(false, BusEvent::Down(error), account),
             FollowStep::Drained => self.table.handle_bus_loss(),
             FollowStep::Gone(error) => {
-                self.report_loss(true, BusEvent::Lost(error), account);
+                self.report_bus_loss(true, BusEvent::Lost(error), account);
                 self.table.handle_bus_loss();
             }
             FollowStep::Refused(error) => self.send_event(BusEvent::Refused(error)),
         }
     }
 
-    fn report_loss(&mut self, gone: bool, bus_event: BusEvent, account: &mut ReportedState) {
+    fn report_bus_loss(&mut self, gone: bool, bus_event: BusEvent, account: &mut ReceiverReportState) {
         if self.receive_end.mark_lost(gone) {
-            account.outages.begin(Instant::now());
-            self.note(BusNote::Lost);
+            account.outages.begin_outage(Instant::now());
+            self.record_bus_note(BusNote::Lost);
             self.send_event(bus_event);
         }
     }
 
     /// Notes a state of the bus in the recording.
-    fn note(&mut self, what: BusNote) {
+    fn record_bus_note(&mut self, what: BusNote) {
         if let Some(outlet) = &mut self.outlet {
             outlet.push_bus_note(wall_clock_ns(), what);
         }
@@ -189,7 +189,7 @@ impl Receiver {
 
     /// Handles the received frames.
     fn handle_frames(&mut self) {
-        self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
+        self.table.set_torque_comparison(self.shared.comparing.load(Ordering::Relaxed));
         let Self { follower, table, positions: queue, outlet, .. } = self;
         follower.for_each_item(|part| match part {
             FollowedItem::Feeds(root, feeds) => table.set_root_feeds_gateway(root, feeds),
@@ -206,11 +206,11 @@ impl Receiver {
     }
 
     /// Forwards drop counts and, once per epoch, contact states to the recorder.
-    fn forward_to_recorder(&mut self, account: &mut ReportedState) {
+    fn forward_to_recorder(&mut self, account: &mut ReceiverReportState) {
         let Some(outlet) = &mut self.outlet else { return };
-        let dropped = self.follower.dropped();
+        let dropped = self.follower.dropped_frames();
         if dropped > account.announced {
-            outlet.push_dropped(wall_clock_ns(), dropped - account.announced);
+            outlet.push_dropped_frames(wall_clock_ns(), dropped - account.announced);
             account.announced = dropped;
         }
         let Some((number, epoch, at)) = self.table.newest_joints() else { return };
@@ -220,22 +220,22 @@ impl Receiver {
         }
     }
 
-    fn publish(&mut self) {
+    fn publish_snapshot(&mut self) {
         let comparing = self.shared.comparing.load(Ordering::Relaxed);
         self.snapshots.input_buffer_mut().copy_from(self.table.snapshot(), comparing);
         self.snapshots.publish();
     }
 
     /// Checks timeouts, and updates the main thread's view.
-    fn refresh_view(&mut self, account: &mut ReportedState) {
+    fn refresh_view(&mut self, account: &mut ReceiverReportState) {
         let now = Micros(wall_clock_ns() / 1_000);
         self.table.handle_time(now);
-        let notices: Vec<_> = self.table.notices().collect();
+        let notices: Vec<_> = self.table.drain_notices().collect();
         for notice in notices {
             self.send_event(BusEvent::Notice(notice));
         }
         let cells = self.table.statuses(now).map(|(cell, status)| CellView::new(cell, status));
-        let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
+        let (cells, read) = (cells.collect(), self.table.counters().sent_count(Kind::Command));
         if !self.receive_end.link.state.is_working() {
             // The lost bus will not deliver the commands that it has accepted.
             account.unread =
@@ -256,12 +256,12 @@ impl Receiver {
 }
 
 /// Reports the items that did not fit into the queues, waiting up to 1 s until the queue has room for the report.
-fn report_remaining(outlet: &mut RecorderSender) -> UnrecordedCounts {
+fn report_unrecorded_items(outlet: &mut RecorderSender) -> UnrecordedCounts {
     let give_up = Instant::now() + Duration::from_secs(1);
     while !outlet.report_unrecorded(wall_clock_ns()) && Instant::now() < give_up {
         std::thread::sleep(Duration::from_millis(1));
     }
-    outlet.unrecorded()
+    outlet.unrecorded_counts()
 }
 
 /// Returns the positions of an epoch's joints. Drops positions of earlier epochs, whose broadcasts were not read back.

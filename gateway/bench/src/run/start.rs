@@ -18,27 +18,27 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 use super::RunOptions;
 use super::bench::{Bench, RunBus};
 use super::commander::SwitchedBuses;
-use super::hosts::Hosts;
+use super::hosts::OtherHosts;
 use super::network::Network;
 use super::receiver::{BusEvent, Receiver, check_interval};
 use crate::bus::follow::Follower;
 use crate::bus::link::{BusSlot, ReceiveEnd, SharedBus};
 use crate::bus::realtime;
 use crate::bus::roots::{ReceiveFilter, RootWires};
-use crate::bus::served::{BusTarget, IfAbsent, ServedBus, open_or_serve, open_or_serve_all};
+use crate::bus::served::{AbsentBusAction, BusTarget, ServedBus, open_or_serve, open_or_serve_all};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::error::RunError;
 use crate::processes::ended::EndedProcesses;
-use crate::processes::{Processes, allow_files, program_path};
+use crate::processes::{Processes, program_path, raise_open_file_limit};
 use crate::record::feed::{self, RecorderFeed, RecorderSender};
-use crate::record::{Mcap, Outputs, Recorder, backlog, facts};
+use crate::record::{McapOutput, Recorder, RecordingOutputs, backlog, facts};
 use crate::signals::{SignalError, catch_signals};
 use crate::threads::spawn;
 use crate::view::BusView;
 use control::controller::{Controller, PlannedController};
-use control::cycle::Cycle;
+use control::cycle::ControlCycle;
 use control::cycle::turn::{BusPort, SharedRunState, TimedRecord};
-use control::motion::controller_of;
+use control::motion::controller_for_motion;
 use control::robot::SimulatedArm;
 use model::quantiles::Quantiles;
 use model::table::BusTable;
@@ -62,9 +62,10 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     // Ignore the signal, so that a file at its size limit is an ordinary write error.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|source| SignalError { signal: SIGXFSZ, source })?;
-    let outputs = Outputs::open_outputs(&options.record, &signalled, eprint_line).map_err(|refused| {
-        if signalled.load(Ordering::Relaxed) { RunError::Interrupted } else { refused.into() }
-    })?;
+    let outputs =
+        RecordingOutputs::open_outputs(&options.record, &signalled, eprint_line).map_err(|refused| {
+            if signalled.load(Ordering::Relaxed) { RunError::Interrupted } else { refused.into() }
+        })?;
     let numbered = options.record.candump.as_ref().is_some_and(|candump| candump.numbered);
     let log = outputs.candump_path().filter(|_| numbered).map(Path::to_owned);
     // From here on an external controller can connect, so that it is ready when the loop starts.
@@ -73,24 +74,24 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
             let motion = motion.clone();
             Box::new(PlannedController::new(skin, move |seconds| motion.state_at(seconds).position))
         }
-        None => controller_of(skin, &options.scenario.motion)?,
+        None => controller_for_motion(skin, &options.scenario.motion)?,
     };
     let arm = SimulatedArm::new(skin, options.scenario.motion.start);
-    let cycle = Some(Cycle::new(skin, controller, Box::new(arm)));
+    let cycle = Some(ControlCycle::new(skin, controller, Box::new(arm)));
     let idle = realtime::idle_lateness(skin.timing.tick_nanos());
     let backlog_dropped = backlog::dropped_packets();
     let (mut served, mut processes) = (Vec::new(), Processes::new()?);
     // Commission the cells before this run opens its buses, because the run would take the commissioning for another
     // gateway.
-    let emulation =
-        emulator.map(|emulator| emulate(options, &emulator, &mut served, &mut processes, &signalled));
+    let emulation = emulator
+        .map(|emulator| start_emulated_cells(options, &emulator, &mut served, &mut processes, &signalled));
     let emulation = emulation.transpose()?;
     let targets = skin.buses.iter().enumerate().map(|(index, bus)| {
         let receive_filter = ReceiveFilter::for_bus(skin, index, !outputs.is_empty());
         bus_target(options, bus, receive_filter.filters)
     });
     let targets: Vec<_> = targets.collect();
-    let (opened, own) = open_or_serve_all(&targets, if_absent(options))?;
+    let (opened, own) = open_or_serve_all(&targets, action_if_bus_absent(options))?;
     served.extend(own);
     let opened = skin.buses.iter().zip(targets).zip(opened);
     let opened = opened.map(|((bus, (.., target)), opened)| create_link(options, bus, target, opened));
@@ -159,12 +160,12 @@ fn check_options(options: &RunOptions) -> Result<Option<Emulator<'_>>, RunError>
     let buses = options.skin.buses.len();
     let clients =
         (0..buses).map(|bus| options.skin.cells_on_bus(bus).count().div_ceil(options.cells_per_process));
-    allow_files(buses, clients.max().unwrap_or(0))?;
+    raise_open_file_limit(buses, clients.max().unwrap_or(0))?;
     Ok(options.emulated.as_ref().map(Emulator::new).transpose()?)
 }
 
 /// Starts emulated cells and commissions them, on buses that are served meanwhile.
-fn emulate(
+fn start_emulated_cells(
     options: &RunOptions,
     emulator: &Emulator<'_>,
     served: &mut Vec<ServedBus>,
@@ -176,7 +177,8 @@ fn emulate(
         let target =
             BusOptions { filters: Vec::new(), directory: directory.clone(), ..BusOptions::default() };
         let target = BusOptions { fd: bus.format == Format::Fd, ..target };
-        let (_, own) = open_or_serve(&bus.name, kinds.kind_of(&bus.name), &target, if_absent(options))?;
+        let (_, own) =
+            open_or_serve(&bus.name, kinds.kind_of(&bus.name), &target, action_if_bus_absent(options))?;
         served.extend(own);
     }
     let bench =
@@ -191,8 +193,8 @@ fn emulate(
 
 /// Returns the action for a bus that does not exist. It is refused if other programs use it: with emulated cells, or
 /// with cells that are not started here.
-const fn if_absent(options: &RunOptions) -> IfAbsent {
-    if options.spawn && options.emulated.is_none() { IfAbsent::Create } else { IfAbsent::Fail }
+const fn action_if_bus_absent(options: &RunOptions) -> AbsentBusAction {
+    if options.spawn && options.emulated.is_none() { AbsentBusAction::Create } else { AbsentBusAction::Fail }
 }
 
 /// Returns the options for opening a bus.
@@ -222,7 +224,7 @@ fn create_link(
         return Err(RunError::RealWires(name.clone()));
     }
     if !options.quiet {
-        let (kind, bytes) = (bus.kind(), bus.receive_buffer());
+        let (kind, bytes) = (bus.kind(), bus.receive_buffer_bytes());
         let less = if bytes < options.receive_buffer { SMALL_BUFFER_REMARK } else { "" };
         let why = match (options.kinds.kind_of(name), kind) {
             (KindChoice::Auto, BusKind::Embedded) => format!(" (there is no interface {name})"),
@@ -237,7 +239,7 @@ fn create_link(
 /// Starts the recorder, if anything is to be recorded. Returns it with the queue for the loop's records.
 fn start_recorder(
     options: &RunOptions,
-    outputs: Outputs,
+    outputs: RecordingOutputs,
     bus_feeds: Vec<feed::BusFeed>,
     bus_links: &[RunBus],
     idle: &Histogram<u64>,
@@ -245,9 +247,14 @@ fn start_recorder(
     if outputs.is_empty() {
         return Ok((None, None));
     }
-    let (recorded, ticks) = outputs.records_all().then(|| rtrb::RingBuffer::new(feed::TICK_QUEUE)).unzip();
-    let head =
-        options.record.mcap.as_ref().map(|mcap| head(options, mcap, bus_links, idle)).unwrap_or_default();
+    let (recorded, ticks) =
+        outputs.records_all().then(|| rtrb::RingBuffer::new(feed::TICK_QUEUE_LENGTH)).unzip();
+    let head = options
+        .record
+        .mcap
+        .as_ref()
+        .map(|mcap| recording_head(options, mcap, bus_links, idle))
+        .unwrap_or_default();
     let feed = RecorderFeed { bus_feeds, ticks };
     let mut layout = Layout::new(&options.skin);
     if let Some(robot) = options.record.mcap.as_ref().and_then(|mcap| mcap.robot.clone()) {
@@ -257,7 +264,12 @@ fn start_recorder(
 }
 
 /// Returns the head that each file of a recording begins with.
-fn head(options: &RunOptions, mcap: &Mcap, bus_links: &[RunBus], idle: &Histogram<u64>) -> FileHead {
+fn recording_head(
+    options: &RunOptions,
+    mcap: &McapOutput,
+    bus_links: &[RunBus],
+    idle: &Histogram<u64>,
+) -> FileHead {
     let nanos = realtime::wall_clock_ns();
     let mut run = vec![
         ("duration_s".to_owned(), options.scenario.duration.seconds().to_string()),
@@ -272,8 +284,8 @@ fn head(options: &RunOptions, mcap: &Mcap, bus_links: &[RunBus], idle: &Histogra
     let metadata = vec![
         ("program", facts::program_metadata(&mcap.command_line, nanos)),
         ("machine", facts::machine_metadata(&Quantiles::from_histogram(idle, 1e-3))),
-        ("configuration", facts::configuration(&options.skin, run)),
-        ("configuration_hashes", facts::hashes(&options.skin)),
+        ("configuration", facts::configuration_metadata(&options.skin, run)),
+        ("configuration_hashes", facts::configuration_hashes(&options.skin)),
     ];
     FileHead { nanos, metadata, attachments: mcap.attachments.clone() }
 }
@@ -296,7 +308,7 @@ fn start_receiver(
     }
     let root_wires = RootWires::for_bus(skin, index);
     if root_wires.is_some() {
-        table.follow_root_wires();
+        table.use_root_wires_not_tree_pages();
     }
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; MAX_JOINTS])>::new(64);
@@ -330,7 +342,7 @@ fn start_receiver(
         view,
         receiver,
         possibly_missed: in_doubt,
-        hosts: Hosts::new(),
+        hosts: OtherHosts::new(),
         network,
         shared,
     })

@@ -3,7 +3,7 @@
 use protocol::usage::printable;
 
 /// Duration in s from which a run counts as endless.
-const ENDLESS_S: f64 = 86_400.0;
+const ENDLESS_DURATION_S: f64 = 86_400.0;
 
 /// Values of a run's progress line.
 #[derive(Clone, Debug)]
@@ -88,7 +88,7 @@ impl StatusLine<'_> {
 
     fn time_text(&self, detail: u8) -> String {
         let (elapsed, duration) = (self.elapsed_s, self.duration_s);
-        let has_end = detail > 0 && duration < ENDLESS_S;
+        let has_end = detail > 0 && duration < ENDLESS_DURATION_S;
         if has_end { format!("{elapsed:5.1} of {duration:.1} s") } else { format!("{elapsed:5.1} s") }
     }
 
@@ -221,7 +221,7 @@ mod tests {
 
     #[test]
     fn a_run_without_an_end_has_no_duration() {
-        let endless = StatusLine { duration_s: ENDLESS_S, ..line(6) };
+        let endless = StatusLine { duration_s: ENDLESS_DURATION_S, ..line(6) };
         assert!(endless.text(None).starts_with("  3.2 s    4 of 253"));
     }
 }

@@ -38,7 +38,7 @@ pub struct RepliesSummary {
 
 impl RepliesSummary {
     /// Adds the replies of a cell, and attributes missing ones to reasons as far as these are known.
-    pub(super) fn add(&mut self, cell: &CellState) {
+    pub(super) fn add_replies_of(&mut self, cell: &CellState) {
         let Replies { due, in_time, late, missing, in_doubt, unasked, contact_unknown, unexpected, too_late } =
             cell.replies;
         let mut rest = missing.saturating_sub(in_doubt);
@@ -47,7 +47,7 @@ impl RepliesSummary {
             rest -= explained;
             explained
         };
-        let (skipped, not_heard) = cell.unanswered().unwrap_or((0, 0));
+        let (skipped, not_heard) = cell.unanswered_joint_counts().unwrap_or((0, 0));
         self.due += due;
         self.in_time += in_time;
         self.late += late;
@@ -64,7 +64,7 @@ impl RepliesSummary {
 
     /// Returns the numbers of missing replies by reason; unknown reasons are last.
     #[must_use]
-    pub const fn missing(&self) -> [(&'static str, u64); 6] {
+    pub const fn missing_replies_by_reason(&self) -> [(&'static str, u64); 6] {
         [
             ("too_late", self.too_late),
             ("skipped", self.skipped),
@@ -110,7 +110,7 @@ impl CellSummary {
     #[must_use]
     pub fn new(skin: &Skin, described: &skin::Cell, known: Option<&CellState>) -> Self {
         let mut replies = RepliesSummary::default();
-        known.into_iter().for_each(|cell| replies.add(cell));
+        known.into_iter().for_each(|cell| replies.add_replies_of(cell));
         let mode =
             known.and_then(CellState::is_measuring).map(|measures| if measures { "measure" } else { "test" });
         Self {
@@ -120,10 +120,14 @@ impl CellSummary {
             due: replies.due,
             in_time: replies.in_time,
             late: replies.late,
-            missing: replies.missing().into_iter().filter(|(_, count)| *count > 0).collect(),
+            missing: replies
+                .missing_replies_by_reason()
+                .into_iter()
+                .filter(|(_, count)| *count > 0)
+                .collect(),
             contact_unknown: replies.contact_unknown,
             error: known.map(CellState::errors).unwrap_or_default(),
-            stuck: known.into_iter().flat_map(CellState::stuck).collect(),
+            stuck: known.into_iter().flat_map(CellState::stuck_word_runs).collect(),
             restarts: known.map_or(0, |cell| cell.uplink().restarts),
         }
     }

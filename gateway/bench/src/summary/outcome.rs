@@ -1,6 +1,6 @@
 //! Outcome of a run, and the halts of the robot.
 
-use model::listing::ranges;
+use model::listing::node_id_ranges;
 use serde::Serialize;
 
 /// Maximum number of cell errors given one by one.
@@ -86,7 +86,7 @@ impl CellError {
     #[must_use]
     pub fn names(&self) -> String {
         let of_bus =
-            |ErrorCells { bus, nodes }: &ErrorCells| format!("{} on {bus}", ranges(nodes).join(", "));
+            |ErrorCells { bus, nodes }: &ErrorCells| format!("{} on {bus}", node_id_ranges(nodes).join(", "));
         self.cells.iter().map(of_bus).collect::<Vec<_>>().join("; ")
     }
 }

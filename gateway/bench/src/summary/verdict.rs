@@ -5,22 +5,22 @@
 
 use std::collections::BTreeMap;
 
-use model::listing::ranges;
-use model::table::Event;
+use model::listing::node_id_ranges;
+use model::table::FrameEvent;
 use serde::Serialize;
 
 use super::{BusSummary, CellSummary, Outcome, RepliesSummary, Summary, cells_in_error};
 
 /// Maximum mean error of one cell's torques in Nm that rounding explains: four steps of a torque's word. A correct cell
 /// has a tenth of this error.
-pub const CELL_ERROR_NM: f64 = 4.0 / 4_096.0;
+pub const MAX_CELL_ERROR_NM: f64 = 4.0 / 4_096.0;
 /// Maximum mean error of sums along a tree in Nm that rounding explains: four steps of a sum's word.
-const SUM_ERROR_NM: f64 = 4.0 / 256.0;
+const MAX_SUM_ERROR_NM: f64 = 4.0 / 256.0;
 /// Names under which the summary counts events that have a finding of their own.
-const SATURATED: &str = Event::Saturated.name();
-const STALE: &str = Event::StaleTorque.name();
+const SATURATED_EVENT_NAME: &str = FrameEvent::Saturated.name();
+const STALE_TORQUE_EVENT_NAME: &str = FrameEvent::StaleTorque.name();
 /// Maximum number of groups of node ids in a list; further groups are only counted.
-const MAX_RANGES: usize = 12;
+const MAX_LISTED_NODE_RANGES: usize = 12;
 
 /// Verdict on a run.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
@@ -38,19 +38,19 @@ impl Verdict {
         let mut look_at = Vec::new();
         add_ending_findings(&mut look_at, summary);
         let buses = || summary.buses.iter();
-        absent_cells(&mut look_at, summary);
-        buses().for_each(|bus| unexplained_losses(&mut look_at, bus));
+        add_absence_findings(&mut look_at, summary);
+        buses().for_each(|bus| add_unexplained_losses(&mut look_at, bus));
         buses().for_each(|bus| add_network_findings(&mut look_at, bus));
         add_torque_findings(&mut look_at, summary);
         add_restart_findings(&mut look_at, summary);
         add_recording_findings(&mut look_at, summary);
-        buses().for_each(|bus| explained_losses(&mut look_at, bus));
+        buses().for_each(|bus| add_explained_losses(&mut look_at, bus));
         add_unchecked_findings(&mut look_at, summary);
         add_control_findings(&mut look_at, summary);
-        buses().for_each(|bus| late_replies(&mut look_at, bus));
+        buses().for_each(|bus| add_late_replies(&mut look_at, bus));
         buses().for_each(|bus| add_incomplete_epochs(&mut look_at, bus));
         add_tick_findings(&mut look_at, summary);
-        buses().for_each(|bus| irregular_frames(&mut look_at, bus));
+        buses().for_each(|bus| add_irregular_frames(&mut look_at, bus));
         let ended_well = matches!(summary.outcome, Outcome::Done | Outcome::Interrupted);
         if look_at.is_empty() && !ended_well {
             look_at.push(format!("the run ended as {}", summary.outcome));
@@ -95,22 +95,22 @@ pub(crate) fn count_noun(count: impl TryInto<u64>, one: &str, more: &str) -> Str
 }
 
 /// Formats the number of times that an event happened: `once`, `3 times`.
-fn times_text(count: u64) -> String {
+fn occurrence_count_text(count: u64) -> String {
     if count == 1 { "once".to_owned() } else { format!("{count} times") }
 }
 
 /// Formats cells of a bus: `cell 3 on vcan0`, `cells 1-4, 6 on vcan0`.
 fn cell_names(nodes: &[u8], bus: &str) -> String {
-    let all = ranges(nodes);
+    let all = node_id_ranges(nodes);
     let noun = if nodes.len() == 1 { "cell" } else { "cells" };
-    match all.get(..MAX_RANGES).filter(|_| all.len() > MAX_RANGES) {
+    match all.get(..MAX_LISTED_NODE_RANGES).filter(|_| all.len() > MAX_LISTED_NODE_RANGES) {
         Some(first) => format!("{} cells ({}, ...) on {bus}", nodes.len(), first.join(", ")),
         None => format!("{noun} {} on {bus}", all.join(", ")),
     }
 }
 
 /// Lists the cells for which a condition holds, by bus.
-fn cells_that(summary: &Summary, holds: impl Fn(&CellSummary) -> bool) -> Vec<String> {
+fn cells_where(summary: &Summary, holds: impl Fn(&CellSummary) -> bool) -> Vec<String> {
     let mut buses = BTreeMap::<&str, Vec<u8>>::new();
     for cell in summary.cells.iter().filter(|cell| holds(cell)) {
         buses.entry(&cell.bus).or_default().push(cell.node);
@@ -122,7 +122,7 @@ fn cells_that(summary: &Summary, holds: impl Fn(&CellSummary) -> bool) -> Vec<St
 }
 
 /// Lists counts with their nouns, without counts of 0.
-fn nonzero<'a>(counts: impl IntoIterator<Item = (u64, &'a str)>) -> Vec<String> {
+fn nonzero_counts<'a>(counts: impl IntoIterator<Item = (u64, &'a str)>) -> Vec<String> {
     let counts = counts.into_iter().filter(|(count, _)| *count > 0);
     counts.map(|(count, what)| format!("{count} {what}")).collect()
 }
@@ -146,13 +146,13 @@ fn add_ending_findings(look_at: &mut Vec<String>, summary: &Summary) {
 }
 
 /// Adds findings on buses that were lost, and on cells that were silent at the end.
-fn absent_cells(look_at: &mut Vec<String>, summary: &Summary) {
+fn add_absence_findings(look_at: &mut Vec<String>, summary: &Summary) {
     for bus in summary.buses.iter().filter(|bus| bus.outages.times > 0) {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         look_at.push(format!(
             "{} was lost {} for {:.1} s in all{end}: its cells' torques decayed to zero",
             bus.name,
-            times_text(bus.outages.times),
+            occurrence_count_text(bus.outages.times),
             bus.outages.lost_s
         ));
     }
@@ -165,14 +165,14 @@ fn absent_cells(look_at: &mut Vec<String>, summary: &Summary) {
     // A receiver that panicked has left no figures of its bus.
     let is_known = |cell: &CellSummary| summary.buses.iter().any(|bus| bus.name == cell.bus);
     if summary.failure.is_none() {
-        let unknown = cells_that(summary, |cell| !is_known(cell));
+        let unknown = cells_where(summary, |cell| !is_known(cell));
         look_at
             .extend(unknown.into_iter().map(|cells| format!("{cells}: the run has no figures of this bus")));
     }
     for host in summary.buses.iter().flat_map(|bus| &bus.hosts) {
         let lost = host.lost_from + host.lost_to;
         let gone = (host.gone > 0)
-            .then(|| format!("gone {} for {:.1} s in all", times_text(host.gone), host.gone_s));
+            .then(|| format!("gone {} for {:.1} s in all", occurrence_count_text(host.gone), host.gone_s));
         let end = (!host.at_end).then(|| "not reached at the end".to_owned());
         let lost = (lost > 0).then(|| format!("{} lost", count_noun(lost, "frame", "frames")));
         let parts: Vec<_> = [gone, end, lost].into_iter().flatten().collect();
@@ -187,7 +187,7 @@ fn absent_cells(look_at: &mut Vec<String>, summary: &Summary) {
 }
 
 /// Adds findings on replies and packets that are missing for an unknown reason.
-fn unexplained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn add_unexplained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     if replies.unknown > 0 {
         look_at.push(format!(
@@ -229,13 +229,14 @@ fn add_network_findings(look_at: &mut Vec<String>, bus: &BusSummary) {
 /// Adds findings on wrong torques.
 fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
     let accuracy = &summary.accuracy;
-    let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| is_above(mean, CELL_ERROR_NM));
-    for cells in cells_that(summary, is_off) {
+    let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| is_above(mean, MAX_CELL_ERROR_NM));
+    for cells in cells_where(summary, is_off) {
         look_at.push(format!(
-            "{cells}: mean error above {CELL_ERROR_NM:.1e} Nm, which rounding does not explain; check pose and parameters"
+            "{cells}: mean error above {MAX_CELL_ERROR_NM:.1e} Nm, which rounding does not explain; check pose and parameters"
         ));
     }
-    let of_all = [("single cells", &accuracy.single, CELL_ERROR_NM), ("sums", &accuracy.sums, SUM_ERROR_NM)];
+    let of_all =
+        [("single cells", &accuracy.single, MAX_CELL_ERROR_NM), ("sums", &accuracy.sums, MAX_SUM_ERROR_NM)];
     for (what, errors, limit) in of_all {
         if let Some(mean) = errors.mean().filter(|mean| is_above(*mean, limit)) {
             look_at.push(format!(
@@ -243,7 +244,7 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
             ));
         }
     }
-    let saturated: u64 = summary.buses.iter().filter_map(|bus| bus.events.get(SATURATED)).sum();
+    let saturated: u64 = summary.buses.iter().filter_map(|bus| bus.events.get(SATURATED_EVENT_NAME)).sum();
     if saturated > 0 {
         look_at.push(format!(
             "{} saturated: larger than the torque format can carry, and not compared",
@@ -253,7 +254,7 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
         look_at
             .push(format!("{} saturated, and not compared", count_noun(accuracy.saturated, "word", "words")));
     }
-    for cells in cells_that(summary, |cell| !cell.stuck.is_empty()) {
+    for cells in cells_where(summary, |cell| !cell.stuck.is_empty()) {
         look_at.push(format!("{cells}: stuck, sent constant words while the expected words changed"));
     }
     for bus in &summary.buses {
@@ -272,7 +273,7 @@ fn add_torque_findings(look_at: &mut Vec<String>, summary: &Summary) {
 
 /// Adds findings on restarts of cells, and on halts that have ended.
 fn add_restart_findings(look_at: &mut Vec<String>, summary: &Summary) {
-    for cells in cells_that(summary, |cell| cell.restarts > 0) {
+    for cells in cells_where(summary, |cell| cell.restarts > 0) {
         look_at.push(format!("{cells}: restarted; it is unknown whether replies due at that time were sent"));
     }
     for bus in &summary.buses {
@@ -290,8 +291,10 @@ fn add_restart_findings(look_at: &mut Vec<String>, summary: &Summary) {
     let ended = halts.saturating_sub(summary.halted.is_some().into());
     if ended > 0 {
         let why = summary.halts.first().map_or("", |halt| &halt.reason);
-        look_at
-            .push(format!("the robot was halted {} and resumed; the first reason: {why}", times_text(ended)));
+        look_at.push(format!(
+            "the robot was halted {} and resumed; the first reason: {why}",
+            occurrence_count_text(ended)
+        ));
     }
 }
 
@@ -309,14 +312,14 @@ fn add_recording_findings(look_at: &mut Vec<String>, summary: &Summary) {
 }
 
 /// Adds findings on losses whose reason is known.
-fn explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn add_explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     let reasons = [
         (replies.lost, "lost on the way to the gateway"),
         (replies.not_heard, "not sent, because the cell did not receive the joints"),
         (replies.in_doubt, "in doubt, of cells that were silent or restarted, or of a lost bus"),
     ];
-    let missing = nonzero(reasons);
+    let missing = nonzero_counts(reasons);
     if !missing.is_empty() {
         look_at.push(format!("replies missing on {name}: {}", missing.join(", ")));
     }
@@ -329,7 +332,7 @@ fn explained_losses(look_at: &mut Vec<String>, bus: &BusSummary) {
         (up.in_doubt, "in doubt, from before a restart"),
         (up.surplus, "more than their cells have sent: duplicates, or another sender"),
     ];
-    let packets = nonzero(reasons);
+    let packets = nonzero_counts(reasons);
     if !packets.is_empty() {
         look_at.push(format!("packets of cells on {name}: {}", packets.join(", ")));
     }
@@ -378,10 +381,12 @@ fn add_tick_findings(look_at: &mut Vec<String>, summary: &Summary) {
 }
 
 /// Adds findings on late replies, and on replies of cells that received the joints too late.
-fn late_replies(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn add_late_replies(look_at: &mut Vec<String>, bus: &BusSummary) {
     let RepliesSummary { due, late, too_late, skipped, .. } = bus.replies;
-    let parts =
-        nonzero([(late + too_late, "late"), (skipped, "skipped by cells that received the joints too late")]);
+    let parts = nonzero_counts([
+        (late + too_late, "late"),
+        (skipped, "skipped by cells that received the joints too late"),
+    ]);
     if !parts.is_empty() {
         look_at.push(format!(
             "{} of {} on {}: this machine was busy, or the cells are slow; -v has the times",
@@ -417,13 +422,13 @@ fn add_incomplete_epochs(look_at: &mut Vec<String>, bus: &BusSummary) {
 }
 
 /// Adds a finding on irregular frames, except those reported above: saturated torques and torques that came too late.
-fn irregular_frames(look_at: &mut Vec<String>, bus: &BusSummary) {
+fn add_irregular_frames(look_at: &mut Vec<String>, bus: &BusSummary) {
     let odd = bus.events.iter().map(|(name, count)| match *name {
-        SATURATED => (0, SATURATED),
-        STALE => (count.saturating_sub(bus.replies.too_late), STALE),
+        SATURATED_EVENT_NAME => (0, SATURATED_EVENT_NAME),
+        STALE_TORQUE_EVENT_NAME => (count.saturating_sub(bus.replies.too_late), STALE_TORQUE_EVENT_NAME),
         name => (*count, name),
     });
-    let odd = nonzero(odd);
+    let odd = nonzero_counts(odd);
     if !odd.is_empty() {
         look_at.push(format!("anomalies on {}: {}; skinbus dump shows the frames", bus.name, odd.join(", ")));
     }
@@ -431,12 +436,12 @@ fn irregular_frames(look_at: &mut Vec<String>, bus: &BusSummary) {
 
 /// Adds findings on everything that the run could not check.
 fn add_unchecked_findings(look_at: &mut Vec<String>, summary: &Summary) {
-    for cells in cells_that(summary, |cell| cell.contact_unknown > 0 && !cell.is_measuring()) {
+    for cells in cells_where(summary, |cell| cell.contact_unknown > 0 && !cell.is_measuring()) {
         look_at.push(format!(
             "{cells}: contact unknown, so torques were not compared; the cause is stimuli from before this run, or a baseline"
         ));
     }
-    for cells in cells_that(summary, CellSummary::is_measuring) {
+    for cells in cells_where(summary, CellSummary::is_measuring) {
         look_at.push(format!(
             "{cells}: in mode \"measure\" and not pressed by the scenario, so torques were not compared"
         ));

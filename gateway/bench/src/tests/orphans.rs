@@ -7,7 +7,7 @@ use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, symlink};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use crate::record::{Mcap, Outputs, RecordOptions};
+use crate::record::{McapOutput, RecordOptions, RecordingOutputs};
 use rustix::fs::{FlockOperation, Mode, flock};
 use tempfile::TempDir;
 use trace::recording::file::FileWriter;
@@ -32,8 +32,8 @@ fn left(folder: &TempDir, name: &str) {
 }
 
 /// Claims the files of the next run. Returns its messages.
-fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
-    let mcap = Mcap {
+fn claims(folder: &Path, name: &str) -> (Result<RecordingOutputs, String>, Vec<String>) {
+    let mcap = McapOutput {
         path: folder.join(name),
         split: trace::recording::series::SplitLimits::default(),
         attachments: Vec::new(),
@@ -42,7 +42,7 @@ fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
     };
     let options = RecordOptions { mcap: Some(mcap), ..RecordOptions::default() };
     let mut said = Vec::new();
-    let claimed = Outputs::open_outputs(&options, &AtomicBool::new(false), |line| {
+    let claimed = RecordingOutputs::open_outputs(&options, &AtomicBool::new(false), |line| {
         said.push(line.replace(&format!("{}/", folder.display()), ""));
     });
     (claimed.map_err(|error| error.to_string()), said)

@@ -9,7 +9,7 @@ use crate::summary::{
     TickSummary, Verdict, WrittenFile,
 };
 use model::quantiles::{Quantiles, histogram};
-use model::table::{Accuracy, BusTable, CellStatus, Event};
+use model::table::{BusTable, CellStatus, FrameEvent, TorqueAccuracy};
 use protocol::can::Format;
 use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::{CellId, Kind, Node};
@@ -98,7 +98,7 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
             records_lost: 0,
             unsent: 0,
         },
-        accuracy: Accuracy::default(),
+        accuracy: TorqueAccuracy::default(),
         backlog_dropped: Some(0),
         buses: vec![bus],
         processor: ProcessorUse::default(),
@@ -163,7 +163,7 @@ fn rows() -> impl Iterator<Item = (&'static str, &'static str, &'static str)> {
 }
 
 fn documented(target: impl Fn(&str) -> bool) -> BTreeMap<String, &'static str> {
-    let events: BTreeSet<_> = Event::ALL.into_iter().map(Event::name).collect();
+    let events: BTreeSet<_> = FrameEvent::ALL.into_iter().map(FrameEvent::name).collect();
     let rows = rows().filter(|(heading, key, _)| target(heading) && !events.contains(key));
     rows.map(|(_, key, kind)| (key.to_owned(), kind)).collect()
 }
@@ -213,7 +213,7 @@ fn the_keys_of_quantiles_and_errors_are_documented() {
     };
     let quantiles = serde_json::to_value(Quantiles::default()).unwrap();
     assert_eq!(documented(|heading| heading == "Quantiles"), of(quantiles));
-    let errors = serde_json::to_value(Accuracy::default().single).unwrap();
+    let errors = serde_json::to_value(TorqueAccuracy::default().single).unwrap();
     assert_eq!(documented(|heading| heading == "Errors"), of(errors));
 }
 
@@ -221,7 +221,7 @@ fn the_keys_of_quantiles_and_errors_are_documented() {
 fn the_names_in_maps_are_documented() {
     let statuses =
         [CellStatus::Unknown, CellStatus::Quiet, CellStatus::Active, CellStatus::Stale, CellStatus::Dead];
-    let names = Event::ALL.into_iter().map(Event::name);
+    let names = FrameEvent::ALL.into_iter().map(FrameEvent::name);
     let names = names.chain(Kind::ALL.into_iter().map(Kind::name)).chain(statuses.map(CellStatus::name));
     for name in names {
         assert!(SUMMARY_MD.contains(&format!("`{name}`")), "{name}");
@@ -263,7 +263,7 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
     };
     let cells = [1, 2].map(|node| CellId::new(node).unwrap());
     let heartbeat = |table: &BusTable, place: usize, sent| {
-        let state = State::CONFIGURED.with(State::TEST_MODE, true);
+        let state = State::CONFIGURED.with_flags(State::TEST_MODE, true);
         let configuration = table.cells()[place].configuration;
         let page = Heartbeat { serial: 1, configuration, sent, rejected: 0, state };
         let from = Node::Cell(cells[place]);
@@ -276,7 +276,7 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
         torque: [Q3_12::nearest(0.5); WORDS].map(Q3_12::to_bits).into(),
     };
     let skin_page = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
-    table.set_comparing(true);
+    table.set_torque_comparison(true);
     for place in 0..2 {
         let word = heartbeat(&table, place, 0);
         say(&mut table, false, &word, false);
@@ -350,7 +350,7 @@ fn what_the_document_says_adds_up_does() {
     let of = |figure: fn(&CellSummary) -> u64| cells.iter().map(figure).sum::<u64>();
     assert_eq!((of(|cell| cell.due), of(|cell| cell.in_time), of(|cell| cell.late)), (due, in_time, late));
     assert_eq!(of(|cell| cell.missing.values().sum()), missing, "{cells:?}");
-    for (why, count) in replies.missing() {
+    for (why, count) in replies.missing_replies_by_reason() {
         assert_eq!(
             cells.iter().filter_map(|cell| cell.missing.get(why)).sum::<u64>(),
             count,

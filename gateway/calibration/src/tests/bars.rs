@@ -18,14 +18,14 @@
 use crate::motion::MotionPlan;
 use crate::neighbors::Spacing;
 use crate::observe::Observations;
-use crate::plan::{Bounds, plan};
+use crate::plan::{PlanBounds, plan_motion};
 use crate::result::{CellResult, Diagnosis};
-use crate::simulate::{Defect, observe};
+use crate::simulate::{CellDefect, simulate_observations};
 use crate::write::calibrated_text;
 use crate::{Calibration, Refusal, Settings, calibrate};
 use model::accelerometer::Accelerometers;
 use model::accelerometer::kinematics::STANDARD_GRAVITY;
-use model::accelerometer::sensor::{DataSheet, rotation};
+use model::accelerometer::sensor::{DataSheet, cell_rotation};
 use model::central::CentralComputation;
 use model::testing;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -47,11 +47,11 @@ fn settings(skin: &Skin) -> Settings {
     settings
 }
 
-fn moved(skin: &Skin, bounds: &Bounds, seed: u64, defects: &[Defect]) -> Observations {
+fn moved(skin: &Skin, bounds: &PlanBounds, seed: u64, defects: &[CellDefect]) -> Observations {
     let sheet = DataSheet::default();
-    let motion = plan(skin, bounds, &sheet, GRAVITY).unwrap();
+    let motion = plan_motion(skin, bounds, &sheet, GRAVITY).unwrap();
     assert!(motion.length_s() <= 180.0, "{} s on the robot", motion.length_s());
-    observe(skin, &motion, &Accelerometers::new(skin, &sheet, seed, GRAVITY), defects)
+    simulate_observations(skin, &motion, &Accelerometers::new(skin, &sheet, seed, GRAVITY), defects)
 }
 
 /// The differences between a calibration and the truth.
@@ -78,7 +78,7 @@ impl Errors {
             }
             let [x, y, z, w] = found.orientation;
             let rotation_found = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-            let turn = rotation_found.angle_to(&rotation(cell.orientation, cell.normal)).to_degrees();
+            let turn = rotation_found.angle_to(&cell_rotation(cell.orientation, cell.normal)).to_degrees();
             let way = (Vector3::from(found.position) - Vector3::from(cell.position)).norm() * 1e3;
             self.covered[0] += usize::from(way <= found.position_mm);
             self.covered[1] += usize::from(turn <= found.orientation_deg);
@@ -114,7 +114,7 @@ impl Errors {
 
 /// Returns the mean error of torques relative to their mean size, for forces on every cell in a few poses.
 fn torque_error(truth: &Skin, found: &Skin) -> f64 {
-    let [truth_central, found_central] = [truth, found].map(CentralComputation::unquantised);
+    let [truth_central, found_central] = [truth, found].map(CentralComputation::without_quantisation);
     let (mut off, mut size) = (0.0, 0.0);
     for step in 0..10 {
         let mut q = [0.0; 14];
@@ -122,8 +122,8 @@ fn torque_error(truth: &Skin, found: &Skin) -> f64 {
             *q = (f64::from(step) * 1.3 + joint as f64 * 2.1).sin() * 1.5;
         }
         for cell in 0..truth.cells.len() {
-            let expected = truth_central.torque(cell, &truth_central.frames_at_positions(&q), 5.0);
-            let got = found_central.torque(cell, &found_central.frames_at_positions(&q), 5.0);
+            let expected = truth_central.cell_torque(cell, &truth_central.frames_at_positions(&q), 5.0);
+            let got = found_central.cell_torque(cell, &found_central.frames_at_positions(&q), 5.0);
             off += expected.iter().zip(got).map(|(one, other)| (one - other).abs()).sum::<f64>();
             size += expected.iter().map(|torque| torque.abs()).sum::<f64>();
         }
@@ -133,7 +133,7 @@ fn torque_error(truth: &Skin, found: &Skin) -> f64 {
 
 #[test]
 fn cells_on_a_ur5_are_found() {
-    let skin = testing::ur5();
+    let skin = testing::ur5_skin();
     let (mut alone, mut together, mut torques) = (Errors::default(), Errors::default(), Vec::new());
     for seed in 0..seeds() {
         let settings = settings(&skin);
@@ -147,7 +147,7 @@ fn cells_on_a_ur5_are_found() {
         let calibration = calibrate(&unknown, &seen, &settings).unwrap();
         assert_eq!(calibration.cells.iter().flat_map(|cell| &cell.troubles).count(), 0);
         alone.add(&skin, &calibration, |_, _| true);
-        let text = calibrated_text(&skin, testing::UR5, &calibration).unwrap();
+        let text = calibrated_text(&skin, testing::UR5_SKIN_TOML, &calibration).unwrap();
         torques.push(torque_error(&skin, &Skin::parse("new.toml", &text).unwrap()));
         let spacing = Some(Spacing::with_distance(0.028));
         let settings = Settings { spacing, ..settings };
@@ -161,7 +161,7 @@ fn cells_on_a_ur5_are_found() {
 
 #[test]
 fn cells_on_an_arm_of_seven_joints_are_found() {
-    let skin = testing::panda();
+    let skin = testing::panda_skin();
     let mut errors = Errors::default();
     for seed in 0..seeds() {
         let settings = settings(&skin);
@@ -191,18 +191,18 @@ fn cells_on_an_arm_of_seven_joints_are_found() {
 
 #[test]
 fn dead_swapped_and_loose_cells_are_named_and_spoil_no_other() {
-    let skin = testing::ur5();
+    let skin = testing::ur5_skin();
     let mut errors = Errors::default();
     for seed in 0..seeds() {
         let mut settings = settings(&skin);
         settings.spacing = Some(Spacing::with_distance(0.028));
-        let mut defects = vec![Defect::None; skin.cells.len()];
+        let mut defects = vec![CellDefect::None; skin.cells.len()];
         // 13 cells of 253 are 5 %; 5 are 2 %, in two pairs and a half.
         for dead in (0..13).map(|index| (index * 19 + 7) % 253) {
-            defects[dead] = if dead % 3 == 0 { Defect::Stuck } else { Defect::Dead };
+            defects[dead] = if dead % 3 == 0 { CellDefect::Stuck } else { CellDefect::Dead };
         }
-        defects[3] = Defect::Silent(0.2);
-        defects[100] = Defect::Loose(0.04);
+        defects[3] = CellDefect::Silent(0.2);
+        defects[100] = CellDefect::Loose(0.04);
         let seen = moved(&skin, &settings.bounds, seed, &defects);
         let mut described = skin.clone();
         let pairs = [(1, 11), (60, 61), (150, 20)];
@@ -225,14 +225,14 @@ fn dead_swapped_and_loose_cells_are_named_and_spoil_no_other() {
             let real = skin.cells.iter().position(|it| it.node == cell.node).unwrap();
             let troubles = &calibration.cells[index].troubles;
             let expected = match defects[real] {
-                Defect::Dead => Some(Diagnosis::Dead),
-                Defect::Stuck => Some(Diagnosis::Stuck),
-                Defect::Silent(_) => Some(Diagnosis::Silent { share: 0.0 }),
-                Defect::Loose(_) => Some(Diagnosis::Loose { times: 0.0 }),
-                Defect::None if real != index => {
+                CellDefect::Dead => Some(Diagnosis::Dead),
+                CellDefect::Stuck => Some(Diagnosis::Stuck),
+                CellDefect::Silent(_) => Some(Diagnosis::Silent { share: 0.0 }),
+                CellDefect::Loose(_) => Some(Diagnosis::Loose { times: 0.0 }),
+                CellDefect::None if real != index => {
                     Some(Diagnosis::Swapped { node: skin.cells[index].node.get() })
                 }
-                Defect::None => None,
+                CellDefect::None => None,
             };
             match (expected, troubles.as_slice()) {
                 (None, []) => {}
@@ -250,18 +250,18 @@ fn dead_swapped_and_loose_cells_are_named_and_spoil_no_other() {
             let at = skin.cells.iter().position(|it| it.node == cell.node).unwrap();
             real.cells[at] = calibration.cells[index].clone();
         }
-        errors.add(&skin, &real, |index, _| defects[index] == Defect::None);
+        errors.add(&skin, &real, |index, _| defects[index] == CellDefect::None);
     }
     errors.check("UR5, with defects", 1.0);
 }
 
 #[test]
 fn a_joint_that_does_not_move_is_named_as_what_would_help() {
-    let skin = testing::panda();
+    let skin = testing::panda_skin();
     let mut settings = settings(&skin);
     settings.bounds.length_s = 60.0;
     let sheet = DataSheet::default();
-    let mut motion = plan(&skin, &settings.bounds, &sheet, GRAVITY).unwrap();
+    let mut motion = plan_motion(&skin, &settings.bounds, &sheet, GRAVITY).unwrap();
     // The last joints stand still.
     for timed in &mut motion.steps {
         use crate::motion::MotionStep;
@@ -271,7 +271,7 @@ fn a_joint_that_does_not_move_is_named_as_what_would_help() {
             MotionStep::Swing { about, amplitude, .. } => (about[5..].fill(1.5), amplitude[5..].fill(0.0)).1,
         }
     }
-    let seen = observe(&skin, &motion, &Accelerometers::new(&skin, &sheet, 5, GRAVITY), &[]);
+    let seen = simulate_observations(&skin, &motion, &Accelerometers::new(&skin, &sheet, 5, GRAVITY), &[]);
     let calibration = calibrate(&skin, &seen, &settings).unwrap();
     for (cell, result) in skin.cells.iter().zip(&calibration.cells) {
         let unsure = result.troubles.iter().any(|trouble| matches!(trouble, Diagnosis::Joint { .. }));
@@ -282,7 +282,7 @@ fn a_joint_that_does_not_move_is_named_as_what_would_help() {
 
 #[test]
 fn zero_offsets_of_joints_are_found_or_called_not_observable() {
-    let skin = testing::panda();
+    let skin = testing::panda_skin();
     let settings = Settings { zero_offsets: true, ..settings(&skin) };
     let seen = moved(&skin, &settings.bounds, 11, &[]);
     // The described robot has other zeros than the one that moved.

@@ -17,18 +17,18 @@ const MAX_LATENESS_US: u64 = 20_000;
 const CLOCK_TOLERANCE_US: u64 = 3_000;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.prepare_cell(&arm::fast_parameters(2))?;
-    session.settle()?;
-    let first = check_regular(session, 1_300)?;
-    check_not_shifted(session)?;
+    session.prepare_cell(&arm::fast_example_parameters(2))?;
+    session.wait_for_late_packets()?;
+    let first = check_regular_heartbeats(session, 1_300)?;
+    check_heartbeats_not_shifted(session)?;
     if session.about.test_mode && session.about.committed {
-        check_early(session)?;
+        check_early_heartbeats(session)?;
     } else {
-        session.findings.not_tested("BEAT-2", "without test mode nothing presses the cell");
+        session.findings.mark_not_tested("BEAT-2", "without test mode nothing presses the cell");
     }
     let last = check_held_state(session)?;
     if let (Some(first), Some(last)) = (first, last) {
-        check_clock(session, first, last);
+        check_clock_rate(session, first, last);
     }
     Ok(())
 }
@@ -48,49 +48,50 @@ pub(super) fn format_ms(times: impl Iterator<Item = u64>) -> String {
 }
 
 /// Returns the times of the heartbeats since the exchange began, in us.
-fn times(session: &Session<'_>) -> Vec<u64> {
-    session.answers().iter().filter(|it| it.beat().is_some()).map(|it| it.at.0).collect()
+fn heartbeat_times_us(session: &Session<'_>) -> Vec<u64> {
+    session.answers().iter().filter(|it| it.heartbeat_and_epoch().is_some()).map(|it| it.at.0).collect()
 }
 
 /// Checks that a halt and a latched stimulus last longer than 2 s, and that heartbeats continue meanwhile.
 fn check_held_state(session: &mut Session<'_>) -> Result<Option<HeartbeatGrid>, StopReason> {
     let presses = session.about.test_mode && session.about.committed;
     if presses {
-        session.press_and_step(&[0; MAX_JOINTS], arm::press_with_sum(4_096))?;
+        session.stimulate_and_send_joints(&[0; MAX_JOINTS], arm::press_with_sum(4_096))?;
     }
     session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
     let first = session.packets.len();
-    let grid = check_regular(session, 2_300)?;
-    let beats = session.packets.get(first..).unwrap_or_default().iter().filter_map(CellPacket::beat);
+    let grid = check_regular_heartbeats(session, 2_300)?;
+    let beats =
+        session.packets.get(first..).unwrap_or_default().iter().filter_map(CellPacket::heartbeat_and_epoch);
     let is_halted = beats.clone().all(|(beat, _)| beat.state.has(State::HALTED));
     session.check("CMD-1", is_halted, || {
         "HALTED must stay set until a resume, but a heartbeat came without it".to_owned()
     });
-    session.step(&[0; MAX_JOINTS])?;
+    session.send_next_joints(&[0; MAX_JOINTS])?;
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
     if presses {
-        let step = session.step(&[0; MAX_JOINTS])?;
+        let step = session.send_next_joints(&[0; MAX_JOINTS])?;
         let is_there = step.torque.is_some();
         session.check("STIM-7", is_there, || {
             "a latched stimulus must hold for more than 2 s, but no torque came after that time".to_owned()
         });
-        session.press_and_step(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
+        session.stimulate_and_send_joints(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
     }
     Ok(grid)
 }
 
 /// Checks that without any request a heartbeat comes every 250 ms, at most 20 ms late. Returns the measured times if
 /// that is so.
-fn check_regular(session: &mut Session<'_>, ms: u64) -> Result<Option<HeartbeatGrid>, StopReason> {
+fn check_regular_heartbeats(session: &mut Session<'_>, ms: u64) -> Result<Option<HeartbeatGrid>, StopReason> {
     let due = usize::try_from(ms * 1_000 / HEARTBEAT_INTERVAL_US).unwrap_or_default();
     for attempt in 0..3 {
         session.begin_exchange();
-        session.idle(Span::from_millis(ms))?;
-        let late = session.lateness();
-        let times = times(session);
-        session.mark_expected();
+        session.receive_for(Span::from_millis(ms))?;
+        let late = session.bench_lateness();
+        let times = heartbeat_times_us(session);
+        session.mark_packets_expected();
         let apart: Vec<_> = times.windows(2).filter_map(|pair| Some(pair.get(1)? - pair.first()?)).collect();
         let (from, to) = (
             HEARTBEAT_INTERVAL_US - MAX_LATENESS_US - CLOCK_TOLERANCE_US,
@@ -116,21 +117,22 @@ fn check_regular(session: &mut Session<'_>, ms: u64) -> Result<Option<HeartbeatG
 }
 
 /// Checks that heartbeats that answer a sync or a claimant do not shift the regular ones.
-fn check_not_shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_heartbeats_not_shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claim = twin_heartbeat(session, 1, true);
     for (what, message, offset) in
         [("a sync", Message::Sync, 100), ("a claim", claim, 170), ("a sync", Message::Sync, 60)]
     {
         for attempt in 0..3 {
             let Some(grid) = next_beat(session)? else { return Ok(()) };
-            session.idle(Span::from_millis(offset))?;
+            session.receive_for(Span::from_millis(offset))?;
             session.begin_exchange();
             let at = session.send_messages(&[message])?;
-            session
-                .idle(Span((grid.0 + 2 * HEARTBEAT_INTERVAL_US + 60_000).saturating_sub(session.now().0)))?;
-            let late = session.lateness();
-            let times = times(session);
-            session.mark_expected();
+            session.receive_for(Span(
+                (grid.0 + 2 * HEARTBEAT_INTERVAL_US + 60_000).saturating_sub(session.now().0),
+            ))?;
+            let late = session.bench_lateness();
+            let times = heartbeat_times_us(session);
+            session.mark_packets_expected();
             // The answer, and two regular heartbeats.
             let is_so = match times.as_slice() {
                 [answer, first, second] => {
@@ -159,38 +161,39 @@ fn check_not_shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
 
 /// Waits for the next regular heartbeat, and returns its time.
 fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, StopReason> {
-    session.settle()?;
+    session.wait_for_late_packets()?;
     let until = session.now() + Span(HEARTBEAT_INTERVAL_US + MAX_LATENESS_US + 50_000);
-    let came = session.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    let came =
+        session.wait_for_packets(until, |heard| heard.iter().any(|it| it.heartbeat_and_epoch().is_some()))?;
     session.check("BEAT-1", came, || "a heartbeat is due every 250 ms, but none came for 320 ms".to_owned());
-    let at = session.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
-    session.mark_expected();
+    let at = session.answers().iter().rev().find(|it| it.heartbeat_and_epoch().is_some()).map(|it| it.at);
+    session.mark_packets_expected();
     Ok(at)
 }
 
 /// Checks the heartbeats while joints come every 16 ms: each may be early by at most that period.
-fn check_early(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_early_heartbeats(session: &mut Session<'_>) -> Result<(), StopReason> {
     const JOINTS_PERIOD_US: u64 = 16_000;
     for press in [4_096, 0] {
         for attempt in 0..3 {
             let Some(grid) = next_beat(session)? else { return Ok(()) };
             session.begin_exchange();
-            session.press(arm::press_with_sum(press))?;
+            session.send_stimulus(arm::press_with_sum(press))?;
             for step in 1..=64 {
                 let due = grid + Span(5_000 + step * JOINTS_PERIOD_US);
-                session.wait(due, |_| false)?;
+                session.wait_for_packets(due, |_| false)?;
                 let epoch = session.next_epoch();
-                let joints = session.joints(epoch, &[0; MAX_JOINTS]);
+                let joints = session.joints_message(epoch, &[0; MAX_JOINTS]);
                 session.send_messages(&[joints])?;
                 session.known.epoch = Some(epoch);
             }
-            session.idle(Span::from_millis(40))?;
-            let late = session.lateness();
-            let times = times(session);
+            session.receive_for(Span::from_millis(40))?;
+            let late = session.bench_lateness();
+            let times = heartbeat_times_us(session);
             if press > 0 {
-                check_order(session);
+                check_torque_before_heartbeat(session);
             }
-            session.mark_expected();
+            session.mark_packets_expected();
             session.known.pending = None;
             session.known.skin = Some(arm::press_with_sum(press));
             session.known.active = Some(press > 0);
@@ -218,20 +221,21 @@ fn check_early(session: &mut Session<'_>) -> Result<(), StopReason> {
             }
         }
     }
-    session.step(&[0; MAX_JOINTS])?;
+    session.send_next_joints(&[0; MAX_JOINTS])?;
     Ok(())
 }
 
 /// Checks that a regular heartbeat follows the torque of its epoch. One exception is allowed: the cell may send a
 /// heartbeat between receiving joints and answering them.
-fn check_order(session: &mut Session<'_>) {
+fn check_torque_before_heartbeat(session: &mut Session<'_>) {
     let before = |place: usize, of: Epoch| {
         let later = session.answers().get(place..).unwrap_or_default();
         later.iter().any(|it| it.torque().is_some_and(|(epoch, _)| epoch == of))
     };
     let answers = session.answers().iter().enumerate();
-    let first =
-        answers.filter(|(place, it)| it.beat().is_some_and(|(_, epoch)| before(*place, epoch))).count();
+    let first = answers
+        .filter(|(place, it)| it.heartbeat_and_epoch().is_some_and(|(_, epoch)| before(*place, epoch)))
+        .count();
     session.check("TIME-3", first <= 1, || {
         format!(
             "a regular heartbeat must follow the torque of its epoch, but {first} heartbeats came before it"
@@ -240,7 +244,7 @@ fn check_order(session: &mut Session<'_>) {
 }
 
 /// Checks the cell's clock by two groups of regular heartbeats, which are several seconds apart.
-fn check_clock(session: &mut Session<'_>, first: HeartbeatGrid, last: HeartbeatGrid) {
+fn check_clock_rate(session: &mut Session<'_>, first: HeartbeatGrid, last: HeartbeatGrid) {
     let span = last.due.saturating_sub(first.due);
     let each = ((first.each + last.each) / 2).max(1);
     let beats = (span + each / 2) / each;

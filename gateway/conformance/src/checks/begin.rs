@@ -16,7 +16,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.known.senses = true;
     session.write_first_words(Parameter::Sensing.number(), [0])?;
     session.write_first_words(Parameter::Reply.number(), [0])?;
-    session.idle(Span::from_millis(20))?;
+    session.receive_for(Span::from_millis(20))?;
     session.begin_exchange();
     session.known.senses = false;
     session.measure_round_trip()?;
@@ -27,17 +27,17 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         unconfigured::run(session)?;
     } else {
         let why = "joints without a configuration: the cell had a configuration";
-        session.findings.not_tested("JOINTS-2", why);
+        session.findings.mark_not_tested("JOINTS-2", why);
     }
     let document = arm::example_parameters(2);
-    session.about.committed = session.commit(&document)?;
+    session.about.committed = session.commit_parameters(&document)?;
     session.known.halted = Some(false);
     // Before the commit the hash may have been 0.
     if session.about.committed { check_identity(session) } else { Ok(()) }
 }
 
 fn check_identity(session: &mut Session<'_>) -> Result<(), StopReason> {
-    let reply = session.read(Parameter::Identity.number())?;
+    let reply = session.read_parameter(Parameter::Identity.number())?;
     let Reply::Value([.., version, hash, state, _]) = reply else {
         session.check("CONF-1", false, || {
             format!("a read of the identity (parameter 0) must return its words, but the answer was {reply}")
@@ -47,7 +47,7 @@ fn check_identity(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("CONF-1", version == i16::from(VERSION), || {
         format!("the identity must have version 1, but has {version}")
     });
-    let exchange = session.exchange_all(&[])?;
+    let exchange = session.exchange_messages(&[])?;
     let Some((beat, _)) = exchange.beat else { return Ok(()) };
     session.check("CONF-1", hash.cast_unsigned() == beat.configuration, || {
         format!(
@@ -82,13 +82,13 @@ fn check_options(session: &mut Session<'_>) -> Result<(), StopReason> {
         format!("a write of 2 to parameter 7 must be accepted, or refused with reason 19, but the answer was {reply}")
     });
     session.write_first_words(Parameter::Sensing.number(), [0])?;
-    let reply = session.write(Parameter::Baseline.number(), baseline::HOLD_RULE)?;
+    let reply = session.write_parameter(Parameter::Baseline.number(), baseline::HELD_ZERO_RULE)?;
     session.about.baseline = reply.words().is_some();
     // A cell that implements the protocol without baselines refuses with 18.
     let is_known = session.about.baseline || matches!(reply, Reply::Refused(18 | 19));
     session.check("OPT-1", is_known, || format!("a write of parameter 11 must be accepted, or refused with reason 18 or 19, but the answer was {reply}"));
     session.write_first_words(Parameter::Baseline.number(), [0])?;
-    session.settle()?;
+    session.wait_for_late_packets()?;
     session.known.senses = false;
     Ok(())
 }

@@ -13,11 +13,11 @@ use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The minimum time between two claims that a cell answers.
-const DEFENCE_INTERVAL: Span = Span::from_millis(10);
+const MIN_CLAIM_ANSWER_INTERVAL: Span = Span::from_millis(10);
 
 /// Returns a heartbeat of another cell with the node id of the cell under test.
 pub(super) fn twin_heartbeat(session: &Session<'_>, serial: u32, claiming: bool) -> Message {
-    let state = State::default().with(State::CLAIMING, claiming).with_joint(0);
+    let state = State::default().with_flags(State::CLAIMING_NODE_ID, claiming).with_joint(0);
     let beat = Heartbeat { serial, state, ..Heartbeat::default() };
     Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
 }
@@ -31,11 +31,11 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.prepare_cell(&arm::example_parameters(2))?;
     let own = session.about.serial.unwrap_or_default();
     for serial in [own.wrapping_sub(1), own.wrapping_add(1), 0, u32::MAX, own] {
-        check_defence(session, serial)?;
+        check_claim_defence(session, serial)?;
     }
     check_simultaneous_claims(session, own)?;
     // The words of a heartbeat's serial number and CLAIMING have other meanings in these pages.
-    let state = State::CLAIMING.0 | 1 << 12;
+    let state = State::CLAIMING_NODE_ID.0 | 1 << 12;
     let pages = [
         NetworkPage::Received(HeardPage::default()),
         NetworkPage::Rejected(RejectedCounts::default()),
@@ -48,61 +48,64 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     others.push(twin_heartbeat(session, own.wrapping_sub(1), false));
     others.push(twin_heartbeat(session, own, false));
     for other in others {
-        check_not_answered(session, &other)?;
+        check_non_claim_unanswered(session, &other)?;
     }
     // A claim is answered regardless of the packets before it.
-    session.wait_for_quiet(Span::from_millis(120))?;
+    session.wait_for_heartbeat_gap(Span::from_millis(120))?;
     let other = twin_page(session, NetworkPage::Received(HeardPage::default()));
     session.send_messages(&[other])?;
-    check_defence(session, own.wrapping_sub(1))?;
-    session.exchange_all(&[])?;
+    check_claim_defence(session, own.wrapping_sub(1))?;
+    session.exchange_messages(&[])?;
     Ok(())
 }
 
 /// Returns the time and the state of each heartbeat since the exchange began.
-fn beats(session: &Session<'_>) -> Vec<(Micros, State)> {
-    session.answers().iter().filter_map(|it| Some((it.at, it.beat()?.0.state))).collect()
+fn heartbeat_states(session: &Session<'_>) -> Vec<(Micros, State)> {
+    session.answers().iter().filter_map(|it| Some((it.at, it.heartbeat_and_epoch()?.0.state))).collect()
 }
 
 /// Checks that a claim is answered at once with DUPLICATE, and that DUPLICATE is clear in the next heartbeat.
-fn check_defence(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
+fn check_claim_defence(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
     // The time of the answer is a matter of TIME-2.
-    session.wait_for_quiet(Span::from_millis(160))?;
+    session.wait_for_heartbeat_gap(Span::from_millis(160))?;
     session.begin_exchange();
     let claim = twin_heartbeat(session, serial, true);
     let at = session.send_messages(&[claim])?;
-    let came =
-        session.wait(at + Span::from_millis(120), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    let came = session.wait_for_packets(at + Span::from_millis(120), |heard| {
+        heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
+    })?;
     session.check("CLAIM-6", came, || format!("a claim of the cell's node id with serial number {serial} must be answered with a heartbeat, but none came"));
-    if let Some((answered, state)) = beats(session).first().copied() {
-        session.note_time("heartbeat to a claimant", at, answered);
+    if let Some((answered, state)) = heartbeat_states(session).first().copied() {
+        session.record_answer_time("heartbeat to a claimant", at, answered);
         session.check("CLAIM-7", state.has(State::DUPLICATE), || {
             format!("DUPLICATE must be set in the answer to a claim, but the state is {:04X}", state.0)
         });
-        session.check("CLAIM-6", !state.has(State::CLAIMING), || {
+        session.check("CLAIM-6", !state.has(State::CLAIMING_NODE_ID), || {
             "CLAIMING must be clear in the answer of a settled cell to a claim, but is set".to_owned()
         });
     }
-    session.idle(Span::from_millis(5))?;
-    let count = beats(session).len();
+    session.receive_for(Span::from_millis(5))?;
+    let count = heartbeat_states(session).len();
     session.check("CLAIM-6", count <= 1, || {
         format!("a claim must be answered with one heartbeat, but {count} came")
     });
-    session.mark_expected();
+    session.mark_packets_expected();
     // The heartbeat that answers the sync is checked as usual.
-    session.exchange_all(&[])?;
-    session.idle(DEFENCE_INTERVAL)
+    session.exchange_messages(&[])?;
+    session.receive_for(MIN_CLAIM_ANSWER_INTERVAL)
 }
 
 /// Checks that of three claims within 10 ms only one is answered, and that DUPLICATE in the next heartbeat shows the
 /// others.
 fn check_simultaneous_claims(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
-    if session.is_slow() {
-        session.findings.not_tested("CLAIM-6", "claims within 10 ms: the connection to the cell is too slow");
+    if session.are_answers_slow() {
+        session
+            .findings
+            .mark_not_tested("CLAIM-6", "claims within 10 ms: the connection to the cell is too slow");
         return Ok(());
     }
     for _ in 0..3 {
-        session.wait_for_quiet(Span::from_millis(120))?;
+        session.wait_for_heartbeat_gap(Span::from_millis(120))?;
         session.begin_exchange();
         let frames: Vec<_> = (1..=3)
             .flat_map(|it| session.frames(&twin_heartbeat(session, own.wrapping_add(it), true)))
@@ -113,9 +116,9 @@ fn check_simultaneous_claims(session: &mut Session<'_>, own: u32) -> Result<(), 
             .copied()
             .unwrap_or_default()
             .elapsed_since(times.first().copied().unwrap_or_default());
-        session.idle(Span::from_millis(25))?;
-        let count = beats(session).len();
-        session.mark_expected();
+        session.receive_for(Span::from_millis(25))?;
+        let count = heartbeat_states(session).len();
+        session.mark_packets_expected();
         if apart > Span::from_millis(7) {
             continue;
         }
@@ -128,33 +131,35 @@ fn check_simultaneous_claims(session: &mut Session<'_>, own: u32) -> Result<(), 
         // The next heartbeat shows the later claims.
         session.begin_exchange();
         let at = session.send_messages(&[Message::Sync])?;
-        session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
-        let is_set = beats(session).first().is_some_and(|(_, state)| state.has(State::DUPLICATE));
+        session.wait_for_packets(at + Span::from_millis(50), |heard| {
+            heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
+        })?;
+        let is_set = heartbeat_states(session).first().is_some_and(|(_, state)| state.has(State::DUPLICATE));
         session.check("CLAIM-7", is_set, || {
             "DUPLICATE must be set in the heartbeat after a claim that was not answered, but is clear"
                 .to_owned()
         });
-        session.mark_expected();
-        session.exchange_all(&[])?;
+        session.mark_packets_expected();
+        session.exchange_messages(&[])?;
         return Ok(());
     }
-    session.findings.not_tested("CLAIM-6", "claims within 10 ms: the bench was late each time");
+    session.findings.mark_not_tested("CLAIM-6", "claims within 10 ms: the bench was late each time");
     Ok(())
 }
 
 /// Checks that a `4nn` that is not a claim gets no answer, and sets DUPLICATE in one heartbeat.
-fn check_not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), StopReason> {
-    session.wait_for_quiet(Span::from_millis(80))?;
+fn check_non_claim_unanswered(session: &mut Session<'_>, other: &Message) -> Result<(), StopReason> {
+    session.wait_for_heartbeat_gap(Span::from_millis(80))?;
     session.begin_exchange();
     session.send_messages(&[*other])?;
-    session.idle(Span::from_millis(25))?;
-    let count = beats(session).len();
+    session.receive_for(Span::from_millis(25))?;
+    let count = heartbeat_states(session).len();
     session.check("CLAIM-6", count == 0, || {
         "a 4nn that is not a claim must not be answered, but a heartbeat came".to_owned()
     });
-    session.mark_expected();
+    session.mark_packets_expected();
     // A read of the identity shows DUPLICATE, and does not clear it.
-    let reply = session.read(Parameter::Identity.number())?;
+    let reply = session.read_parameter(Parameter::Identity.number())?;
     let shown = reply.words().map(|[.., state, _]| State(state.cast_unsigned())).unwrap_or_default();
     let is_set = shown.has(State::DUPLICATE);
     session.check("CONF-1", is_set, || {
@@ -165,15 +170,17 @@ fn check_not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), 
     });
     session.begin_exchange();
     let at = session.send_messages(&[Message::Sync])?;
-    session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
-    let state = beats(session).last().map(|(_, state)| *state).unwrap_or_default();
+    session.wait_for_packets(at + Span::from_millis(50), |heard| {
+        heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
+    })?;
+    let state = heartbeat_states(session).last().map(|(_, state)| *state).unwrap_or_default();
     session.check("CLAIM-7", state.has(State::DUPLICATE), || {
         format!(
             "DUPLICATE must be set in the heartbeat after a network packet (4nn) of another cell, but the state is {:04X}",
             state.0
         )
     });
-    session.mark_expected();
-    session.exchange_all(&[])?;
+    session.mark_packets_expected();
+    session.exchange_messages(&[])?;
     Ok(())
 }

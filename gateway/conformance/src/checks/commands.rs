@@ -36,7 +36,7 @@ fn check_command(
     if is_halt {
         session.known.active = Some(false);
     }
-    let exchange = session.exchange_all(&[command])?;
+    let exchange = session.exchange_messages(&[command])?;
     session.check(id, exchange.is_silent(), || {
         "the command must not be answered, but packets came besides the heartbeat to the sync after it"
             .to_owned()
@@ -54,7 +54,7 @@ fn check_command(
 /// Checks that a halt or a resume is not answered, and that a halted cell answers a sync with one heartbeat. Commands
 /// are sent at times when no regular heartbeat is due.
 fn check_answer_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
-    const ATTEMPTS: usize = 3;
+    const MAX_CHECK_ATTEMPTS: usize = 3;
     let cases = [
         ("a halt", Message::Halt, "CMD-1"),
         ("a sync", Message::Sync, "CMD-3"),
@@ -62,16 +62,16 @@ fn check_answer_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
     ];
     for (what, message, id) in cases {
         let expected = usize::from(message == Message::Sync);
-        for attempt in 1..=ATTEMPTS {
-            session.wait_for_quiet(Span::from_millis(120))?;
+        for attempt in 1..=MAX_CHECK_ATTEMPTS {
+            session.wait_for_heartbeat_gap(Span::from_millis(120))?;
             session.begin_exchange();
             let at = session.send_messages(&[message])?;
-            session.wait(at + Span::from_millis(25 + 60 * expected as u64), |heard| {
-                expected > 0 && heard.iter().any(|it| it.beat().is_some())
+            session.wait_for_packets(at + Span::from_millis(25 + 60 * expected as u64), |heard| {
+                expected > 0 && heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
             })?;
             let came = session.answers().len();
-            session.mark_expected();
-            if came == expected || attempt == ATTEMPTS {
+            session.mark_packets_expected();
+            if came == expected || attempt == MAX_CHECK_ATTEMPTS {
                 session.check(id, came == expected, || {
                     let halted = if expected > 0 { " to a halted cell" } else { "" };
                     format!("{what}{halted} must be answered with {expected} packets, but {came} came")
@@ -82,7 +82,7 @@ fn check_answer_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.halted = Some(message != Message::Resume);
         session.known.active = Some(false);
     }
-    session.exchange_all(&[])?;
+    session.exchange_messages(&[])?;
     Ok(())
 }
 
@@ -90,7 +90,7 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
     let unit = arm::press_with_sum(arm::unit_press_sum(protocol::fixed::TorqueFormat::Q3_12));
     let central = CentralComputation::for_single_cell(&arm::example_parameters(6));
     for round in 0..2 {
-        session.press_and_step(&FIRST_POSITIONS, unit)?;
+        session.stimulate_and_send_joints(&FIRST_POSITIONS, unit)?;
         let exchange = check_command(session, Message::Halt, "CMD-1")?;
         session.check("STATE-1", !exchange.state().has(State::ACTIVE), || {
             "ACTIVE must be clear after a halt, but is set".to_owned()
@@ -99,19 +99,19 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
             check_command(session, Message::Halt, "CMD-1")?;
         } else {
             // Only a resume ends a halt: neither a commit nor an exchange does.
-            session.commit(&protocol::parameters::Parameters {
+            session.commit_parameters(&protocol::parameters::Parameters {
                 period_us: 46_500,
                 ..arm::example_parameters(6)
             })?;
-            session.commit(&arm::example_parameters(6))?;
-            session.exchange_all(&[])?;
+            session.commit_parameters(&arm::example_parameters(6))?;
+            session.exchange_messages(&[])?;
         }
         let before = session.counters()?.heard;
         for positions in
             [FIRST_POSITIONS, FIRST_POSITIONS, FIRST_POSITIONS, FIRST_POSITIONS, SECOND_POSITIONS]
         {
             let epoch = session.next_epoch();
-            session.step_at(epoch, &positions)?;
+            session.send_joints_at_epoch(epoch, &positions)?;
         }
         let after = session.counters()?.heard;
         let taken = |of: &protocol::message::ReceivedCounts| of.joints.wrapping_add(of.joints_late);
@@ -123,13 +123,13 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
             "a halted cell must not count torques, but its count changed".to_owned()
         });
         check_command(session, Message::Resume, "CMD-2")?;
-        let step = session.step(&SECOND_POSITIONS)?;
+        let step = session.send_next_joints(&SECOND_POSITIONS)?;
         let exact = arm::exact_jacobian(&central, &SECOND_POSITIONS);
         let off = step
             .words()
             .iter()
             .zip(exact)
-            .map(|(word, exact)| arm::steps_from_exact(*word, exact))
+            .map(|(word, exact)| arm::rounding_error_steps(*word, exact))
             .max()
             .unwrap_or(0);
         session.check("CMD-2", off <= 8, || {
@@ -140,18 +140,18 @@ fn check_halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         });
         // A release while halted clears ACTIVE, so no torque of zeros is due.
         check_command(session, Message::Halt, "CMD-1")?;
-        session.press_and_step(&FIRST_POSITIONS, arm::press_with_sum(0))?;
+        session.stimulate_and_send_joints(&FIRST_POSITIONS, arm::press_with_sum(0))?;
         check_command(session, Message::Resume, "CMD-2")?;
-        let step = session.step(&SECOND_POSITIONS)?;
+        let step = session.send_next_joints(&SECOND_POSITIONS)?;
         session.check("CMD-1", step.torque.is_none(), || {
             "after a release while halted no torque must come, but one came".to_owned()
         });
     }
     // A resume does not change a cell that is not halted.
-    session.press_and_step(&FIRST_POSITIONS, unit)?;
+    session.stimulate_and_send_joints(&FIRST_POSITIONS, unit)?;
     check_command(session, Message::Resume, "CMD-2")?;
-    session.press_and_step(&FIRST_POSITIONS, arm::press_with_sum(0))?;
-    session.step(&FIRST_POSITIONS)?;
+    session.stimulate_and_send_joints(&FIRST_POSITIONS, arm::press_with_sum(0))?;
+    session.send_next_joints(&FIRST_POSITIONS)?;
     Ok(())
 }
 
@@ -164,10 +164,11 @@ fn check_syncs(session: &mut Session<'_>) -> Result<(), StopReason> {
     for _ in 0..SYNCS {
         let at = session.send_messages(&[Message::Sync])?;
         let before = beats;
-        let count =
-            |heard: &[crate::session::CellPacket]| heard.iter().filter(|it| it.beat().is_some()).count();
-        session.wait(at + ANSWER_TIMEOUT, |heard| count(heard) > before)?;
-        session.idle(Span::from_millis(4))?;
+        let count = |heard: &[crate::session::CellPacket]| {
+            heard.iter().filter(|it| it.heartbeat_and_epoch().is_some()).count()
+        };
+        session.wait_for_packets(at + ANSWER_TIMEOUT, |heard| count(heard) > before)?;
+        session.receive_for(Span::from_millis(4))?;
         beats = count(session.answers());
     }
     // Regular heartbeats may come between.
@@ -188,16 +189,16 @@ fn check_report(session: &mut Session<'_>) -> Result<(), StopReason> {
     let to = Node::Cell(session.cell);
     let page = SensorPage::Acceleration(acceleration);
     session.send_messages(&[Message::Stimulus { to, from: StimulusStart::Next, page }])?;
-    session.press_and_step(&FIRST_POSITIONS, skin)?;
+    session.stimulate_and_send_joints(&FIRST_POSITIONS, skin)?;
     // Pending values are not reported yet.
-    session.press(arm::press_with_sum(77))?;
+    session.send_stimulus(arm::press_with_sum(77))?;
     for _ in 0..3 {
         session.begin_exchange();
         let asked = session.send_messages(&[Message::Report])?;
         let answers = session.report_pages(asked)?;
-        session.idle(Span::from_millis(5))?;
+        session.receive_for(Span::from_millis(5))?;
         if let Some(last) = answers.last() {
-            session.note_time("report", asked, last.at);
+            session.record_answer_time("report", asked, last.at);
         }
         let epochs_right =
             answers.iter().all(|heard| heard.message.epoch().map(|it| it.0) == session.known.epoch);
@@ -208,8 +209,8 @@ fn check_report(session: &mut Session<'_>) -> Result<(), StopReason> {
         let sent: Vec<_> =
             answers.iter().filter_map(|heard| heard.sensors().map(|(_, page)| *page)).collect();
         let mut latched = SensorReadings::default();
-        [SensorPage::Skin(skin), page].iter().for_each(|page| latched.set(page));
-        let latched = latched.pages();
+        [SensorPage::Skin(skin), page].iter().for_each(|page| latched.set_page(page));
+        let latched = latched.simulated_pages();
         session.check("SENSE-1", sent.len() == latched.len(), || {
             format!("a report must be answered with each latched sensors page, but {} pages came", sent.len())
         });
@@ -224,7 +225,7 @@ fn check_report(session: &mut Session<'_>) -> Result<(), StopReason> {
             )
         });
     }
-    session.press_and_step(&FIRST_POSITIONS, arm::press_with_sum(0))?;
-    session.step(&FIRST_POSITIONS)?;
+    session.stimulate_and_send_joints(&FIRST_POSITIONS, arm::press_with_sum(0))?;
+    session.send_next_joints(&FIRST_POSITIONS)?;
     Ok(())
 }

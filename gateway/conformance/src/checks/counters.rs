@@ -23,7 +23,7 @@ enum RejectCounter {
 }
 
 impl RejectCounter {
-    const fn text(self) -> &'static str {
+    const fn expected_change_text(self) -> &'static str {
         match self {
             Self::Length => "only in the counter length",
             Self::Crc => "only in the counter crc",
@@ -36,15 +36,15 @@ impl RejectCounter {
 }
 
 /// The number of attempts, so that a regular heartbeat is not taken for an answer.
-const ATTEMPTS: usize = 3;
+const MAX_CHECK_ATTEMPTS: usize = 3;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.prepare_cell(&arm::example_parameters(2))?;
     let mut before = session.counters()?;
-    for (what, frames, reason) in cases(session) {
+    for (what, frames, reason) in rejected_packet_cases(session) {
         let mut beats = usize::MAX;
-        for _ in 0..ATTEMPTS {
-            let exchange = session.exchange(&frames)?;
+        for _ in 0..MAX_CHECK_ATTEMPTS {
+            let exchange = session.exchange_frames(&frames)?;
             session.check("COUNT-1", exchange.is_silent(), || {
                 format!("{what} must be dropped, but was answered")
             });
@@ -56,11 +56,12 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
                 session.send_messages(&[protocol::message::Message::Resume])?;
             }
             let after = session.counters()?;
-            let is_so = is_counted(before.refused, after.refused, reason) && before.heard == after.heard;
+            let is_so =
+                is_rejection_counted(before.refused, after.refused, reason) && before.heard == after.heard;
             session.check("COUNT-1", is_so, || {
                 format!(
                     "{what} must be counted {}, but the counters are {after}; before: {before}",
-                    reason.text()
+                    reason.expected_change_text()
                 )
             });
             before = after;
@@ -77,7 +78,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn is_counted(before: RejectedCounts, after: RejectedCounts, reason: RejectCounter) -> bool {
+fn is_rejection_counted(before: RejectedCounts, after: RejectedCounts, reason: RejectCounter) -> bool {
     let mut expected = before;
     let field = match reason {
         RejectCounter::Length => &mut expected.length,
@@ -92,11 +93,11 @@ fn is_counted(before: RejectedCounts, after: RejectedCounts, reason: RejectCount
 }
 
 /// Returns packets that would have an effect if the cell accepted them.
-fn packets(session: &Session<'_>) -> Vec<(&'static str, Packet)> {
+fn effective_packets(session: &Session<'_>) -> Vec<(&'static str, Packet)> {
     let own = Node::Cell(session.cell);
     let packet =
         |id, words: [i16; 6], epoch, count| Packet { id, words: words.into(), epoch: Epoch(epoch), count };
-    let claim = [1, 0, 0, 0, 0, (State::CLAIMING.0 | 1 << 12).cast_signed()];
+    let claim = [1, 0, 0, 0, 0, (State::CLAIMING_NODE_ID.0 | 1 << 12).cast_signed()];
     vec![
         ("a halt", packet(Id::command(Command::Halt), [0; 6], 0, 0)),
         ("a sync", packet(Id::command(Command::Sync), [0; 6], 0, 0)),
@@ -113,13 +114,13 @@ fn packets(session: &Session<'_>) -> Vec<(&'static str, Packet)> {
     ]
 }
 
-fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, RejectCounter)> {
+fn rejected_packet_cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, RejectCounter)> {
     let mut cases = Vec::new();
     let (format, own) = (session.format, session.cell);
-    for (name, packet) in packets(session) {
+    for (name, packet) in effective_packets(session) {
         let id = u32::from(packet.id.to_bits());
         let bytes = packet.encode();
-        let framed = |bytes: &[u8]| frames(format, id, bytes);
+        let framed = |bytes: &[u8]| frames_from_bytes(format, id, bytes);
         let wrong = if format == Format::Fd { RejectCounter::Crc } else { RejectCounter::Incomplete };
         for (what, place, flip) in
             [("first", 0, 1), ("tenth", 9, 0x40), ("next to last", 14, 0x80), ("last", 15, 1)]
@@ -151,7 +152,7 @@ fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, RejectCounter)> {
             cases.push((format!("{name} with its CRC's bytes swapped"), framed(&swapped), wrong));
         }
         if format == Format::Fd {
-            add_fd_lengths(&mut cases, name, &packet);
+            add_wrong_fd_lengths(&mut cases, name, &packet);
         } else {
             let lengths: &[usize] =
                 if packet.id == Id::command(Command::Joints) { &[0, 5, 7] } else { &[0, 4, 7] };
@@ -169,14 +170,18 @@ fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, RejectCounter)> {
     }
     for byte in [0, 0xFF] {
         let wrong = if format == Format::Fd { RejectCounter::Crc } else { RejectCounter::Incomplete };
-        cases.push((format!("a halt with 16 bytes of {byte:02X}"), frames(format, 0, &[byte; 16]), wrong));
+        cases.push((
+            format!("a halt with 16 bytes of {byte:02X}"),
+            frames_from_bytes(format, 0, &[byte; 16]),
+            wrong,
+        ));
     }
     add_bad_pages(session, &mut cases);
     cases
 }
 
 /// Returns frames with these bytes in the format of a bus.
-fn frames(format: Format, id: u32, bytes: &[u8]) -> Vec<Frame> {
+fn frames_from_bytes(format: Format, id: u32, bytes: &[u8]) -> Vec<Frame> {
     match format {
         Format::Fd => Frame::fd(id, BIT_RATE_SWITCH, bytes).into_iter().collect(),
         Format::Classic => bytes.chunks(8).filter_map(|bytes| Frame::classic(id, bytes).ok()).collect(),
@@ -184,7 +189,7 @@ fn frames(format: Format, id: u32, bytes: &[u8]) -> Vec<Frame> {
 }
 
 /// Adds FD frames with lengths that this kind of packet cannot have, with a correct CRC if there is room for one.
-fn add_fd_lengths(cases: &mut Vec<(String, Vec<Frame>, RejectCounter)>, name: &str, packet: &Packet) {
+fn add_wrong_fd_lengths(cases: &mut Vec<(String, Vec<Frame>, RejectCounter)>, name: &str, packet: &Packet) {
     let id = u32::from(packet.id.to_bits());
     let has_long = packet.id == Id::command(Command::Joints);
     for length in [0, 1, 8, 12, 20, 24, 32, 48, 64] {
@@ -221,11 +226,11 @@ fn add_foreign_frames(
     bytes: &[u8],
 ) {
     // On a classic bus, only the first segment.
-    let whole = frames(format, id | EXTENDED, bytes).into_iter().take(1).collect();
+    let whole = frames_from_bytes(format, id | EXTENDED, bytes).into_iter().take(1).collect();
     cases.push((format!("{name} with a 29-bit identifier"), whole, RejectCounter::MaybeForeign));
     // The upper 11 of 29 bits; the frames of a wire have the uppermost bit set.
     if id < 0x400 {
-        let upper = frames(format, id << 18 | EXTENDED, bytes).into_iter().take(1).collect();
+        let upper = frames_from_bytes(format, id << 18 | EXTENDED, bytes).into_iter().take(1).collect();
         cases.push((
             format!("{name} with its identifier in the upper 11 of 29 bits"),
             upper,
@@ -247,7 +252,7 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
         cases.push((what, packet.frames(session.format).collect(), reason));
     };
     for page in [5, 9, 127, 128, 255] {
-        let claim = [1, 0, 0, 0, 0, (State::CLAIMING.0 | 1 << 12).cast_signed()];
+        let claim = [1, 0, 0, 0, 0, (State::CLAIMING_NODE_ID.0 | 1 << 12).cast_signed()];
         add(
             format!("a network packet (4nn) with its node id and page {page}"),
             packet(Id::new(Kind::Network, own), claim, 0, page),
@@ -278,7 +283,7 @@ fn add_bad_pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Rej
             add(format!("a {} packet of node {node}", kind.name()), packet, RejectCounter::None);
             others.push((
                 format!("{length} bytes with the identifier of a {} packet of node {node}", kind.name()),
-                frames(session.format, id.to_bits().into(), &bytes),
+                frames_from_bytes(session.format, id.to_bits().into(), &bytes),
                 RejectCounter::None,
             ));
         }

@@ -11,9 +11,9 @@ use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The number of random forces for each of several rules.
-const RANDOM_FORCES: usize = 40;
+const RANDOM_FORCE_COUNT: usize = 40;
 /// The number of forces that are sent to reveal a rounding error.
-const ROUNDING_FORCES: usize = 12;
+const ROUNDING_FORCE_COUNT: usize = 12;
 
 /// The sensor words of a press: three of contact, and one of proximity.
 type SensorWords = ([i16; 3], i16);
@@ -32,25 +32,28 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     let mut known = Vec::new();
     for _ in 0..4 {
-        let positions = arm::positions(&mut dice, &parameters);
+        let positions = arm::random_positions(&mut dice, &parameters);
         let j = session
-            .press_and_step(&positions, arm::press_with_sum(arm::unit_press_sum(TorqueFormat::Q3_12)))?
+            .stimulate_and_send_joints(
+                &positions,
+                arm::press_with_sum(arm::unit_press_sum(TorqueFormat::Q3_12)),
+            )?
             .words();
         known.push(MeasuredPose { positions, j });
     }
-    check_ties(session, &parameters, &known)?;
-    for (contact, crafted) in rules() {
+    check_rounding_ties(session, &parameters, &known)?;
+    for (contact, crafted) in contact_rule_cases() {
         let parameters = Parameters { contact, ..parameters };
         if session.prepare_cell(&parameters)? {
-            check_rule(session, &mut dice, &parameters, &known, &crafted)?;
+            check_contact_rule(session, &mut dice, &parameters, &known, &crafted)?;
         }
     }
     for format in [TorqueFormat::Q5_10, TorqueFormat::Q7_8] {
-        let parameters = Parameters { torque_format: format, contact: arm::PLAIN_CONTACT, ..parameters };
+        let parameters = Parameters { torque_format: format, contact: arm::UNIT_GAIN_CONTACT, ..parameters };
         if session.about.abilities.first_missing(&parameters).is_none()
             && session.prepare_cell(&parameters)?
         {
-            check_ties(session, &parameters, &known)?;
+            check_rounding_ties(session, &parameters, &known)?;
         }
     }
     Ok(())
@@ -64,8 +67,8 @@ fn check_press(
     skin: SkinSensors,
     id: &'static str,
 ) -> Result<(), StopReason> {
-    let step = session.press_and_step(&known.positions, skin)?;
-    let force = arm::force(&parameters.contact, &skin);
+    let step = session.stimulate_and_send_joints(&known.positions, skin)?;
+    let force = arm::expected_force(&parameters.contact, &skin);
     let is_there = step.torque.is_some_and(|words| !words.is_zero() || force > 0);
     let sensed = || {
         format!(
@@ -85,7 +88,7 @@ fn check_press(
 }
 
 /// Checks products that end in exactly half a step, and words at the limits of their range.
-fn check_ties(
+fn check_rounding_ties(
     session: &mut Session<'_>,
     parameters: &Parameters,
     known: &[MeasuredPose],
@@ -115,7 +118,7 @@ fn check_ties(
 }
 
 /// Returns gains and thresholds, each with sensor words at their corner cases.
-fn rules() -> Vec<(Contact, Vec<SensorWords>)> {
+fn contact_rule_cases() -> Vec<(Contact, Vec<SensorWords>)> {
     let rule = |words: [i16; 5]| {
         let [alpha_c, alpha_p, contact, proximity, force] = words;
         Contact {
@@ -131,7 +134,7 @@ fn rules() -> Vec<(Contact, Vec<SensorWords>)> {
     vec![
         // Thresholds: a value equal to the threshold counts.
         (
-            arm::document_contact(),
+            arm::example_contact(),
             vec![
                 ([103, 0, 0], 0),
                 ([102, 0, 0], 0),
@@ -193,7 +196,7 @@ fn rules() -> Vec<(Contact, Vec<SensorWords>)> {
     ]
 }
 
-fn check_rule(
+fn check_contact_rule(
     session: &mut Session<'_>,
     dice: &mut TestRandom,
     parameters: &Parameters,
@@ -211,10 +214,10 @@ fn check_rule(
         }
     }
     let mut random = |shift: u32| {
-        let contact = [0; 3].map(|_| dice.word() >> shift);
-        (contact, (dice.word() >> shift) & i16::MAX)
+        let contact = [0; 3].map(|_| dice.random_word() >> shift);
+        (contact, (dice.random_word() >> shift) & i16::MAX)
     };
-    for place in 0..session.reduced_attempts(RANDOM_FORCES) {
+    for place in 0..session.reduced_attempts(RANDOM_FORCE_COUNT) {
         let shift = [0, 2, 4, 7];
         let (Some(known), Some(shift)) = (known.get(place % 4), shift.get(place / 2 % 4)) else { continue };
         check_press(session, parameters, known, skin(random(*shift)), "FORCE-1")?;
@@ -223,15 +226,15 @@ fn check_rule(
     let mut shown = 0;
     for attempt in 0..4_000 {
         let (Some(known), skin) = (known.get(attempt % 4), skin(random(3))) else { continue };
-        let force = arm::force(&parameters.contact, &skin);
+        let force = arm::expected_force(&parameters.contact, &skin);
         let shows = |j: &i16| {
             let word = |force| arm::torque_word(*j, force, parameters.torque_format);
             word(force) != word(force - 1) && !protocol::fixed::is_saturated(word(force))
         };
-        if force > 1 && is_rounded_up(&parameters.contact, &skin) && known.j.iter().any(shows) {
+        if force > 1 && is_force_rounded_up(&parameters.contact, &skin) && known.j.iter().any(shows) {
             check_press(session, parameters, known, skin, "FORCE-1")?;
             shown += 1;
-            if shown >= session.reduced_attempts(ROUNDING_FORCES) {
+            if shown >= session.reduced_attempts(ROUNDING_FORCE_COUNT) {
                 break;
             }
         }
@@ -240,7 +243,7 @@ fn check_rule(
 }
 
 /// Returns true if F_z is rounded up, so that truncating it would give one step of 2^-16 N less.
-fn is_rounded_up(contact: &Contact, skin: &SkinSensors) -> bool {
+fn is_force_rounded_up(contact: &Contact, skin: &SkinSensors) -> bool {
     let bits = |word: i16| i64::from(word);
     let sum: i64 = skin.contact.iter().map(|word| bits(word.to_bits())).sum();
     let sum = if sum < bits(contact.contact_threshold.to_bits()) { 0 } else { sum };

@@ -16,23 +16,23 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.prepare_cell(&arm::example_parameters(6))? {
         return Ok(());
     }
-    session.press_and_step(&POSITIONS, arm::press_with_sum(4_096))?;
-    check_epochs(session)?;
-    check_repeats(session)?;
-    check_counts(session)?;
-    check_contacts(session)
+    session.stimulate_and_send_joints(&POSITIONS, arm::press_with_sum(4_096))?;
+    check_epoch_jumps(session)?;
+    check_repeated_epochs(session)?;
+    check_joint_counts(session)?;
+    check_contact_changes(session)
 }
 
 /// Checks that joints of any epoch other than the last one are accepted, at any distance from it, and more than 256 in
 /// a row.
-fn check_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_epoch_jumps(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?.heard;
     let mut torque: Option<Words> = None;
     let mut epoch = session.known.last_epoch;
     let jumps: [u8; 13] = [255, 254, 128, 127, 129, 2, 250, 100, 200, 255, 1, 3, 64];
     for step in jumps.into_iter().chain(core::iter::repeat_n(1, 270)).chain([255, 255, 255]) {
         epoch = epoch.wrapping_add(step);
-        let came = session.step_at(epoch, &POSITIONS)?.torque;
+        let came = session.send_joints_at_epoch(epoch, &POSITIONS)?.torque;
         session.check("JOINTS-1", came.is_some(), || {
             format!("joints of epoch {epoch}, {} epochs after the last ones, must be answered with a torque, but none came", step.cast_signed())
         });
@@ -61,32 +61,32 @@ fn check_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that the epoch of the last joints is dropped when it is repeated; epoch 0 is not special.
-fn check_repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_repeated_epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
     for is_zero in [false, true] {
-        session.press_and_step(&POSITIONS, arm::press_with_sum(4_096))?;
+        session.stimulate_and_send_joints(&POSITIONS, arm::press_with_sum(4_096))?;
         let before = session.counters()?.heard;
         let first = if is_zero { 0 } else { session.next_epoch() };
-        session.step_at(first, &POSITIONS)?;
+        session.send_joints_at_epoch(first, &POSITIONS)?;
         for positions in [POSITIONS, [0x1234; MAX_JOINTS]] {
-            let joints = session.joints(first, &positions);
-            let exchange = session.exchange_all(&[joints])?;
+            let joints = session.joints_message(first, &positions);
+            let exchange = session.exchange_messages(&[joints])?;
             session.check("JOINTS-1", exchange.is_silent(), || {
                 format!("repeated joints of epoch {first} must not be answered, but were")
             });
         }
         // A pending stimulus must not be latched by repeated joints.
-        session.press(arm::press_with_sum(2_000))?;
-        let joints = session.joints(first, &POSITIONS);
-        session.exchange_all(&[joints])?;
+        session.send_stimulus(arm::press_with_sum(2_000))?;
+        let joints = session.joints_message(first, &POSITIONS);
+        session.exchange_messages(&[joints])?;
         let skin = session.read_latched_skin()?;
         session.check("JOINTS-1", skin == Some(arm::press_with_sum(4_096)), || {
             format!("repeated joints must not latch a stimulus, but {} is latched", arm::format_skin(skin))
         });
         let second = session.next_epoch();
-        session.step_at(second, &POSITIONS)?;
+        session.send_joints_at_epoch(second, &POSITIONS)?;
         // After other joints, the same epoch counts as a new one.
-        session.step_at(first, &POSITIONS)?;
-        session.step_at(second, &POSITIONS)?;
+        session.send_joints_at_epoch(first, &POSITIONS)?;
+        session.send_joints_at_epoch(second, &POSITIONS)?;
         let after = session.counters()?.heard;
         let counted = after.joints_repeated.wrapping_sub(before.joints_repeated);
         session.check("JOINTS-1", counted == 3, || {
@@ -97,18 +97,18 @@ fn check_repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that joints are dropped if their count is not that of the chain, or is impossible.
-fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.press_and_step(&POSITIONS, arm::press_with_sum(4_096))?;
+fn check_joint_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.stimulate_and_send_joints(&POSITIONS, arm::press_with_sum(4_096))?;
     let mut before = session.counters()?;
     for count in [5, 1, 4, 0, 7, 15, 255] {
         let epoch = session.next_epoch();
         // The stimulus is latched by the next valid joints, whatever their epoch.
         let sum = 4_096 + i32::from(count) * 8;
         let before_press = session.read_latched_skin()?;
-        session.press(arm::press_with_sum(sum))?;
+        session.send_stimulus(arm::press_with_sum(sum))?;
         before = session.counters()?;
         let frames = joints_frames(session, epoch, count, Length::Six);
-        let exchange = session.exchange(&frames)?;
+        let exchange = session.exchange_frames(&frames)?;
         let skin = session.read_latched_skin()?;
         session.check("JOINTS-2", skin == before_press, || {
             format!(
@@ -129,7 +129,7 @@ fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
             format!("joints with count {count} must be counted only in the counter meaning, but the counters are {after}; before: {before}")
         });
         // The epoch of the dropped joints does not become the last one.
-        let step = session.step_at(epoch, &POSITIONS)?;
+        let step = session.send_joints_at_epoch(epoch, &POSITIONS)?;
         session.check("JOINTS-2", step.torque.is_some(), || {
             format!("joints of epoch {epoch} with the right count must be answered after joints with a wrong count, but were not")
         });
@@ -139,7 +139,7 @@ fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
     let last = session.known.last_epoch;
     for (count, is_repeated) in [(5, true), (0, false)] {
         let frames = joints_frames(session, last, count, Length::Six);
-        session.exchange(&frames)?;
+        session.exchange_frames(&frames)?;
         let after = session.counters()?;
         let repeated = after.heard.joints_repeated.wrapping_sub(before.heard.joints_repeated);
         let meaning = after.refused.meaning.wrapping_sub(before.refused.meaning);
@@ -155,7 +155,7 @@ fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.format == protocol::can::Format::Fd {
         let epoch = session.next_epoch();
         let frames = joints_frames(session, epoch, 7, Length::Eight);
-        session.exchange(&frames)?;
+        session.exchange_frames(&frames)?;
         let after = session.counters()?;
         let is_so = after.refused.meaning == before.refused.meaning.wrapping_add(1)
             && after.refused.length == before.refused.length;
@@ -168,25 +168,25 @@ fn check_counts(session: &mut Session<'_>) -> Result<(), StopReason> {
 
 /// Returns the frames of joints with this count, which need not match the chain.
 fn joints_frames(session: &Session<'_>, epoch: u8, count: u8, length: Length) -> Vec<Frame> {
-    let id = session.joints(epoch, &POSITIONS).id();
+    let id = session.joints_message(epoch, &POSITIONS).id();
     let packet = Packet { id, words: Words::new(length, POSITIONS), epoch: Epoch(epoch), count };
     packet.frames(session.format).collect()
 }
 
 /// Checks touches and releases: in contact each joints message is answered with a torque, a release with one torque of
 /// zeros, and later joints with nothing.
-fn check_contacts(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_contact_changes(session: &mut Session<'_>) -> Result<(), StopReason> {
     for round in 0..4 {
         for sum in [3_000, 3_000, 0, 0, 0, 9_000, 0, 0] {
             let positions = POSITIONS.map(|word| word.wrapping_add(round * 0x0111));
-            session.press_and_step(&positions, arm::press_with_sum(sum))?;
+            session.stimulate_and_send_joints(&positions, arm::press_with_sum(sum))?;
         }
-        session.press(arm::press_with_sum(500))?;
+        session.send_stimulus(arm::press_with_sum(500))?;
         for _ in 0..3 {
-            session.step(&POSITIONS)?;
+            session.send_next_joints(&POSITIONS)?;
         }
-        session.press_and_step(&POSITIONS, arm::press_with_sum(0))?;
-        session.step(&POSITIONS)?;
+        session.stimulate_and_send_joints(&POSITIONS, arm::press_with_sum(0))?;
+        session.send_next_joints(&POSITIONS)?;
     }
     Ok(())
 }
@@ -198,13 +198,15 @@ pub(super) fn check_old_joints(session: &mut Session<'_>) -> Result<(), StopReas
     }
     let mut shown = BurstResults::default();
     for press in [4_096, 1_024, 2_048, 512] {
-        send_burst(session, press, &mut shown)?;
+        send_joints_burst(session, press, &mut shown)?;
     }
     if !shown.any {
-        session.findings.not_tested("JOINTS-4", "the cell processed all joints at once, and skipped none");
+        session
+            .findings
+            .mark_not_tested("JOINTS-4", "the cell processed all joints at once, and skipped none");
     }
     session.known.active = None;
-    check_none_lost(session)?;
+    check_no_joints_lost(session)?;
     session.prepare_cell(&arm::example_parameters(6))?;
     Ok(())
 }
@@ -218,37 +220,41 @@ struct BurstResults {
 }
 
 /// The number of bursts of joints; JOINTS-4 fails if old joints are answered in all of them.
-const BURSTS: usize = 4;
+const BURST_COUNT: usize = 4;
 
-fn send_burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -> Result<(), StopReason> {
-    const BURST_JOINTS: u8 = 24;
+fn send_joints_burst(
+    session: &mut Session<'_>,
+    press: i32,
+    shown: &mut BurstResults,
+) -> Result<(), StopReason> {
+    const JOINTS_PER_BURST: u8 = 24;
     // In contact: skipped joints change the contact as little as the commit does.
-    session.commit(&arm::example_parameters(6))?;
-    session.press_and_step(&POSITIONS, arm::press_with_sum(press + 1))?;
-    session.commit(&Parameters { period_us: 1, ..arm::example_parameters(6) })?;
-    session.exchange_all(&[])?;
+    session.commit_parameters(&arm::example_parameters(6))?;
+    session.stimulate_and_send_joints(&POSITIONS, arm::press_with_sum(press + 1))?;
+    session.commit_parameters(&Parameters { period_us: 1, ..arm::example_parameters(6) })?;
+    session.exchange_messages(&[])?;
     let before = session.counters()?;
-    session.press(arm::press_with_sum(press))?;
+    session.send_stimulus(arm::press_with_sum(press))?;
     session.begin_exchange();
     let mut sent: Vec<(u8, Micros)> = Vec::new();
     let mut frames = Vec::new();
-    for _ in 0..BURST_JOINTS {
+    for _ in 0..JOINTS_PER_BURST {
         let epoch = session.next_epoch();
         sent.push((epoch, Micros(0)));
-        frames.extend(session.frames(&session.joints(epoch, &POSITIONS)));
+        frames.extend(session.frames(&session.joints_message(epoch, &POSITIONS)));
     }
     let times = session.send_all(&frames)?;
-    let each = frames.len() / usize::from(BURST_JOINTS);
+    let each = frames.len() / usize::from(JOINTS_PER_BURST);
     for (sent, at) in sent.iter_mut().zip(times.chunks(each)) {
         sent.1 = at.last().copied().unwrap_or_default();
     }
-    session.idle(Span::from_millis(60))?;
-    session.mark_expected();
+    session.receive_for(Span::from_millis(60))?;
+    session.mark_packets_expected();
     let answers: Vec<_> = session.answers().iter().filter_map(|it| Some((it.at, it.torque()?.0.0))).collect();
     if let Some(text) = find_old_answer(&sent, &answers) {
         (shown.any, shown.answered) = (true, shown.answered + 1);
         // The time stamps of the bus differ from those of the cell: a single burst proves nothing.
-        session.check("JOINTS-4", shown.answered < BURSTS, || text);
+        session.check("JOINTS-4", shown.answered < BURST_COUNT, || text);
     }
     session.known.epoch = None;
     // A cell may lose some joints of a burst.
@@ -261,15 +267,15 @@ fn send_burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -
     ];
     let taken = joints.wrapping_add(skipped);
     let is_so =
-        taken <= u16::from(BURST_JOINTS) && usize::from(torques) == answers.len() && joints >= torques;
+        taken <= u16::from(JOINTS_PER_BURST) && usize::from(torques) == answers.len() && joints >= torques;
     session.check("JOINTS-4", is_so, || {
         format!(
-            "the counters must match the {BURST_JOINTS} joints messages sent and the torques that came, but {joints} messages were counted as joints, {skipped} as skipped and {torques} as torques, and {} torques came",
+            "the counters must match the {JOINTS_PER_BURST} joints messages sent and the torques that came, but {joints} messages were counted as joints, {skipped} as skipped and {torques} as torques, and {} torques came",
             answers.len()
         )
     });
     shown.any |= skipped > 0;
-    if skipped > 0 && taken == u16::from(BURST_JOINTS) {
+    if skipped > 0 && taken == u16::from(JOINTS_PER_BURST) {
         // Skipped joints still count as the last ones, latch stimuli and leave ACTIVE unchanged.
         let page = session.read_latched_skin()?;
         session.check("STIM-8", page == Some(arm::press_with_sum(press)), || {
@@ -277,9 +283,9 @@ fn send_burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -
         });
         session.known.epoch = Some(session.known.last_epoch);
         session.known.active = Some(true);
-        session.exchange_all(&[])?;
-        let joints = session.joints(session.known.last_epoch, &POSITIONS);
-        session.exchange_all(&[joints])?;
+        session.exchange_messages(&[])?;
+        let joints = session.joints_message(session.known.last_epoch, &POSITIONS);
+        session.exchange_messages(&[joints])?;
         let again = session.counters()?.heard.joints_repeated.wrapping_sub(after.heard.joints_repeated);
         session.check("JOINTS-3", again == 1, || {
             "joints with the epoch of skipped ones must be counted as repeated, but were not".to_owned()
@@ -291,10 +297,10 @@ fn send_burst(session: &mut Session<'_>, press: i32, shown: &mut BurstResults) -
 /// Returns a description of joints that were answered although they were too old, if there are any. A cell that answers
 /// one joints message after the next one has come is too late for that next one, and must not answer it.
 fn find_old_answer(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String> {
-    const TIME_MARGIN: Span = Span(100);
+    const OLD_JOINTS_TIME_MARGIN: Span = Span(100);
     let late = answers.windows(2).find(|pair| match pair {
         [(before, _), (_, epoch)] => {
-            sent.iter().any(|(of, at)| of == epoch && before.elapsed_since(*at) > TIME_MARGIN)
+            sent.iter().any(|(of, at)| of == epoch && before.elapsed_since(*at) > OLD_JOINTS_TIME_MARGIN)
         }
         _ => false,
     });
@@ -306,24 +312,24 @@ fn find_old_answer(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<St
 }
 
 /// Checks that joints that wait in the cell's receive queue are accepted too: the counters add up to the number sent.
-fn check_none_lost(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_no_joints_lost(session: &mut Session<'_>) -> Result<(), StopReason> {
     const WAITING_JOINTS: usize = 3;
-    session.commit(&arm::example_parameters(6))?;
-    session.press_and_step(&POSITIONS, arm::press_with_sum(4_096))?;
+    session.commit_parameters(&arm::example_parameters(6))?;
+    session.stimulate_and_send_joints(&POSITIONS, arm::press_with_sum(4_096))?;
     session.counters()?;
     for _ in 0..8 {
         session.begin_exchange();
         let all: Vec<_> = (0..WAITING_JOINTS)
             .map(|_| {
                 let epoch = session.next_epoch();
-                session.joints(epoch, &POSITIONS)
+                session.joints_message(epoch, &POSITIONS)
             })
             .collect();
         let frames: Vec<_> = all.iter().flat_map(|joints| session.frames(joints)).collect();
         session.send(&frames)?;
         session.known.epoch = Some(session.known.last_epoch);
-        session.idle(Span::from_millis(4))?;
-        session.mark_expected();
+        session.receive_for(Span::from_millis(4))?;
+        session.mark_packets_expected();
     }
     session.known.active = None;
     session.counters()?;

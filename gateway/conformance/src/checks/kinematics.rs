@@ -15,20 +15,20 @@ const POSES_PER_LENGTH: usize = 4;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut dice = TestRandom::new(1);
-    for parameters in arms(&mut dice, session.about.abilities) {
+    for parameters in test_arms(&mut dice, session.about.abilities) {
         check_arm(session, &mut dice, &parameters, POSES_PER_ARM)?;
     }
-    for parameters in arms_by_length(&mut dice, session.about.abilities) {
+    for parameters in arms_of_each_length(&mut dice, session.about.abilities) {
         check_arm(session, &mut dice, &parameters, POSES_PER_LENGTH)?;
     }
-    check_saturation(session)
+    check_jacobian_saturation(session)
 }
 
 /// Returns arms that the cell can compute: a UR5, six revolute joints of any shape, and the further shapes that its
 /// identity allows.
-fn arms(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
+fn test_arms(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
     let mut arms: Vec<_> = [2, 6, 1].map(arm::example_parameters).into();
-    arms.extend(half_turns());
+    arms.extend(arms_with_half_turns());
     let six = |prismatic, rows| ChainShape { joints: 6, rows, prismatic };
     arms.extend((0..4).map(|_| arm::random_parameters(dice, six(false, 6))));
     let (joints, rows) = (abilities.max_joints(), abilities.max_rows());
@@ -59,7 +59,7 @@ fn arms(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
 }
 
 /// Returns two UR5s with angles of half a turn, which is the lowest word: in two twists, and in two joint offsets.
-fn half_turns() -> [Parameters; 2] {
+fn arms_with_half_turns() -> [Parameters; 2] {
     let half = |places: [usize; 2], turn: fn(&mut Row)| {
         let mut parameters = arm::example_parameters(6);
         for place in places {
@@ -71,7 +71,7 @@ fn half_turns() -> [Parameters; 2] {
 }
 
 /// Returns arms of each number of joints above six, with a row for each joint and the cell at the tip.
-fn arms_by_length(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
+fn arms_of_each_length(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
     let most = abilities.max_joints().min(abilities.max_rows());
     let of = |joints| {
         let arm = arm::random_parameters(dice, ChainShape { joints, rows: joints, prismatic: false });
@@ -94,20 +94,22 @@ fn check_arm(
     let format = parameters.torque_format;
     let mut positions = [0; MAX_JOINTS];
     for pose in 0..session.reduced_attempts(poses) {
-        let next = arm::positions(dice, parameters);
+        let next = arm::random_positions(dice, parameters);
         // Every third time only joints beyond the sixth move.
         let stays = if pose % 3 == 2 && parameters.joints > 6 { 6 } else { 0 };
         positions.iter_mut().zip(next).skip(stays).for_each(|(position, next)| *position = next);
-        let j = session.press_and_step(&positions, arm::press_with_sum(arm::unit_press_sum(format)))?.words();
+        let j = session
+            .stimulate_and_send_joints(&positions, arm::press_with_sum(arm::unit_press_sum(format)))?
+            .words();
         check_jacobian(session, parameters, &central, &positions, &j);
         // The same joints again, with any force: J is known now.
-        let press = arm::press_with_sum(i32::from(dice.word()).abs() * 3);
-        let words = session.press_and_step(&positions, press)?.words();
+        let press = arm::press_with_sum(i32::from(dice.random_word()).abs() * 3);
+        let words = session.stimulate_and_send_joints(&positions, press)?.words();
         check_torque_words(
             session,
             parameters,
             &j,
-            arm::force(&parameters.contact, &press),
+            arm::expected_force(&parameters.contact, &press),
             &words,
             "TORQUE-1",
         );
@@ -123,8 +125,9 @@ fn check_jacobian(
     j: &[i16; MAX_JOINTS],
 ) {
     let exact = arm::exact_jacobian(central, positions);
-    let off = j.iter().zip(exact).map(|(&word, exact)| arm::steps_from_exact(word, exact)).max().unwrap_or(0);
-    let most = arm::tolerance(parameters);
+    let off =
+        j.iter().zip(exact).map(|(&word, exact)| arm::rounding_error_steps(word, exact)).max().unwrap_or(0);
+    let most = arm::jacobian_tolerance_steps(parameters);
     let joints = usize::from(parameters.joints);
     session.check("J-3", off <= most, || {
         let nearest = exact.map(|x| Q1_14::nearest(x).to_bits());
@@ -159,7 +162,7 @@ pub(super) fn check_torque_words(
 
 /// Checks that J saturates with levers of 3.8 m: one of a link, and one of a prismatic joint that slides beyond the
 /// range of a word.
-fn check_saturation(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_jacobian_saturation(session: &mut Session<'_>) -> Result<(), StopReason> {
     let far = Q1_14::from_bits(31_000);
     let mut long = Parameters { joint: 1, joints: 1, ..arm::example_parameters(1) };
     long.rows = [Row { a: far, ..Row::default() }; protocol::parameters::MAX_ROWS];
@@ -196,7 +199,7 @@ fn check_saturated_jacobian(
             return Ok(());
         }
         let press = arm::press_with_sum(arm::unit_press_sum(parameters.torque_format));
-        let [first, ..] = session.press_and_step(positions, press)?.words();
+        let [first, ..] = session.stimulate_and_send_joints(positions, press)?.words();
         let is_held = if sign > 0 { first <= i16::MIN + 8 } else { first >= i16::MAX - 8 };
         session.check("J-2", is_held, || {
             let word = if sign > 0 { "8000" } else { "7FFF" };

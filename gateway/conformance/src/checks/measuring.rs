@@ -22,7 +22,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut before = None;
     for number in 0..JOINTS_MESSAGES {
         let skips = session.skips;
-        let step = session.step(&[number << 9; MAX_JOINTS])?;
+        let step = session.send_next_joints(&[number << 9; MAX_JOINTS])?;
         let Some((beat, _)) = step.exchange.beat.filter(|_| skips == session.skips) else {
             before = None;
             continue;

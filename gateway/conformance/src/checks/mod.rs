@@ -62,7 +62,7 @@ const fn check_group(
     CheckGroup { about, needs, run }
 }
 
-const GROUPS: &[CheckGroup] = &[
+const CHECK_GROUPS: &[CheckGroup] = &[
     check_group(
         &["CONF-1", "CONF-2", "CONF-3", "CONF-4", "CONF-7", "CONF-12"],
         Precondition::Nothing,
@@ -80,7 +80,7 @@ const GROUPS: &[CheckGroup] = &[
         Precondition::Nothing,
         options::check_switches,
     ),
-    check_group(&["OPT-2"], Precondition::Nothing, options::check_ignored),
+    check_group(&["OPT-2"], Precondition::Nothing, options::check_unused_bits_ignored),
     check_group(&["J-1", "J-2", "J-3", "TORQUE-1"], Precondition::Press, kinematics::run),
     check_group(&["FORCE-1", "TORQUE-1", "TORQUE-2", "STATE-1"], Precondition::Press, force::run),
     check_group(
@@ -129,10 +129,10 @@ const GROUPS: &[CheckGroup] = &[
 ];
 
 /// The time to leave for the other groups when a group is repeated.
-const TIME_RESERVE: Span = Span::from_millis(20_000);
+const OTHER_GROUPS_TIME_RESERVE: Span = Span::from_millis(20_000);
 
 /// The parts of requirements that cannot be tested from the bus of any cell, with the reason.
-const UNTESTABLE: &[(&str, &str)] = &[
+const UNTESTABLE_REQUIREMENTS: &[(&str, &str)] = &[
     ("CLAIM-8", "wires cannot be reached from the bus"),
     ("TIME-3", "the order of packets of the tree"),
     ("CONF-7", "a failing flash: the bus cannot cause it"),
@@ -149,67 +149,72 @@ const UNTESTABLE: &[(&str, &str)] = &[
 pub fn run(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), StopReason> {
     let done = run_groups(session, only);
     if done.is_ok() {
-        for (id, why) in UNTESTABLE {
-            session.findings.not_tested(id, *why);
+        for (id, why) in UNTESTABLE_REQUIREMENTS {
+            session.findings.mark_not_tested(id, *why);
         }
     }
-    session.check_times();
+    session.check_answer_times();
     done
 }
 
 fn run_groups(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), StopReason> {
     begin::run(session)?;
     mark_tree_requirements(session);
-    for group in GROUPS {
-        if let Err((is_applicable, why)) = check_needs(session, group.needs) {
+    for group in CHECK_GROUPS {
+        if let Err((is_applicable, why)) = check_precondition(session, group.needs) {
             for id in group.about {
                 if is_applicable {
-                    session.findings.not_tested(id, why);
+                    session.findings.mark_not_tested(id, why);
                 } else {
-                    session.findings.not_applicable(id, why);
+                    session.findings.mark_not_applicable(id, why);
                 }
             }
-        } else if group.about.iter().any(|id| only.has(id)) {
+        } else if group.about.iter().any(|id| only.is_selected(id)) {
             if group.needs == Precondition::Restart {
-                session.check_all_beats();
+                session.check_heartbeat_total();
             }
             run_group(session, group)?;
         }
     }
-    session.check_all_beats();
-    session.check_segments()?;
-    if only.has("TIME-2") && session.about.committed { session.measure_times() } else { Ok(()) }
+    session.check_heartbeat_total();
+    session.check_segment_times()?;
+    if only.is_selected("TIME-2") && session.about.committed {
+        session.measure_answer_times()
+    } else {
+        Ok(())
+    }
 }
 
 /// Runs a group, and repeats it if something failed while this computer was late: a cell that is a process may have
 /// waited for a processor as well. The cell then has to meet each requirement in one of a few attempts.
 fn run_group(session: &mut Session<'_>, group: &CheckGroup) -> Result<(), StopReason> {
-    const ATTEMPTS: usize = 4;
-    const MAX_LATENESS: Span = Span::from_millis(4);
+    const MAX_GROUP_ATTEMPTS: usize = 4;
+    const MAX_BENCH_LATENESS: Span = Span::from_millis(4);
     let before = session.findings.clone();
     let mut failed: Option<BTreeSet<&'static str>> = None;
-    for attempt in 1..=ATTEMPTS {
-        session.worst_lateness();
+    for attempt in 1..=MAX_GROUP_ATTEMPTS {
+        session.worst_bench_lateness();
         let began = session.now();
-        session.check_regular_beat()?;
+        session.check_regular_heartbeat()?;
         (group.run)(session)?;
-        session.settle()?;
+        session.wait_for_late_packets()?;
         if group.needs != Precondition::Restart {
-            session.check_regular_beat()?;
+            session.check_regular_heartbeat()?;
         }
         let now: BTreeSet<_> = session.findings.failed_since(&before).collect();
         let each: BTreeSet<_> =
             failed.map_or_else(|| now.clone(), |failed| failed.intersection(&now).copied().collect());
         for forgiven in now.difference(&each) {
-            session.findings.retract(forgiven, &before);
+            session.findings.retract_failures(forgiven, &before);
         }
         let took = session.now().elapsed_since(began);
-        let is_over = attempt == ATTEMPTS || session.remaining_time().0 < took.0 + TIME_RESERVE.0;
-        if each.is_empty() || is_over || session.worst_lateness() < MAX_LATENESS {
+        let is_over = attempt == MAX_GROUP_ATTEMPTS
+            || session.remaining_time().0 < took.0 + OTHER_GROUPS_TIME_RESERVE.0;
+        if each.is_empty() || is_over || session.worst_bench_lateness() < MAX_BENCH_LATENESS {
             break;
         }
         session.findings = before.clone();
-        session.forget_state();
+        session.forget_cell_state();
         failed = Some(each);
     }
     Ok(())
@@ -217,7 +222,7 @@ fn run_group(session: &mut Session<'_>, group: &CheckGroup) -> Result<(), StopRe
 
 /// Checks that the cell has the group's precondition. The error gives the reason, and true if the cell might have it
 /// (not tested) or false if it does not (not applicable).
-fn check_needs(session: &Session<'_>, needs: Precondition) -> Result<(), (bool, &'static str)> {
+fn check_precondition(session: &Session<'_>, needs: Precondition) -> Result<(), (bool, &'static str)> {
     let about = &session.about;
     match needs {
         Precondition::Press if !about.test_mode => {
@@ -253,9 +258,9 @@ fn mark_tree_requirements(session: &mut Session<'_>) {
     let ids = REQUIREMENTS.iter().filter(|it| it.document == Document::Tree && it.id != "LINK-1");
     for id in ids.map(|it| it.id).chain(["CLAIM-8"]) {
         if session.about.ports {
-            session.findings.not_tested(id, "wires cannot be reached from the bus");
+            session.findings.mark_not_tested(id, "wires cannot be reached from the bus");
         } else {
-            session.findings.not_applicable(id, "it has no ports");
+            session.findings.mark_not_applicable(id, "it has no ports");
         }
     }
 }

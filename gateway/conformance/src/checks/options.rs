@@ -22,12 +22,12 @@ pub(super) fn check_switches(session: &mut Session<'_>) -> Result<(), StopReason
     session.known.senses = true;
     check_test_mode(session)?;
     check_reply_mode(session)?;
-    check_sensing(session)?;
+    check_sensing_parameters(session)?;
     check_no_baseline(session)?;
     check_links(session)?;
     check_impossible_row(session)?;
     session.write_first_words(SENSING_PARAMETER, [0])?;
-    session.settle()?;
+    session.wait_for_late_packets()?;
     session.known.senses = false;
     Ok(())
 }
@@ -40,7 +40,7 @@ fn expect_reply(
     written: [i16; WORDS],
     expected: Reply,
 ) -> Result<(), StopReason> {
-    let reply = session.write(number, written)?;
+    let reply = session.write_parameter(number, written)?;
     session.check(id, reply == expected, || {
         format!("a write of {} to parameter {number} must be answered with {expected}, but the answer was {reply}", Reply::Value(written))
     });
@@ -54,9 +54,9 @@ fn expect_refusal(
     number: u8,
     written: [i16; WORDS],
 ) -> Result<(), StopReason> {
-    let before = session.read(number)?;
+    let before = session.read_parameter(number)?;
     expect_reply(session, id, number, written, Reply::Refused(19))?;
-    let after = session.read(number)?;
+    let after = session.read_parameter(number)?;
     session.check("CONF-5", before == after, || {
         format!("a refused write must not change parameter {number}, but changed it from {before} to {after}")
     });
@@ -76,11 +76,11 @@ fn check_test_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
         expect_reply(session, "CONF-3", 5, junk, Reply::Value(padded_words([on.into()])))?;
         session.known.test_mode = Some(on);
         session.known.skin = on.then(Default::default);
-        let reply = session.read(5)?;
+        let reply = session.read_parameter(5)?;
         session.check("CONF-9", reply == Reply::Value(padded_words([on.into()])), || {
             format!("only a write of 1 may switch test mode on, but after a write of {written} parameter 5 reads as {reply}")
         });
-        let state = session.exchange_all(&[])?.state();
+        let state = session.exchange_messages(&[])?.state();
         session.check("CONF-9", state.has(State::TEST_MODE) == on, || {
             format!("only a write of 1 may set TEST_MODE, but after a write of {written} to parameter 5 the state is {:04X}", state.0)
         });
@@ -102,18 +102,18 @@ fn check_reply_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
         expect_refusal(session, "OPT-1", REPLY_PARAMETER, padded_words([1, 500, 3, 1]))?;
     }
     expect_reply(session, "CONF-3", REPLY_PARAMETER, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
-    let reply = session.read(REPLY_PARAMETER)?;
+    let reply = session.read_parameter(REPLY_PARAMETER)?;
     session.check("CONF-9", reply == Reply::Value([0; WORDS]), || {
         format!("parameter 6 must read as 0 after a write of 0, but reads as {reply}")
     });
     Ok(())
 }
 
-fn check_sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_sensing_parameters(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.about.sensing {
         for number in [SENSING_PARAMETER, EVENTS_PARAMETER] {
             expect_reply(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
-            let reply = session.read(number)?;
+            let reply = session.read_parameter(number)?;
             session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
                 format!(
                     "parameter {number} of an option that the cell lacks must read as 0, but reads as {reply}"
@@ -121,7 +121,7 @@ fn check_sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
             });
             expect_refusal(session, "OPT-1", number, padded_words([1, 50]))?;
         }
-        session.findings.not_applicable("SENSE-3", "it sends no sensor values without a request");
+        session.findings.mark_not_applicable("SENSE-3", "it sends no sensor values without a request");
         return Ok(());
     }
     for bad in [[3, 50], [-1, 50], [1, 0], [i16::MAX, 1]] {
@@ -150,7 +150,7 @@ fn check_sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
     for good in [[0, 0, 0, 0, 0x4000, 0], [i16::MAX, i16::MAX, i16::MAX, i16::MAX, 0, 0], usual] {
         let [a, b, c, d, e, _] = good;
         expect_reply(session, "SENSE-3", EVENTS_PARAMETER, [a, b, c, d, e, 77], Reply::Value(good))?;
-        let reply = session.read(EVENTS_PARAMETER)?;
+        let reply = session.read_parameter(EVENTS_PARAMETER)?;
         session.check("CONF-9", reply == Reply::Value(good), || {
             format!("parameter 8 must read as it was written, but reads as {reply}")
         });
@@ -160,7 +160,7 @@ fn check_sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
 
 /// Checks that a cell without a baseline accepts only zeros in parameters 11 and 12.
 fn check_no_baseline(session: &mut Session<'_>) -> Result<(), StopReason> {
-    let reply = session.read(BASELINE_PARAMETER)?;
+    let reply = session.read_parameter(BASELINE_PARAMETER)?;
     if session.about.baseline || reply == Reply::Refused(18) {
         return Ok(());
     }
@@ -203,7 +203,7 @@ fn check_impossible_row(session: &mut Session<'_>) -> Result<(), StopReason> {
     let Some(number) = u8::try_from(most).ok().filter(|most| *most < 32).map(|most| 16 + most) else {
         return Ok(());
     };
-    let reply = session.read(number)?;
+    let reply = session.read_parameter(number)?;
     session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
         format!("row {} of a cell with at most {most} rows must read as 0, but reads as {reply}", most + 1)
     });
@@ -212,7 +212,7 @@ fn check_impossible_row(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that the cell ignores words, bytes and bits that a packet does not use.
-pub(super) fn check_ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
+pub(super) fn check_unused_bits_ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.prepare_cell(&arm::example_parameters(2))?;
     let junk = |command| Packet {
         id: Id::command(command),
@@ -223,12 +223,12 @@ pub(super) fn check_ignored(session: &mut Session<'_>) -> Result<(), StopReason>
     let frames =
         |session: &Session<'_>, packet: Packet| packet.frames(session.format).collect::<Vec<Frame>>();
     session.known.halted = Some(true);
-    let halted = session.exchange(&frames(session, junk(Command::Halt)))?;
+    let halted = session.exchange_frames(&frames(session, junk(Command::Halt)))?;
     session.check("OPT-2", halted.state().has(State::HALTED), || {
         "unused words, epoch and count of a halt must be ignored, but the halt had no effect".to_owned()
     });
     session.known.halted = Some(false);
-    let resumed = session.exchange(&frames(session, junk(Command::Resume)))?;
+    let resumed = session.exchange_frames(&frames(session, junk(Command::Resume)))?;
     session.check("OPT-2", !resumed.state().has(State::HALTED), || {
         "unused words, epoch and count of a resume must be ignored, but the resume had no effect".to_owned()
     });
@@ -241,8 +241,9 @@ pub(super) fn check_ignored(session: &mut Session<'_>) -> Result<(), StopReason>
     let frames_of_sync = frames(session, junk(Command::Sync));
     session.begin_exchange();
     let at = session.send(&frames_of_sync)?;
-    let is_there = session
-        .wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    let is_there = session.wait_for_packets(at + crate::session::ANSWER_TIMEOUT, |heard| {
+        heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
+    })?;
     session.check("OPT-2", is_there, || {
         "unused words of a sync must be ignored, but it was not answered".to_owned()
     });
@@ -254,8 +255,9 @@ pub(super) fn check_ignored(session: &mut Session<'_>) -> Result<(), StopReason>
         session.begin_exchange();
         let frames: Vec<_> = frame.into_iter().collect();
         let at = session.send(&frames)?;
-        let is_there = session
-            .wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        let is_there = session.wait_for_packets(at + crate::session::ANSWER_TIMEOUT, |heard| {
+            heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
+        })?;
         session.check("OPT-2", is_there, || {
             "a sync in a frame without bit-rate switch must be answered, but was not".to_owned()
         });
@@ -271,7 +273,7 @@ fn check_read_with_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let id = Id::new(Kind::Configure, Node::Cell(session.cell));
     let packet = Packet { id, words: [9, 8, 7, 6, 5, 4].into(), epoch: Epoch(3), count: 2 };
     let frames: Vec<_> = packet.frames(session.format).collect();
-    let exchange = session.exchange(&frames)?;
+    let exchange = session.exchange_frames(&frames)?;
     let expected = arm::example_parameters(2).words(Parameter::Pose);
     let answer = protocol::message::Answer::Value { number: 2, written: false, words: expected };
     let answer = Message::Configured { from: session.cell, tag: 3, answer };
@@ -290,14 +292,14 @@ fn check_extra_words(session: &mut Session<'_>) -> Result<(), StopReason> {
         return Ok(());
     }
     let positions = [0x0123, -0x2345, 0x0456, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
-    let expected = session.press_and_step(&positions, arm::press_with_sum(4_096))?.words();
+    let expected = session.stimulate_and_send_joints(&positions, arm::press_with_sum(4_096))?.words();
     let epoch = session.next_epoch();
     let id = Id::command(Command::Joints);
     let words = [0x0123, -0x2345, 0x0456, 0x7777, -1, 0x1111].into();
     let packet = Packet { id, words, epoch: Epoch(epoch), count: 3 };
     let frames: Vec<_> = packet.frames(session.format).collect();
     session.known.epoch = Some(epoch);
-    let exchange = session.exchange(&frames)?;
+    let exchange = session.exchange_frames(&frames)?;
     let got = exchange.answers.iter().find_map(|heard| heard.torque()).map(|(_, words)| words.padded());
     session.check("OPT-2", got == Some(expected), || {
         let got = got.map_or_else(|| "nothing".to_owned(), |got| arm::format_words(&got));
@@ -312,10 +314,10 @@ fn check_extra_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let frames: Vec<_> = packet.frames(session.format).collect();
     session.begin_exchange();
     session.send(&frames)?;
-    let after = session.step(&positions)?.words();
+    let after = session.send_next_joints(&positions)?.words();
     session.check("OPT-2", after == expected, || {
         "unused words of a stimulus of the acceleration must be ignored, but changed the torque".to_owned()
     });
-    session.press_and_step(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
+    session.stimulate_and_send_joints(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
     Ok(())
 }

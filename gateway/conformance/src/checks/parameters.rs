@@ -11,7 +11,7 @@ use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
 /// Returns a configuration that differs from `arm::document` in each parameter.
-fn other_parameters() -> Parameters {
+fn all_different_parameters() -> Parameters {
     let mut other = Parameters { joint: 6, period_us: 50_000, ..arm::example_parameters(6) };
     other.contact.alpha_c = Q3_12::from_bits(5_000);
     other.pose.position = [0x0777, -0x0333, 0x0123].map(Q1_14::from_bits);
@@ -22,26 +22,26 @@ fn other_parameters() -> Parameters {
 }
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    let (one, other) = (arm::example_parameters(2), other_parameters());
+    let (one, other) = (arm::example_parameters(2), all_different_parameters());
     if !session.prepare_cell(&one)? {
         return Ok(());
     }
-    check_reads(session, &one, "CONF-1")?;
-    session.stage(&other)?;
+    check_parameter_reads(session, &one, "CONF-1")?;
+    session.stage_parameters(&other)?;
     // Staged values are neither read, hashed nor used for computing.
-    check_reads(session, &one, "CONF-2")?;
-    session.exchange_all(&[])?;
-    check_computes_with(session, &one, &other, "CONF-2")?;
+    check_parameter_reads(session, &one, "CONF-2")?;
+    session.exchange_messages(&[])?;
+    check_torque_parameters(session, &one, &other, "CONF-2")?;
     if session.about.test_mode {
         // The joints of the chain are those in use, too.
-        session.stage(&Parameters { joints: 3, joint: 3, ..other })?;
-        let step = session.press_and_step(&[0x0222; MAX_JOINTS], arm::press_with_sum(4_096))?;
+        session.stage_parameters(&Parameters { joints: 3, joint: 3, ..other })?;
+        let step = session.stimulate_and_send_joints(&[0x0222; MAX_JOINTS], arm::press_with_sum(4_096))?;
         session.check("JOINTS-2", step.torque.is_some(), || {
             "joints of the chain in use must be answered while a shorter chain is staged, but were not"
                 .to_owned()
         });
-        session.press_and_step(&[0x0222; MAX_JOINTS], arm::press_with_sum(0))?;
-        session.stage(&other)?;
+        session.stimulate_and_send_joints(&[0x0222; MAX_JOINTS], arm::press_with_sum(0))?;
+        session.stage_parameters(&other)?;
     }
     for wrong in [0x0001, 0x0080, 0x0100, 0x8000, 0xFFFF, one.hash() ^ other.hash(), other.hash()] {
         let hash = other.hash() ^ wrong;
@@ -50,24 +50,28 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
             format!("a commit with hash {hash:04X} while {:04X} is staged must be refused with reason 16, but the answer was {reply}", other.hash())
         });
     }
-    check_reads(session, &one, "CONF-5")?;
+    check_parameter_reads(session, &one, "CONF-5")?;
     session.known.active = None;
-    session.commit(&other)?;
-    check_reads(session, &other, "CONF-7")?;
-    session.exchange_all(&[])?;
-    check_computes_with(session, &other, &one, "CONF-7")?;
-    let reply = session.read(Parameter::Commit.number())?;
+    session.commit_parameters(&other)?;
+    check_parameter_reads(session, &other, "CONF-7")?;
+    session.exchange_messages(&[])?;
+    check_torque_parameters(session, &other, &one, "CONF-7")?;
+    let reply = session.read_parameter(Parameter::Commit.number())?;
     session.check("CONF-1", reply == Reply::Value([0; WORDS]), || {
         format!("the commit parameter must read as 0, but reads as {reply}")
     });
-    check_unused_words(session)?;
-    check_tags(session)
+    check_unused_words_zeroed(session)?;
+    check_answer_tags(session)
 }
 
 /// Checks that each stored parameter reads as the value in use.
-fn check_reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> Result<(), StopReason> {
+fn check_parameter_reads(
+    session: &mut Session<'_>,
+    expected: &Parameters,
+    id: &'static str,
+) -> Result<(), StopReason> {
     for parameter in Parameter::stored_for_rows(6) {
-        let reply = session.read(parameter.number())?;
+        let reply = session.read_parameter(parameter.number())?;
         let words = expected.words(parameter);
         session.check(id, reply == Reply::Value(words), || {
             format!(
@@ -81,7 +85,7 @@ fn check_reads(session: &mut Session<'_>, expected: &Parameters, id: &'static st
 }
 
 /// Checks that the torque follows from the parameters `expected`, and not from `not`.
-fn check_computes_with(
+fn check_torque_parameters(
     session: &mut Session<'_>,
     expected: &Parameters,
     not: &Parameters,
@@ -93,11 +97,11 @@ fn check_computes_with(
     let positions = [0x0111, -0x1222, 0x2333, 0x0444, -0x0555, 0x0666, 0, 0, 0, 0, 0, 0, 0, 0];
     debug_assert_eq!(positions.len(), MAX_JOINTS);
     let press = arm::press_with_sum(4_096);
-    let step = session.press_and_step(&positions, press)?;
+    let step = session.stimulate_and_send_joints(&positions, press)?;
     let near = |parameters: &Parameters| {
         let central = model::central::CentralComputation::for_single_cell(parameters);
         let exact = arm::exact_jacobian(&central, &positions);
-        let force = arm::force(&parameters.contact, &press);
+        let force = arm::expected_force(&parameters.contact, &press);
         let word = |x: f64| {
             i32::from(arm::torque_word(Q1_14::nearest(x).to_bits(), force, parameters.torque_format))
         };
@@ -110,14 +114,14 @@ fn check_computes_with(
             arm::format_words(&step.words())
         )
     });
-    session.press_and_step(&positions, arm::press_with_sum(0))?;
+    session.stimulate_and_send_joints(&positions, arm::press_with_sum(0))?;
     Ok(())
 }
 
 /// Checks that words which a parameter does not use become 0, in the answer to a write and in the hash.
-fn check_unused_words(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_unused_words_zeroed(session: &mut Session<'_>) -> Result<(), StopReason> {
     let expected = Parameters { period_us: 57_001, ..arm::example_parameters(3) };
-    session.stage(&expected)?;
+    session.stage_parameters(&expected)?;
     session.known.staged = None;
     for parameter in Parameter::stored_for_rows(6).filter(|it| *it != Parameter::Pose) {
         let clean = expected.words(parameter);
@@ -128,7 +132,7 @@ fn check_unused_words(session: &mut Session<'_>) -> Result<(), StopReason> {
             .skip(used)
             .zip([0x1234, -2, 7, 0x7FFF, i16::MIN])
             .for_each(|(word, junk)| *word = junk);
-        let reply = session.write(parameter.number(), dirty)?;
+        let reply = session.write_parameter(parameter.number(), dirty)?;
         session.check("CONF-3", reply == Reply::Value(clean), || {
             format!(
                 "parameter {} was written with unused words, which must become 0, but the answer was {reply}",
@@ -137,7 +141,7 @@ fn check_unused_words(session: &mut Session<'_>) -> Result<(), StopReason> {
         });
     }
     let hash = expected.hash();
-    let reply = session.write(Parameter::Commit.number(), [hash.cast_signed(), 1, 2, 3, 4, 5])?;
+    let reply = session.write_parameter(Parameter::Commit.number(), [hash.cast_signed(), 1, 2, 3, 4, 5])?;
     let is_so = reply == Reply::Value(padded_words([hash.cast_signed()]));
     session.check("CONF-3", is_so, || {
         format!("unused words must be hashed as 0, but a commit with that hash ({hash:04X}) was answered with {reply}")
@@ -147,7 +151,7 @@ fn check_unused_words(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.staged = Some(expected);
         session.known.hash = Some(hash);
         session.known.active = None;
-        check_reads(session, &expected, "CONF-3")?;
+        check_parameter_reads(session, &expected, "CONF-3")?;
     } else {
         session.known.parameters = None;
         session.known.hash = None;
@@ -155,7 +159,7 @@ fn check_unused_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-fn check_tags(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_answer_tags(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = Node::Cell(session.cell);
     let (number, on) = (Parameter::Mode.number(), i16::from(session.about.test_mode));
     for tag in [0, 1, 0x7E, 0x7F, 0x80, 0xFE, 0xFF, 0xFF, 0] {
@@ -166,7 +170,7 @@ fn check_tags(session: &mut Session<'_>) -> Result<(), StopReason> {
     // An identical request is answered each time.
     let pose = arm::example_parameters(3).words(Parameter::Pose);
     let hash = session.known.hash.unwrap_or_default().cast_signed();
-    session.write(Parameter::Pose.number(), pose)?;
+    session.write_parameter(Parameter::Pose.number(), pose)?;
     let staged = session.known.staged.take();
     let requests = [
         (Request::Read { number: 2 }, "CONF-1"),
@@ -198,7 +202,7 @@ pub(super) fn check_addressing(session: &mut Session<'_>) -> Result<(), StopReas
         format!("a read sent to everyone must return the value in use, but the answer was {reply}")
     });
     let number = Parameter::Pose.number();
-    let pose = other_parameters().words(Parameter::Pose);
+    let pose = all_different_parameters().words(Parameter::Pose);
     let reply = session.request(Node::Everyone, Request::Write { number, words: pose })?;
     session.check("CONF-11", reply == Reply::Value(pose), || {
         format!("a write sent to everyone must be answered with its words, but the answer was {reply}")
@@ -211,7 +215,7 @@ pub(super) fn check_addressing(session: &mut Session<'_>) -> Result<(), StopReas
             "a write of the mode sent to everyone must be answered with its words, but the answer was {reply}"
         )
     });
-    let staged = Parameters { pose: other_parameters().pose, ..arm::example_parameters(2) };
+    let staged = Parameters { pose: all_different_parameters().pose, ..arm::example_parameters(2) };
     session.known.staged = Some(staged);
     // A commit to everyone is a commit of this cell.
     let hash = padded_words([staged.hash().cast_signed()]);
@@ -224,17 +228,17 @@ pub(super) fn check_addressing(session: &mut Session<'_>) -> Result<(), StopReas
     let done = reply == Reply::Value(hash);
     (session.known.parameters, session.known.hash) =
         if done { (Some(staged), Some(staged.hash())) } else { (None, None) };
-    session.exchange_all(&[])?;
-    session.commit(&staged)?;
-    check_unknown(session)?;
-    check_other_cells(session)
+    session.exchange_messages(&[])?;
+    session.commit_parameters(&staged)?;
+    check_unknown_parameters(session)?;
+    check_other_cells_ignored(session)
 }
 
-fn check_unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_unknown_parameters(session: &mut Session<'_>) -> Result<(), StopReason> {
     for number in (10..=10).chain(13..16).chain(48..127) {
         // Reads and writes alternate.
         let reply = if number % 2 == 0 {
-            session.read(number)?
+            session.read_parameter(number)?
         } else {
             session.write_first_words(number, [1, 2, 3])?
         };
@@ -243,7 +247,7 @@ fn check_unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
         });
     }
     for number in [10, 15, 48, 126] {
-        let replies = [session.read(number)?, session.write_first_words(number, [0])?];
+        let replies = [session.read_parameter(number)?, session.write_first_words(number, [0])?];
         session.check("CONF-13", replies == [Reply::Refused(18); 2], || {
             let [read, write] = replies;
             format!("parameter {number} does not exist and must be refused with reason 18, but the answers were {read} and {write}")
@@ -253,7 +257,7 @@ fn check_unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that a packet for another cell gets no answer and has no effect.
-fn check_other_cells(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_other_cells_ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?;
     let own = session.cell.get();
     let near = [own ^ 1, own ^ 0x80, own.wrapping_add(1), own.wrapping_sub(1)];
@@ -263,11 +267,11 @@ fn check_other_cells(session: &mut Session<'_>) -> Result<(), StopReason> {
         let read = Message::Configure { to, tag: 9, request: Request::Read { number: 0 } };
         let press = protocol::message::SensorPage::Skin(arm::press_with_sum(4_096));
         let press = Message::Stimulus { to, from: protocol::message::StimulusStart::Next, page: press };
-        let exchange = session.exchange_all(&[read, press])?;
+        let exchange = session.exchange_messages(&[read, press])?;
         session.check("ID-2", exchange.is_silent(), || {
             format!("a request to cell {cell} must not be answered by this cell, but was")
         });
-        session.step(&[0; MAX_JOINTS])?;
+        session.send_next_joints(&[0; MAX_JOINTS])?;
     }
     let after = session.counters()?;
     session.check("COUNT-1", before.refused == after.refused, || {

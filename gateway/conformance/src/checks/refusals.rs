@@ -14,8 +14,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     let before = session.counters()?;
     let staged = Parameters { period_us: 45_000, ..arm::example_parameters(5) };
-    session.stage(&staged)?;
-    check_writes(session, &staged)?;
+    session.stage_parameters(&staged)?;
+    check_refused_writes(session, &staged)?;
     // A refused write does not change the staged copy.
     let hash = staged.hash().cast_signed();
     let reply = session.write_first_words(Parameter::Commit.number(), [hash])?;
@@ -30,14 +30,14 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     } else {
         (session.known.parameters, session.known.hash, session.known.staged) = (None, None, None);
     }
-    check_commits(session)?;
+    check_refused_commits(session)?;
     // The values in use are unchanged, and so is the rest of the staged copy.
-    session.stage(&staged)?;
-    let reply = session.read(Parameter::Timing.number())?;
+    session.stage_parameters(&staged)?;
+    let reply = session.read_parameter(Parameter::Timing.number())?;
     session.check("CONF-5", reply == Reply::Value(staged.words(Parameter::Timing)), || {
         format!("refused commits must not change the period in use, but it reads as {reply}")
     });
-    session.exchange_all(&[])?;
+    session.exchange_messages(&[])?;
     let after = session.counters()?;
     session.check("COUNT-2", before.refused == after.refused, || {
         format!("refusals must not be counted, but the counters are {after}; before: {before}")
@@ -46,7 +46,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks writes that are refused at once. If several words are bad, the refusal gives the lowest of their reasons.
-fn check_writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), StopReason> {
+fn check_refused_writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), StopReason> {
     let mount = |words: [i16; 5], reason| (Parameter::Mount, words, reason);
     let row = |kind: i16| (Parameter::Row(1), [1, 2, 3, 4, kind], 9);
     let large = session.about.abilities.word() != 0;
@@ -87,16 +87,16 @@ fn check_writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), Stop
         });
         if reply.words().is_some() {
             // The cell staged it after all: restore the staged copy.
-            session.write(parameter.number(), good.words(parameter))?;
+            session.write_parameter(parameter.number(), good.words(parameter))?;
         }
     }
     Ok(())
 }
 
 /// A defect of a configuration: the reason that a commit gives, and the change that causes it.
-type Flaw = (i16, fn(&mut Parameters));
+type ConfigurationFlaw = (i16, fn(&mut Parameters));
 
-const FLAWS: &[Flaw] = &[
+const CONFIGURATION_FLAWS: &[ConfigurationFlaw] = &[
     (2, |it| it.joints = 0),
     (3, |it| it.joint = 0),
     (4, |it| it.pose.normal = [Q1_14::ZERO, Q1_14::ZERO, Q1_14::from_bits(16_512)]),
@@ -106,7 +106,7 @@ const FLAWS: &[Flaw] = &[
     (8, |it| it.row = 40),
 ];
 
-const COMMIT_FLAWS: &[Flaw] = &[
+const COMMIT_FLAWS: &[ConfigurationFlaw] = &[
     (2, |it| it.joints = 15),
     (2, |it| it.joints = 255),
     (3, |it| it.joint = 7),
@@ -125,7 +125,7 @@ const COMMIT_FLAWS: &[Flaw] = &[
 ];
 
 /// Defects of a configuration's table of rows.
-const ROW_TABLE_FLAWS: &[Flaw] = &[
+const ROW_TABLE_FLAWS: &[ConfigurationFlaw] = &[
     (7, |it| (it.table_rows, it.row) = (5, 2)),
     (7, |it| it.table_rows = 255),
     (8, |it| (it.table_rows, it.row) = (6, 0)),
@@ -140,45 +140,48 @@ const ROW_TABLE_FLAWS: &[Flaw] = &[
 ];
 
 /// Checks defects that are refused at the commit. The hash is wrong too, so that a faulty cell commits nothing.
-fn check_commits(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_refused_commits(session: &mut Session<'_>) -> Result<(), StopReason> {
     let can_rows = session.about.abilities.word() != 0;
-    let is_apt = |flaw: &&Flaw| can_rows || !matches!(flaw.0, 7 | 8);
+    let is_apt = |flaw: &&ConfigurationFlaw| can_rows || !matches!(flaw.0, 7 | 8);
     let base = arm::example_parameters(2);
     if session.about.abilities.max_rows() == MAX_ROWS {
-        check_one_row_more(session, &base)?;
+        check_33_rows_refused(session, &base)?;
     }
-    let all =
-        FLAWS.iter().chain(COMMIT_FLAWS).chain(if can_rows { ROW_TABLE_FLAWS } else { &[] }).filter(is_apt);
+    let all = CONFIGURATION_FLAWS
+        .iter()
+        .chain(COMMIT_FLAWS)
+        .chain(if can_rows { ROW_TABLE_FLAWS } else { &[] })
+        .filter(is_apt);
     for (reason, flaw) in all {
         let mut parameters = base;
         flaw(&mut parameters);
-        check_refused(session, &parameters, *reason)?;
+        check_commit_refused(session, &parameters, *reason)?;
     }
-    let apt: Vec<_> = FLAWS.iter().filter(is_apt).collect();
+    let apt: Vec<_> = CONFIGURATION_FLAWS.iter().filter(is_apt).collect();
     for (place, (reason, first)) in apt.iter().enumerate() {
         for (_, second) in apt.iter().skip(place + 1) {
             let mut parameters = base;
             first(&mut parameters);
             second(&mut parameters);
-            check_refused(session, &parameters, *reason)?;
+            check_commit_refused(session, &parameters, *reason)?;
         }
     }
     let mut all = base;
     apt.iter().for_each(|(_, flaw)| flaw(&mut all));
-    check_refused(session, &all, 2)
+    check_commit_refused(session, &all, 2)
 }
 
 /// Checks that a table of 33 rows, one more than possible, is refused with reason 7, whatever the number of joints.
-fn check_one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), StopReason> {
+fn check_33_rows_refused(session: &mut Session<'_>, base: &Parameters) -> Result<(), StopReason> {
     let mut full = Parameters { table_rows: 32, row: 6, joint: 6, ..*base };
     for (place, row) in full.rows.iter_mut().enumerate().skip(6) {
         let a = Q1_14::from_bits(i16::try_from(place).unwrap_or_default());
         *row = Row { kind: RowKind::Fixed, a, ..Row::default() };
     }
-    check_refused(session, &full, 16)?;
+    check_commit_refused(session, &full, 16)?;
     for joints in [6, 7] {
         let over = Parameters { table_rows: 33, joints, ..full };
-        session.write(Parameter::Mount.number(), over.words(Parameter::Mount))?;
+        session.write_parameter(Parameter::Mount.number(), over.words(Parameter::Mount))?;
         let reply = session.write_first_words(Parameter::Commit.number(), [1])?;
         session.check("CONF-6", reply == Reply::Refused(7), || {
             format!("a commit of 33 rows with {joints} joints must be refused with reason 7, but the answer was {reply}")
@@ -188,8 +191,12 @@ fn check_one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<()
     Ok(())
 }
 
-fn check_refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> Result<(), StopReason> {
-    session.stage(parameters)?;
+fn check_commit_refused(
+    session: &mut Session<'_>,
+    parameters: &Parameters,
+    reason: i16,
+) -> Result<(), StopReason> {
+    session.stage_parameters(parameters)?;
     let hash = !parameters.hash();
     let reply = session.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;
     session.check("CONF-6", reply == Reply::Refused(reason), || {

@@ -13,8 +13,8 @@ use protocol::time::{Micros, Span};
 use super::claims::{twin_heartbeat, twin_page};
 use crate::arm;
 use crate::bus::StopReason;
-use crate::session::{ANSWER_TIMEOUT, CellPacket, Reply, Session, TrackedState};
-use claiming::{check_gives_way, check_invalid_page, check_stays, check_while_claiming};
+use crate::session::{ANSWER_TIMEOUT, CellPacket, KnownCellState, Reply, Session};
+use claiming::{check_gives_way, check_invalid_page_ignored, check_keeps_node_id, check_while_claiming};
 
 /// The time limit from switching the cell off to its first packet.
 const BOOT_TIMEOUT: Span = Span::from_millis(8_000);
@@ -23,11 +23,11 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.prepare_cell(&arm::example_parameters(2))?;
     let after_test_mode = survives(session)?;
     check_while_claiming(session, after_test_mode)?;
-    check_stays(session)?;
-    check_invalid_page(session)?;
+    check_keeps_node_id(session)?;
+    check_invalid_page_ignored(session)?;
     let own = session.about.serial.unwrap_or_default();
     // CLAIMING and a higher serial number have these meanings in a heartbeat only.
-    let state = State::CLAIMING.0 | 1 << 12;
+    let state = State::CLAIMING_NODE_ID.0 | 1 << 12;
     let other = protocol::message::RejectedCounts {
         length: 0xFFFF,
         crc: 0xFFFF,
@@ -81,24 +81,24 @@ fn restart_with(
     longest: Span,
     meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), StopReason>,
 ) -> Result<Option<Micros>, StopReason> {
-    let keep = TrackedState {
+    let keep = KnownCellState {
         last_epoch: session.known.last_epoch,
         joints: session.known.joints,
-        ..TrackedState::default()
+        ..KnownCellState::default()
     };
     let (parameters, senses) = (session.known.parameters, session.known.senses);
-    session.mark_expected();
+    session.mark_packets_expected();
     session.begin_restart()?;
-    session.known = TrackedState { may_be_silent: true, ..keep };
+    session.known = KnownCellState { may_be_silent: true, ..keep };
     session.begin_expected_exchange();
     let done = await_claim(session, longest, meanwhile);
     session.end_restart();
     done?;
-    let Some(came) = session.claimed() else { return Ok(None) };
+    let Some(came) = session.first_claim_time() else { return Ok(None) };
     // Packets from before the cell was switched off: it was settled, and may have received requests.
     let is_old = |it: &CellPacket| {
         let is_answer = matches!(it.message, Message::Configured { .. });
-        is_answer || it.beat().is_some() || senses && it.sensors().is_some()
+        is_answer || it.heartbeat_and_epoch().is_some() || senses && it.sensors().is_some()
     };
     let stray = session.answers().iter().take_while(|it| it.at < came).any(|it| !is_old(it));
     session.check("CLAIM-1", !stray, || {
@@ -117,18 +117,20 @@ fn await_claim(
 ) -> Result<(), StopReason> {
     const POLL_INTERVAL: Span = Span::from_millis(12);
     let give_up = session.now() + longest;
-    let is_claim = |it: &CellPacket| it.beat().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING));
+    let is_claim = |it: &CellPacket| {
+        it.heartbeat_and_epoch().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING_NODE_ID))
+    };
     loop {
         let is_restarting = session.is_restarting()?;
-        if session.claimed().is_some() {
+        if session.first_claim_time().is_some() {
             if !is_restarting {
                 return Ok(());
             }
-            session.idle(POLL_INTERVAL)?;
+            session.receive_for(POLL_INTERVAL)?;
         } else if is_restarting || session.now() < give_up {
             let until = session.now() + POLL_INTERVAL;
-            session.wait(until, |heard| heard.last().is_some_and(is_claim))?;
-            if session.claimed().is_none() {
+            session.wait_for_packets(until, |heard| heard.last().is_some_and(is_claim))?;
+            if session.first_claim_time().is_none() {
                 meanwhile(session)?;
             }
         } else {
@@ -140,7 +142,8 @@ fn await_claim(
 /// Waits until the node id is settled, and returns the time of the first heartbeat without CLAIMING.
 fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>, StopReason> {
     let is_settled = |it: &CellPacket| {
-        it.at > claimed && it.beat().is_some_and(|(beat, _)| !beat.state.has(State::CLAIMING))
+        it.at > claimed
+            && it.heartbeat_and_epoch().is_some_and(|(beat, _)| !beat.state.has(State::CLAIMING_NODE_ID))
     };
     let until = claimed + claim(session) + Span::from_millis(300);
     // It may have come in an earlier exchange, if the bench was late.
@@ -149,10 +152,10 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
         since.filter(|it| is_settled(it)).last().map(|it| it.at)
     };
     if first(session).is_none() {
-        session.wait(until, |heard| heard.iter().any(is_settled))?;
+        session.wait_for_packets(until, |heard| heard.iter().any(is_settled))?;
     }
     let at = first(session);
-    session.mark_expected();
+    session.mark_packets_expected();
     let expected = claim(session);
     session.check("CLAIM-5", at.is_some(), || {
         format!(
@@ -161,7 +164,7 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
         )
     });
     session.known.may_be_silent = false;
-    session.excuse_silence();
+    session.excuse_silence_until_now();
     Ok(at)
 }
 
@@ -171,10 +174,10 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let kept = arm::distinct_parameters(session.about.abilities);
     session.prepare_cell(&kept)?;
     let before = touched(session)?;
-    session.press(arm::press_with_sum(0))?;
-    session.step(&[0; MAX_JOINTS])?;
+    session.send_stimulus(arm::press_with_sum(0))?;
+    session.send_next_joints(&[0; MAX_JOINTS])?;
     let staged = Parameters { period_us: 44_000, ..arm::example_parameters(4) };
-    session.stage(&staged)?;
+    session.stage_parameters(&staged)?;
     if session.about.sensing {
         session.known.senses = true;
         // Sensor pages are set to come only after the cell is switched off.
@@ -186,7 +189,9 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let claimed = restart(session)?;
     // Earlier packets belong to the time before the restart.
     let mut new = session.answers().iter().filter(|it| it.at >= claimed);
-    let first = new.find_map(|it| Some((*it.beat()?.0, it.beat()?.1))).unwrap_or_default();
+    let first = new
+        .find_map(|it| Some((*it.heartbeat_and_epoch()?.0, it.heartbeat_and_epoch()?.1)))
+        .unwrap_or_default();
     let is_new = (first.0.sent, first.0.rejected, first.1.0) == (0, 0, 0);
     session.check("CLAIM-1", is_new, || {
         format!(
@@ -204,7 +209,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let at = settled(session, claimed)?;
     if let Some(at) = at {
         let (took, expected) = (at.elapsed_since(claimed).0, claim(session).0);
-        let late = session.lateness().0;
+        let late = session.bench_lateness().0;
         let range = expected - expected / 100 - 2_000..=expected + expected / 100 + 22_000 + late;
         session.check("CLAIM-5", range.contains(&took), || {
             format!(
@@ -229,9 +234,9 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     });
     session.known.hash = Some(kept.hash());
     (session.known.halted, session.known.epoch) = (Some(false), Some(0));
-    session.exchange_all(&[])?;
+    session.exchange_messages(&[])?;
     for parameter in Parameter::stored_for_rows(kept.all_rows().len()) {
-        let reply = session.read(parameter.number())?;
+        let reply = session.read_parameter(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
             format!(
                 "after a restart parameter {} must read as it was committed, but reads as {reply}",
@@ -250,7 +255,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     // The staged copy equals the values in use.
     let next = Parameters { period_us: 45_250, ..kept };
     session.known.active = None;
-    let done = session.commit(&next)?;
+    let done = session.commit_parameters(&next)?;
     session.switch_test_mode(session.about.test_mode)?;
     session.check("CONF-2", done, || {
         "after a restart the staged copy must equal the values in use, but a commit on top of it failed"
@@ -277,13 +282,13 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
 fn volatile(session: &mut Session<'_>) -> Result<(), StopReason> {
     let events = if session.about.sensing { Events::default().words() } else { [0; WORDS] };
     for (number, expected) in [(6, [0; WORDS]), (7, [0; WORDS]), (8, events), (9, [0; WORDS])] {
-        let reply = session.read(number)?;
+        let reply = session.read_parameter(number)?;
         session.check("CONF-9", reply == Reply::Value(expected), || {
             format!("after a restart parameter {number} is {reply}, but must be {}", Reply::Value(expected))
         });
     }
     // A simulated cell may be started with test mode on.
-    let reply = session.read(5)?;
+    let reply = session.read_parameter(5)?;
     session.known.test_mode = reply.words().map(|words| words.first() == Some(&1));
     Ok(())
 }
@@ -296,7 +301,7 @@ fn touched(session: &mut Session<'_>) -> Result<Option<Words>, StopReason> {
     session.known.active = None;
     let positions =
         core::array::from_fn(|place| [0x0777, -0x0555, 0x0333].get(place % 3).copied().unwrap_or(0));
-    Ok(session.press_and_step(&positions, arm::press_with_sum(9_000))?.torque)
+    Ok(session.stimulate_and_send_joints(&positions, arm::press_with_sum(9_000))?.torque)
 }
 
 /// Checks a reset just after a commit was requested: the cell uses the old or the new configuration, or reports that
@@ -308,21 +313,27 @@ fn in_the_middle(session: &mut Session<'_>) -> Result<(), StopReason> {
     let (old, new) =
         (arm::example_parameters(2), Parameters { period_us: 44_000, ..arm::example_parameters(4) });
     session.prepare_cell(&old)?;
-    session.stage(&new)?;
+    session.stage_parameters(&new)?;
     let request = Request::Write {
         number: Parameter::Commit.number(),
         words: padded_words([new.hash().cast_signed()]),
     };
     session.send_messages(&[Message::Configure { to: Node::Cell(session.cell), tag: 1, request }])?;
-    session.mark_expected();
+    session.mark_packets_expected();
     let claimed = restart(session)?;
     settled(session, claimed)?;
     session.begin_expected_exchange();
     let sync = session.send_messages(&[Message::Sync])?;
-    session.wait(sync + ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
-    let beat =
-        session.answers().iter().rev().find_map(|it| it.beat().map(|(beat, _)| *beat)).unwrap_or_default();
-    session.mark_expected();
+    session.wait_for_packets(sync + ANSWER_TIMEOUT, |heard| {
+        heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
+    })?;
+    let beat = session
+        .answers()
+        .iter()
+        .rev()
+        .find_map(|it| it.heartbeat_and_epoch().map(|(beat, _)| *beat))
+        .unwrap_or_default();
+    session.mark_packets_expected();
     let is_whole =
         beat.state.has(State::CONFIGURED) && [old.hash(), new.hash()].contains(&beat.configuration);
     let is_noticed = !beat.state.has(State::CONFIGURED) && beat.state.has(State::FLASH_DAMAGED);

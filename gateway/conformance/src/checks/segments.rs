@@ -43,7 +43,7 @@ fn read_segments(session: &Session<'_>, number: u8, tag: u8) -> SegmentPair {
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.prepare_cell(&arm::example_parameters(6))?;
-    for series in series(session) {
+    for series in segment_series(session) {
         run_series(session, &series)?;
     }
     check_seven_segments(session)?;
@@ -64,27 +64,27 @@ fn check_three_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.about.abilities.first_missing(&parameters).is_some() || !session.prepare_cell(&parameters)? {
         return Ok(());
     }
-    session.press_and_step(&[0x0111; MAX_JOINTS], arm::press_with_sum(4_096))?;
+    session.stimulate_and_send_joints(&[0x0111; MAX_JOINTS], arm::press_with_sum(4_096))?;
     let epoch = session.next_epoch();
-    let frames = session.frames(&session.joints(epoch, &[0x0111; MAX_JOINTS]));
+    let frames = session.frames(&session.joints_message(epoch, &[0x0111; MAX_JOINTS]));
     session.begin_exchange();
     for frame in frames {
         session.send(&[frame])?;
-        session.idle(Span::from_millis(9))?;
+        session.receive_for(Span::from_millis(9))?;
     }
-    session.idle(Span::from_millis(10))?;
-    session.mark_expected();
+    session.receive_for(Span::from_millis(10))?;
+    session.mark_packets_expected();
     let came = session.answers().iter().any(|it| it.torque().is_some());
     session.check("COUNT-3", !came, || {
         "joints of three segments 9 ms apart must not be answered, because the first is too old for the last, but were".to_owned()
     });
-    session.step(&[0x0111; MAX_JOINTS])?;
+    session.send_next_joints(&[0x0111; MAX_JOINTS])?;
     session.forget_counters();
     session.prepare_cell(&arm::example_parameters(6))?;
     Ok(())
 }
 
-fn series(session: &Session<'_>) -> Vec<SegmentSeries> {
+fn segment_series(session: &Session<'_>) -> Vec<SegmentSeries> {
     let [a1, a2] = read_segments(session, 0, 0x11);
     let [b1, b2] = read_segments(session, 2, 0x22);
     let stimulus = Message::Stimulus {
@@ -97,7 +97,7 @@ fn series(session: &Session<'_>) -> Vec<SegmentSeries> {
         session,
         &Message::Configure { to: Node::Everyone, tag: 0x33, request: Request::Read { number: 3 } },
     );
-    let bad = flipped(&a2);
+    let bad = with_flipped_bit(&a2);
     let of =
         |what, acts: Vec<SeriesStep>, packets, incomplete| SegmentSeries { what, acts, packets, incomplete };
     vec![
@@ -140,7 +140,7 @@ fn series(session: &Session<'_>) -> Vec<SegmentSeries> {
     ]
 }
 
-fn flipped(frame: &Frame) -> Frame {
+fn with_flipped_bit(frame: &Frame) -> Frame {
     let mut bytes: Vec<u8> = frame.data().to_vec();
     bytes.iter_mut().take(1).for_each(|byte| *byte ^= 0x10);
     Frame::classic(frame.raw_id(), &bytes).unwrap_or(*frame)
@@ -157,7 +157,7 @@ fn run_series(session: &mut Session<'_>, series: &SegmentSeries) -> Result<(), S
         for act in &series.acts {
             match act {
                 Wait(ms) => {
-                    session.idle(Span::from_millis(*ms))?;
+                    session.receive_for(Span::from_millis(*ms))?;
                     pause = *ms;
                 }
                 Send(frame) => {
@@ -170,11 +170,11 @@ fn run_series(session: &mut Session<'_>, series: &SegmentSeries) -> Result<(), S
                 }
             }
         }
-        session.idle(Span::from_millis(30))?;
-        let answers = session.answers().iter().filter(|heard| heard.beat().is_none()).count();
-        session.mark_expected();
+        session.receive_for(Span::from_millis(30))?;
+        let answers = session.answers().iter().filter(|heard| heard.heartbeat_and_epoch().is_none()).count();
+        session.mark_packets_expected();
         // The next packet under this identifier counts the remaining segments.
-        session.read(1)?;
+        session.read_parameter(1)?;
         let after = session.counters()?.refused;
         if !in_time {
             continue;
@@ -191,7 +191,7 @@ fn run_series(session: &mut Session<'_>, series: &SegmentSeries) -> Result<(), S
         });
         return Ok(());
     }
-    session.findings.not_tested("COUNT-3", "the bench was late each time");
+    session.findings.mark_not_tested("COUNT-3", "the bench was late each time");
     Ok(())
 }
 
@@ -219,15 +219,15 @@ fn check_seven_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     // A frame of a wrong length or format between two segments does not affect them.
     let [b1, b2] = read_segments(session, 2, 0x55);
     let short = Frame::classic(a1.raw_id(), &[1, 2, 3, 4, 5, 6, 7]);
-    check_frame_between(session, "a frame of 7 bytes", [b1, b2], short)?;
+    check_interleaved_frame(session, "a frame of 7 bytes", [b1, b2], short)?;
     if session.supports_format(Format::Fd) {
-        check_frame_between(session, "an FD frame", [b1, b2], Frame::fd(a1.raw_id(), 0, &[0; 16]))?;
+        check_interleaved_frame(session, "an FD frame", [b1, b2], Frame::fd(a1.raw_id(), 0, &[0; 16]))?;
     }
     Ok(())
 }
 
 /// Checks a frame between two segments of a packet.
-fn check_frame_between(
+fn check_interleaved_frame(
     session: &mut Session<'_>,
     what: &str,
     [first, last]: SegmentPair,
@@ -235,7 +235,7 @@ fn check_frame_between(
 ) -> Result<(), StopReason> {
     let Ok(other) = other else { return Ok(()) };
     let before = session.counters()?;
-    let exchange = session.exchange(&[first, other, last])?;
+    let exchange = session.exchange_frames(&[first, other, last])?;
     let after = session.counters()?;
     // The cell's controller may drop the other format.
     let counted = after.refused.length.wrapping_sub(before.refused.length);
@@ -254,18 +254,18 @@ fn check_frame_between(
 /// Checks that segments of joints wait for 15 ms.
 fn check_joints_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
     let positions = [0x0111; MAX_JOINTS];
-    session.press_and_step(&positions, arm::press_with_sum(4_096))?;
+    session.stimulate_and_send_joints(&positions, arm::press_with_sum(4_096))?;
     for (ms, arrives) in [(5, true), (13, true), (40, false)] {
         for _ in 0..3 {
             let before = session.counters()?;
             let epoch = session.next_epoch();
-            let [first, second] = two_segments(session, &session.joints(epoch, &positions));
+            let [first, second] = two_segments(session, &session.joints_message(epoch, &positions));
             session.begin_exchange();
             let began = session.send(&[first])?;
-            session.idle(Span::from_millis(ms))?;
+            session.receive_for(Span::from_millis(ms))?;
             let ended = session.send(&[second])?;
-            session.idle(Span::from_millis(10))?;
-            session.mark_expected();
+            session.receive_for(Span::from_millis(10))?;
+            session.mark_packets_expected();
             let came = session.answers().iter().any(|heard| heard.torque().is_some());
             let apart = ended.elapsed_since(began);
             if arrives {
@@ -273,7 +273,7 @@ fn check_joints_segments(session: &mut Session<'_>) -> Result<(), StopReason> {
             }
             // A waiting segment is counted with the next ones.
             let next = session.next_epoch();
-            let step = session.step_at(next, &positions)?;
+            let step = session.send_joints_at_epoch(next, &positions)?;
             let after = session.counters()?;
             // In time for 15 ms; a late computer may exceed that.
             if arrives && apart > Span(14_700) {

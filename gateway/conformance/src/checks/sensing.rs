@@ -16,31 +16,31 @@ use crate::session::{CellPacket, Session};
 
 const SENSING_PARAMETER: u8 = 7;
 const EVENTS_PARAMETER: u8 = 8;
-const EVENT_STEPS: usize = 160;
+const EVENT_TEST_STEPS: usize = 160;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
-    session.prepare_cell(&arm::fast_parameters(6))?;
+    session.prepare_cell(&arm::fast_example_parameters(6))?;
     session.known.senses = true;
-    session.write(EVENTS_PARAMETER, Events::default().words())?;
-    let done = check_switches(session)
-        .and_then(|()| check_order(session))
+    session.write_parameter(EVENTS_PARAMETER, Events::default().words())?;
+    let done = check_sensing_switches(session)
+        .and_then(|()| check_torque_before_page(session))
         .and_then(|()| check_events(session, Events::default(), 3))
-        .and_then(|()| check_events(session, fine_thresholds(), 4))
+        .and_then(|()| check_events(session, smallest_event_thresholds(), 4))
         .and_then(|()| check_pages_after_beats(session))
-        .and_then(|()| check_halted(session))
-        .and_then(|()| check_continuous(session));
+        .and_then(|()| check_events_while_halted(session))
+        .and_then(|()| check_continuous_pages(session));
     done?;
     session.write_first_words(SENSING_PARAMETER, [0])?;
-    session.write(EVENTS_PARAMETER, Events::default().words())?;
-    session.settle()?;
+    session.write_parameter(EVENTS_PARAMETER, Events::default().words())?;
+    session.wait_for_late_packets()?;
     session.known.senses = false;
-    session.idle(Span::from_millis(300))?;
+    session.receive_for(Span::from_millis(300))?;
     session.begin_exchange();
     Ok(())
 }
 
 /// Returns thresholds for which every change except that of proximity is an event, without hysteresis.
-fn fine_thresholds() -> Events {
+fn smallest_event_thresholds() -> Events {
     let [contact, proximity, temperature, acceleration, hysteresis] = [0, 700, 0, 0, 0];
     Events {
         contact: Q::from_bits(contact),
@@ -52,7 +52,7 @@ fn fine_thresholds() -> Events {
 }
 
 /// Returns the numbers of the sensors pages among these packets.
-fn pages(heard: &[CellPacket]) -> Vec<u8> {
+fn sensor_page_numbers(heard: &[CellPacket]) -> Vec<u8> {
     heard.iter().filter_map(|it| Some(it.sensors()?.1.number())).collect()
 }
 
@@ -64,17 +64,17 @@ fn format_pages(pages: &[u8]) -> String {
 }
 
 /// Writes parameter 7, and checks the pages that follow at once.
-fn check_switch(
+fn check_sensing_switch(
     session: &mut Session<'_>,
     mode: [i16; 2],
     expected: &[u8],
     what: &str,
 ) -> Result<(), StopReason> {
-    session.wait_for_quiet(Span::from_millis(60))?;
+    session.wait_for_heartbeat_gap(Span::from_millis(60))?;
     session.begin_exchange();
-    session.write(SENSING_PARAMETER, padded_words(mode))?;
-    session.idle(Span::from_millis(8))?;
-    let pages = pages(session.answers());
+    session.write_parameter(SENSING_PARAMETER, padded_words(mode))?;
+    session.receive_for(Span::from_millis(8))?;
+    let pages = sensor_page_numbers(session.answers());
     session.check("SENSE-4", pages == expected, || {
         format!(
             "after {what}, sensors pages {} came, but {} were expected",
@@ -82,28 +82,28 @@ fn check_switch(
             format_pages(expected)
         )
     });
-    session.mark_expected();
+    session.mark_packets_expected();
     Ok(())
 }
 
-fn check_switches(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_sensing_switches(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.write_first_words(SENSING_PARAMETER, [0])?;
-    session.settle()?;
-    check_switch(session, [2, 0], &[0, 1], "a switch to event mode")?;
-    check_switch(session, [2, 0], &[], "the same mode again")?;
-    check_switch(session, [1, 1_000], &[0, 1], "a switch to continuous mode")?;
-    check_switch(session, [1, 1_000], &[], "the same period again")?;
-    check_switch(session, [1, 1_001], &[0, 1], "another period")?;
-    check_switch(session, [0, 0], &[], "a switch off")?;
-    check_switch(session, [2, 0], &[0, 1], "a switch to event mode")
+    session.wait_for_late_packets()?;
+    check_sensing_switch(session, [2, 0], &[0, 1], "a switch to event mode")?;
+    check_sensing_switch(session, [2, 0], &[], "the same mode again")?;
+    check_sensing_switch(session, [1, 1_000], &[0, 1], "a switch to continuous mode")?;
+    check_sensing_switch(session, [1, 1_000], &[], "the same period again")?;
+    check_sensing_switch(session, [1, 1_001], &[0, 1], "another period")?;
+    check_sensing_switch(session, [0, 0], &[], "a switch off")?;
+    check_sensing_switch(session, [2, 0], &[0, 1], "a switch to event mode")
 }
 
 /// Checks that the torque of a touch is sent before its sensors page.
-fn check_order(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_torque_before_page(session: &mut Session<'_>) -> Result<(), StopReason> {
     for sum in [4_096, 0] {
-        session.wait_for_quiet(Span::from_millis(60))?;
-        session.press(arm::press_with_sum(sum))?;
-        let step = session.step(&[0x0321; MAX_JOINTS])?;
+        session.wait_for_heartbeat_gap(Span::from_millis(60))?;
+        session.send_stimulus(arm::press_with_sum(sum))?;
+        let step = session.send_next_joints(&[0x0321; MAX_JOINTS])?;
         let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
         session.check("TIME-3", kinds == ["torque", "sensors"], || {
             let kinds = kinds.join(", ");
@@ -117,25 +117,25 @@ fn check_order(session: &mut Session<'_>) -> Result<(), StopReason> {
 fn check_events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), StopReason> {
     let mut dice = TestRandom::new(seed);
     session.write_first_words(SENSING_PARAMETER, [0])?;
-    session.write(EVENTS_PARAMETER, events.words())?;
+    session.write_parameter(EVENTS_PARAMETER, events.words())?;
     session.switch_test_mode(true)?;
     session.known.active = None;
-    session.step(&[0; MAX_JOINTS])?;
+    session.send_next_joints(&[0; MAX_JOINTS])?;
     session.known.active = Some(false);
     session.write_first_words(SENSING_PARAMETER, [2])?;
-    session.idle(Span::from_millis(10))?;
+    session.receive_for(Span::from_millis(10))?;
     session.begin_exchange();
     let mut model = EventModel::new(events);
-    for step in 0..session.reduced_attempts(EVENT_STEPS) {
-        let (skin, acceleration) = match crafted(&events).get(step) {
+    for step in 0..session.reduced_attempts(EVENT_TEST_STEPS) {
+        let (skin, acceleration) = match crafted_readings(&events).get(step) {
             Some(skin) => (*skin, None),
             None => random_readings(&mut dice, &events, &model, step),
         };
         if step == CRAFTED_READINGS - 1 {
             // Writing the same thresholds again changes nothing.
-            session.write(EVENTS_PARAMETER, events.words())?;
+            session.write_parameter(EVENTS_PARAMETER, events.words())?;
         }
-        session.press(skin)?;
+        session.send_stimulus(skin)?;
         if let Some(acceleration) = acceleration {
             let to = Node::Cell(session.cell);
             let page = SensorPage::Acceleration(acceleration);
@@ -144,20 +144,20 @@ fn check_events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<
         // Pages that came with a regular heartbeat count as sent, too.
         for heard in session.packets_since_exchange() {
             if let Some((_, page)) = heard.sensors() {
-                model.mark_sent(page);
+                model.mark_page_sent(page);
             }
         }
         let turned = model.state_text();
-        let (expected, ids) = model.latch(skin, acceleration);
+        let (expected, ids) = model.latch_values(skin, acceleration);
         let before = Epoch(session.known.last_epoch);
         let (from, skips) = (session.packets.len(), session.skips);
-        let came = session.step(&[0; MAX_JOINTS])?;
-        let beats = session.answers().iter().filter(|it| it.beat().is_some()).count();
+        let came = session.send_next_joints(&[0; MAX_JOINTS])?;
+        let beats = session.answers().iter().filter(|it| it.heartbeat_and_epoch().is_some()).count();
         let sent: Vec<_> =
             came.exchange.answers.iter().filter_map(|it| it.sensors().map(|(_, page)| *page)).collect();
-        let numbers = pages(&came.exchange.answers);
+        let numbers = sensor_page_numbers(&came.exchange.answers);
         let all = session.packets.get(from..).unwrap_or_default().iter().filter_map(CellPacket::sensors);
-        all.for_each(|(_, page)| model.mark_sent(page));
+        all.for_each(|(_, page)| model.mark_page_sent(page));
         // Skipped joints make no event, and a page with a heartbeat may replace the one that the next joints would have
         // sent.
         if beats == 1 && skips == session.skips {
@@ -176,7 +176,7 @@ fn check_events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<
         // Pages with a regular heartbeat may have come before the joints, or have crossed them on the bus.
         let after = came.exchange.answers.iter().filter(|it| it.at > came.exchange.at);
         let mut pages = after.filter_map(CellPacket::sensors).filter(|(epoch, _)| *epoch != before);
-        let is_latched = pages.all(|(_, page)| model.has(page));
+        let is_latched = pages.all(|(_, page)| model.equals_latched(page));
         session.check("SENSE-7", is_latched, || {
             let sent: Vec<_> = sent.iter().map(|page| arm::format_page(*page)).collect();
             format!(
@@ -186,13 +186,13 @@ fn check_events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<
         });
         if step % 40 == 39 {
             // The pages of a report count as sent, too.
-            for page in session.report()?.iter().filter_map(CellPacket::sensors) {
-                model.mark_sent(page.1);
+            for page in session.request_report()?.iter().filter_map(CellPacket::sensors) {
+                model.mark_page_sent(page.1);
             }
         }
     }
-    session.press_and_step(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
-    session.step(&[0; MAX_JOINTS])?;
+    session.stimulate_and_send_joints(&[0; MAX_JOINTS], arm::press_with_sum(0))?;
+    session.send_next_joints(&[0; MAX_JOINTS])?;
     Ok(())
 }
 
@@ -201,7 +201,7 @@ const CRAFTED_READINGS: usize = 6;
 
 /// Returns a touch whose sum exceeds a word, and one that fades. Each ends so softly that only the end of the contact
 /// is an event.
-fn crafted(events: &Events) -> [SkinSensors; CRAFTED_READINGS] {
+fn crafted_readings(events: &Events) -> [SkinSensors; CRAFTED_READINGS] {
     let touch = events.contact.to_bits().max(1);
     let soft = (touch / 8).max(1);
     [[i16::MAX, i16::MAX, 0], [soft, 0, 0], [0; 3], [touch, 0, 0], [soft, 0, 0], [0; 3]]
@@ -254,15 +254,15 @@ fn random_readings(
 /// Checks that in event mode page 0 follows each regular heartbeat, and page 1 every fourth one since the switch.
 fn check_pages_after_beats(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.write_first_words(SENSING_PARAMETER, [0])?;
-    session.wait_for_quiet(Span::from_millis(60))?;
+    session.wait_for_heartbeat_gap(Span::from_millis(60))?;
     session.begin_exchange();
     session.write_first_words(SENSING_PARAMETER, [2])?;
-    session.idle(Span::from_millis(10))?;
+    session.receive_for(Span::from_millis(10))?;
     session.begin_expected_exchange();
-    session.idle(Span::from_millis(2_050))?;
+    session.receive_for(Span::from_millis(2_050))?;
     let mut beats: Vec<Vec<u8>> = Vec::new();
     for heard in session.answers() {
-        match (heard.beat(), heard.sensors(), beats.last_mut()) {
+        match (heard.heartbeat_and_epoch(), heard.sensors(), beats.last_mut()) {
             (Some(_), ..) => beats.push(Vec::new()),
             (None, Some((_, page)), Some(last)) => {
                 last.push(page.number());
@@ -270,8 +270,8 @@ fn check_pages_after_beats(session: &mut Session<'_>) -> Result<(), StopReason> 
             _ => {}
         }
     }
-    session.mark_expected();
-    let all = SensorReadings::default().pages().map(|page| page.number());
+    session.mark_packets_expected();
+    let all = SensorReadings::default().simulated_pages().map(|page| page.number());
     let is_so = beats.len() >= 7
         && beats.iter().enumerate().all(|(place, pages)| {
             let expected: &[u8] = if place % 4 == 3 { &all } else { &[0] };
@@ -283,23 +283,23 @@ fn check_pages_after_beats(session: &mut Session<'_>) -> Result<(), StopReason> 
         format!("in event mode page 0 must follow each heartbeat, and every page each fourth one, but these came after {count} heartbeats: {}", all.join(", "))
     });
     // Other heartbeats are not followed by pages.
-    session.wait_for_quiet(Span::from_millis(60))?;
-    let sync = session.exchange_all(&[])?;
+    session.wait_for_heartbeat_gap(Span::from_millis(60))?;
+    let sync = session.exchange_messages(&[])?;
     session.check("SENSE-10", sync.is_silent(), || {
         "no page must follow the heartbeat to a sync, but one came".to_owned()
     });
     Ok(())
 }
 
-fn check_halted(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_events_while_halted(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.begin_exchange();
     session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
-    session.wait_for_quiet(Span::from_millis(60))?;
+    session.wait_for_heartbeat_gap(Span::from_millis(60))?;
     for sum in [5_000, 0] {
-        session.press(arm::press_with_sum(sum))?;
-        let step = session.step(&[0; MAX_JOINTS])?;
-        let pages = pages(&step.exchange.answers);
+        session.send_stimulus(arm::press_with_sum(sum))?;
+        let step = session.send_next_joints(&[0; MAX_JOINTS])?;
+        let pages = sensor_page_numbers(&step.exchange.answers);
         session.check("SENSE-11", pages == [0], || {
             let pages = format_pages(&pages);
             format!(
@@ -310,10 +310,10 @@ fn check_halted(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
     session.write_first_words(SENSING_PARAMETER, [0])?;
-    session.settle()
+    session.wait_for_late_packets()
 }
 
-fn check_continuous(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_continuous_pages(session: &mut Session<'_>) -> Result<(), StopReason> {
     for period in [50, 120] {
         check_page_times(session, period, false)?;
     }
@@ -330,7 +330,7 @@ fn check_continuous(session: &mut Session<'_>) -> Result<(), StopReason> {
 fn check_page_times(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(), StopReason> {
     const JOINTS_PERIOD_US: u64 = 16_000;
     const MAX_LATENESS_US: u64 = 20_000;
-    const SLACK_US: u64 = 2_000;
+    const PAGE_TIME_SLACK_US: u64 = 2_000;
     let (id, early) = match with_joints {
         true if period * 1_000 > JOINTS_PERIOD_US => ("SENSE-6", JOINTS_PERIOD_US),
         true => ("SENSE-6", 0),
@@ -338,7 +338,7 @@ fn check_page_times(session: &mut Session<'_>, period: u64, with_joints: bool) -
     };
     for attempt in 0..3 {
         session.write_first_words(SENSING_PARAMETER, [0])?;
-        session.settle()?;
+        session.wait_for_late_packets()?;
         session.begin_exchange();
         let period_ms = i16::try_from(period).unwrap_or_default();
         session.write_first_words(SENSING_PARAMETER, [1, period_ms])?;
@@ -346,23 +346,23 @@ fn check_page_times(session: &mut Session<'_>, period: u64, with_joints: bool) -
         let span = Span::from_millis(12 * period);
         let mut due = began + Span(7_000);
         while with_joints && due < began + span {
-            session.wait(due, |_| false)?;
+            session.wait_for_packets(due, |_| false)?;
             let epoch = session.next_epoch();
-            let joints = session.joints(epoch, &[0; MAX_JOINTS]);
+            let joints = session.joints_message(epoch, &[0; MAX_JOINTS]);
             session.send_messages(&[joints])?;
             session.known.epoch = Some(epoch);
             due = due + Span(JOINTS_PERIOD_US);
         }
-        session.wait(began + span, |_| false)?;
-        let late = session.lateness();
+        session.wait_for_packets(began + span, |_| false)?;
+        let late = session.bench_lateness();
         let all: Vec<_> = session.answers().iter().filter_map(|it| Some((it.at, *it.sensors()?.1))).collect();
-        session.mark_expected();
+        session.mark_packets_expected();
         let skin = all.iter().filter(|(_, page)| matches!(page, SensorPage::Skin(_))).skip(1);
         let times: Vec<_> = skin.map(|(at, _)| at.elapsed_since(began).0).collect();
         let first = period * 1_000 + period * 1_000 * u64::from(session.cell.get()) / 255;
         let is_in_time = |(place, at): (usize, &u64)| {
             let due = first + place as u64 * period * 1_000;
-            let slack = SLACK_US + at / 100;
+            let slack = PAGE_TIME_SLACK_US + at / 100;
             (due.saturating_sub(early + slack)..=due + MAX_LATENESS_US + slack).contains(at)
         };
         let is_so = (10..=12).contains(&times.len()) && times.iter().enumerate().all(is_in_time);

@@ -6,14 +6,14 @@ use protocol::parameters::Events;
 
 /// The state of contact or of proximity in event mode.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-enum Touch {
+enum ModelTouchState {
     #[default]
     Free,
     Touched,
     Fading,
 }
 
-impl Touch {
+impl ModelTouchState {
     /// Returns the state after a value `v`, by the table of SENSE-9. The hysteresis is in steps of 2^-14 of the
     /// threshold.
     const fn next(self, v: i64, threshold: i64, hysteresis: i64) -> Self {
@@ -41,17 +41,22 @@ pub(super) struct EventModel {
     events: Events,
     latched: SensorReadings,
     sent: SensorReadings,
-    contact: Touch,
-    proximity: Touch,
+    contact: ModelTouchState,
+    proximity: ModelTouchState,
 }
 
 impl EventModel {
     /// Creates the state at a switch to event mode, if all latched values are 0.
     pub(super) fn new(events: Events) -> Self {
         let nothing = SensorReadings::default();
-        let mut model =
-            Self { events, latched: nothing, sent: nothing, contact: Touch::Free, proximity: Touch::Free };
-        model.update_states();
+        let mut model = Self {
+            events,
+            latched: nothing,
+            sent: nothing,
+            contact: ModelTouchState::Free,
+            proximity: ModelTouchState::Free,
+        };
+        model.update_touch_states();
         model
     }
 
@@ -66,26 +71,26 @@ impl EventModel {
     /// Returns a description of the states of contact and proximity, for a message.
     pub(super) fn state_text(&self) -> String {
         let name = |touch| match touch {
-            Touch::Free => "free",
-            Touch::Touched => "touched",
-            Touch::Fading => "fading",
+            ModelTouchState::Free => "free",
+            ModelTouchState::Touched => "touched",
+            ModelTouchState::Fading => "fading",
         };
         format!("contact {}, proximity {}", name(self.contact), name(self.proximity))
     }
 
     /// Takes the values of a page that the cell sent as its last sent ones.
-    pub(super) const fn mark_sent(&mut self, page: &SensorPage) {
-        self.sent.set(page);
+    pub(super) const fn mark_page_sent(&mut self, page: &SensorPage) {
+        self.sent.set_page(page);
     }
 
     /// Returns true if a page equals the latched values.
-    pub(super) fn has(&self, page: &SensorPage) -> bool {
+    pub(super) fn equals_latched(&self, page: &SensorPage) -> bool {
         // The model has no baseline.
-        self.latched.pages().contains(page)
+        self.latched.simulated_pages().contains(page)
     }
 
     /// Updates the states of contact and proximity from the latched values, and returns true if one has changed.
-    fn update_states(&mut self) -> bool {
+    fn update_touch_states(&mut self) -> bool {
         let before = (self.contact, self.proximity);
         let hysteresis = i64::from(self.events.hysteresis.to_bits());
         let skin = self.latched.skin;
@@ -97,7 +102,7 @@ impl EventModel {
     }
 
     /// Latches values, and returns the pages that must follow and the requirement that demands them.
-    pub(super) fn latch(
+    pub(super) fn latch_values(
         &mut self,
         skin: SkinSensors,
         acceleration: Option<[Q3_12; 3]>,
@@ -105,22 +110,23 @@ impl EventModel {
         let before = self.latched;
         self.latched.skin = skin;
         self.latched.acceleration = acceleration.unwrap_or(self.latched.acceleration);
-        let turned = self.update_states();
+        let turned = self.update_touch_states();
         let (now, sent, events) = (self.latched.skin, self.sent.skin, self.events);
         let has_moved = |from: &SkinSensors| {
-            is_far(&now.contact, &from.contact, events.contact)
-                || is_far(&now.temperature, &from.temperature, events.temperature)
-                || is_far(&[now.proximity], &[from.proximity], events.proximity)
+            differs_by_threshold(&now.contact, &from.contact, events.contact)
+                || differs_by_threshold(&now.temperature, &from.temperature, events.temperature)
+                || differs_by_threshold(&[now.proximity], &[from.proximity], events.proximity)
         };
         let moved = has_moved(&sent);
         let mut pages = Vec::new();
         if now != sent && (turned || moved) {
             pages.push(0);
         }
-        if is_far(&self.latched.acceleration, &self.sent.acceleration, events.acceleration) {
+        if differs_by_threshold(&self.latched.acceleration, &self.sent.acceleration, events.acceleration) {
             pages.push(1);
         }
-        let far = |from: &[Q3_12; 3]| is_far(&self.latched.acceleration, from, events.acceleration);
+        let far =
+            |from: &[Q3_12; 3]| differs_by_threshold(&self.latched.acceleration, from, events.acceleration);
         // The difference to the last latched values is not the difference to the last sent ones.
         let by_sent =
             moved != has_moved(&before.skin) || far(&before.acceleration) != far(&self.sent.acceleration);
@@ -135,7 +141,7 @@ impl EventModel {
 
 /// Returns true if a value differs from the last sent one by the threshold or more; a threshold of 0 counts as one
 /// step.
-fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
+fn differs_by_threshold<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
     let threshold = i32::from(threshold.to_bits()).max(1);
     now.iter()
         .zip(sent)

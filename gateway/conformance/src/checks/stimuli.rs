@@ -25,15 +25,18 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         return Ok(());
     }
     let j = session
-        .press_and_step(&POSITIONS, arm::press_with_sum(arm::unit_press_sum(parameters.torque_format)))?
+        .stimulate_and_send_joints(
+            &POSITIONS,
+            arm::press_with_sum(arm::unit_press_sum(parameters.torque_format)),
+        )?
         .words();
     let cell = PressedCell { parameters, j };
     let before = session.counters()?;
-    let mut count = check_next_joints(session, &cell)?;
-    count += check_first_epoch(session, &cell)?;
-    let late = check_too_late(session, &cell)?;
+    let mut count = check_stimuli_for_next_joints(session, &cell)?;
+    count += check_stimulus_first_epochs(session, &cell)?;
+    let late = check_late_stimuli(session, &cell)?;
     count += late;
-    count += check_order(session, &cell)?;
+    count += check_stimulus_order(session, &cell)?;
     let after = session.counters()?;
     let counted = after.heard.stimuli.wrapping_sub(before.heard.stimuli);
     session.check("STIM-3", counted == count, || {
@@ -47,14 +50,14 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("STIM-6", is_same, || {
         format!("stimuli must not be refused while fewer than 8 are pending, but the counters are {after}")
     });
-    check_pending(session, &cell)?;
-    check_cleared(session, &cell)?;
-    check_measuring(session)?;
-    check_halted(session, &cell)
+    check_pending_limit(session, &cell)?;
+    check_mode_write_clears(session, &cell)?;
+    check_measuring_refuses_stimuli(session)?;
+    check_halted_accepts_stimuli(session, &cell)
 }
 
 /// Sends joints of an epoch, and checks by the torque that a press with this sum of contact words is latched.
-fn check_latched(
+fn check_press_latched(
     session: &mut Session<'_>,
     cell: &PressedCell,
     epoch: u8,
@@ -64,8 +67,8 @@ fn check_latched(
     let skin = arm::press_with_sum(sum);
     session.known.skin = Some(skin);
     session.known.pending = None;
-    let step = session.step_at(epoch, &POSITIONS)?;
-    let force = arm::force(&cell.parameters.contact, &skin);
+    let step = session.send_joints_at_epoch(epoch, &POSITIONS)?;
+    let force = arm::expected_force(&cell.parameters.contact, &skin);
     let is_there = step.torque.is_some_and(|words| !words.is_zero());
     session.check(id, is_there == (sum > 0), || {
         format!(
@@ -81,14 +84,14 @@ fn check_latched(
 }
 
 /// Checks stimuli for the next joints, and returns the number of stimuli sent.
-fn check_next_joints(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
+fn check_stimuli_for_next_joints(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     let start = session.known.last_epoch;
     for (jump, sum) in [(1, 1_000), (200, 1_500), (3, 0), (128, 2_000), (255, 2_500)] {
         let epoch = session.known.last_epoch.wrapping_add(jump);
-        session.press(arm::press_with_sum(sum))?;
-        check_latched(session, cell, epoch, sum, "STIM-4")?;
-        check_latched(session, cell, epoch.wrapping_add(1), sum, "STIM-7")?;
+        session.send_stimulus(arm::press_with_sum(sum))?;
+        check_press_latched(session, cell, epoch, sum, "STIM-4")?;
+        check_press_latched(session, cell, epoch.wrapping_add(1), sum, "STIM-7")?;
         count += 1;
     }
     // The epoch byte is then ignored, and a stimulus to everyone counts too.
@@ -103,79 +106,79 @@ fn check_next_joints(session: &mut Session<'_>, cell: &PressedCell) -> Result<u1
         let frames: Vec<_> = packet.frames(session.format).collect();
         session.send(&frames)?;
         let epoch = session.next_epoch();
-        check_latched(session, cell, epoch, sum, "STIM-4")?;
+        check_press_latched(session, cell, epoch, sum, "STIM-4")?;
         count += 1;
     }
     Ok(count)
 }
 
 /// Checks stimuli whose first epoch is near, far, or past the wrap-around, and returns the number of stimuli sent.
-fn check_first_epoch(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
+fn check_stimulus_first_epochs(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut held = 4_000;
     let mut count = 1;
-    session.press(arm::press_with_sum(held))?;
+    session.send_stimulus(arm::press_with_sum(held))?;
     let epoch = session.next_epoch();
-    check_latched(session, cell, epoch, held, "STIM-3")?;
+    check_press_latched(session, cell, epoch, held, "STIM-3")?;
     for (last, ahead) in [(10, 3), (250, 8), (250, 6), (100, 1), (20, 127), (200, 100)] {
-        check_latched(session, cell, last, held, "STIM-3")?;
+        check_press_latched(session, cell, last, held, "STIM-3")?;
         let (first, sum) = (u8::wrapping_add(last, ahead), held + 111);
-        session.press_at(first, arm::press_with_sum(sum))?;
+        session.send_stimulus_at_epoch(first, arm::press_with_sum(sum))?;
         count += 1;
         for step in [1, 2, ahead / 2, ahead - 1].into_iter().filter(|step| (1..ahead).contains(step)) {
             let epoch = last.wrapping_add(step);
             if epoch != session.known.last_epoch {
-                check_latched(session, cell, epoch, held, "STIM-3")?;
+                check_press_latched(session, cell, epoch, held, "STIM-3")?;
             }
         }
         // The first epoch itself, or one or two after it.
         let epoch = first.wrapping_add(ahead % 3);
-        check_latched(session, cell, epoch, sum, "STIM-3")?;
+        check_press_latched(session, cell, epoch, sum, "STIM-3")?;
         held = sum;
     }
     // Two stimuli at once, each for its own epoch; joints with an earlier epoch do not latch later stimuli.
     let last = session.known.last_epoch;
-    session.press_at(last.wrapping_add(2), arm::press_with_sum(held + 300))?;
-    session.press_at(last.wrapping_add(3), arm::press_with_sum(held + 600))?;
+    session.send_stimulus_at_epoch(last.wrapping_add(2), arm::press_with_sum(held + 300))?;
+    session.send_stimulus_at_epoch(last.wrapping_add(3), arm::press_with_sum(held + 600))?;
     count += 2;
-    check_latched(session, cell, last.wrapping_add(1), held, "STIM-3")?;
-    check_latched(session, cell, last.wrapping_sub(20), held, "STIM-3")?;
-    check_latched(session, cell, last.wrapping_add(2), held + 300, "STIM-3")?;
-    check_latched(session, cell, last.wrapping_add(3), held + 600, "STIM-3")?;
+    check_press_latched(session, cell, last.wrapping_add(1), held, "STIM-3")?;
+    check_press_latched(session, cell, last.wrapping_sub(20), held, "STIM-3")?;
+    check_press_latched(session, cell, last.wrapping_add(2), held + 300, "STIM-3")?;
+    check_press_latched(session, cell, last.wrapping_add(3), held + 600, "STIM-3")?;
     // The first epoch is exactly 128 ahead of the joints.
     let first = session.known.last_epoch.wrapping_add(100);
-    session.press_at(first, arm::press_with_sum(held + 900))?;
-    check_latched(session, cell, first.wrapping_sub(128), held + 600, "STIM-3")?;
-    check_latched(session, cell, first, held + 900, "STIM-3")?;
+    session.send_stimulus_at_epoch(first, arm::press_with_sum(held + 900))?;
+    check_press_latched(session, cell, first.wrapping_sub(128), held + 600, "STIM-3")?;
+    check_press_latched(session, cell, first, held + 900, "STIM-3")?;
     Ok(count + 1)
 }
 
 /// Checks stimuli for epochs that are over, and returns the number of stimuli sent.
-fn check_too_late(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
+fn check_late_stimuli(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     for (behind, jump) in [(0, 1), (5, 1), (2, 250), (127, 1)] {
         let last = session.known.last_epoch;
         let sum = 5_000 + 100 * i32::from(behind) + i32::from(jump);
-        session.press_at(last.wrapping_sub(behind), arm::press_with_sum(sum))?;
+        session.send_stimulus_at_epoch(last.wrapping_sub(behind), arm::press_with_sum(sum))?;
         count += 1;
-        check_latched(session, cell, last.wrapping_add(jump), sum, "STIM-5")?;
+        check_press_latched(session, cell, last.wrapping_add(jump), sum, "STIM-5")?;
     }
     // Late for the joints of epoch 0.
-    session.step_at(0, &POSITIONS)?;
-    session.press_at(0, arm::press_with_sum(5_777))?;
-    check_latched(session, cell, 1, 5_777, "STIM-5")?;
+    session.send_joints_at_epoch(0, &POSITIONS)?;
+    session.send_stimulus_at_epoch(0, arm::press_with_sum(5_777))?;
+    check_press_latched(session, cell, 1, 5_777, "STIM-5")?;
     Ok(count + 1)
 }
 
 /// Checks several stimuli for the same joints, and returns the number of stimuli sent.
-fn check_order(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
+fn check_stimulus_order(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, StopReason> {
     let mut count = 0;
     for (first, second, jump) in [(1, 1, 1), (2, 1, 2), (1, 2, 2), (3, 0, 3)] {
         let last = session.known.last_epoch;
         for (ahead, sum) in [(first, 6_000), (second, 7_000)] {
             if ahead > 0 {
-                session.press_at(last.wrapping_add(ahead), arm::press_with_sum(sum))?;
+                session.send_stimulus_at_epoch(last.wrapping_add(ahead), arm::press_with_sum(sum))?;
             } else {
-                session.press(arm::press_with_sum(sum))?;
+                session.send_stimulus(arm::press_with_sum(sum))?;
             }
             count += 1;
         }
@@ -184,20 +187,20 @@ fn check_order(session: &mut Session<'_>, cell: &PressedCell) -> Result<u16, Sto
         let page = SensorPage::Acceleration([1, 2, 3].map(protocol::fixed::Q3_12::from_bits));
         session.send_messages(&[Message::Stimulus { to, from: StimulusStart::Next, page }])?;
         count += 1;
-        check_latched(session, cell, last.wrapping_add(jump), 7_000, "STIM-7")?;
+        check_press_latched(session, cell, last.wrapping_add(jump), 7_000, "STIM-7")?;
         // A stimulus stays latched, whatever else comes.
         session.counters()?;
-        session.read(1)?;
+        session.read_parameter(1)?;
         for _ in 0..2 {
             let epoch = session.next_epoch();
-            check_latched(session, cell, epoch, 7_000, "STIM-7")?;
+            check_press_latched(session, cell, epoch, 7_000, "STIM-7")?;
         }
     }
     Ok(count)
 }
 
 /// Checks that eight stimuli can be pending, and the ninth is refused.
-fn check_pending(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
+fn check_pending_limit(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     let before = session.counters()?;
     let last = session.known.last_epoch;
     let to = Node::Cell(session.cell);
@@ -223,39 +226,39 @@ fn check_pending(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), St
     });
     for ahead in [1, 2, 3, 5, 6, 7, 8, 9, 10, 11] {
         let expected = if ahead < 8 { 1_000 * i32::from(ahead) } else { 7_000 };
-        check_latched(session, cell, last.wrapping_add(20 + ahead), expected, "STIM-6")?;
+        check_press_latched(session, cell, last.wrapping_add(20 + ahead), expected, "STIM-6")?;
     }
     // There is room again.
-    session.press(arm::press_with_sum(1_234))?;
+    session.send_stimulus(arm::press_with_sum(1_234))?;
     let epoch = session.next_epoch();
-    check_latched(session, cell, epoch, 1_234, "STIM-6")
+    check_press_latched(session, cell, epoch, 1_234, "STIM-6")
 }
 
 /// Checks that a write of parameter 5 clears the latched and the pending stimuli.
-fn check_cleared(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
+fn check_mode_write_clears(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     for on_between in [true, false] {
-        session.press(arm::press_with_sum(3_333))?;
+        session.send_stimulus(arm::press_with_sum(3_333))?;
         let epoch = session.next_epoch();
-        check_latched(session, cell, epoch, 3_333, "STIM-2")?;
-        session.press_at(epoch.wrapping_add(2), arm::press_with_sum(4_444))?;
+        check_press_latched(session, cell, epoch, 3_333, "STIM-2")?;
+        session.send_stimulus_at_epoch(epoch.wrapping_add(2), arm::press_with_sum(4_444))?;
         if !on_between {
             session.switch_test_mode(false)?;
         }
         session.switch_test_mode(true)?;
-        check_latched(session, cell, epoch.wrapping_add(1), 0, "STIM-2")?;
-        check_latched(session, cell, epoch.wrapping_add(2), 0, "STIM-2")?;
+        check_press_latched(session, cell, epoch.wrapping_add(1), 0, "STIM-2")?;
+        check_press_latched(session, cell, epoch.wrapping_add(2), 0, "STIM-2")?;
     }
     Ok(())
 }
 
 /// Checks that a cell that measures accepts no stimuli.
-fn check_measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_measuring_refuses_stimuli(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.switch_test_mode(false)?;
     let before = session.counters()?;
-    session.press(arm::press_with_sum(5_555))?;
+    session.send_stimulus(arm::press_with_sum(5_555))?;
     session.known.pending = None;
     let last = session.known.last_epoch;
-    session.press_at(last.wrapping_add(1), arm::press_with_sum(6_666))?;
+    session.send_stimulus_at_epoch(last.wrapping_add(1), arm::press_with_sum(6_666))?;
     let after = session.counters()?;
     let counted = after.refused.stimuli.wrapping_sub(before.refused.stimuli);
     session.check("STIM-1", counted == 2 && after.heard.stimuli == before.heard.stimuli, || {
@@ -263,8 +266,8 @@ fn check_measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
     });
     session.switch_test_mode(true)?;
     session.known.active = None;
-    session.step(&POSITIONS)?;
-    let step = session.step(&POSITIONS)?;
+    session.send_next_joints(&POSITIONS)?;
+    let step = session.send_next_joints(&POSITIONS)?;
     session.check("STIM-1", step.torque.is_none(), || {
         "a stimulus sent outside test mode must not be latched, but a torque came".to_owned()
     });
@@ -272,22 +275,22 @@ fn check_measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that a halted cell accepts and latches stimuli.
-fn check_halted(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
+fn check_halted_accepts_stimuli(session: &mut Session<'_>, cell: &PressedCell) -> Result<(), StopReason> {
     let epoch = session.next_epoch();
     session.begin_exchange();
     session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
-    session.press_at(epoch.wrapping_add(1), arm::press_with_sum(2_222))?;
-    session.step_at(epoch, &POSITIONS)?;
+    session.send_stimulus_at_epoch(epoch.wrapping_add(1), arm::press_with_sum(2_222))?;
+    session.send_joints_at_epoch(epoch, &POSITIONS)?;
     session.known.skin = Some(arm::press_with_sum(2_222));
-    session.step_at(epoch.wrapping_add(1), &POSITIONS)?;
+    session.send_joints_at_epoch(epoch.wrapping_add(1), &POSITIONS)?;
     let skin = session.read_latched_skin()?;
     session.check("STIM-8", skin == Some(arm::press_with_sum(2_222)), || {
         format!("a halted cell must latch a stimulus, but {} is latched", arm::format_skin(skin))
     });
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
-    check_latched(session, cell, epoch.wrapping_add(2), 2_222, "STIM-8")?;
-    session.press_and_step(&POSITIONS, arm::press_with_sum(0))?;
+    check_press_latched(session, cell, epoch.wrapping_add(2), 2_222, "STIM-8")?;
+    session.stimulate_and_send_joints(&POSITIONS, arm::press_with_sum(0))?;
     Ok(())
 }

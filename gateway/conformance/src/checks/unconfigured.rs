@@ -16,10 +16,10 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     check_staged_reads(session)?;
     let skin = arm::press_with_sum(4_096);
     if session.about.test_mode {
-        session.press(skin)?;
+        session.send_stimulus(skin)?;
         session.known.pending = None;
     }
-    check_joints(session)?;
+    check_joints_unanswered(session)?;
     if session.about.test_mode {
         let latched = session.read_latched_skin()?;
         session.check("JOINTS-3", latched == Some(skin), || {
@@ -39,16 +39,16 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 fn check_staged_reads(session: &mut Session<'_>) -> Result<(), StopReason> {
     let pose = arm::example_parameters(2).words(Parameter::Pose);
     let number = Parameter::Pose.number();
-    let before = session.read(number)?;
-    session.write(number, pose)?;
-    let reply = session.read(number)?;
+    let before = session.read_parameter(number)?;
+    session.write_parameter(number, pose)?;
+    let reply = session.read_parameter(number)?;
     session.check("CONF-1", reply == Reply::Value(pose), || {
         format!(
             "without a configuration, parameter {number} must read as the staged {}, but reads as {reply}",
             Reply::Value(pose)
         )
     });
-    session.write(number, before.words().unwrap_or([0; WORDS]))?;
+    session.write_parameter(number, before.words().unwrap_or([0; WORDS]))?;
     let reply = session.write_first_words(Parameter::Commit.number(), [0])?;
     let is_refused = matches!(reply, Reply::Refused(_));
     session.check("CONF-7", is_refused, || {
@@ -58,19 +58,19 @@ fn check_staged_reads(session: &mut Session<'_>) -> Result<(), StopReason> {
 }
 
 /// Checks that the cell accepts joints of any chain, if their count matches their length, and does not answer them.
-fn check_joints(session: &mut Session<'_>) -> Result<(), StopReason> {
+fn check_joints_unanswered(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?;
     // The cell need not accept more joints than it can compute.
     let most = u8::try_from(session.about.abilities.max_joints()).unwrap_or(u8::MAX);
     for count in 1..=most {
         let epoch = session.next_epoch();
-        let joints = session.joints_of(epoch, &POSITIONS, count);
+        let joints = session.joints_message_for_chain(epoch, &POSITIONS, count);
         session.known.epoch = Some(epoch);
-        let exchange = session.exchange_all(&[joints])?;
+        let exchange = session.exchange_messages(&[joints])?;
         session.check("JOINTS-5", exchange.is_silent(), || {
             format!("a cell without a configuration must not answer joints, but answered those of a chain of {count} joints")
         });
-        session.exchange_all(&[joints])?;
+        session.exchange_messages(&[joints])?;
     }
     let after = session.counters()?;
     let skipped = after.heard.joints_late.wrapping_sub(before.heard.joints_late);
@@ -97,10 +97,10 @@ fn check_joints(session: &mut Session<'_>) -> Result<(), StopReason> {
     let can = wrong.iter().filter(|(_, length)| length.words() <= usize::from(most));
     for &(count, length) in can.clone() {
         let epoch = session.next_epoch();
-        let id = session.joints_of(epoch, &POSITIONS, 1).id();
+        let id = session.joints_message_for_chain(epoch, &POSITIONS, 1).id();
         let packet = Packet { id, words: Words::new(length, POSITIONS), epoch: Epoch(epoch), count };
         let frames: Vec<_> = packet.frames(session.format).collect();
-        session.exchange(&frames)?;
+        session.exchange_frames(&frames)?;
     }
     let last = session.counters()?;
     let counted = last.refused.meaning.wrapping_sub(after.refused.meaning);
@@ -110,6 +110,6 @@ fn check_joints(session: &mut Session<'_>) -> Result<(), StopReason> {
             "{expected} joints messages whose count does not match their length must be counted in the counter meaning, but {counted} were"
         )
     });
-    session.exchange_all(&[Message::Resume])?;
+    session.exchange_messages(&[Message::Resume])?;
     Ok(())
 }

@@ -3,7 +3,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id};
 use protocol::message::{Message, NetworkPage, ReceivedCounts as HeardPage, RejectedCounts, State};
-use protocol::packet::{Epoch, Lengths, Packet, Reassembler, Reassembly, data_id};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembler, Reassembly, data_frame_id};
 use protocol::time::{Micros, Span};
 
 use crate::bus::ObservedFrame;
@@ -11,7 +11,7 @@ use crate::bus::ObservedFrame;
 /// The interval of regular heartbeats.
 pub(crate) const HEARTBEAT_INTERVAL: Span = Span::from_millis(250);
 /// The time after an answered claim within which the cell may answer the next one or not.
-const DEFENCE_MARGIN: Span = Span::from_millis(40);
+const CLAIM_ANSWER_MARGIN: Span = Span::from_millis(40);
 
 /// The numbers of packets that a cell counts too, modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -66,7 +66,7 @@ impl PacketAccounts {
         format: Format,
         joints: Option<u8>,
     ) {
-        let Some(message) = self.message(seen, format) else { return };
+        let Some(message) = self.completed_message(seen, format) else { return };
         if let Message::Joints { epoch, joints: came } = message {
             if self.last == Some(epoch) {
                 self.counts.repeated = self.counts.repeated.wrapping_add(1);
@@ -74,16 +74,16 @@ impl PacketAccounts {
                 self.last = Some(epoch);
                 self.counts.taken = self.counts.taken.wrapping_add(1);
             }
-        } else if matches!(message, Message::Stimulus { to, .. } if to.addresses(cell)) {
+        } else if matches!(message, Message::Stimulus { to, .. } if to.addresses_cell(cell)) {
             self.counts.stimuli = self.counts.stimuli.wrapping_add(1);
         } else if message == Message::Sync {
             self.beats.asked.0 += 1;
             self.beats.asked.1 += 1;
         } else if let Message::Network { from, page: NetworkPage::Heartbeat(beat), .. } = message
-            && from.addresses(cell)
-            && beat.state.has(State::CLAIMING)
+            && from.addresses_cell(cell)
+            && beat.state.has(State::CLAIMING_NODE_ID)
         {
-            let is_again = self.defended.is_some_and(|at| seen.at.elapsed_since(at) < DEFENCE_MARGIN);
+            let is_again = self.defended.is_some_and(|at| seen.at.elapsed_since(at) < CLAIM_ANSWER_MARGIN);
             self.beats.asked.0 += u64::from(!is_again);
             self.beats.asked.1 += 1;
             self.defended = Some(seen.at);
@@ -91,17 +91,17 @@ impl PacketAccounts {
     }
 
     /// Returns the message that a frame of the bench completes, as the cell decodes it.
-    fn message(&mut self, seen: &ObservedFrame, format: Format) -> Option<Message> {
+    fn completed_message(&mut self, seen: &ObservedFrame, format: Format) -> Option<Message> {
         let ObservedFrame { at, frame, .. } = seen;
-        let id = data_id(frame).ok().filter(|_| frame.format() == format)?;
+        let id = data_frame_id(frame).ok().filter(|_| frame.format() == format)?;
         let packet = match format {
             Format::Fd => Packet::from_fd(frame).ok()?,
-            Format::Classic => self.segment(*at, id, frame)?,
+            Format::Classic => self.add_segment(*at, id, frame)?,
         };
         Message::decode(&packet).ok()
     }
 
-    fn segment(&mut self, at: Micros, id: Id, frame: &Frame) -> Option<Packet> {
+    fn add_segment(&mut self, at: Micros, id: Id, frame: &Frame) -> Option<Packet> {
         let place = self.segments.iter().position(|(of, _)| *of == id).unwrap_or_else(|| {
             self.segments.push((id, Reassembler::NONE));
             self.segments.len() - 1
@@ -123,7 +123,7 @@ impl PacketAccounts {
     }
 
     /// Returns the counts after a restart of the cell: all are 0, and the bench's waiting segments are kept.
-    pub(super) fn restarted(self) -> Self {
+    pub(super) fn after_cell_restart(self) -> Self {
         Self { segments: self.segments, ..Self::default() }
     }
 
@@ -133,7 +133,7 @@ impl PacketAccounts {
     }
 
     /// Compares the cell's counters with the bench's counts, and returns the discrepancies since the last comparison.
-    pub(super) fn compare(&mut self, heard: HeardPage, refused: RejectedCounts) -> Vec<Discrepancy> {
+    pub(super) fn compare_counters(&mut self, heard: HeardPage, refused: RejectedCounts) -> Vec<Discrepancy> {
         let now = self.counts;
         let Some((heard_before, refused_before, before)) = self.compared.replace((heard, refused, now))
         else {
@@ -181,10 +181,10 @@ impl PacketAccounts {
 
     /// Returns true if fewer heartbeats came than were requested or regularly due, apart from those given up.
     pub(super) fn is_heartbeat_missing(&self, now: Micros) -> bool {
-        self.missing(now) > self.given_up
+        self.missing_heartbeats(now) > self.given_up
     }
 
-    fn missing(&self, now: Micros) -> u64 {
+    fn missing_heartbeats(&self, now: Micros) -> u64 {
         let Some((at, before)) = self.anchor else { return 0 };
         let regular = now.elapsed_since(at).0 / HEARTBEAT_INTERVAL.0;
         let asked = self.beats.asked.0 - before.asked.0;
@@ -192,8 +192,8 @@ impl PacketAccounts {
     }
 
     /// Stops waiting for the missing heartbeats.
-    pub(super) fn excuse_missing(&mut self, now: Micros) {
-        self.given_up = self.missing(now);
+    pub(super) fn excuse_missing_heartbeats(&mut self, now: Micros) {
+        self.given_up = self.missing_heartbeats(now);
     }
 
     /// Notes a regular heartbeat. Returns the number of heartbeats since the last regular one, and the minimum and
@@ -212,7 +212,7 @@ impl PacketAccounts {
 
     /// Returns the number of surplus heartbeats over all intervals, as far as it is certain; negative if heartbeats are
     /// missing.
-    pub(super) const fn surplus(&self) -> i64 {
+    pub(super) const fn surplus_heartbeats(&self) -> i64 {
         let (min, max) = self.surplus;
         if min > 0 {
             min

@@ -5,7 +5,7 @@ use protocol::message::{Heartbeat, Message, State};
 use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
 
-use super::{ANSWER_TIMEOUT, CellPacket, SYNC_GRACE, Session};
+use super::{ANSWER_TIMEOUT, CellPacket, SYNC_ANSWER_GRACE, Session};
 use crate::bus::StopReason;
 
 /// The packets and heartbeats that a cell sent during an exchange.
@@ -34,54 +34,61 @@ impl Exchange {
 
 impl Session<'_> {
     /// Sends frames and then a sync, and collects packets until the sync is answered.
-    pub(crate) fn exchange(&mut self, frames: &[Frame]) -> Result<Exchange, StopReason> {
+    pub(crate) fn exchange_frames(&mut self, frames: &[Frame]) -> Result<Exchange, StopReason> {
         self.begin_exchange();
         let at = self.send(frames)?;
-        self.finish(at)
+        self.finish_exchange(at)
     }
 
     /// Sends packets and then a sync, and collects packets until the sync is answered.
-    pub(crate) fn exchange_all(&mut self, messages: &[Message]) -> Result<Exchange, StopReason> {
+    pub(crate) fn exchange_messages(&mut self, messages: &[Message]) -> Result<Exchange, StopReason> {
         self.begin_exchange();
         let at = self.send_messages(messages)?;
-        self.finish(at)
+        self.finish_exchange(at)
     }
 
     /// Sends a sync, and returns the result of the exchange.
-    fn finish(&mut self, at: Micros) -> Result<Exchange, StopReason> {
+    fn finish_exchange(&mut self, at: Micros) -> Result<Exchange, StopReason> {
         let sync = self.send_messages(&[Message::Sync])?;
-        let is_answer = |heard: &CellPacket| heard.beat().is_some() && heard.at >= sync;
+        let is_answer = |heard: &CellPacket| heard.heartbeat_and_epoch().is_some() && heard.at >= sync;
         let answered = self.wait_for_answer(sync)?;
         self.check("CMD-3", answered, || {
             "a sync must be answered with a heartbeat, but none came".to_owned()
         });
-        let beats = |it: &Self| it.answers().iter().filter(|heard| heard.beat().is_some()).count();
+        let beats =
+            |it: &Self| it.answers().iter().filter(|heard| heard.heartbeat_and_epoch().is_some()).count();
         if self.answers().len() == beats(self) || self.known.senses {
             // A regular heartbeat may have come between, and a faulty cell may answer later.
-            self.idle(SYNC_GRACE)?;
+            self.receive_for(SYNC_ANSWER_GRACE)?;
         }
         let first = self.answers().iter().find(|heard| is_answer(heard)).copied();
         if let (Some(first), 1) = (first, beats(self)) {
-            self.note_time("heartbeat to sync", sync, first.at);
+            self.record_answer_time("heartbeat to sync", sync, first.at);
         }
         let torque = self.answers().iter().rposition(|heard| heard.torque().is_some());
         if let Some(torque) = torque {
-            let after = |it: &Self| it.answers().iter().skip(torque).any(|heard| heard.beat().is_some());
+            let after = |it: &Self| {
+                it.answers().iter().skip(torque).any(|heard| heard.heartbeat_and_epoch().is_some())
+            };
             if !after(self) {
-                self.idle(Span::from_millis(20))?;
+                self.receive_for(Span::from_millis(20))?;
             }
             let is_after = after(self);
             self.check("CMD-3", is_after, || {
                 "the heartbeat to a sync must follow the torque, but came before it".to_owned()
             });
         }
-        let beat =
-            self.answers().iter().rev().find_map(|heard| heard.beat().map(|(beat, epoch)| (*beat, epoch)));
+        let beat = self
+            .answers()
+            .iter()
+            .rev()
+            .find_map(|heard| heard.heartbeat_and_epoch().map(|(beat, epoch)| (*beat, epoch)));
         let came = beats(self);
-        let answers = self.answers().iter().filter(|heard| heard.beat().is_none()).copied().collect();
-        self.mark_expected();
+        let answers =
+            self.answers().iter().filter(|heard| heard.heartbeat_and_epoch().is_none()).copied().collect();
+        self.mark_packets_expected();
         let exchange = Exchange { at, answers, beats: came, beat };
-        self.check_state(&exchange);
+        self.check_reported_state(&exchange);
         Ok(exchange)
     }
 
@@ -91,7 +98,11 @@ impl Session<'_> {
         let until = sync + ANSWER_TIMEOUT;
         loop {
             let epoch = self.known.epoch.filter(|_| !self.clock.other_epochs);
-            let beats = self.answers().iter().filter(|heard| heard.at >= sync).filter_map(CellPacket::beat);
+            let beats = self
+                .answers()
+                .iter()
+                .filter(|heard| heard.at >= sync)
+                .filter_map(CellPacket::heartbeat_and_epoch);
             let (mut any, mut right) = (false, false);
             for (_, of) in beats {
                 // A heartbeat that was due before the cell processed the joints has the previous epoch.
@@ -102,7 +113,7 @@ impl Session<'_> {
             }
             if self.bus.now() >= until {
                 // Missing heartbeats are not awaited again.
-                self.life.accounts.excuse_missing(self.bus.now());
+                self.life.accounts.excuse_missing_heartbeats(self.bus.now());
                 self.clock.other_epochs |= any && !right;
                 return Ok(any);
             }

@@ -40,7 +40,7 @@ impl Session<'_> {
     }
 
     /// Sends a stimulus for the next joints.
-    pub(crate) fn press(&mut self, skin: SkinSensors) -> Result<(), StopReason> {
+    pub(crate) fn send_stimulus(&mut self, skin: SkinSensors) -> Result<(), StopReason> {
         self.known.pending = Some(skin);
         let to = Node::Cell(self.cell);
         self.send_messages(&[Message::Stimulus {
@@ -52,7 +52,7 @@ impl Session<'_> {
     }
 
     /// Sends a stimulus for the joints of an epoch.
-    pub(crate) fn press_at(&mut self, first: u8, skin: SkinSensors) -> Result<(), StopReason> {
+    pub(crate) fn send_stimulus_at_epoch(&mut self, first: u8, skin: SkinSensors) -> Result<(), StopReason> {
         let to = Node::Cell(self.cell);
         self.send_messages(&[Message::Stimulus {
             to,
@@ -63,13 +63,16 @@ impl Session<'_> {
     }
 
     /// Sends joints of the next epoch, and repeats them if the cell processed them too late.
-    pub(crate) fn step(&mut self, positions: &[i16; MAX_JOINTS]) -> Result<JointsResult, StopReason> {
-        const ATTEMPTS: usize = 6;
+    pub(crate) fn send_next_joints(
+        &mut self,
+        positions: &[i16; MAX_JOINTS],
+    ) -> Result<JointsResult, StopReason> {
+        const MAX_SEND_ATTEMPTS: usize = 6;
         let mut attempt = 1;
         loop {
             let epoch = self.next_epoch();
-            let step = self.step_at(epoch, positions)?;
-            if !self.clock.skipped || attempt == ATTEMPTS {
+            let step = self.send_joints_at_epoch(epoch, positions)?;
+            if !self.clock.skipped || attempt == MAX_SEND_ATTEMPTS {
                 return Ok(step);
             }
             attempt += 1;
@@ -77,22 +80,22 @@ impl Session<'_> {
     }
 
     /// Sends a stimulus for the next joints, then sends those joints, and returns their result.
-    pub(crate) fn press_and_step(
+    pub(crate) fn stimulate_and_send_joints(
         &mut self,
         positions: &[i16; MAX_JOINTS],
         skin: SkinSensors,
     ) -> Result<JointsResult, StopReason> {
-        self.press(skin)?;
-        self.step(positions)
+        self.send_stimulus(skin)?;
+        self.send_next_joints(positions)
     }
 
     /// Sends joints of an epoch other than the last one, and checks the answers.
-    pub(crate) fn step_at(
+    pub(crate) fn send_joints_at_epoch(
         &mut self,
         epoch: u8,
         positions: &[i16; MAX_JOINTS],
     ) -> Result<JointsResult, StopReason> {
-        let joints = self.joints(epoch, positions);
+        let joints = self.joints_message(epoch, positions);
         if let Some(skin) = self.known.pending.take() {
             self.known.skin = Some(skin);
         }
@@ -101,13 +104,13 @@ impl Session<'_> {
         // After joints without a force the cell is not active, whatever it was before.
         self.known.active = match due {
             Some(due) => Some(due == ExpectedAnswer::Torque),
-            None => self.force().map(|force| force > 0),
+            None => self.latched_force().map(|force| force > 0),
         };
         let active = self.known.active.take();
-        let exchange = self.exchange_all(&[joints])?;
+        let exchange = self.exchange_messages(&[joints])?;
         let step = self.check_torques(epoch, due, exchange)?;
         self.known.active = active;
-        self.check_state(&step.exchange);
+        self.check_reported_state(&step.exchange);
         if self.clock.skipped {
             // The cell is as it was before the skipped joints.
             self.known.active = None;
@@ -121,7 +124,7 @@ impl Session<'_> {
         if known.halted == Some(true) {
             return Some(ExpectedAnswer::Nothing);
         }
-        match (self.force()? > 0, known.active) {
+        match (self.latched_force()? > 0, known.active) {
             (true, _) => Some(ExpectedAnswer::Torque),
             (false, Some(true)) => Some(ExpectedAnswer::Zeros),
             (false, Some(false)) => Some(ExpectedAnswer::Nothing),
@@ -130,9 +133,9 @@ impl Session<'_> {
     }
 
     /// Returns F_z of the latched values, if they are known.
-    fn force(&self) -> Option<i64> {
+    fn latched_force(&self) -> Option<i64> {
         let skin = self.known.skin.filter(|_| !self.known.adapts)?;
-        Some(arm::force(&self.known.parameters?.contact, &skin))
+        Some(arm::expected_force(&self.known.parameters?.contact, &skin))
     }
 
     /// Checks the answers to joints.
@@ -180,8 +183,12 @@ impl Session<'_> {
         }
         if let Some((at, of, words)) = first {
             // The limit is a quarter of the period, and the test's period is long except where times are measured.
-            if self.known.parameters.is_some_and(|it| it.period_us == arm::fast_parameters(1).period_us) {
-                self.note_time("torque", exchange.at, at);
+            if self
+                .known
+                .parameters
+                .is_some_and(|it| it.period_us == arm::fast_example_parameters(1).period_us)
+            {
+                self.record_answer_time("torque", exchange.at, at);
             }
             self.check("JOINTS-6", of.0 == epoch, || {
                 format!("the torque that answers epoch {epoch} must have that epoch, but has {of}")
@@ -191,10 +198,10 @@ impl Session<'_> {
                     "after a release the torque must be of zeros, but is not".to_owned()
                 });
             }
-            self.check_words(&words);
-            self.check_saturation(&words);
+            self.check_torque_shape(&words);
+            self.check_saturated_flag(&words);
         } else {
-            self.check_saturation(&Words::zeros(Length::Six));
+            self.check_saturated_flag(&Words::zeros(Length::Six));
         }
         Ok(JointsResult { torque: first.map(|(.., words)| words), exchange })
     }
@@ -203,11 +210,11 @@ impl Session<'_> {
     /// shows. It then skipped them, and their consequences cannot be expected.
     fn were_joints_late(&self, exchange: &Exchange) -> bool {
         let period = self.known.parameters.map_or(u64::MAX, |it| it.period_us.into());
-        let beat = self.answers().iter().rev().find(|heard| heard.beat().is_some());
+        let beat = self.answers().iter().rev().find(|heard| heard.heartbeat_and_epoch().is_some());
         beat.is_some_and(|heard| heard.at.elapsed_since(exchange.at).0 > period && period > 1_000)
     }
 
-    fn check_words(&mut self, words: &Words) {
+    fn check_torque_shape(&mut self, words: &Words) {
         let Some(parameters) = self.known.parameters else { return };
         let length = Length::for_joints(parameters.joints.into());
         self.check("SEND-1", words.length() == length, || {
@@ -224,11 +231,11 @@ impl Session<'_> {
     }
 
     /// Checks that SATURATED is set in the next heartbeat and in no other.
-    fn check_saturation(&mut self, words: &Words) {
+    fn check_saturated_flag(&mut self, words: &Words) {
         let expected = words.is_saturated();
         let after = |heard: &[CellPacket]| {
             let torque = heard.iter().rposition(|it| it.torque().is_some()).unwrap_or(0);
-            let beats = heard.iter().skip(torque).filter_map(CellPacket::beat);
+            let beats = heard.iter().skip(torque).filter_map(CellPacket::heartbeat_and_epoch);
             beats.map(|(beat, _)| beat.state.has(State::SATURATED)).collect::<Vec<_>>()
         };
         let beats = after(self.answers());
@@ -249,7 +256,7 @@ impl Session<'_> {
 
     /// Requests a report, and returns its skin page, which has the latched values.
     pub(crate) fn read_latched_skin(&mut self) -> Result<Option<SkinSensors>, StopReason> {
-        let pages = self.report()?;
+        let pages = self.request_report()?;
         Ok(pages.iter().find_map(|heard| match heard.sensors() {
             Some((_, SensorPage::Skin(skin))) => Some(*skin),
             _ => None,
@@ -279,14 +286,14 @@ impl Session<'_> {
         self.begin_exchange();
         self.send_messages(&[Message::Resume])?;
         self.known.halted = Some(false);
-        let done = self.commit(parameters)?;
+        let done = self.commit_parameters(parameters)?;
         if self.about.test_mode {
             self.switch_test_mode(true)?;
         } else {
             (self.known.skin, self.known.pending) = (None, None);
         }
         self.known.active = None;
-        self.step(&[0; MAX_JOINTS])?;
+        self.send_next_joints(&[0; MAX_JOINTS])?;
         self.known.active = Some(false);
         Ok(done)
     }

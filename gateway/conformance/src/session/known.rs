@@ -24,7 +24,7 @@ pub(crate) struct CellAbilities {
 
 /// The present state of the cell; `None` means unknown.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct TrackedState {
+pub(crate) struct KnownCellState {
     pub(crate) hash: Option<u16>,
     /// The parameters in use, if this bench committed them.
     pub(crate) parameters: Option<Parameters>,
@@ -50,7 +50,7 @@ pub(crate) struct TrackedState {
     pub(crate) pending: Option<SkinSensors>,
 }
 
-impl TrackedState {
+impl KnownCellState {
     /// Returns the requirement that forbids the cell to send this packet unrequested.
     pub(crate) fn violated_requirement(&self, message: &Message) -> Option<&'static str> {
         match message {
@@ -76,13 +76,13 @@ impl TrackedState {
 
 impl Session<'_> {
     /// Checks the state that the heartbeat to a sync reports.
-    pub(super) fn check_state(&mut self, exchange: &Exchange) {
+    pub(super) fn check_reported_state(&mut self, exchange: &Exchange) {
         let Some((beat, epoch)) = exchange.beat else { return };
         let (state, known) = (beat.state, self.known);
         let bits = [
             ("HALTED", State::HALTED, known.halted, "STATE-3"),
             ("TEST_MODE", State::TEST_MODE, known.test_mode, "STATE-3"),
-            ("CLAIMING", State::CLAIMING, Some(false), "STATE-3"),
+            ("CLAIMING", State::CLAIMING_NODE_ID, Some(false), "STATE-3"),
             ("DUPLICATE", State::DUPLICATE, Some(false), "STATE-2"),
             (
                 "FLASH_DAMAGED",

@@ -40,7 +40,7 @@ impl CellLife {
     /// Returns the state for a life that begins with a heartbeat at this time. Waiting segments of the bench's own
     /// packets are kept, because they were on the bus.
     fn after_restart(former: Self, claimed: Micros) -> Self {
-        let accounts = former.accounts.restarted();
+        let accounts = former.accounts.after_cell_restart();
         Self { claimed: Some(claimed), joined: [true; 8], accounts, ..Self::default() }
     }
 
@@ -50,7 +50,7 @@ impl CellLife {
     }
 
     /// Returns true if a segment waits for others.
-    pub(super) fn is_waiting(&self) -> bool {
+    pub(super) fn has_waiting_segment(&self) -> bool {
         self.segments.iter().any(|(segments, _)| segments.is_waiting())
     }
 }
@@ -77,12 +77,12 @@ impl Session<'_> {
     }
 
     /// Returns the time of the first heartbeat with CLAIMING in the present life, after a restart.
-    pub(crate) const fn claimed(&self) -> Option<Micros> {
+    pub(crate) const fn first_claim_time(&self) -> Option<Micros> {
         self.life.claimed
     }
 
     /// Processes a frame of the cell, or holds it while a restart is in progress.
-    pub(super) fn receive(&mut self, seen: ObservedFrame, id: Id) {
+    pub(super) fn receive_cell_frame(&mut self, seen: ObservedFrame, id: Id) {
         let Some(held) = &mut self.held else { return self.handle_cell_frame(seen, id) };
         held.push((seen, id));
         let Some((beat, places)) = completed_claim(held, self.format) else { return };
@@ -125,7 +125,7 @@ fn completed_claim(held: &[(ObservedFrame, Id)], format: Format) -> Option<(Hear
     let Message::Network { page: NetworkPage::Heartbeat(beat), .. } = Message::decode(&packet).ok()? else {
         return None;
     };
-    beat.state.has(State::CLAIMING).then_some((beat, places))
+    beat.state.has(State::CLAIMING_NODE_ID).then_some((beat, places))
 }
 
 /// Returns the packet that these segments form.

@@ -25,14 +25,14 @@ impl Session<'_> {
             return Ok(Some(seen));
         }
         self.check_time_limits()?;
-        let Ok(id) = packet::data_id(&seen.frame) else { return Ok(Some(seen)) };
+        let Ok(id) = packet::data_frame_id(&seen.frame) else { return Ok(Some(seen)) };
         if id.sender().is_none() && !self.clock.finishing {
             return Err(StopReason::Gateway(seen.frame.to_string()));
         }
         if id.node == self.cell.get() {
             self.log.frames.push(seen);
             self.clock.last = seen.at;
-            self.receive(seen, id);
+            self.receive_cell_frame(seen, id);
         }
         Ok(Some(seen))
     }
@@ -113,7 +113,7 @@ impl Session<'_> {
         });
         match message {
             Ok(message) => {
-                self.findings.pass("SEND-1");
+                self.findings.count_passed("SEND-1");
                 let heard = CellPacket { at: seen.at, message };
                 self.packets.push(heard);
                 self.check_packet(&heard);
@@ -127,10 +127,10 @@ impl Session<'_> {
     /// Checks the rules for every packet, and that a heartbeat has the number of packets sent before it.
     fn check_packet(&mut self, heard: &CellPacket) {
         self.life.accounts.count_cell_packet(&heard.message);
-        if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
+        if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.heartbeat_and_epoch() {
             // The cell has been switched off and on.
-            let begins = state.has(State::CLAIMING) && !self.life.claiming;
-            self.life.claiming = state.has(State::CLAIMING);
+            let begins = state.has(State::CLAIMING_NODE_ID) && !self.life.claiming;
+            self.life.claiming = state.has(State::CLAIMING_NODE_ID);
             if begins {
                 self.life.sent = None;
             }

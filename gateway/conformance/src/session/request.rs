@@ -35,12 +35,12 @@ impl Reply {
 
 /// The counters that a cell reports in network pages 1 and 2.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(crate) struct Counters {
+pub(crate) struct CellCounters {
     pub(crate) heard: HeardPage,
     pub(crate) refused: RejectedCounts,
 }
 
-impl core::fmt::Display for Counters {
+impl core::fmt::Display for CellCounters {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let (from, epoch) = (Node::Gateway, Epoch(0));
         let text = |page| Decoded::Message(Message::Network { from, epoch, page }).to_string();
@@ -55,13 +55,14 @@ impl core::fmt::Display for Counters {
 /// The network pages that answer a report; the simulated sensors pages follow them.
 const REPORT_PAGES: [u8; 2] = [1, 2];
 /// The further network pages of a cell with ports.
-const REPORT_OF_PORTS: [u8; 2] = [3, 4];
+const PORT_REPORT_PAGES: [u8; 2] = [3, 4];
 
 /// Returns the names of the pages that answer a report, in order.
 fn report_page_names(has_ports: bool) -> Vec<String> {
     let network = |pages: &[u8]| pages.iter().map(|page| format!("network {page}")).collect::<Vec<_>>();
-    let sensors = SensorReadings::default().pages().map(|page| format!("sensors {}", page.number()));
-    let of_ports = if has_ports { network(&REPORT_OF_PORTS) } else { Vec::new() };
+    let sensors =
+        SensorReadings::default().simulated_pages().map(|page| format!("sensors {}", page.number()));
+    let of_ports = if has_ports { network(&PORT_REPORT_PAGES) } else { Vec::new() };
     network(&REPORT_PAGES).into_iter().chain(sensors).chain(of_ports).collect()
 }
 
@@ -109,12 +110,12 @@ impl Session<'_> {
     }
 
     /// Reads a parameter, and returns the cell's reply.
-    pub(crate) fn read(&mut self, number: u8) -> Result<Reply, StopReason> {
+    pub(crate) fn read_parameter(&mut self, number: u8) -> Result<Reply, StopReason> {
         self.request(self.cell_node(), Request::Read { number })
     }
 
     /// Writes a parameter, and returns the cell's reply.
-    pub(crate) fn write(&mut self, number: u8, words: [i16; WORDS]) -> Result<Reply, StopReason> {
+    pub(crate) fn write_parameter(&mut self, number: u8, words: [i16; WORDS]) -> Result<Reply, StopReason> {
         self.request(self.cell_node(), Request::Write { number, words })
     }
 
@@ -124,7 +125,7 @@ impl Session<'_> {
         number: u8,
         first: [i16; N],
     ) -> Result<Reply, StopReason> {
-        self.write(number, padded_words(first))
+        self.write_parameter(number, padded_words(first))
     }
 
     /// Sends a request with the next tag and waits for the answer.
@@ -144,13 +145,14 @@ impl Session<'_> {
         self.begin_exchange();
         let at = self.send_messages(&[Message::Configure { to, tag, request }])?;
         let longest = if is_commit { COMMIT_TIMEOUT } else { ANSWER_TIMEOUT };
-        self.wait(at + longest, |heard| {
+        self.wait_for_packets(at + longest, |heard| {
             heard.iter().any(|it| matches!(it.message, Message::Configured { .. }))
         })?;
         // The answer to an earlier, interrupted request may come first.
-        let is_its =
-            |heard: &CellPacket| heard.message.tag() == Some(tag) && configured_answer(heard).is_some();
-        self.wait(self.now() + LATE_ANSWER_TIMEOUT, |heard| {
+        let is_its = |heard: &CellPacket| {
+            heard.message.configuration_tag() == Some(tag) && configured_answer(heard).is_some()
+        };
+        self.wait_for_packets(self.now() + LATE_ANSWER_TIMEOUT, |heard| {
             heard.iter().any(is_its) || !heard.iter().any(|it| configured_answer(it).is_some())
         })?;
         let place = self.answers().iter().position(is_its);
@@ -166,7 +168,7 @@ impl Session<'_> {
             });
             return Ok(Reply::Nothing);
         };
-        self.note_time(if is_commit { "commit" } else { "configured" }, at, answered);
+        self.record_answer_time(if is_commit { "commit" } else { "configured" }, at, answered);
         self.check("CONF-12", came == tag, || {
             format!("the answer must have the request's tag {tag:02X}, but has {came:02X}")
         });
@@ -197,12 +199,12 @@ impl Session<'_> {
     }
 
     /// Stages parameters: writes all stored ones that differ from the staged ones.
-    pub(crate) fn stage(&mut self, parameters: &Parameters) -> Result<(), StopReason> {
+    pub(crate) fn stage_parameters(&mut self, parameters: &Parameters) -> Result<(), StopReason> {
         let before = self.known.staged.take();
         for parameter in Parameter::stored_for_rows(parameters.all_rows().len()) {
             let words = parameters.words(parameter);
             if before.is_none_or(|before| before.words(parameter) != words) {
-                let reply = self.write(parameter.number(), words)?;
+                let reply = self.write_parameter(parameter.number(), words)?;
                 self.check("CONF-4", reply == Reply::Value(words), || {
                     format!(
                         "a write of parameter {} must be answered with its words, but the answer was {reply}",
@@ -222,12 +224,12 @@ impl Session<'_> {
     }
 
     /// Commits parameters. Returns true if the cell uses them.
-    pub(crate) fn commit(&mut self, parameters: &Parameters) -> Result<bool, StopReason> {
+    pub(crate) fn commit_parameters(&mut self, parameters: &Parameters) -> Result<bool, StopReason> {
         let is_so = |known: Option<Parameters>| known.is_some_and(|it| it.hash() == parameters.hash());
         if self.known.parameters == Some(*parameters) && is_so(self.known.staged) {
             return Ok(true);
         }
-        self.stage(parameters)?;
+        self.stage_parameters(parameters)?;
         let hash = parameters.hash();
         let reply = self.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;
         let done = reply == Reply::Value(padded_words([hash.cast_signed()]));
@@ -244,7 +246,7 @@ impl Session<'_> {
     }
 
     /// Requests a report, and returns its packets, without heartbeats.
-    pub(crate) fn report(&mut self) -> Result<Vec<CellPacket>, StopReason> {
+    pub(crate) fn request_report(&mut self) -> Result<Vec<CellPacket>, StopReason> {
         self.begin_exchange();
         let asked = self.send_messages(&[Message::Report])?;
         self.report_pages(asked)
@@ -254,24 +256,29 @@ impl Session<'_> {
     pub(crate) fn has_ports(&mut self) -> Result<bool, StopReason> {
         self.begin_exchange();
         let asked = self.send_messages(&[Message::Report])?;
-        let pages = self.collect(asked, report_page_names(true).len())?;
+        let pages = self.collect_report_pages(asked, report_page_names(true).len())?;
         let is_of_ports = |page: &NetworkPage| matches!(page, NetworkPage::Tree(_) | NetworkPage::Ports(_));
         Ok(pages.iter().any(|it| matches!(&it.message, Message::Network { page, .. } if is_of_ports(page))))
     }
 
     /// Collects a number of pages, or fewer if no more come.
-    fn collect(&mut self, asked: Micros, expected: usize) -> Result<Vec<CellPacket>, StopReason> {
-        let pages = |heard: &[CellPacket]| heard.iter().filter(|it| it.beat().is_none()).count();
-        self.wait(asked + REPORT_TIMEOUT, |heard| pages(heard) >= expected)?;
-        let pages = self.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
-        self.mark_expected();
+    fn collect_report_pages(
+        &mut self,
+        asked: Micros,
+        expected: usize,
+    ) -> Result<Vec<CellPacket>, StopReason> {
+        let pages =
+            |heard: &[CellPacket]| heard.iter().filter(|it| it.heartbeat_and_epoch().is_none()).count();
+        self.wait_for_packets(asked + REPORT_TIMEOUT, |heard| pages(heard) >= expected)?;
+        let pages = self.answers().iter().filter(|it| it.heartbeat_and_epoch().is_none()).copied().collect();
+        self.mark_packets_expected();
         Ok(pages)
     }
 
     /// Returns the pages of a report that was requested at a time.
     pub(crate) fn report_pages(&mut self, asked: Micros) -> Result<Vec<CellPacket>, StopReason> {
         let order = report_page_names(self.about.ports);
-        let pages = self.collect(asked, order.len() + usize::from(self.known.adapts))?;
+        let pages = self.collect_report_pages(asked, order.len() + usize::from(self.known.adapts))?;
         if !self.known.senses {
             let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();
             self.check("CMD-4", names == order, || {
@@ -286,8 +293,8 @@ impl Session<'_> {
     }
 
     /// Requests the counters, and checks that they match the packets sent and received.
-    pub(crate) fn counters(&mut self) -> Result<Counters, StopReason> {
-        let report = self.report()?;
+    pub(crate) fn counters(&mut self) -> Result<CellCounters, StopReason> {
+        let report = self.request_report()?;
         let (mut heard, mut refused) = (None, None);
         for answer in &report {
             if let Message::Network { page, .. } = answer.message {
@@ -303,11 +310,11 @@ impl Session<'_> {
             "a report must be answered with network pages 1 and 2, but they did not both come".to_owned()
         });
         if let Some((heard, refused)) = whole {
-            for (id, what) in self.life.accounts.compare(heard, refused) {
+            for (id, what) in self.life.accounts.compare_counters(heard, refused) {
                 self.check(id, false, || what);
             }
         }
-        let sync = self.exchange_all(&[])?;
+        let sync = self.exchange_messages(&[])?;
         if let (Some((beat, _)), Some((_, refused))) = (sync.beat, refused.and(whole)) {
             let RejectedCounts { length, crc, foreign, meaning, incomplete, stimuli } = refused;
             let sum =
@@ -317,7 +324,7 @@ impl Session<'_> {
             });
         }
         let (heard, refused) = whole.unwrap_or_default();
-        Ok(Counters { heard, refused })
+        Ok(CellCounters { heard, refused })
     }
 
     /// Skips the next comparison of counters, because the cell may have lost packets of a burst.

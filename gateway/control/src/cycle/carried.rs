@@ -20,7 +20,7 @@ pub struct BusInput<'a> {
 
 /// Returns the bit of a bus in a mask of buses.
 #[must_use]
-pub fn bit(bus: usize) -> u32 {
+pub fn bus_bit(bus: usize) -> u32 {
     1 << bus.min(31)
 }
 
@@ -37,7 +37,12 @@ impl CarriedBroadcasts {
     /// Returns the number of broadcasts that should have been read back from the bus and were not. `last` is the epoch
     /// of the last one read back. `epoch` is the epoch of the latest of `broadcasts` broadcasts, which may not have
     /// been read back yet.
-    pub(super) fn unanswered(&mut self, last: Option<Epoch>, epoch: Epoch, broadcasts: u64) -> u64 {
+    pub(super) fn unanswered_broadcasts(
+        &mut self,
+        last: Option<Epoch>,
+        epoch: Epoch,
+        broadcasts: u64,
+    ) -> u64 {
         // Epochs wrap around, so compare each once, when it is new.
         if let Some(read) = last.filter(|_| last != self.last) {
             self.number = broadcasts.saturating_sub(u64::try_from(epoch.epochs_since(read)).unwrap_or(0));
@@ -48,7 +53,7 @@ impl CarriedBroadcasts {
 }
 
 /// Returns the fraction of the last torque, 0 to 1, that counts after this many broadcasts were not read back.
-pub(super) fn remaining_fraction(unanswered: u64, safety: &SafetyLimits) -> f64 {
+pub(super) fn remaining_torque_fraction(unanswered: u64, safety: &SafetyLimits) -> f64 {
     let hold = u64::from(safety.hold_epochs);
     if unanswered <= hold {
         return 1.0;
@@ -59,6 +64,6 @@ pub(super) fn remaining_fraction(unanswered: u64, safety: &SafetyLimits) -> f64 
 }
 
 /// Returns true if a bus that has missed this many broadcasts contributes no torque any more.
-pub(super) fn is_lost(unanswered: u64, safety: &SafetyLimits) -> bool {
+pub(super) fn is_bus_lost(unanswered: u64, safety: &SafetyLimits) -> bool {
     unanswered > u64::from(safety.hold_epochs) + u64::from(safety.decay_epochs)
 }

@@ -47,7 +47,12 @@ impl Chain {
 
     /// Adds the fraction `part` of a chain's torques to the torques of the robot's joints. A joint that two chains
     /// share gets the torques of both.
-    pub(super) fn add(&self, part: f64, torque: &[f64; MAX_JOINTS], sum: &mut [f64; MAX_ROBOT_JOINTS]) {
+    pub(super) fn add_torque_share(
+        &self,
+        part: f64,
+        torque: &[f64; MAX_JOINTS],
+        sum: &mut [f64; MAX_ROBOT_JOINTS],
+    ) {
         for ((joint, _), torque) in self.joints.iter().zip(torque) {
             if let Some(sum) = sum.get_mut(*joint) {
                 *sum += part * torque;

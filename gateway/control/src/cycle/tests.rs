@@ -21,15 +21,15 @@ fn tick(number: u64) -> Tick {
     Tick { number, time: Micros(number * 2_000) }
 }
 
-fn cycle(controller: Box<dyn Controller>) -> (Cycle, BusTotals) {
-    let skin = testing::skin();
+fn cycle(controller: Box<dyn Controller>) -> (ControlCycle, BusTotals) {
+    let skin = testing::one_cell_skin();
     let robot = SimulatedArm::new(&skin, [0.0; MAX_ROBOT_JOINTS]);
-    (Cycle::new(&skin, controller, Box::new(robot)), BusTotals::default())
+    (ControlCycle::new(&skin, controller, Box::new(robot)), BusTotals::default())
 }
 
 #[test]
 fn joints_go_out_every_eighth_tick_also_after_skipped_ones() {
-    let (mut cycle, bus) = cycle(Box::new(KinestheticController::new(&testing::skin()).unwrap()));
+    let (mut cycle, bus) = cycle(Box::new(KinestheticController::new(&testing::one_cell_skin()).unwrap()));
     let mut sent = vec![];
     for number in [0, 1, 7, 8, 9, 17, 18, 40, 41] {
         let outcome = cycle.tick(tick(number), 0, [works(&bus)]);
@@ -43,7 +43,7 @@ fn joints_go_out_every_eighth_tick_also_after_skipped_ones() {
 #[test]
 fn bad_cycles_in_a_row_halt_once_and_a_resume_releases() {
     let (mut cycle, mut bus) = cycle(Box::new(Dead));
-    let limit = u64::from(testing::skin().safety.bad_cycles);
+    let limit = u64::from(testing::one_cell_skin().safety.bad_cycles);
     let halts: Vec<u64> = (0..limit + 10)
         .filter(|&number| cycle.tick(tick(number), 0, [works(&bus)]).command.is_some())
         .collect();
@@ -77,12 +77,13 @@ impl Controller for FailingController {
 
 #[test]
 fn another_program_may_take_its_time_to_begin() {
-    let mut skin = testing::skin();
+    let mut skin = testing::one_cell_skin();
     let limit = u64::from(skin.safety.bad_cycles);
     let kind = |start| ControllerKind::External { socket: "arm.sock".to_owned(), start };
     let halts = |skin: &Skin, misses: Vec<u64>| {
         let robot = SimulatedArm::new(skin, [0.0; MAX_ROBOT_JOINTS]);
-        let mut cycle = Cycle::new(skin, Box::new(FailingController { misses, ticks: 0 }), Box::new(robot));
+        let mut cycle =
+            ControlCycle::new(skin, Box::new(FailingController { misses, ticks: 0 }), Box::new(robot));
         let bus = BusTotals::default();
         let records: Vec<_> =
             (0..3_000).map(|number| cycle.tick(tick(number), 0, [works(&bus)]).record).collect();
@@ -107,11 +108,12 @@ fn another_program_may_take_its_time_to_begin() {
 
 #[test]
 fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
-    let skin = testing::skin();
+    let skin = testing::one_cell_skin();
     let limit = u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1);
     let (mut cycle, mut bus) = cycle(Box::new(KinestheticController::new(&skin).unwrap()));
-    let bad =
-        |cycle: &mut Cycle, bus: &BusTotals, number| cycle.tick(tick(number), 0, [works(bus)]).record.bad;
+    let bad = |cycle: &mut ControlCycle, bus: &BusTotals, number| {
+        cycle.tick(tick(number), 0, [works(bus)]).record.bad
+    };
     for number in 0..=limit * 8 {
         assert_eq!(bad(&mut cycle, &bus, number), None, "tick {number}");
     }
@@ -122,7 +124,7 @@ fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
 
 /// A loop over two buses with eight ticks per epoch. Each bus has a torque of 1 Nm.
 struct TwoBuses {
-    cycle: Cycle,
+    cycle: ControlCycle,
     buses: [BusTotals; 2],
     works: [bool; 2],
     number: u64,
@@ -130,13 +132,13 @@ struct TwoBuses {
 
 impl TwoBuses {
     fn new(lost_bus: LostBusReaction) -> Self {
-        let mut skin = testing::two_buses();
+        let mut skin = testing::two_bus_skin();
         skin.safety.lost_bus = lost_bus;
         let robot = SimulatedArm::new(&skin, [0.0; MAX_ROBOT_JOINTS]);
         let controller = Box::new(KinestheticController::new(&skin).unwrap());
         let reference_torque =
             BusTotals { torque: [1.0; MAX_JOINTS], contributing: 1, ..BusTotals::default() };
-        let cycle = Cycle::new(&skin, controller, Box::new(robot));
+        let cycle = ControlCycle::new(&skin, controller, Box::new(robot));
         Self { cycle, buses: [reference_torque; 2], works: [true; 2], number: 0 }
     }
 
@@ -220,7 +222,8 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
 
 #[test]
 fn a_halted_robot_stands_whatever_is_commanded() {
-    let (mut cycle, mut bus) = cycle(Box::new(KinestheticController::new(&testing::skin()).unwrap()));
+    let (mut cycle, mut bus) =
+        cycle(Box::new(KinestheticController::new(&testing::one_cell_skin()).unwrap()));
     bus.torque = [5.0; MAX_JOINTS];
     for number in 0..50 {
         cycle.tick(tick(number), 0, [works(&bus)]);
@@ -267,7 +270,7 @@ fn absence_after(ticks: u64, present: std::ops::Range<u64>) -> (Option<Controlle
 
 #[test]
 fn a_run_that_ends_before_its_missing_controller_halts_it_is_without_one() {
-    let limit = u64::from(testing::skin().safety.bad_cycles);
+    let limit = u64::from(testing::one_cell_skin().safety.bad_cycles);
     assert!(absence_after(400, 0..0).0.is_some());
     // It has started to answer, and ends before it counts as present.
     assert!(absence_after(400, 100..100 + limit - 1).0.is_some());

@@ -11,7 +11,7 @@ use protocol::packet::{Epoch, Length, Packet};
 use protocol::parameters::MAX_JOINTS;
 
 use crate::cycle::carried::BusInput;
-use crate::cycle::{CentralTorque, Cycle, Tick, TickRecord};
+use crate::cycle::{CentralTorque, ControlCycle, Tick, TickRecord};
 use crate::external::ControllerAbsence;
 use model::scenario::{Scenario, TorqueSource};
 use model::table::Snapshot;
@@ -99,7 +99,7 @@ pub struct BusPort {
 /// The driver of the ticks. Its caller reads the clock and sends the frames.
 #[derive(Debug)]
 pub struct TickDriver {
-    cycle: Cycle,
+    cycle: ControlCycle,
     lines: Vec<BusPort>,
     scenario: Arc<Scenario>,
     shared: Arc<SharedRunState>,
@@ -116,7 +116,7 @@ impl TickDriver {
     /// Creates a driver for a loop over these buses, before its first tick.
     #[must_use]
     pub fn new(
-        cycle: Cycle,
+        cycle: ControlCycle,
         lines: Vec<BusPort>,
         scenario: Arc<Scenario>,
         shared: Arc<SharedRunState>,
@@ -135,8 +135,8 @@ impl TickDriver {
 
     /// Returns the controller's counters, each with its name.
     #[must_use]
-    pub fn counts(&self) -> Vec<(String, u64)> {
-        self.cycle.counts()
+    pub fn named_counters(&self) -> Vec<(String, u64)> {
+        self.cycle.named_counters()
     }
 
     /// Returns the reason for which the controller counts as absent; `None` if it does not.
@@ -183,11 +183,11 @@ impl TickDriver {
             // Many buses have the same joints: encode them once.
             let mut encoded_joints: Option<(usize, Format, EncodedFrames, [f64; MAX_JOINTS])> = None;
             for (bus, line) in self.lines.iter_mut().enumerate() {
-                let chain = self.cycle.chain_of(bus);
+                let chain = self.cycle.chain_index(bus);
                 let same =
                     encoded_joints.as_ref().filter(|(of, format, ..)| (*of, *format) == (chain, line.format));
                 if same.is_none() {
-                    let joints = Message::Joints { epoch, joints: self.cycle.joints(chain) };
+                    let joints = Message::Joints { epoch, joints: self.cycle.broadcast_joints(chain) };
                     let encoded = EncodedFrames::new(&joints.encode(), line.format);
                     encoded_joints = Some((chain, line.format, encoded, self.cycle.chain_positions(chain)));
                 }
@@ -200,9 +200,9 @@ impl TickDriver {
             self.shared.broadcasts.fetch_add(1, Ordering::Release);
         }
         if outcome.command == Some(Command::Halt) {
-            self.command(Message::Halt, &mut send);
+            self.command_all_buses(Message::Halt, &mut send);
         } else if outcome.command == Some(Command::Resume) {
-            self.command(Message::Resume, &mut send);
+            self.command_all_buses(Message::Resume, &mut send);
         }
         let timed = TimedRecord {
             record: outcome.record,
@@ -239,7 +239,7 @@ impl TickDriver {
 
     /// Sends a halt or resume on all buses. If a bus does not accept it, it is sent again before each of the next
     /// joints on that bus.
-    fn command(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+    fn command_all_buses(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
         self.pending_commands.fill(Some(message));
         self.send_pending(send);
     }

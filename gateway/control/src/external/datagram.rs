@@ -22,7 +22,7 @@ const STATE_KIND: u16 = 1;
 const ANSWER_KIND: u16 = 2;
 const HELLO_KIND: u16 = 3;
 
-const HEAD_BYTES: usize = 8;
+const HEADER_BYTES: usize = 8;
 /// Size of the longest answer in bytes.
 pub(super) const MAX_ANSWER_BYTES: usize = answer_bytes(MAX_ROBOT_JOINTS);
 
@@ -114,7 +114,7 @@ impl InvalidDatagram {
 struct Writer<'a>(&'a mut [u8]);
 
 impl Writer<'_> {
-    fn put<const N: usize>(&mut self, bytes: [u8; N]) {
+    fn put_bytes<const N: usize>(&mut self, bytes: [u8; N]) {
         if let Some((head, rest)) = core::mem::take(&mut self.0).split_first_chunk_mut() {
             *head = bytes;
             self.0 = rest;
@@ -122,14 +122,14 @@ impl Writer<'_> {
     }
 
     fn write_header(&mut self, kind: u16) {
-        self.put(MAGIC);
-        self.put(VERSION.to_le_bytes());
-        self.put(kind.to_le_bytes());
+        self.put_bytes(MAGIC);
+        self.put_bytes(VERSION.to_le_bytes());
+        self.put_bytes(kind.to_le_bytes());
     }
 
     fn write_joints(&mut self, all: [f64; MAX_ROBOT_JOINTS], joints: usize) {
         for value in all.into_iter().take(value_count(joints)) {
-            self.put(value.to_le_bytes());
+            self.put_bytes(value.to_le_bytes());
         }
     }
 }
@@ -138,7 +138,7 @@ impl Writer<'_> {
 struct Reader<'a>(&'a [u8]);
 
 impl Reader<'_> {
-    fn take<const N: usize>(&mut self) -> [u8; N] {
+    fn take_bytes<const N: usize>(&mut self) -> [u8; N] {
         let Some((head, rest)) = self.0.split_first_chunk() else { return [0; N] };
         self.0 = rest;
         *head
@@ -148,23 +148,23 @@ impl Reader<'_> {
     fn read_joints(&mut self, joints: usize) -> [f64; MAX_ROBOT_JOINTS] {
         let mut all = [0.0; MAX_ROBOT_JOINTS];
         for value in all.iter_mut().take(value_count(joints)) {
-            *value = f64::from_le_bytes(self.take());
+            *value = f64::from_le_bytes(self.take_bytes());
         }
         all
     }
 
     /// Reads the header and returns the kind of the datagram.
     fn read_header(&mut self) -> Result<u16, InvalidDatagram> {
-        if self.0.len() < HEAD_BYTES {
+        if self.0.len() < HEADER_BYTES {
             return Err(InvalidDatagram::Length);
         }
-        if self.take() != MAGIC {
+        if self.take_bytes() != MAGIC {
             return Err(InvalidDatagram::Magic);
         }
-        if u16::from_le_bytes(self.take()) != VERSION {
+        if u16::from_le_bytes(self.take_bytes()) != VERSION {
             return Err(InvalidDatagram::Version);
         }
-        Ok(u16::from_le_bytes(self.take()))
+        Ok(u16::from_le_bytes(self.take_bytes()))
     }
 }
 
@@ -183,15 +183,15 @@ impl StateDatagram {
         let mut out = Writer(&mut bytes);
         let input = &self.input;
         out.write_header(STATE_KIND);
-        out.put(input.tick.to_le_bytes());
-        out.put(input.time.0.to_le_bytes());
-        out.put(input.age.to_le_bytes());
-        out.put(input.contributing.to_le_bytes());
+        out.put_bytes(input.tick.to_le_bytes());
+        out.put_bytes(input.time.0.to_le_bytes());
+        out.put_bytes(input.age.to_le_bytes());
+        out.put_bytes(input.contributing.to_le_bytes());
         let flag = |bit, set| if set { bit } else { 0 };
         let missing = input.missing | flag(1 << 15, input.missing >> 16 != 0);
         let flags = flag(Self::VALID_FLAG, input.valid) | flag(Self::HALTED_FLAG, input.halted);
-        out.put((flags | missing << Self::MISSING_BUSES_SHIFT).to_le_bytes());
-        out.put(self.joints.to_le_bytes());
+        out.put_bytes((flags | missing << Self::MISSING_BUSES_SHIFT).to_le_bytes());
+        out.put_bytes(self.joints.to_le_bytes());
         out.write_joints(input.q, joints);
         out.write_joints(input.qdot, joints);
         out.write_joints(input.torque, joints);
@@ -212,19 +212,19 @@ impl ReceivedDatagram {
     pub(super) fn decode(bytes: &[u8], joints: usize) -> Result<Self, InvalidDatagram> {
         let mut from = Reader(bytes);
         let expected = match from.read_header()? {
-            HELLO_KIND => HEAD_BYTES,
+            HELLO_KIND => HEADER_BYTES,
             ANSWER_KIND => answer_bytes(joints),
             _ => return Err(InvalidDatagram::Kind),
         };
         if bytes.len() != expected {
             return Err(InvalidDatagram::Length);
         }
-        if expected == HEAD_BYTES {
+        if expected == HEADER_BYTES {
             return Ok(Self::Hello);
         }
-        let tick = u64::from_le_bytes(from.take());
-        let command = u32::from_le_bytes(from.take());
-        let _zero: [u8; 4] = from.take();
+        let tick = u64::from_le_bytes(from.take_bytes());
+        let command = u32::from_le_bytes(from.take_bytes());
+        let _zero: [u8; 4] = from.take_bytes();
         let values = from.read_joints(joints);
         if !values.iter().all(|value| value.is_finite()) {
             return Err(InvalidDatagram::NotFinite);
@@ -251,17 +251,17 @@ mod peer {
                 return Err(InvalidDatagram::Kind);
             }
             let mut input = ControllerInput {
-                tick: u64::from_le_bytes(from.take()),
-                time: protocol::time::Micros(u64::from_le_bytes(from.take())),
-                age: u32::from_le_bytes(from.take()),
-                contributing: u32::from_le_bytes(from.take()),
+                tick: u64::from_le_bytes(from.take_bytes()),
+                time: protocol::time::Micros(u64::from_le_bytes(from.take_bytes())),
+                age: u32::from_le_bytes(from.take_bytes()),
+                contributing: u32::from_le_bytes(from.take_bytes()),
                 ..ControllerInput::default()
             };
-            let flags = u32::from_le_bytes(from.take());
+            let flags = u32::from_le_bytes(from.take_bytes());
             input.valid = flags & Self::VALID_FLAG != 0;
             input.halted = flags & Self::HALTED_FLAG != 0;
             input.missing = flags >> Self::MISSING_BUSES_SHIFT;
-            let joints = u32::from_le_bytes(from.take());
+            let joints = u32::from_le_bytes(from.take_bytes());
             let count = usize::try_from(joints).unwrap();
             if bytes.len() != state_bytes(count) {
                 return Err(InvalidDatagram::Length);
@@ -279,13 +279,13 @@ mod peer {
             let mut bytes = vec![0; answer_bytes(joints)];
             let mut out = Writer(&mut bytes);
             out.write_header(ANSWER_KIND);
-            out.put(self.tick.to_le_bytes());
+            out.put_bytes(self.tick.to_le_bytes());
             let (command, values) = match self.command {
                 JointCommand::Velocity(values) => (Self::VELOCITY_COMMAND, values),
                 JointCommand::Position(values) => (Self::POSITION_COMMAND, values),
             };
-            out.put(command.to_le_bytes());
-            out.put([0; 4]);
+            out.put_bytes(command.to_le_bytes());
+            out.put_bytes([0; 4]);
             out.write_joints(values, joints);
             bytes
         }

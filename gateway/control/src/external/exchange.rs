@@ -34,7 +34,7 @@ pub(super) struct ExchangeCounts {
 
 impl ExchangeCounts {
     /// Returns all counters with their names.
-    pub(super) fn named(&self) -> impl Iterator<Item = (String, u64)> {
+    pub(super) fn named_counters(&self) -> impl Iterator<Item = (String, u64)> {
         let own = [
             ("hellos", self.hellos),
             ("answers", self.answers),
@@ -81,7 +81,7 @@ impl ExchangeCounts {
 
 /// The sender of a datagram.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Sender {
+pub(super) enum DatagramSender {
     Peer,
     Other,
 }
@@ -114,28 +114,28 @@ impl DatagramExchange {
     }
 
     /// Handles a received datagram. Returns true if the datagram is a hello that makes its sender the peer.
-    pub(super) fn handle(&mut self, bytes: &[u8], sender: Sender) -> bool {
+    pub(super) fn handle_datagram(&mut self, bytes: &[u8], sender: DatagramSender) -> bool {
         let answer = match (ReceivedDatagram::decode(bytes, self.joints), sender) {
             (Ok(ReceivedDatagram::Hello), _) => {
                 let counts =
                     ExchangeCounts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
                 // A second hello of the peer keeps its pending answer.
-                if sender == Sender::Other || !self.connected {
+                if sender == DatagramSender::Other || !self.connected {
                     *self = Self::new(self.joints);
                 }
                 (self.connected, self.counts) = (true, counts);
                 return true;
             }
-            (_, Sender::Other) => {
+            (_, DatagramSender::Other) => {
                 self.counts.other_senders += 1;
                 return false;
             }
-            (Err(why), Sender::Peer) => {
+            (Err(why), DatagramSender::Peer) => {
                 self.nonsense = true;
                 self.counts.count_invalid(why);
                 return false;
             }
-            (Ok(ReceivedDatagram::Answer(answer)), Sender::Peer) => answer,
+            (Ok(ReceivedDatagram::Answer(answer)), DatagramSender::Peer) => answer,
         };
         match self.due {
             Some(due) if answer.tick > due => {
@@ -177,7 +177,7 @@ impl DatagramExchange {
     }
 
     /// Records the result of sending the state of a tick.
-    pub(super) fn note_sent(&mut self, tick: u64, sent: SendResult) {
+    pub(super) fn record_send_result(&mut self, tick: u64, sent: SendResult) {
         match sent {
             SendResult::Taken => self.due = Some(tick),
             SendResult::QueueFull => {

@@ -14,7 +14,7 @@ use thiserror::Error;
 
 use super::absence::ControllerAbsence;
 use super::datagram::{MAX_ANSWER_BYTES, StateDatagram};
-use super::exchange::{DatagramExchange, SendResult, Sender};
+use super::exchange::{DatagramExchange, DatagramSender, SendResult};
 use crate::controller::{Controller, ControllerInput, ControllerOutput, SpeedLimits};
 
 /// Maximum number of datagrams that are received per tick. Others remain in the socket's queue, so that no sender can
@@ -102,8 +102,8 @@ impl ExternalController {
                 continue;
             }
             let known = self.peer.as_ref().is_some_and(|peer| is_same_address(peer, &from));
-            let sender = if known { Sender::Peer } else { Sender::Other };
-            if self.exchange.handle(bytes.get(..length).unwrap_or(&bytes), sender) {
+            let sender = if known { DatagramSender::Peer } else { DatagramSender::Other };
+            if self.exchange.handle_datagram(bytes.get(..length).unwrap_or(&bytes), sender) {
                 self.peer = Some(from);
             }
         }
@@ -121,7 +121,7 @@ impl ExternalController {
         if sent == SendResult::PeerGone {
             self.peer = None;
         }
-        self.exchange.note_sent(input.tick, sent);
+        self.exchange.record_send_result(input.tick, sent);
     }
 }
 
@@ -133,8 +133,8 @@ impl Controller for ExternalController {
         step
     }
 
-    fn counts(&self) -> Vec<(String, u64)> {
-        self.exchange.counts.named().collect()
+    fn named_counters(&self) -> Vec<(String, u64)> {
+        self.exchange.counts.named_counters().collect()
     }
 
     fn absence(&self, silent: Option<u32>) -> Option<ControllerAbsence> {

@@ -9,13 +9,13 @@ use tempfile::TempDir;
 use super::datagram::ReceivedDatagram;
 use super::*;
 use crate::controller::{BadCycle, Controller, ControllerInput, ControllerOutput};
-use model::testing::skin;
-use protocol::packet::padded;
+use model::testing::one_cell_skin;
+use protocol::packet::pad_with_defaults;
 
 const HELLO: &[u8] = b"SKBC\x01\x00\x03\x00";
 
 fn listen(path: &Path) -> Result<ExternalController, SocketError> {
-    ExternalController::listen(path, &skin())
+    ExternalController::listen(path, &one_cell_skin())
 }
 
 /// Creates a directory, and a gateway that listens on a socket in it. Returns both, and the path of the socket.
@@ -39,7 +39,7 @@ fn input(tick: u64) -> ControllerInput {
 }
 
 fn velocity(tick: u64, first: f64) -> Vec<u8> {
-    let command = JointCommand::Velocity(padded(&[first, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    let command = JointCommand::Velocity(pad_with_defaults(&[first, 0.0, 0.0, 0.0, 0.0, 0.0]));
     AnswerDatagram { tick, command }.encode(6)
 }
 
@@ -50,7 +50,7 @@ fn state(socket: &UnixDatagram) -> StateDatagram {
 }
 
 fn count(gateway: &ExternalController, name: &str) -> u64 {
-    gateway.counts().into_iter().find(|(known, _)| known == name).unwrap().1
+    gateway.named_counters().into_iter().find(|(known, _)| known == name).unwrap().1
 }
 
 #[test]
@@ -58,9 +58,9 @@ fn a_state_is_the_bytes_of_the_documented_table() {
     let input = ControllerInput {
         tick: 0x0102,
         time: protocol::time::Micros(516_000),
-        q: padded(&[1.0, 0.0, 0.0, 0.0, 0.0, -2.0]),
-        qdot: padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0]),
-        torque: padded(&[0.0, 0.0, 0.0, 0.0, 0.0, 0.25]),
+        q: pad_with_defaults(&[1.0, 0.0, 0.0, 0.0, 0.0, -2.0]),
+        qdot: pad_with_defaults(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        torque: pad_with_defaults(&[0.0, 0.0, 0.0, 0.0, 0.0, 0.25]),
         age: 3,
         contributing: 20,
         valid: true,
@@ -85,7 +85,7 @@ fn a_robot_of_more_joints_has_longer_datagrams() {
     assert_eq!(bytes[40 + 13 * 8..][..8], *b"\0\0\0\0\0\0\xe0\x3f");
     assert_eq!(bytes[40 + 39 * 8 - 8..], *b"\0\0\0\0\0\0\xd0\x3f");
     assert_eq!(StateDatagram::decode(&bytes), Ok(StateDatagram { input, joints: 13 }));
-    let answer = AnswerDatagram { tick: 7, command: JointCommand::Velocity(padded(&[1.0; 13])) };
+    let answer = AnswerDatagram { tick: 7, command: JointCommand::Velocity(pad_with_defaults(&[1.0; 13])) };
     assert_eq!(answer.encode(13).len(), 24 + 13 * 8);
     assert_eq!(ReceivedDatagram::decode(&answer.encode(13), 13), Ok(ReceivedDatagram::Answer(answer)));
     assert_eq!(ReceivedDatagram::decode(&answer.encode(13), 7), Err(InvalidDatagram::Length));
@@ -104,7 +104,7 @@ fn buses_beyond_the_16th_share_its_bit() {
 
 #[test]
 fn an_answer_is_the_bytes_of_the_documented_table() {
-    let command = JointCommand::Position(padded(&[-2.0, 0.0, 0.0, 0.0, 0.0, 1.0]));
+    let command = JointCommand::Position(pad_with_defaults(&[-2.0, 0.0, 0.0, 0.0, 0.0, 1.0]));
     let bytes = AnswerDatagram { tick: 7, command }.encode(6);
     assert_eq!(bytes[..24], *b"SKBC\x01\x00\x02\x00\x07\0\0\0\0\0\0\0\x02\0\0\0\0\0\0\0");
     assert_eq!(bytes[24..32], *b"\0\0\0\0\0\0\0\xc0");
@@ -128,8 +128,11 @@ fn an_answer_is_executed_in_the_next_tick() {
     );
     assert_eq!(state(&program), StateDatagram { input: input(1), joints: 6 });
     program.send(&velocity(1, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(2)), ControllerOutput::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
-    let command = JointCommand::Position(padded(&[0.001, 0.0, 0.0, 0.0, 0.0, -9.0]));
+    assert_eq!(
+        gateway.step(&input(2)),
+        ControllerOutput::Move(pad_with_defaults(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    );
+    let command = JointCommand::Position(pad_with_defaults(&[0.001, 0.0, 0.0, 0.0, 0.0, -9.0]));
     program.send(&AnswerDatagram { tick: 2, command }.encode(6)).unwrap();
     let ControllerOutput::Move([first, _, _, _, _, last, ..]) = gateway.step(&input(3)) else {
         panic!("an answer was there")
@@ -137,10 +140,17 @@ fn an_answer_is_executed_in_the_next_tick() {
     assert!((first - 0.5).abs() < 1e-12, "a thousandth of a radian in 2 ms");
     assert!((last + 3.0).abs() < 1e-12, "no quicker than it may");
     program.send(&velocity(3, 99.0)).unwrap();
-    assert_eq!(gateway.step(&input(4)), ControllerOutput::Move(padded(&[2.0, 0.0, 0.0, 0.0, 0.0, 0.0])));
+    assert_eq!(
+        gateway.step(&input(4)),
+        ControllerOutput::Move(pad_with_defaults(&[2.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    );
     program.send(&velocity(4, 1.0)).unwrap();
     let halted = ControllerInput { halted: true, ..input(5) };
-    assert_eq!(gateway.step(&halted), ControllerOutput::Move(padded(&[0.0; 6])), "a halted robot stays");
+    assert_eq!(
+        gateway.step(&halted),
+        ControllerOutput::Move(pad_with_defaults(&[0.0; 6])),
+        "a halted robot stays"
+    );
     assert_eq!((count(&gateway, "answers"), count(&gateway, "missing")), (4, 0));
 }
 
@@ -159,7 +169,7 @@ fn a_missing_answer_is_a_bad_cycle_and_a_late_one_is_none() {
     let step = gateway.step(&input(7));
     assert_eq!(
         step,
-        ControllerOutput::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])),
+        ControllerOutput::Move(pad_with_defaults(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])),
         "the first answer to the last tick"
     );
     assert_eq!((count(&gateway, "missing"), count(&gateway, "late")), (2, 2));
@@ -209,7 +219,10 @@ fn the_sender_of_the_last_hello_is_the_peer_and_others_are_ignored() {
     second.send(b"nonsense").unwrap();
     second.send(&velocity(1, 1.0)).unwrap();
     first.send(&velocity(1, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(2)), ControllerOutput::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
+    assert_eq!(
+        gateway.step(&input(2)),
+        ControllerOutput::Move(pad_with_defaults(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    );
     assert_eq!(count(&gateway, "other senders"), 2);
     second.send(HELLO).unwrap();
     first.send(&velocity(2, 0.5)).unwrap();
@@ -223,7 +236,7 @@ fn the_sender_of_the_last_hello_is_the_peer_and_others_are_ignored() {
     let step = gateway.step(&input(4));
     assert_eq!(
         step,
-        ControllerOutput::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])),
+        ControllerOutput::Move(pad_with_defaults(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])),
         "a second hello changes nothing"
     );
 }
@@ -254,7 +267,7 @@ fn a_peer_that_does_not_read_delays_nothing() {
     for tick in 0..10_000 {
         gateway.step(&input(tick));
     }
-    assert!(count(&gateway, "unsent") > 9_000, "{:?}", gateway.counts());
+    assert!(count(&gateway, "unsent") > 9_000, "{:?}", gateway.named_counters());
     assert_eq!(count(&gateway, "missing"), 9_999);
 }
 
@@ -339,7 +352,7 @@ proptest! {
 
     #[test]
     fn an_answer_comes_back(tick: u64, values in proptest::array::uniform6(-1e9..1e9), which: bool) {
-        let command = if which { JointCommand::Velocity(padded(&values)) } else { JointCommand::Position(padded(&values)) };
+        let command = if which { JointCommand::Velocity(pad_with_defaults(&values)) } else { JointCommand::Position(pad_with_defaults(&values)) };
         let answer = AnswerDatagram { tick, command };
         prop_assert_eq!(ReceivedDatagram::decode(&answer.encode(6), 6), Ok(ReceivedDatagram::Answer(answer)));
     }

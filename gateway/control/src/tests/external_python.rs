@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use crate::controller::{Controller, ControllerInput, ControllerOutput};
 use crate::external::ExternalController;
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
@@ -32,7 +32,7 @@ fn the_example_in_python_makes_the_arm_give_way() {
     let python = Command::new("python3").arg(example).arg(&path).stdout(Stdio::piped()).spawn();
     let mut python = Running(python.expect("python3 is needed: apt install python3"));
     let torque = [2.0, -1.0, 0.5, 0.0, 0.0, 0.0];
-    let target = ControllerOutput::Move(padded(&[0.5, -0.25, 0.125, 0.0, 0.0, 0.0]));
+    let target = ControllerOutput::Move(pad_with_defaults(&[0.5, -0.25, 0.125, 0.0, 0.0, 0.0]));
     let (start, mut tick, mut answers) = (Instant::now(), 0, 0);
     let mut report = BufReader::new(python.0.stdout.take().unwrap());
     let report = thread::spawn(move || {
@@ -46,7 +46,7 @@ fn the_example_in_python_makes_the_arm_give_way() {
         let input = ControllerInput {
             tick,
             time,
-            torque: padded(&torque),
+            torque: pad_with_defaults(&torque),
             contributing: 3,
             valid: true,
             ..ControllerInput::default()
@@ -58,7 +58,7 @@ fn the_example_in_python_makes_the_arm_give_way() {
         }
         thread::yield_now();
     }
-    let counts = gateway.counts();
+    let counts = gateway.named_counters();
     assert!(counts.iter().all(|(name, count)| !name.starts_with("nonsense") || *count == 0), "{counts:?}");
     let report = report.join().unwrap().unwrap();
     assert!(report.contains("3 cells") && report.contains("torque +2.00 -1.00 +0.50"), "{report}");

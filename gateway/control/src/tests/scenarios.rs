@@ -3,13 +3,13 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use crate::controller::{ControllerInput, ControllerOutput};
-use crate::motion::controller_of;
+use crate::motion::controller_for_motion;
 use crate::robot::{Robot, SimulatedArm};
 use model::central::CentralComputation;
 use model::scenario::{Scenario, Touches};
 use protocol::fixed::Q1_14;
 use protocol::message::SkinSensors;
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::time::Micros;
@@ -33,7 +33,7 @@ fn play(scenario: &str) -> Maxima {
     let skin = Skin::parse("ur5-253.toml", include_str!("../../../examples/ur5-253.toml")).unwrap();
     let scenario = Scenario::parse("scenario", scenario, &skin).unwrap();
     let start = scenario.motion.start;
-    let mut controller = controller_of(&skin, &scenario.motion).unwrap();
+    let mut controller = controller_for_motion(&skin, &scenario.motion).unwrap();
     let central = CentralComputation::new(&skin);
     let mut arm = SimulatedArm::new(&skin, start);
     let mut touches = Touches::new(&scenario, &skin);
@@ -47,12 +47,12 @@ fn play(scenario: &str) -> Maxima {
                 *sensors.get_mut(stimulus.cell).unwrap() = stimulus.readings.skin;
             }
             let joints: Vec<_> = arm.positions().map(|angle| Q1_14::from_radians(angle).unwrap()).to_vec();
-            let frames = central.frames(&joints);
+            let frames = central.link_frames(&joints);
             let total = central.total_torque(&frames, &sensors);
             torque = total.torque;
             most.active.push(total.active);
             for (cell, sensors) in sensors.iter().enumerate() {
-                let own = central.torque(cell, &frames, central.force(cell, sensors));
+                let own = central.cell_torque(cell, &frames, central.cell_force(cell, sensors));
                 most.torque = own.iter().fold(most.torque, |most, torque| most.max(torque.abs()));
             }
             most.sum = torque.iter().fold(most.sum, |most, torque| most.max(torque.abs()));
@@ -64,7 +64,7 @@ fn play(scenario: &str) -> Maxima {
             time,
             q,
             qdot,
-            torque: padded(&torque),
+            torque: pad_with_defaults(&torque),
             valid: true,
             ..ControllerInput::default()
         };

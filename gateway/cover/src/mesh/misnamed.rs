@@ -9,7 +9,7 @@ use super::MeshError;
 const CONVERT_ADVICE: &str = "convert it to stl, dae or obj, and name that in the URDF";
 
 /// The first bytes, the name of the format, and the advice for each known format.
-const MAGIC: &[(&[u8], &str, &str)] = &[
+const FORMAT_SIGNATURES: &[(&[u8], &str, &str)] = &[
     (b"glTF", "a binary glTF file", CONVERT_ADVICE),
     (b"ply\n", "a PLY mesh", CONVERT_ADVICE),
     (b"ply\r", "a PLY mesh", CONVERT_ADVICE),
@@ -20,14 +20,14 @@ const MAGIC: &[(&[u8], &str, &str)] = &[
 
 /// Returns an error that names the actual format of a file; `None` if no other format is recognised. `extension` is in
 /// lower case.
-pub(super) fn error(file: &str, extension: &str, bytes: &[u8]) -> Option<MeshError> {
+pub(super) fn actual_format_error(file: &str, extension: &str, bytes: &[u8]) -> Option<MeshError> {
     let (what, hint) = detect_format(extension, bytes)?;
     Some(MeshError::Foreign { file: file.to_owned(), line: None, what, hint })
 }
 
 fn detect_format(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).trim_ascii_start();
-    if let Some((_, what, hint)) = MAGIC.iter().find(|(magic, ..)| bytes.starts_with(magic)) {
+    if let Some((_, what, hint)) = FORMAT_SIGNATURES.iter().find(|(magic, ..)| bytes.starts_with(magic)) {
         return Some(((*what).to_owned(), hint));
     }
     if extension != "stl" && text.starts_with(b"solid") {

@@ -16,7 +16,7 @@ use std::io;
 use std::path::Path;
 
 use nalgebra::{Matrix3, Point3, Vector3};
-use protocol::xml::{ForeignFile, XmlFault, detect_foreign};
+use protocol::xml::{UnexpectedFileKind, XmlFault, detect_unexpected_file};
 use thiserror::Error;
 
 pub use simplify::simplify;
@@ -200,7 +200,7 @@ impl Mesh {
     /// # Errors
     /// Returns [`MeshError`] as [`Mesh::load`] does.
     pub fn parse(name: &str, bytes: &[u8], up: UpAxis) -> Result<Self, MeshError> {
-        if let Some(ForeignFile { line, what, hint }) = detect_foreign(bytes) {
+        if let Some(UnexpectedFileKind { line, what, hint }) = detect_unexpected_file(bytes) {
             return Err(MeshError::Foreign { file: name.to_owned(), line, what: what.to_owned(), hint });
         }
         let extension = Path::new(name).extension().and_then(OsStr::to_str).unwrap_or_default();
@@ -216,7 +216,7 @@ impl Mesh {
                 error,
                 MeshError::Syntax { .. } | MeshError::Damaged { .. } | MeshError::Empty { .. }
             );
-            let other = if is_of_content { misnamed::error(name, &known, bytes) } else { None };
+            let other = if is_of_content { misnamed::actual_format_error(name, &known, bytes) } else { None };
             other.unwrap_or(error)
         })
     }

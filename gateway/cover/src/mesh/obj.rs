@@ -11,15 +11,17 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
     let mut filled = Triangulation::default();
     // Names may have any encoding, but numbers are always ASCII.
     let text = String::from_utf8_lossy(bytes);
-    for (line, words) in lines(&text) {
+    for (line, words) in numbered_word_lines(&text) {
         let wrong = |why: String| syntax(name, &format!("line {line}: {why}"));
         let mut words = words.iter().flat_map(|part| part.split_ascii_whitespace());
         match words.next() {
-            Some("v") => vertices.push(vertex(words).map_err(wrong)?),
+            Some("v") => vertices.push(parse_vertex(words).map_err(wrong)?),
             Some("f") => {
-                let corners: Vec<_> =
-                    words.map(|word| corner(word, &vertices)).collect::<Result<_, _>>().map_err(wrong)?;
-                filled.add(&corners, &[]);
+                let corners: Vec<_> = words
+                    .map(|word| parse_corner(word, &vertices))
+                    .collect::<Result<_, _>>()
+                    .map_err(wrong)?;
+                filled.add_polygon(&corners, &[]);
                 if filled.triangles.len() > MAX_TRIANGLES {
                     return Err(too_many(name, filled.triangles.len()));
                 }
@@ -32,7 +34,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
 
 /// Splits a text into lines of words, each with its line number from 1. Comments are removed, and a line that ends with
 /// `\` is joined with the next one.
-fn lines(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
+fn numbered_word_lines(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
     let text = text.trim_start_matches('\u{feff}');
     let mut lines = text.lines().enumerate();
     core::iter::from_fn(move || {
@@ -51,7 +53,7 @@ fn lines(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
 }
 
 /// Parses a vertex: x, y, z, and optionally a weight or a colour.
-fn vertex<'a>(words: impl Iterator<Item = &'a str>) -> Result<Point3<f64>, String> {
+fn parse_vertex<'a>(words: impl Iterator<Item = &'a str>) -> Result<Point3<f64>, String> {
     let number = |word: &str| word.parse::<f32>().map_err(|_| format!("{word:?} is not a number"));
     let number = |word| number(word).map(f64::from);
     let numbers = words.map(number).collect::<Result<Vec<_>, _>>()?;
@@ -65,7 +67,7 @@ fn vertex<'a>(words: impl Iterator<Item = &'a str>) -> Result<Point3<f64>, Strin
 
 /// Returns the vertex of a face's corner: `5`, `5/1`, `5//1` or `5/1/1`. Only the first number is used; a negative one
 /// counts back from the last vertex.
-fn corner(word: &str, vertices: &[Point3<f64>]) -> Result<Point3<f64>, String> {
+fn parse_corner(word: &str, vertices: &[Point3<f64>]) -> Result<Point3<f64>, String> {
     let number = word.split('/').next().unwrap_or_default();
     let index = number.parse::<i64>().map_err(|_| format!("{word:?} is not a corner of a face"))?;
     let count = i64::try_from(vertices.len()).unwrap_or(i64::MAX);

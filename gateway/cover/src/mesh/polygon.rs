@@ -33,21 +33,21 @@ pub(super) struct Triangulation {
 impl Triangulation {
     /// Adds the triangles of a polygon with holes. The polygon need not be planar: it is projected along its mean
     /// normal (Newell's method). A polygon without an area adds no triangles.
-    pub(super) fn add(&mut self, outline: &[Point3<f64>], holes: &[Vec<Point3<f64>>]) {
+    pub(super) fn add_polygon(&mut self, outline: &[Point3<f64>], holes: &[Vec<Point3<f64>>]) {
         if let (&[a, b, c], []) = (outline, holes) {
             self.triangles.push([a, b, c]);
             return;
         }
         let corners = outline.len() + holes.iter().map(Vec::len).sum::<usize>();
-        let plane = match Plane::project(outline) {
-            Outline::Flat(plane) => plane,
-            Outline::Thin => return,
-            Outline::Opposite { area } => {
+        let plane = match Plane::project_polygon(outline) {
+            ProjectedPolygon::Flat(plane) => plane,
+            ProjectedPolygon::Thin => return,
+            ProjectedPolygon::Opposite { area } => {
                 self.record_fault(area, &format!("a polygon with {corners} corners crosses itself"));
                 return;
             }
         };
-        let flat = plane.points(outline);
+        let flat = plane.plane_coordinates(outline);
         let from = self.triangles.len();
         let (expected, got) = if holes.is_empty() && is_fan(&flat) {
             add_fan(outline, &mut self.triangles);
@@ -66,7 +66,7 @@ impl Triangulation {
             return;
         }
         let added = self.triangles.get(from..).unwrap_or_default();
-        let bent = added.iter().map(surface::area).sum::<f64>() / scale;
+        let bent = added.iter().map(surface::triangle_area).sum::<f64>() / scale;
         if bent > MAX_BENT_AREA_RATIO * expected {
             let share = bent / expected;
             let why = format!(
@@ -89,7 +89,7 @@ impl Triangulation {
         let mut expected = area(&flat);
         let mut starts = Vec::new();
         for hole in holes.iter().filter(|hole| hole.len() >= 3) {
-            let flat_hole = plane.points(hole);
+            let flat_hole = plane.plane_coordinates(hole);
             expected -= area(&flat_hole).abs();
             starts.push(flat.len());
             flat.extend(flat_hole);
@@ -120,7 +120,7 @@ impl Triangulation {
     /// Returns all triangles. Returns a description of the worst polygon instead, if too much of the area is in
     /// polygons that intersect themselves or are bent.
     pub(super) fn finish(self) -> Result<Vec<Triangle>, String> {
-        let whole: f64 = self.triangles.iter().map(surface::area).sum();
+        let whole: f64 = self.triangles.iter().map(surface::triangle_area).sum();
         match self.worst {
             Some((_, why)) if self.off.is_nan() || self.off > MAX_FAULTY_AREA_SHARE * whole => {
                 Err(format!("{why}: triangulate it in the program in which it was drawn"))
@@ -141,7 +141,7 @@ pub(super) fn add_fan(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
 }
 
 /// The result of projecting a polygon along its mean normal.
-enum Outline {
+enum ProjectedPolygon {
     Flat(Plane),
     /// The polygon has no area.
     Thin,
@@ -160,8 +160,8 @@ struct Plane {
 }
 
 impl Plane {
-    fn project(outline: &[Point3<f64>]) -> Outline {
-        let [origin, ..] = *outline else { return Outline::Thin };
+    fn project_polygon(outline: &[Point3<f64>]) -> ProjectedPolygon {
+        let [origin, ..] = *outline else { return ProjectedPolygon::Thin };
         let far = |point: &Point3<f64>| (point - origin).norm();
         let farthest = outline.iter().max_by(|a, b| far(a).total_cmp(&far(b))).unwrap_or(&origin);
         let extent = far(farthest);
@@ -169,18 +169,18 @@ impl Plane {
         let along = from(farthest);
         let width = outline.iter().map(|point| from(point).cross(&along).norm()).fold(0.0, f64::max);
         if width < MAX_THIN_WIDTH_RATIO || !along.norm().is_finite() {
-            return Outline::Thin;
+            return ProjectedPolygon::Thin;
         }
         let next = outline.iter().cycle().skip(1);
         let normal: Vector3<f64> = outline.iter().zip(next).map(|(a, b)| from(a).cross(&from(b))).sum();
         match Unit::try_new(normal, MAX_THIN_WIDTH_RATIO * width) {
-            Some(normal) => Outline::Flat(Self { origin, axes: tangents(&normal), extent }),
-            None => Outline::Opposite { area: width * extent * extent },
+            Some(normal) => ProjectedPolygon::Flat(Self { origin, axes: tangents(&normal), extent }),
+            None => ProjectedPolygon::Opposite { area: width * extent * extent },
         }
     }
 
     /// Returns the coordinates of points in the plane. The polygon is counterclockwise in these.
-    fn points(&self, corners: &[Point3<f64>]) -> Vec<[f64; 2]> {
+    fn plane_coordinates(&self, corners: &[Point3<f64>]) -> Vec<[f64; 2]> {
         let Self { origin, axes: (x, y), extent } = self;
         let flat = |corner: &Point3<f64>| {
             let from = (corner - origin) / *extent;
@@ -212,13 +212,13 @@ fn is_fan(polygon: &[[f64; 2]]) -> bool {
         _ => false,
     });
     let turns: f64 =
-        rest.windows(2).map(|edge| if let &[a, b] = edge { angle(*first, a, b) } else { 0.0 }).sum();
+        rest.windows(2).map(|edge| if let &[a, b] = edge { angle_between(*first, a, b) } else { 0.0 }).sum();
     runs_on && signed_triangle_area(*first, *second, *last) >= 0.0 && turns < core::f64::consts::PI
 }
 
 /// Returns the angle between the directions from one point to two others, in rad. Returns 0 if one of them is the point
 /// itself.
-fn angle([x, y]: [f64; 2], [ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
+fn angle_between([x, y]: [f64; 2], [ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
     let ([ax, ay], [bx, by]) = ([ax - x, ay - y], [bx - x, by - y]);
     (ax * by - ay * bx).atan2(ax * bx + ay * by).abs()
 }
@@ -240,13 +240,13 @@ mod tests {
         };
         let holes: Vec<_> = holes.iter().map(|hole| points(hole)).collect();
         let mut filled = Triangulation::default();
-        filled.add(&points(outline), &holes);
+        filled.add_polygon(&points(outline), &holes);
         let triangles = filled.finish()?;
         Ok(triangles.iter().map(|triangle| triangle.map(|corner| pose.inverse() * corner)).collect())
     }
 
     fn total(triangles: &[Triangle]) -> f64 {
-        triangles.iter().map(surface::area).sum()
+        triangles.iter().map(surface::triangle_area).sum()
     }
 
     fn is_inside([x, y]: [f64; 2], polygon: &[[f64; 2]]) -> bool {
@@ -307,8 +307,8 @@ mod tests {
         assert!(filled(&star, &[]).unwrap_err().contains("5 corners crosses itself"));
         let mut filled = Triangulation::default();
         let corner = |&[x, y]: &[f64; 2]| Point3::new(x, y, 0.0);
-        filled.add(&[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].each_ref().map(corner), &[]);
-        filled.add(&[[0.0, 0.0], [0.01, 0.01], [0.01, 0.0], [0.0, 0.01]].each_ref().map(corner), &[]);
+        filled.add_polygon(&[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].each_ref().map(corner), &[]);
+        filled.add_polygon(&[[0.0, 0.0], [0.01, 0.01], [0.01, 0.0], [0.0, 0.01]].each_ref().map(corner), &[]);
         assert!((total(&filled.finish().unwrap()) - 1.0).abs() < 1e-3);
     }
 
@@ -317,7 +317,7 @@ mod tests {
         let folded = |lift: f64| {
             let mut filled = Triangulation::default();
             let corner = |[x, y, z]: [f64; 3]| Point3::new(x, y, z);
-            filled.add(
+            filled.add_polygon(
                 &[[0.0, 0.0, 0.0], [1.0, 0.0, lift], [1.0, 1.0, 0.0], [0.0, 1.0, lift]].map(corner),
                 &[],
             );
@@ -353,7 +353,7 @@ mod tests {
             prop_assert!((total(&triangles) - own).abs() < 1e-9 * own, "{} {own}", total(&triangles));
             for [a, b, c] in triangles {
                 let middle = (a.coords + b.coords + c.coords) / 3.0;
-                if surface::area(&[a, b, c]) > 1e-6 {
+                if surface::triangle_area(&[a, b, c]) > 1e-6 {
                     prop_assert!(is_inside([middle.x, middle.y], &outline));
                 }
             }
@@ -366,7 +366,7 @@ mod tests {
         ) {
             let points = |corners: Vec<[f64; 3]>| -> Vec<_> { corners.into_iter().map(Point3::from).collect() };
             let mut filled = Triangulation::default();
-            filled.add(&points(corners), &[points(hole)]);
+            filled.add_polygon(&points(corners), &[points(hole)]);
             let _ = filled.finish().is_ok();
         }
     }

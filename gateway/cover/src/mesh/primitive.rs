@@ -16,7 +16,7 @@ fn check_positive(shape: &'static str, what: &'static str, value: f64) -> Result
 }
 
 /// Returns the two triangles between four corners, which are given in order. Triangles without an area are left out.
-fn quad([a, b, c, d]: [Point3<f64>; 4]) -> impl Iterator<Item = Triangle> {
+fn quad_triangles([a, b, c, d]: [Point3<f64>; 4]) -> impl Iterator<Item = Triangle> {
     [[a, b, c], [a, c, d]].into_iter().filter(|[a, b, c]| a != b && b != c && c != a)
 }
 
@@ -39,7 +39,7 @@ impl Mesh {
             [[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]],
             [[-1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [1.0, -1.0, -1.0], [-1.0, -1.0, -1.0]],
         ];
-        Self::new("box", sides.into_iter().flat_map(|side| quad(side.map(point))).collect())
+        Self::new("box", sides.into_iter().flat_map(|side| quad_triangles(side.map(point))).collect())
     }
 
     /// Creates a cylinder with this radius and length, in m, closed at both ends.
@@ -81,7 +81,7 @@ fn surface_of_revolution(profile: &[(f64, f64)]) -> Vec<Triangle> {
     let strips = profile.iter().zip(profile.iter().skip(1));
     let quads = strips.flat_map(|(&low, &high)| {
         (0..CIRCLE_SEGMENTS).flat_map(move |step| {
-            quad([point(low, step), point(low, step + 1), point(high, step + 1), point(high, step)])
+            quad_triangles([point(low, step), point(low, step + 1), point(high, step + 1), point(high, step)])
         })
     });
     quads.collect()

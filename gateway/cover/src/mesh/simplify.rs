@@ -24,7 +24,7 @@ pub fn simplify(mut parts: Vec<Vec<Triangle>>, most: usize) -> Vec<Vec<Triangle>
     if parts.iter().map(Vec::len).sum::<usize>() <= most {
         return parts;
     }
-    let area: f64 = parts.iter().flatten().map(area).sum();
+    let area: f64 = parts.iter().flatten().map(triangle_area).sum();
     // A flat surface keeps two triangles per cube, so this first size leaves about twice the allowed number.
     let mut size = (area / most.max(1) as f64).sqrt().max(1e-6);
     loop {
@@ -36,7 +36,7 @@ pub fn simplify(mut parts: Vec<Vec<Triangle>>, most: usize) -> Vec<Vec<Triangle>
     }
 }
 
-fn area([a, b, c]: &Triangle) -> f64 {
+fn triangle_area([a, b, c]: &Triangle) -> f64 {
     (b - a).cross(&(c - a)).norm() / 2.0
 }
 
@@ -86,10 +86,10 @@ mod tests {
             });
             fine = cut.collect();
         }
-        let whole: f64 = fine.iter().map(area).sum();
+        let whole: f64 = fine.iter().map(triangle_area).sum();
         let [few] = simplify(vec![fine.clone()], 2000).try_into().unwrap();
         assert!((800..=2000).contains(&few.len()), "{}", few.len());
-        let left: f64 = few.iter().map(area).sum();
+        let left: f64 = few.iter().map(triangle_area).sum();
         assert!((left / whole - 1.0).abs() < 0.05, "{left} of {whole} m2");
         for [a, b, c] in &few {
             assert!([a, b, c].iter().all(|corner| (corner.coords.norm() - 0.1).abs() < 0.005));

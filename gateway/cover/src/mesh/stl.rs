@@ -19,12 +19,12 @@ const NORMAL_BYTES: usize = 12;
 /// Returns the triangles of a file with these contents. A file is binary if its length fits the number of triangles
 /// that it states, even if its title begins like an ASCII file.
 pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
-    let binary = binary(bytes);
+    let binary = parse_binary(bytes);
     if let Some(BinaryContents { announced, body }) = binary {
         let (all, rest) = body.as_chunks();
         // Some exporters write a line break after the last triangle.
         if usize::try_from(announced) == Ok(all.len()) && matches!(rest, b"" | b"\n" | b"\r\n") {
-            return Ok(all.iter().map(triangle).collect());
+            return Ok(all.iter().map(parse_triangle).collect());
         }
     }
     if is_ascii(bytes) {
@@ -56,12 +56,12 @@ struct BinaryContents<'a> {
     body: &'a [u8],
 }
 
-fn binary(bytes: &[u8]) -> Option<BinaryContents<'_>> {
+fn parse_binary(bytes: &[u8]) -> Option<BinaryContents<'_>> {
     let (count, body) = bytes.get(TITLE_BYTES..)?.split_first_chunk()?;
     Some(BinaryContents { announced: u32::from_le_bytes(*count), body })
 }
 
-fn triangle(bytes: &[u8; TRIANGLE_BYTES]) -> Triangle {
+fn parse_triangle(bytes: &[u8; TRIANGLE_BYTES]) -> Triangle {
     let corners = bytes.get(NORMAL_BYTES..).unwrap_or_default();
     let mut values = corners.as_chunks().0.iter().map(|word| f64::from(f32::from_le_bytes(*word)));
     let mut next = || values.next().unwrap_or(f64::NAN);

@@ -251,7 +251,7 @@ fn files_that_stand_for_others_are_named() {
 
 #[test]
 fn a_face_of_an_obj_has_its_own_area() {
-    let area = |mesh: &Mesh| mesh.triangles().iter().map(crate::surface::area).sum::<f64>();
+    let area = |mesh: &Mesh| mesh.triangles().iter().map(crate::surface::triangle_area).sum::<f64>();
     let text = "# notch\nv 0 0 0\nv 0.3 0 0 1 0.5 0.5\nv 0.3 0.25 0\nv 0.3 0.1 0 2\nv 0 0.25 0\n";
     for face in
         ["f 1 2 3 4 5", "f 5/1 1/2/3 2//1 \\\n 3 4 # all", "f -5 -4 -3 -2 -1", "p 1\nf 1 2\nf 2 3 4 5 1"]

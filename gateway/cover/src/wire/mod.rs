@@ -9,26 +9,26 @@ mod ports;
 use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
 use std::collections::VecDeque;
 
-use crate::grid::Grid;
+use crate::grid::PointGrid;
 use crate::place::CellPosition;
 use crate::surface::{count_to_f64, tangents};
 use crate::{CoverCell, CoverOptions};
 
 /// The number of ports of a cell.
-pub const PORTS: usize = 4;
+pub const PORTS_PER_CELL: usize = 4;
 
 /// The maximum number of cells per bus.
-pub const MAX_NODES: usize = 250;
+pub const MAX_CELLS_PER_BUS: usize = 250;
 
 /// The maximum length of a wire, in pitches.
 const MAX_WIRE_LENGTH_PITCHES: f64 = 1.5;
 
 /// The minimum cosine between the normals of two wired cells. Cells are wired around a sharp edge, but not through a
 /// wall.
-const MIN_NORMAL_COSINE: f64 = -0.2;
+const MIN_WIRED_NORMAL_COSINE: f64 = -0.2;
 
 /// The maximum deviation from a bus' even share that lets the bus end with a link, relative to its budget of nodes.
-const MAX_SHARE_DEVIATION: f64 = 0.1;
+const MAX_BUS_SHARE_DEVIATION: f64 = 0.1;
 
 /// Returns the cells of all links with their wires, and the number of buses.
 pub(crate) fn wire_cells(placed: &[Vec<CellPosition>], options: &CoverOptions) -> (Vec<CoverCell>, usize) {
@@ -70,7 +70,7 @@ fn cells_per_bus(links: &[usize], budget: usize) -> Vec<usize> {
         let of_links =
             ends.iter().map(|end| end.saturating_sub(from)).filter(|share| possible.contains(share));
         let share = of_links
-            .filter(|share| count_to_f64(off(share)) <= MAX_SHARE_DEVIATION * count_to_f64(budget))
+            .filter(|share| count_to_f64(off(share)) <= MAX_BUS_SHARE_DEVIATION * count_to_f64(budget))
             .min_by_key(off)
             .unwrap_or(even);
         shares.push(share);
@@ -134,7 +134,7 @@ impl Limb {
 /// Wires the cells of one bus.
 fn wire_bus(bus: usize, places: &[UnwiredCell], pitch: f64) -> Vec<CoverCell> {
     let wires = wires_by_cell(places.len(), &nearby_pairs(places, pitch));
-    let roots = roots(&wires);
+    let roots = choose_roots(&wires);
     let cell = |(index, place): (usize, &UnwiredCell)| {
         let others = wires.get(index).map_or(&[][..], Vec::as_slice);
         let directions: Vec<_> = others
@@ -165,12 +165,12 @@ fn node_id(index: usize) -> u8 {
 fn nearby_pairs(places: &[UnwiredCell], pitch: f64) -> Vec<[usize; 2]> {
     let longest = MAX_WIRE_LENGTH_PITCHES * pitch;
     let mut found = Vec::new();
-    let grid = Grid::with_points(longest, places.iter().map(|place| &place.spot.point));
+    let grid = PointGrid::with_points(longest, places.iter().map(|place| &place.spot.point));
     for (index, place) in places.iter().enumerate() {
-        for other in grid.points_around(grid.cube(&place.spot.point)).filter(|&other| other > index) {
+        for other in grid.points_around(grid.cube_at(&place.spot.point)).filter(|&other| other > index) {
             let Some(there) = places.get(other).filter(|there| there.link == place.link) else { continue };
             let distance = (there.spot.point - place.spot.point).norm();
-            if distance <= longest && there.spot.normal.dot(&place.spot.normal) > MIN_NORMAL_COSINE {
+            if distance <= longest && there.spot.normal.dot(&place.spot.normal) > MIN_WIRED_NORMAL_COSINE {
                 found.push((distance, [index, other]));
             }
         }
@@ -197,8 +197,9 @@ fn wires_by_cell(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
         true
     };
     // At first one port of each cell stays free, for cells without other neighbours.
-    for (most, &[a, b]) in
-        [PORTS - 1, PORTS].into_iter().flat_map(|most| pairs.iter().map(move |pair| (most, pair)))
+    for (most, &[a, b]) in [PORTS_PER_CELL - 1, PORTS_PER_CELL]
+        .into_iter()
+        .flat_map(|most| pairs.iter().map(move |pair| (most, pair)))
     {
         let group = |cell: usize| groups.get(cell).copied();
         let (Some(from), Some(to)) = (group(b), group(a)) else { continue };
@@ -207,13 +208,13 @@ fn wires_by_cell(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
         }
     }
     for &pair in pairs {
-        join(&mut wires, pair, PORTS);
+        join(&mut wires, pair, PORTS_PER_CELL);
     }
     wires
 }
 
 /// Returns one cell of each wired group: the first one with the smallest distance to its farthest cell.
-fn roots(wires: &[Vec<usize>]) -> Vec<usize> {
+fn choose_roots(wires: &[Vec<usize>]) -> Vec<usize> {
     let mut seen = vec![false; wires.len()];
     let mut roots = Vec::new();
     for first in 0..wires.len() {

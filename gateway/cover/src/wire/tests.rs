@@ -38,7 +38,7 @@ fn ports_are_at_the_side_of_their_wires() {
     assert_eq!(ports(&[100.0]), [None, Some(0), None, None]);
     // Three wires of a honeycomb are rotated: none is displaced more than necessary.
     assert_eq!(ports(&[350.0, 50.0, 110.0]), [Some(0), Some(1), Some(2), None]);
-    assert_eq!(ports(&[]), [None; PORTS]);
+    assert_eq!(ports(&[]), [None; PORTS_PER_CELL]);
     // A cell that faces along the axis has no forward direction, but four ports.
     assert_eq!(ports::assign_ports(&up, &up, &[(8, at(0.0)), (9, at(90.0))]).iter().flatten().count(), 2);
 }
@@ -47,7 +47,7 @@ fn ports_are_at_the_side_of_their_wires() {
 fn a_root_is_in_the_middle_and_one_of_each_group() {
     // The cells are a row of five, and a single one.
     let row = vec![vec![1], vec![0, 2], vec![1, 3], vec![2, 4], vec![3], vec![]];
-    assert_eq!(roots(&row), [2, 5]);
+    assert_eq!(choose_roots(&row), [2, 5]);
 }
 
 #[test]
@@ -56,10 +56,10 @@ fn a_full_cell_leaves_wires_to_others() {
     let spokes = (1..7).map(|at| [0, at]);
     let ring = (1..7).map(|at| [at.min(at % 6 + 1), at.max(at % 6 + 1)]);
     let wires = wires_by_cell(7, &spokes.chain(ring).collect::<Vec<_>>());
-    assert_eq!(wires[0].len(), PORTS);
+    assert_eq!(wires[0].len(), PORTS_PER_CELL);
     assert_eq!(reachable_cells(&wires, 0).len(), 7, "all are joined");
-    assert!(wires.iter().all(|others| others.len() <= PORTS));
-    assert_eq!(roots(&wires).len(), 1);
+    assert!(wires.iter().all(|others| others.len() <= PORTS_PER_CELL));
+    assert_eq!(choose_roots(&wires).len(), 1);
 }
 
 #[test]

@@ -43,27 +43,27 @@ pub struct RowMotion {
 impl RowMotion {
     /// Returns the specific force at a position on the row (in m, in the frame of the row), in g.
     #[must_use]
-    pub fn force_at(&self, position: &Vector3<f64>) -> Vector3<f64> {
+    pub fn specific_force_at(&self, position: &Vector3<f64>) -> Vector3<f64> {
         self.force + self.gradient * position
     }
 }
 
 /// The geometry of a bus's chain and the direction of gravity, from which the specific forces on its rows follow.
 #[derive(Clone, Debug)]
-pub struct Arm {
+pub struct ArmKinematics {
     central: CentralComputation,
     kinds: Vec<RowKind>,
     /// Gravity in the robot's base frame, in m/s2.
     gravity: Vector3<f64>,
 }
 
-impl Arm {
+impl ArmKinematics {
     /// Builds the chain of a bus that has cells; `gravity` is in the robot's base frame, in m/s2.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize, gravity: [f64; 3]) -> Self {
         let kinds = skin.chain(bus).rows.iter().map(|row| row.kind).collect();
         Self {
-            central: CentralComputation::unquantised(&skin.with_cells_of_bus(bus)),
+            central: CentralComputation::without_quantisation(&skin.with_cells_of_bus(bus)),
             kinds,
             gravity: gravity.into(),
         }
@@ -72,14 +72,16 @@ impl Arm {
     /// Returns the specific force field of each row of the chain, base to tip. The first entry is the base, which no
     /// joint moves.
     #[must_use]
-    pub fn rows(&self, state: &JointState) -> [RowMotion; MAX_ROWS + 1] {
+    pub fn row_motions(&self, state: &JointState) -> [RowMotion; MAX_ROWS + 1] {
         let frames = self.central.frames_at_positions(&state.position);
         let mut rows = [RowMotion::default(); MAX_ROWS + 1];
         let (mut spin, mut turn, mut linear) = (Vector3::zeros(), Vector3::zeros(), Vector3::zeros());
         let mut joints = state.speed.iter().zip(&state.acceleration);
         let kinds = core::iter::once(RowKind::Fixed).chain(self.kinds.iter().copied());
         for ((index, kind), motion) in kinds.enumerate().zip(&mut rows) {
-            let (Some(below), Some(frame)) = (frames.row(index.saturating_sub(1)), frames.row(index)) else {
+            let (Some(below), Some(frame)) =
+                (frames.row_frame(index.saturating_sub(1)), frames.row_frame(index))
+            else {
                 break;
             };
             let moved = if kind == RowKind::Fixed { None } else { joints.next() };
@@ -109,7 +111,7 @@ impl Arm {
     #[must_use]
     pub fn transform_between(&self, from: u8, to: u8) -> Isometry3<f64> {
         let frames = self.central.frames_at_positions(&[]);
-        let (Some(from), Some(to)) = (frames.row(from.into()), frames.row(to.into())) else {
+        let (Some(from), Some(to)) = (frames.row_frame(from.into()), frames.row_frame(to.into())) else {
             return Isometry3::identity();
         };
         let change = to.inverse() * from;
@@ -119,10 +121,15 @@ impl Arm {
     /// Converts a position in the frame of a row to a position in the robot's base frame, in m, for these joint
     /// positions in rad or m.
     #[must_use]
-    pub fn base_position(&self, row: usize, position: &Vector3<f64>, joints: &[f64]) -> Vector3<f64> {
+    pub fn position_in_base_frame(
+        &self,
+        row: usize,
+        position: &Vector3<f64>,
+        joints: &[f64],
+    ) -> Vector3<f64> {
         let frames = self.central.frames_at_positions(joints);
         frames
-            .row(row)
+            .row_frame(row)
             .map_or_else(Vector3::zeros, |frame| (frame * nalgebra::Point3::from(*position)).coords)
     }
 }
@@ -148,21 +155,21 @@ mod tests {
 
     #[test]
     fn the_force_is_the_second_difference_of_the_place_less_gravity() {
-        for skin in [testing::ur5(), testing::panda(), testing::lift()] {
-            let arm = Arm::new(&skin, 0, UPRIGHT_GRAVITY);
+        for skin in [testing::ur5_skin(), testing::panda_skin(), testing::lift_skin()] {
+            let arm = ArmKinematics::new(&skin, 0, UPRIGHT_GRAVITY);
             let joints = skin.chain(0).joints.len();
             let (t, step) = (0.37, 1e-4);
             let position = Vector3::new(0.03, -0.05, 0.11);
-            let rows = arm.rows(&state(t, joints));
+            let rows = arm.row_motions(&state(t, joints));
             for (row, motion) in rows.iter().enumerate().take(skin.chain(0).rows.len() + 1) {
-                let at = |t: f64| arm.base_position(row, &position, &state(t, joints).position);
+                let at = |t: f64| arm.position_in_base_frame(row, &position, &state(t, joints).position);
                 let acceleration = (at(t + step) - 2.0 * at(t) + at(t - step)) / (step * step);
                 let frames = arm.central.frames_at_positions(&state(t, joints).position);
-                let rotation = frames.row(row).unwrap().rotation.matrix().to_owned();
+                let rotation = frames.row_frame(row).unwrap().rotation.matrix().to_owned();
                 let expected = rotation.transpose()
                     * (acceleration + Vector3::new(0.0, 0.0, STANDARD_GRAVITY))
                     / STANDARD_GRAVITY;
-                let off = (motion.force_at(&position) - expected).norm();
+                let off = (motion.specific_force_at(&position) - expected).norm();
                 assert!(off < 1e-5, "{} row {row}: {off}", skin.name);
             }
         }

@@ -12,8 +12,8 @@ use nalgebra::Vector3;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
-use kinematics::{Arm, JointState};
-use sensor::{Accelerometer, DataSheet, rotation};
+use kinematics::{ArmKinematics, JointState};
+use sensor::{Accelerometer, DataSheet, cell_rotation};
 
 /// Positions, speeds and accelerations of all joints of a robot.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -48,7 +48,7 @@ impl RobotState {
 /// The simulated accelerometers of all cells of a skin.
 #[derive(Clone, Debug)]
 pub struct Accelerometers {
-    arms: Vec<Option<Arm>>,
+    arms: Vec<Option<ArmKinematics>>,
     /// Sensors by cell index.
     sensors: Vec<Accelerometer>,
 }
@@ -57,7 +57,7 @@ impl Accelerometers {
     /// Creates one sensor per cell from a data sheet and a seed; `gravity` is in the robot's base frame, in m/s2.
     #[must_use]
     pub fn new(skin: &Skin, sheet: &DataSheet, seed: u64, gravity: [f64; 3]) -> Self {
-        let arm = |bus: usize| skin.cells_on_bus(bus).next().map(|_| Arm::new(skin, bus, gravity));
+        let arm = |bus: usize| skin.cells_on_bus(bus).next().map(|_| ArmKinematics::new(skin, bus, gravity));
         let sensors = skin.cells.iter().map(|cell| {
             let stream = u64::from(cell.serial).wrapping_mul(0x9e37_79b9_7f4a_7c15);
             Accelerometer::new(sheet, seed ^ stream)
@@ -81,12 +81,12 @@ impl Accelerometers {
         tilt: impl Fn(usize, &Vector3<f64>) -> Vector3<f64> + 'a,
     ) -> impl Iterator<Item = Vector3<f64>> + 'a {
         skin.cells.iter().zip(&self.sensors).enumerate().map(move |(index, (cell, sensor))| {
-            let moment = state(sensor.sample_instant(now));
+            let moment = state(sensor.shown_motion_time_s(now));
             let state = moment.chain_state(&skin.chain(cell.bus).joints);
-            let rows = self.arms.get(cell.bus).and_then(Option::as_ref).map(|arm| arm.rows(&state));
+            let rows = self.arms.get(cell.bus).and_then(Option::as_ref).map(|arm| arm.row_motions(&state));
             let row = rows.and_then(|rows| rows.get(usize::from(cell.row)).copied()).unwrap_or_default();
-            let force = row.force_at(&cell.position.into());
-            let local = rotation(cell.orientation, cell.normal).inverse() * force;
+            let force = row.specific_force_at(&cell.position.into());
+            let local = cell_rotation(cell.orientation, cell.normal).inverse() * force;
             sensor.reading(now, &tilt(index, &local))
         })
     }

@@ -56,9 +56,9 @@ impl DataSheetInput {
     ///
     /// # Errors
     /// Returns the first value that is out of range.
-    pub fn sheet(&self, at: &KeyPath) -> Result<DataSheet, DocumentFault> {
+    pub fn data_sheet(&self, at: &KeyPath) -> Result<DataSheet, DocumentFault> {
         let kinds = [("perfect", DataSheet::PERFECT), ("bma250", DataSheet::BMA250)];
-        let mut sheet = at.key("kind").parse_choice(self.kind.as_deref().unwrap_or("bma250"), &kinds)?;
+        let mut sheet = at.with_key("kind").parse_choice(self.kind.as_deref().unwrap_or("bma250"), &kinds)?;
         let all = [
             ("bias_g", self.bias_g, &mut sheet.bias_g, [0.0, 1.0]),
             ("gain", self.gain, &mut sheet.gain, [0.0, 0.5]),
@@ -73,7 +73,7 @@ impl DataSheetInput {
         for (key, given, value, [min, max]) in all {
             let Some(given) = given else { continue };
             if !(min..=max).contains(&given) {
-                return Err(at.key(key).fault(given, format_args!("{min} to {max} are possible")));
+                return Err(at.with_key(key).fault(given, format_args!("{min} to {max} are possible")));
             }
             *value = given;
         }
@@ -187,12 +187,12 @@ impl Accelerometer {
     /// Returns the time of the motion that the newest readable sample at `now` shows: the sampling time minus the
     /// delay, in s.
     #[must_use]
-    pub fn sample_instant(&self, now: f64) -> f64 {
-        self.newest_sample(now).1
+    pub fn shown_motion_time_s(&self, now: f64) -> f64 {
+        self.newest_sample_number_and_time(now).1
     }
 
     /// Returns the number of the newest sample at `now` in s, and the time of the motion that it shows, in s.
-    fn newest_sample(&self, now: f64) -> (f64, f64) {
+    fn newest_sample_number_and_time(&self, now: f64) -> (f64, f64) {
         if self.period > 0.0 {
             let number = ((now - self.phase) / self.period).floor();
             (number, number.mul_add(self.period, self.phase) - self.delay)
@@ -202,10 +202,10 @@ impl Accelerometer {
     }
 
     /// Returns the reading at `now`, in g; `force` is the specific force in the cell's frame at
-    /// [`Accelerometer::sample_instant`], in g.
+    /// [`Accelerometer::shown_motion_time_s`], in g.
     #[must_use]
     pub fn reading(&self, now: f64, force: &Vector3<f64>) -> Vector3<f64> {
-        let (number, _) = self.newest_sample(now);
+        let (number, _) = self.newest_sample_number_and_time(now);
         let mut dice = Pcg64Mcg::seed_from_u64(mix_bits(self.seed ^ number.to_bits()));
         let noise = Vector3::from_fn(|_, _| standard_normal(&mut dice) * self.sheet.noise_g);
         let DataSheet { range_g, step_g, .. } = self.sheet;
@@ -234,7 +234,7 @@ const fn mix_bits(bits: u64) -> u64 {
 /// normal, the x axis of the cell is as near as possible to that of its row, or to the y axis if the normal is close to
 /// x.
 #[must_use]
-pub fn rotation(orientation: Option<[f64; 4]>, normal: [f64; 3]) -> nalgebra::UnitQuaternion<f64> {
+pub fn cell_rotation(orientation: Option<[f64; 4]>, normal: [f64; 3]) -> nalgebra::UnitQuaternion<f64> {
     use nalgebra::{Quaternion, Rotation3, UnitQuaternion};
     if let Some([x, y, z, w]) = orientation {
         return UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
@@ -255,7 +255,7 @@ mod tests {
         let sensor = Accelerometer::new(&DataSheet::PERFECT, 7);
         let force = Vector3::new(0.1, -0.7, 0.3);
         assert!((sensor.reading(1.5, &force) - force).norm() < 1e-12);
-        assert!((sensor.sample_instant(1.5) - 1.5).abs() < 1e-12);
+        assert!((sensor.shown_motion_time_s(1.5) - 1.5).abs() < 1e-12);
     }
 
     #[test]
@@ -269,7 +269,7 @@ mod tests {
             gain = [gain[0].min(sensor.gain().min() - 1.0), gain[1].max(sensor.gain().max() - 1.0)];
             for step in 0..20 {
                 let now = f64::from(step) * 0.016;
-                let old = now - sensor.sample_instant(now);
+                let old = now - sensor.shown_motion_time_s(now);
                 age = [age[0].min(old), age[1].max(old)];
             }
         }
@@ -293,7 +293,7 @@ mod tests {
     #[test]
     fn a_normal_alone_makes_an_orientation_that_faces_along_it() {
         for normal in [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, -0.8]] {
-            let faced = rotation(None, normal) * Vector3::z();
+            let faced = cell_rotation(None, normal) * Vector3::z();
             assert!((faced - Vector3::from(normal)).norm() < 1e-12);
         }
     }

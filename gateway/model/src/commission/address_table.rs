@@ -62,7 +62,7 @@ mod tests {
 
     #[test]
     fn a_change_back_shows_that_two_cells_share_one_node_id() {
-        let (claims, settled) = (State::CLAIMING, State::default());
+        let (claims, settled) = (State::CLAIMING_NODE_ID, State::default());
         let both = [(7, settled), (9, settled), (7, settled), (9, settled)];
         assert_eq!(heard(&both), [None, None, Some([7, 9]), None], "told once");
         assert_eq!(heard(&[(7, settled), (9, claims), (7, settled), (9, claims)]), [None; 4]);

@@ -32,7 +32,7 @@ use protocol::time::{Micros, Span};
 use address_table::AddressTable;
 use task::{Stage, Task};
 
-use crate::repeat::{Attempt, RetryAction, RetryLimits};
+use crate::repeat::{RetryAction, RetryLimits, RetryState};
 pub use outcome::{AbortReason, FailureReason, Outcome, RequestStep};
 pub use report::{CellReport, Progress, Report, UnknownNode};
 pub use task::CommissionOptions;
@@ -45,7 +45,7 @@ const DISCOVERY_TIMEOUT: Span = Span::from_millis(3_000);
 const MAX_PENDING_CELLS: usize = 16;
 /// Retry limits of a broadcast request while most cells do not answer. If no cell answers within this time, each
 /// remaining cell gets a request of its own.
-const BROADCAST_LIMITS: RetryLimits =
+const BROADCAST_RETRY_LIMITS: RetryLimits =
     RetryLimits { first_timeout: BROADCAST_TIMEOUT, max_timeout: BROADCAST_TIMEOUT, max_transmissions: 3 };
 const BROADCAST_TIMEOUT: Span = Span::from_millis(150);
 /// Interval of syncs while waiting for heartbeats.
@@ -80,7 +80,7 @@ struct Broadcast {
     /// Number of cells that needed the request when it was first sent.
     needed: usize,
     /// Retry state of the request. An answer from any cell restarts the timeout.
-    attempt: Attempt,
+    attempt: RetryState,
 }
 
 /// The commissioning of one bus.
@@ -187,20 +187,20 @@ impl Commission {
         let before = self.address_table.owner_serial(number).filter(|&serial| serial != heartbeat.serial);
         if let Some([one, other]) = self.address_table.receive_heartbeat(now, number, heartbeat) {
             for (serial, other) in [(one, other), (other, one)] {
-                self.fail(serial, FailureReason::Shared { number, other });
+                self.fail_cell(serial, FailureReason::Shared { number, other });
             }
             return;
         }
         if self.address_table.owner_serial(number) != Some(heartbeat.serial) {
             return; // an address claim for a taken node id, which will be given up
         }
-        if let Some(loser) = before.and_then(|serial| self.task(serial))
+        if let Some(loser) = before.and_then(|serial| self.task_for_serial(serial))
             && loser.number == Some(number)
         {
             loser.lose_node_id(now);
         }
         let wish = self.wish;
-        let Some(task) = self.task(heartbeat.serial) else { return };
+        let Some(task) = self.task_for_serial(heartbeat.serial) else { return };
         let new = task.number.is_none();
         task.handle_heartbeat(now, number, heartbeat, wish);
         if let (true, Phase::Discover(since)) = (new, &mut self.phase) {
@@ -208,12 +208,12 @@ impl Commission {
         }
     }
 
-    fn task(&mut self, serial: u32) -> Option<&mut Task> {
+    fn task_for_serial(&mut self, serial: u32) -> Option<&mut Task> {
         self.tasks.get_mut(*self.by_serial.get(&serial)?)
     }
 
-    fn fail(&mut self, serial: u32, reason: FailureReason) {
-        if let Some(task) = self.task(serial) {
+    fn fail_cell(&mut self, serial: u32, reason: FailureReason) {
+        if let Some(task) = self.task_for_serial(serial) {
             task.fail(reason);
         }
     }
@@ -246,7 +246,7 @@ impl Commission {
                 self.tasks.get_mut(place).and_then(|task| Some((task.number, task.handle_timeout(now)?)));
             if let Some((Some(node), (step, tag))) = again {
                 self.repeated += 1;
-                self.request(place, Node::Cell(node), step, tag);
+                self.queue_request(place, Node::Cell(node), step, tag);
             }
         }
         // Advance through all phases that are complete.
@@ -295,14 +295,14 @@ impl Commission {
                 }) {
                     return None;
                 }
-                if self.any_open(|stage| matches!(stage, Stage::AwaitHeartbeat(_))) {
+                if self.any_open_task_in(|stage| matches!(stage, Stage::AwaitHeartbeat(_))) {
                     self.outbox.push_back(Message::Sync);
                 }
                 Some(Phase::AwaitHeartbeats(now))
             }
             Phase::AwaitHeartbeats(synced) => {
                 if self.send_requests(now, |stage| stage != Stage::Missing) {
-                    let waits = self.any_open(|stage| matches!(stage, Stage::AwaitHeartbeat(_)));
+                    let waits = self.any_open_task_in(|stage| matches!(stage, Stage::AwaitHeartbeat(_)));
                     if waits && now.elapsed_since(synced) >= SYNC_INTERVAL {
                         self.outbox.push_back(Message::Sync);
                         self.phase = Phase::AwaitHeartbeats(now);
@@ -316,7 +316,7 @@ impl Commission {
         }
     }
 
-    fn any_open(&self, is: impl Fn(Stage) -> bool) -> bool {
+    fn any_open_task_in(&self, is: impl Fn(Stage) -> bool) -> bool {
         self.tasks.iter().any(|task| !task.is_done() && is(task.stage))
     }
 
@@ -326,7 +326,7 @@ impl Commission {
         if self.send_broadcasts(now) {
             return true;
         }
-        let mut pending = self.tasks.iter().filter(|task| task.is_requested()).count();
+        let mut pending = self.tasks.iter().filter(|task| task.has_pending_request()).count();
         for place in 0..self.tasks.len() {
             if pending >= MAX_PENDING_CELLS {
                 break;
@@ -334,17 +334,18 @@ impl Commission {
             let Some(task) = self.tasks.get_mut(place).filter(|task| is(task.stage)) else { continue };
             if let (Some(node), Some((step, tag))) = (task.number, task.next_request(now)) {
                 pending += 1;
-                self.request(place, Node::Cell(node), step, tag);
+                self.queue_request(place, Node::Cell(node), step, tag);
             }
         }
-        self.any_open(is) || self.tasks.iter().any(|task| !task.is_done() && task.unsettled.is_some())
+        self.any_open_task_in(is) || self.tasks.iter().any(|task| !task.is_done() && task.unsettled.is_some())
     }
 
     /// Sends or repeats broadcast requests. Returns true if one is pending.
     fn send_broadcasts(&mut self, now: Micros) -> bool {
         loop {
             if let Some(call) = &mut self.broadcast {
-                let mut waiting = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(call.step));
+                let mut waiting =
+                    self.tasks.iter().enumerate().filter(|(_, task)| task.needs_step(call.step));
                 let first = waiting.next().map(|(place, _)| place);
                 // If most cells did not answer, a repeated broadcast costs less than a request to each.
                 match first.map(|place| (place, call.attempt.handle_timeout(now))) {
@@ -352,14 +353,14 @@ impl Commission {
                     Some((place, RetryAction::Resend)) if 2 * (waiting.count() + 1) > call.needed => {
                         let Broadcast { step, tag, .. } = *call;
                         self.repeated += 1;
-                        self.request(place, Node::Everyone, step, tag);
+                        self.queue_request(place, Node::Everyone, step, tag);
                         return true;
                     }
                     Some((_, RetryAction::Resend | RetryAction::GiveUp)) | None => self.broadcast = None,
                 }
             }
             let Some(step) = self.pending_broadcasts.pop_front() else { return false };
-            let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(step));
+            let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs_step(step));
             // A write that only one cell needs goes to that cell alone.
             let (Some((place, _)), Some(_)) = (needing.next(), needing.next()) else { continue };
             let needed = needing.count() + 2;
@@ -370,8 +371,8 @@ impl Commission {
             let tag = BROADCAST_TAG | self.sent_broadcasts.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
             self.sent_broadcasts.push((step, tag));
             self.broadcast =
-                Some(Broadcast { step, tag, needed, attempt: Attempt::new(now, BROADCAST_LIMITS) });
-            self.request(place, Node::Everyone, step, tag);
+                Some(Broadcast { step, tag, needed, attempt: RetryState::new(now, BROADCAST_RETRY_LIMITS) });
+            self.queue_request(place, Node::Everyone, step, tag);
         }
     }
 
@@ -406,7 +407,7 @@ impl Commission {
         Parameter::stored_for_rows(MAX_ROWS).take(longest)
     }
 
-    fn request(&mut self, place: usize, to: Node, step: RequestStep, tag: u8) {
+    fn queue_request(&mut self, place: usize, to: Node, step: RequestStep, tag: u8) {
         let Some(task) = self.tasks.get(place) else { return };
         let number = step.parameter().number();
         let request = match step {
@@ -433,9 +434,9 @@ impl Commission {
             Phase::AwaitHeartbeats(synced) => Some(synced + SYNC_INTERVAL),
             Phase::Write | Phase::Read => None,
         };
-        let call = self.broadcast.map(|call| call.attempt.due());
+        let call = self.broadcast.map(|call| call.attempt.next_timeout());
         let announcement = self.announced.map(|at| at + HEARTBEAT_INTERVAL);
-        let tasks = self.tasks.iter().filter_map(Task::due);
+        let tasks = self.tasks.iter().filter_map(Task::next_timeout);
         tasks.chain([phase, call, announcement].into_iter().flatten()).min()
     }
 }

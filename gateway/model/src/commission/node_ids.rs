@@ -55,10 +55,10 @@ pub fn renumber_nodes(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<Str
     for (index, cell) in skin.cells.iter().enumerate() {
         let new = number(cell.serial, cell.node);
         if new != cell.node {
-            edit.set(index, "node", value(new));
+            edit.set(index, "node", node_id_value(new));
             // An omitted serial number would change with the node id.
-            if !edit.has(index, "serial") {
-                edit.insert(index, "serial", Value::Integer(i64::from(cell.serial)), "node");
+            if !edit.has_key(index, "serial") {
+                edit.insert_key_after(index, "serial", Value::Integer(i64::from(cell.serial)), "node");
             }
         }
         for (port, neighbor) in cell.neighbors.iter().enumerate() {
@@ -66,14 +66,14 @@ pub fn renumber_nodes(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<Str
             if let Some(&renamed) = renamed.get(&(cell.bus, neighbor))
                 && renamed != neighbor
             {
-                edit.set_element(index, "neighbors", port, value(renamed));
+                edit.set_element(index, "neighbors", port, node_id_value(renamed));
             }
         }
     }
-    Ok(edit.text())
+    Ok(edit.edited_text())
 }
 
-fn value(node: CellId) -> Value<'static> {
+fn node_id_value(node: CellId) -> Value<'static> {
     Value::Integer(i64::from(node.get()))
 }
 

@@ -7,20 +7,21 @@ use protocol::parameters::{Abilities, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
 use super::outcome::{FailureReason, Outcome, RequestStep};
-use crate::repeat::{Attempt, RetryAction, RetryLimits};
+use crate::repeat::{RetryAction, RetryLimits, RetryState};
 
 /// Retry limit and timeout of a request to one cell.
-const REQUEST_LIMITS: RetryLimits = RetryLimits {
+const REQUEST_RETRY_LIMITS: RetryLimits = RetryLimits {
     first_timeout: Span::from_millis(100),
     max_timeout: Span::from_millis(800),
     max_transmissions: 6,
 };
 /// Retry limit and timeouts of a commit request; longer than [`ANSWER`], because the cell writes its flash.
-const COMMIT_LIMITS: RetryLimits = RetryLimits { first_timeout: Span::from_millis(400), ..REQUEST_LIMITS };
+const COMMIT_RETRY_LIMITS: RetryLimits =
+    RetryLimits { first_timeout: Span::from_millis(400), ..REQUEST_RETRY_LIMITS };
 /// Maximum number of times that the writing of a cell starts over after the cell restarted meanwhile.
 const MAX_WRITE_RESTARTS: u8 = 6;
 /// Maximum time for a cell to hold a node id after it started or lost its node id.
-pub(super) const SETTLE_TIMEOUT: Span = Span::from_millis(3_000);
+pub(super) const NODE_ID_SETTLE_TIMEOUT: Span = Span::from_millis(3_000);
 /// Time to wait for a heartbeat with the expected hash, after all parameters were read back.
 const HEARTBEAT_TIMEOUT: Span = Span::from_millis(2_000);
 
@@ -46,7 +47,7 @@ pub(super) enum Stage {
 struct PendingRequest {
     step: RequestStep,
     tag: u8,
-    attempt: Attempt,
+    attempt: RetryState,
 }
 
 /// The commissioning of one described cell.
@@ -87,7 +88,7 @@ pub struct CommissionOptions {
     pub verify: bool,
 }
 
-const fn bit(place: usize) -> u64 {
+const fn bit_mask(place: usize) -> u64 {
     1 << place
 }
 
@@ -126,14 +127,14 @@ impl Task {
     }
 
     /// Returns the bit of a parameter in `written`; zero if the cell's configuration lacks the parameter.
-    fn bit(&self, parameter: Parameter) -> u64 {
-        self.stored_parameters().position(|stored| stored == parameter).map_or(0, bit)
+    fn parameter_bit(&self, parameter: Parameter) -> u64 {
+        self.stored_parameters().position(|stored| stored == parameter).map_or(0, bit_mask)
     }
 
-    fn first_missing(&self, mask: u64) -> Option<Parameter> {
+    fn first_missing_parameter(&self, mask: u64) -> Option<Parameter> {
         self.stored_parameters()
             .enumerate()
-            .find(|(place, _)| mask & bit(*place) == 0)
+            .find(|(place, _)| mask & bit_mask(*place) == 0)
             .map(|(_, parameter)| parameter)
     }
 
@@ -141,13 +142,13 @@ impl Task {
         matches!(self.stage, Stage::Done(_))
     }
 
-    pub(super) const fn is_requested(&self) -> bool {
+    pub(super) const fn has_pending_request(&self) -> bool {
         self.pending.is_some()
     }
 
     /// Returns true if the cell still needs this step of a broadcast request.
-    pub(super) fn needs(&self, step: RequestStep) -> bool {
-        let of_step = self.bit(step.parameter());
+    pub(super) fn needs_step(&self, step: RequestStep) -> bool {
+        let of_step = self.parameter_bit(step.parameter());
         let missing = |mask| of_step != 0 && mask & of_step == 0;
         let can = self.number.is_some() && self.unsettled.is_none() && self.pending.is_none();
         can && match step {
@@ -171,7 +172,7 @@ impl Task {
                 return self.fail(FailureReason::Twins(old.min(number), old.max(number)));
             }
             self.previous_number = Some(old);
-            self.restart();
+            self.reset_after_restart();
         }
         self.number = Some(number);
         self.reported_hash = heartbeat.configuration;
@@ -179,14 +180,14 @@ impl Task {
         if version != u16::from(VERSION) {
             return self.fail(FailureReason::Version { got: version });
         }
-        if heartbeat.state.has(State::CLAIMING) {
+        if heartbeat.state.has(State::CLAIMING_NODE_ID) {
             self.unsettled = Some(now);
-            return self.restart();
+            return self.reset_after_restart();
         }
         self.unsettled = None;
         match self.stage {
             Stage::Missing => self.choose_stage(wish),
-            Stage::AwaitHeartbeat(_) if self.reported_hash == self.hash => self.finish(),
+            Stage::AwaitHeartbeat(_) if self.reported_hash == self.hash => self.mark_done(),
             Stage::QueryAbilities
             | Stage::Write
             | Stage::Read
@@ -197,7 +198,7 @@ impl Task {
 
     /// Handles a restart or a new node id: the staged parameters are lost, and the flash content is known only once the
     /// cell has settled.
-    fn restart(&mut self) {
+    fn reset_after_restart(&mut self) {
         self.pending = None;
         (self.written, self.read) = (0, 0);
         if matches!(self.stage, Stage::QueryAbilities | Stage::Write | Stage::Read | Stage::AwaitHeartbeat(_))
@@ -225,7 +226,7 @@ impl Task {
     pub(super) fn lose_node_id(&mut self, now: Micros) {
         self.number = None;
         self.unsettled.get_or_insert(now);
-        self.restart();
+        self.reset_after_restart();
     }
 
     pub(super) fn fail(&mut self, reason: FailureReason) {
@@ -235,7 +236,7 @@ impl Task {
         }
     }
 
-    fn finish(&mut self) {
+    fn mark_done(&mut self) {
         self.stage = Stage::Done(if self.touched { Outcome::Written } else { Outcome::Verified });
     }
 
@@ -246,23 +247,29 @@ impl Task {
         }
         let step = match self.stage {
             Stage::QueryAbilities => RequestStep::Read(Parameter::Identity),
-            Stage::Write => self.first_missing(self.written).map_or(RequestStep::Commit, RequestStep::Write),
-            Stage::Read => RequestStep::Read(self.first_missing(self.read)?),
+            Stage::Write => {
+                self.first_missing_parameter(self.written).map_or(RequestStep::Commit, RequestStep::Write)
+            }
+            Stage::Read => RequestStep::Read(self.first_missing_parameter(self.read)?),
             Stage::Missing | Stage::AwaitHeartbeat(_) | Stage::Done(_) => return None,
         };
         // The upper half of the tags is reserved for broadcast requests.
         self.tag = self.tag.wrapping_add(1) & 0x7F;
         // A commit may take effect without an answer.
         self.touched |= step == RequestStep::Commit;
-        let attempt =
-            Attempt::new(now, if step == RequestStep::Commit { COMMIT_LIMITS } else { REQUEST_LIMITS });
+        let attempt = RetryState::new(
+            now,
+            if step == RequestStep::Commit { COMMIT_RETRY_LIMITS } else { REQUEST_RETRY_LIMITS },
+        );
         self.pending = Some(PendingRequest { step, tag: self.tag, attempt });
         Some((step, self.tag))
     }
 
     /// Handles timeouts: repeats the request, and fails at the retry limit or if the cell does not settle.
     pub(super) fn handle_timeout(&mut self, now: Micros) -> Option<(RequestStep, u8)> {
-        if self.unsettled.is_some_and(|since| now.elapsed_since(since) >= SETTLE_TIMEOUT) && !self.is_done() {
+        if self.unsettled.is_some_and(|since| now.elapsed_since(since) >= NODE_ID_SETTLE_TIMEOUT)
+            && !self.is_done()
+        {
             self.fail(FailureReason::Gone);
         }
         if let Stage::AwaitHeartbeat(since) = self.stage
@@ -283,14 +290,17 @@ impl Task {
     }
 
     /// Returns the time of the next call of [`Task::time`]; `None` if no timeout is running.
-    pub(super) fn due(&self) -> Option<Micros> {
-        let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLE_TIMEOUT);
+    pub(super) fn next_timeout(&self) -> Option<Micros> {
+        let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + NODE_ID_SETTLE_TIMEOUT);
         let beat = if let Stage::AwaitHeartbeat(since) = self.stage {
             Some(since + HEARTBEAT_TIMEOUT)
         } else {
             None
         };
-        [self.pending.map(|pending| pending.attempt.due()), settled, beat].into_iter().flatten().min()
+        [self.pending.map(|pending| pending.attempt.next_timeout()), settled, beat]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// Handles an answer of the cell to the pending request, or to the broadcast request `call` with this tag.
@@ -303,16 +313,16 @@ impl Task {
         wish: CommissionOptions,
     ) {
         let own = self.pending.filter(|pending| pending.tag == tag).map(|pending| pending.step);
-        let called = call.filter(|&step| self.needs(step));
+        let called = call.filter(|&step| self.needs_step(step));
         let Some(step) = own.or(called) else { return };
         let parameter = step.parameter();
         let is_write = !matches!(step, RequestStep::Read(_));
         match answer {
             Answer::Refused { number, reason } if number == parameter.number() => {
                 self.pending = None;
-                if step == RequestStep::Commit && reason == Answer::WRONG_HASH {
+                if step == RequestStep::Commit && reason == Answer::REFUSED_WRONG_HASH {
                     // The cell restarted in between, without a heartbeat that arrived.
-                    return self.start_over(FailureReason::Refused { step, code: reason });
+                    return self.restart_writing(FailureReason::Refused { step, code: reason });
                 }
                 self.fail(FailureReason::Refused { step, code: reason });
             }
@@ -330,7 +340,7 @@ impl Task {
                 }
                 let target = self.words(parameter);
                 if words == target {
-                    return self.confirm(now, step);
+                    return self.confirm_step(now, step);
                 }
                 let differs = FailureReason::Differs { step, target, got: words };
                 if is_write {
@@ -338,7 +348,7 @@ impl Task {
                 } else if wish.dry_run {
                     self.stage = Stage::Done(Outcome::WouldWrite);
                 } else {
-                    self.start_over(differs);
+                    self.restart_writing(differs);
                 }
             }
             // The answer belongs to an earlier request with this tag.
@@ -346,18 +356,18 @@ impl Task {
         }
     }
 
-    fn confirm(&mut self, now: Micros, step: RequestStep) {
-        let bit = self.bit(step.parameter());
+    fn confirm_step(&mut self, now: Micros, step: RequestStep) {
+        let bit = self.parameter_bit(step.parameter());
         match step {
             RequestStep::Write(_) => self.written |= bit,
             RequestStep::Commit => (self.stage, self.read) = (Stage::Read, 0),
             RequestStep::Read(_) => {
                 self.read |= bit;
-                if self.first_missing(self.read).is_none() {
+                if self.first_missing_parameter(self.read).is_none() {
                     self.stage = Stage::AwaitHeartbeat(now);
                     // A heartbeat may have brought the right hash meanwhile.
                     if self.reported_hash == self.hash {
-                        self.finish();
+                        self.mark_done();
                     }
                 }
             }
@@ -365,7 +375,7 @@ impl Task {
     }
 
     /// Starts the writing of the cell over; fails with `why` after the maximum number of rounds.
-    fn start_over(&mut self, why: FailureReason) {
+    fn restart_writing(&mut self, why: FailureReason) {
         self.rounds += 1;
         if self.rounds > MAX_WRITE_RESTARTS {
             return self.fail(why);

@@ -5,7 +5,7 @@ const WISH: CommissionOptions = CommissionOptions { dry_run: false, verify: fals
 
 /// Builds a skin with this number of cells at different positions.
 fn skin(cells: usize) -> Skin {
-    let (head, cell) = crate::testing::SKIN.split_once("[[cell]]").unwrap();
+    let (head, cell) = crate::testing::ONE_CELL_SKIN_TOML.split_once("[[cell]]").unwrap();
     let cells = (1..=cells)
         .map(|node| {
             cell.replace("node = 1", &format!("node = {node}")).replace("0.01,", &format!("0.0{node},"))

@@ -4,7 +4,7 @@ use core::fmt::{self, Display, Formatter};
 
 use protocol::message::State;
 use protocol::packet::WORDS;
-use protocol::schema::{self, Field, FieldFormat, Layout, TextPart, TextPiece, Units};
+use protocol::schema::{self, BusUnits, Field, FieldFormat, Layout, TextAlternative, TextPiece};
 
 use super::ports::{PortName, PortSet, write_joined, write_neighbors};
 
@@ -41,20 +41,20 @@ impl Display for ParameterName {
 
 /// Writes the fields of a layout as text, read from these bytes.
 pub(super) fn write_layout(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
-    write_fields(f, layout, Bytes { bytes, units: Units::default() })
+    write_fields(f, layout, PacketBytes { bytes, units: BusUnits::default() })
 }
 
 /// The bytes of a packet, and the units of joints, torques and sums.
 #[derive(Clone, Copy)]
-pub(super) struct Bytes<'a> {
+pub(super) struct PacketBytes<'a> {
     pub(super) bytes: &'a [u8],
-    pub(super) units: Units,
+    pub(super) units: BusUnits,
 }
 
 /// Writes the fields of a layout.
-pub(super) fn write_fields(f: &mut Formatter<'_>, layout: &Layout, words: Bytes<'_>) -> fmt::Result {
+pub(super) fn write_fields(f: &mut Formatter<'_>, layout: &Layout, words: PacketBytes<'_>) -> fmt::Result {
     let number = layout.fields.first().map_or(0, |first| first.raw_value(words.bytes, 0));
-    write_parts(f, &layout.text, u16::try_from(number).unwrap_or_default(), words, &|_, name| {
+    write_text_parts(f, &layout.text, u16::try_from(number).unwrap_or_default(), words, &|_, name| {
         Ok(field(&layout.fields, name))
     })
 }
@@ -70,11 +70,11 @@ pub(super) type FieldLookup<'a> =
     dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fmt::Error> + 'a;
 
 /// Writes the parts of a text that apply to a value, with their fields filled in.
-pub(super) fn write_parts<'a>(
+pub(super) fn write_text_parts<'a>(
     f: &mut Formatter<'_>,
-    text: &[TextPart],
+    text: &[TextAlternative],
     number: u16,
-    words: Bytes<'_>,
+    words: PacketBytes<'_>,
     find: &FieldLookup<'a>,
 ) -> fmt::Result {
     for part in text {
@@ -83,15 +83,15 @@ pub(super) fn write_parts<'a>(
         if !(part.when[0].into()..=part.when[1].into()).contains(&number) {
             continue;
         }
-        write_pieces(f, &part.pieces, words, find)?;
+        write_text_pieces(f, &part.pieces, words, find)?;
     }
     Ok(())
 }
 
-fn write_pieces<'a>(
+fn write_text_pieces<'a>(
     f: &mut Formatter<'_>,
     pieces: &[TextPiece],
-    words: Bytes<'_>,
+    words: PacketBytes<'_>,
     find: &FieldLookup<'a>,
 ) -> fmt::Result {
     for piece in pieces {
@@ -116,12 +116,12 @@ fn write_pieces<'a>(
 fn write_field(
     f: &mut Formatter<'_>,
     field: &Field,
-    Bytes { bytes, units }: Bytes<'_>,
+    PacketBytes { bytes, units }: PacketBytes<'_>,
     decimals: usize,
 ) -> fmt::Result {
     let first = field.raw_value(bytes, 0);
     match &field.format {
-        FieldFormat::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
+        FieldFormat::Choice => f.write_str(field.value_name(first).unwrap_or_default()),
         FieldFormat::Hex => write!(f, "{first:04X}"),
         FieldFormat::Port => write!(f, "{}", PortName(first)),
         FieldFormat::Ports(..) => write!(f, "{}", PortSet(first)),
@@ -129,7 +129,7 @@ fn write_field(
         FieldFormat::Parameter(_) => write!(f, "{}", ParameterName::from_raw(first)),
         FieldFormat::Reason => write!(f, "{} (reason {first})", schema::refusal_reason(first)),
         FieldFormat::Total(_) => write!(f, "{:.decimals$}", field.sum_of_words(bytes)),
-        FieldFormat::Group(parts) => write_neighbors(f, parts, bytes, field.elements()),
+        FieldFormat::Group(parts) => write_neighbors(f, parts, bytes, field.element_count()),
         FieldFormat::Fixed(_)
         | FieldFormat::Threshold(_)
         | FieldFormat::Saturating(_)
@@ -140,13 +140,13 @@ fn write_field(
         | FieldFormat::Unsigned(_)
         | FieldFormat::Signed
         | FieldFormat::Flag(_)
-        | FieldFormat::Page(_) => (0..field.elements_in(bytes)).try_for_each(|element| {
+        | FieldFormat::Page(_) => (0..field.element_count_in(bytes)).try_for_each(|element| {
             f.write_str(if element == 0 { "" } else { " " })?;
             let raw = field.raw_value(bytes, element);
             match i16::try_from(raw) {
                 Ok(i16::MAX) if field.is_saturating() => f.write_str("+saturated"),
                 Ok(i16::MIN) if field.is_saturating() => f.write_str("-saturated"),
-                _ if field.fraction() > 0 => {
+                _ if field.fraction_bits() > 0 => {
                     write!(f, "{:.decimals$}", field.element_value(raw, element, units))
                 }
                 _ => write!(f, "{raw}"),

@@ -7,7 +7,7 @@ use protocol::id::{Id, Kind};
 use protocol::message::{Message, State};
 use protocol::packet::{Bytes, PacketError};
 use protocol::port::LinkId;
-use protocol::schema::{self, Field, FieldFormat, Layout, PacketSchema, Units, WhenAbsent};
+use protocol::schema::{self, AbsentFieldJson, BusUnits, Field, FieldFormat, Layout, PacketSchema};
 use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
 use super::fields::ParameterName;
@@ -53,7 +53,7 @@ struct PacketValues {
     end: &'static [Field],
     layout: &'static Layout,
     bytes: Bytes,
-    units: Units,
+    units: BusUnits,
 }
 
 impl Serialize for PacketValues {
@@ -77,7 +77,7 @@ struct FieldGroup<'a>(&'a [Field], &'a [u8]);
 impl Serialize for FieldGroup<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
-        serialize_fields(&mut map, self.0, "", self.1, Units::default())?;
+        serialize_fields(&mut map, self.0, "", self.1, BusUnits::default())?;
         map.end()
     }
 }
@@ -88,13 +88,13 @@ fn serialize_fields<M: SerializeMap>(
     fields: &[Field],
     page: &str,
     bytes: &[u8],
-    units: Units,
+    units: BusUnits,
 ) -> Result<(), M::Error> {
     let Some(first) = fields.first() else { return Ok(()) };
     for field in fields.iter().filter(|field| !matches!(field.name.as_str(), "" | "epoch" | "tag")) {
         let raw = field.raw_value(bytes, 0);
         if !field.is_present(bytes, first) {
-            if field.absent == WhenAbsent::Null {
+            if field.absent == AbsentFieldJson::Null {
                 map.serialize_entry(&field.name, &())?;
             }
         } else if let FieldFormat::Page(_) = field.format {
@@ -115,15 +115,15 @@ fn serialize_fields<M: SerializeMap>(
 }
 
 /// The value of a field for JSON, or an array of values if the field has several elements.
-struct FieldValue<'a>(&'a Field, &'a [u8], Units);
+struct FieldValue<'a>(&'a Field, &'a [u8], BusUnits);
 
 impl Serialize for FieldValue<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let Self(field, bytes, units) = *self;
-        let (first, elements) = (field.raw_value(bytes, 0), 0..field.elements_in(bytes));
+        let (first, elements) = (field.raw_value(bytes, 0), 0..field.element_count_in(bytes));
         let real = |element| field.element_value(field.raw_value(bytes, element), element, units);
         match &field.format {
-            FieldFormat::Choice => serializer.serialize_str(field.name_of(first).unwrap_or_default()),
+            FieldFormat::Choice => serializer.serialize_str(field.value_name(first).unwrap_or_default()),
             FieldFormat::Flag(_) => serializer.serialize_bool(first == 1),
             FieldFormat::Hex => serializer.collect_str(&format_args!("{first:04X}")),
             FieldFormat::Parameter(_) => serializer.collect_str(&ParameterName::from_raw(first)),
@@ -166,7 +166,12 @@ impl Serialize for FieldValue<'_> {
 ///
 /// # Errors
 /// Returns the error of `out`.
-pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
+pub fn write_json_line(
+    out: &mut impl Write,
+    record: &Record<'_>,
+    decoded: &Decoded,
+    units: BusUnits,
+) -> io::Result<()> {
     let raw = record.frame.to_string();
     let id = raw.split('#').next().unwrap_or_default().to_owned();
     let mut line = FrameObject {
@@ -178,7 +183,7 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
             Direction::Sent => "T",
             Direction::Received => "R",
         }),
-        verdict: decoded.verdict(),
+        verdict: decoded.verdict_word(),
         error: None,
         kind: None,
         node: None,
@@ -200,22 +205,22 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
             line.kind = Some("wire");
             line.crc = Some(hex_word(packet_crc(record)));
             let (bytes, layout) = wires::encode_with_layout(message);
-            line.epoch = wires::epoch(message);
+            line.epoch = wires::message_epoch(message);
             line.values = Some(PacketValues { link_id: Some(link_id), end: &[], layout, bytes, units });
         }
-        Decoded::Segment { id } => line.set_subject(id),
+        Decoded::Segment { id } => line.set_kind_and_node(id),
         Decoded::Damaged { id, fault } => {
-            line.set_subject(id);
+            line.set_kind_and_node(id);
             line.set_crc_error(fault);
             line.error = Some(fault.to_string());
         }
         Decoded::Meaningless { packet, error } => {
-            line.set_subject(packet.id);
+            line.set_kind_and_node(packet.id);
             line.error = Some(error.to_string());
             line.crc = Some(hex_word(packet_crc(record)));
         }
         Decoded::Message(message) => {
-            line.set_subject(message.id());
+            line.set_kind_and_node(message.id());
             line.crc = Some(hex_word(packet_crc(record)));
             line.saturated = message.is_saturated();
             line.set_message(&message, units);
@@ -236,7 +241,7 @@ fn hex_word(word: u16) -> String {
 
 impl FrameObject<'_> {
     /// Sets the keys for the packet kind and the node, from the identifier.
-    fn set_subject(&mut self, id: Id) {
+    fn set_kind_and_node(&mut self, id: Id) {
         self.kind = Some(id.name());
         self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
     }
@@ -248,8 +253,8 @@ impl FrameObject<'_> {
         }
     }
 
-    fn set_message(&mut self, message: &Message, units: Units) {
-        (self.epoch, self.tag) = (message.epoch().map(|epoch| epoch.0), message.tag());
+    fn set_message(&mut self, message: &Message, units: BusUnits) {
+        (self.epoch, self.tag) = (message.epoch().map(|epoch| epoch.0), message.configuration_tag());
         let packet = message.encode();
         let layout = schema::layout(message, &packet);
         let end = PacketSchema::for_id(packet.id).map_or(&[][..], |schema| schema.trailing_fields(layout));
@@ -287,7 +292,7 @@ mod tests {
                     let at = Micros(record.time.nanos / 1_000);
                     let decoded = decoder.decode(at, record.interface, &record.frame);
                     let mut text = Vec::new();
-                    write(&mut text, &record, &decoded, Units::default()).unwrap();
+                    write_json_line(&mut text, &record, &decoded, BusUnits::default()).unwrap();
                     assert_eq!(text.iter().filter(|&&byte| byte == b'\n').count(), 1);
                     all.push((comment.to_owned(), serde_json::from_slice(&text).unwrap()));
                 }
@@ -415,13 +420,13 @@ mod tests {
         let frame = candump::parse_frame("20C##10011").unwrap();
         let time = candump::Timestamp::with_six_digits(0);
         let record = Record { time, interface: "can0", frame, direction: None };
-        let id = protocol::packet::data_id(&frame).unwrap();
+        let id = protocol::packet::data_frame_id(&frame).unwrap();
         let mut line = Vec::new();
-        write(
+        write_json_line(
             &mut line,
             &record,
             &Decoded::Damaged { id, fault: PacketError::Crc { expected: 1, got: 2 } },
-            Units::default(),
+            BusUnits::default(),
         )
         .unwrap();
         let damaged: Value = serde_json::from_slice(&line).unwrap();

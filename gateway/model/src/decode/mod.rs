@@ -26,13 +26,13 @@ pub use text::InUnits;
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
 use protocol::message::{Message, MessageError};
-use protocol::packet::{Packet, PacketError, data_id};
+use protocol::packet::{Packet, PacketError, data_frame_id};
 use protocol::port::{self, PortMessage};
 use protocol::time::Micros;
 use std::collections::VecDeque;
 use thiserror::Error;
 
-use crate::packets::{ByIdentifier, FrameWithPacket, NoPacket, PacketReader};
+use crate::packets::{ByIdentifier, FrameWithPacket, NoPacketReason, PacketReader};
 
 /// Maximum number of buses whose state is kept. Beyond it, the state of the oldest bus is dropped.
 pub const MAX_BUSES: usize = 64;
@@ -100,7 +100,7 @@ impl ForeignReason {
 impl Decoded {
     /// Returns the one-word verdict with which the line of this frame begins.
     #[must_use]
-    pub const fn verdict(&self) -> &'static str {
+    pub const fn verdict_word(&self) -> &'static str {
         match self {
             Self::Message(_) | Self::Wire(..) => "ok",
             Self::Segment { .. } => "segment",
@@ -145,17 +145,17 @@ fn classify_non_data(frame: &Frame) -> Decoded {
 
 /// Frame counts of one identifier, which decide whether it carries packets.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct IdentifierTraffic {
+pub struct IdentifierFrameCounts {
     packets: u64,
     others: u64,
 }
 
-impl IdentifierTraffic {
+impl IdentifierFrameCounts {
     /// Minimum number of packets that prove that an identifier carries packets: a random frame is a packet with
     /// probability 1/65 536.
-    const MIN_PACKETS: u64 = 2;
+    const MIN_PROVING_PACKETS: u64 = 2;
     /// Maximum number of other frames for each packet, for an identifier that carries packets.
-    const MAX_OTHERS_PER_PACKET: u64 = 32;
+    const MAX_OTHER_FRAMES_PER_PACKET: u64 = 32;
 
     /// Counts a packet.
     pub const fn count_packet(&mut self) {
@@ -163,14 +163,15 @@ impl IdentifierTraffic {
     }
 
     /// Counts a frame that is neither a packet nor a segment.
-    pub const fn count_other(&mut self) {
+    pub const fn count_other_frame(&mut self) {
         self.others += 1;
     }
 
     /// Returns true if the identifier carries packets. If so, other frames with it count as damaged, else as foreign.
     #[must_use]
     pub const fn carries_packets(self) -> bool {
-        self.packets >= Self::MIN_PACKETS && self.others <= Self::MAX_OTHERS_PER_PACKET * self.packets
+        self.packets >= Self::MIN_PROVING_PACKETS
+            && self.others <= Self::MAX_OTHER_FRAMES_PER_PACKET * self.packets
     }
 }
 
@@ -204,13 +205,13 @@ struct Classifier {
 struct IdentifierState {
     /// Numbers of the frames that may be segments of a packet and wait for its other segments.
     waiting: VecDeque<u64>,
-    traffic: IdentifierTraffic,
+    traffic: IdentifierFrameCounts,
 }
 
 impl IdentifierState {
     /// Settles the pending frames as refused, except the newest `kept`; their numbers and classes are appended to
     /// `settled`.
-    fn refuse_older(&mut self, kept: usize, id: Id, settled: &mut Vec<(u64, Decoded)>) {
+    fn refuse_older_segments(&mut self, kept: usize, id: Id, settled: &mut Vec<(u64, Decoded)>) {
         for _ in kept..self.waiting.len() {
             if let Some(number) = self.waiting.pop_front() {
                 settled.push((number, self.classify_unreadable(id, PacketError::Incomplete)));
@@ -220,7 +221,7 @@ impl IdentifierState {
 
     /// Classifies a frame that is neither a packet nor a segment.
     const fn classify_unreadable(&mut self, id: Id, fault: PacketError) -> Decoded {
-        self.traffic.count_other();
+        self.traffic.count_other_frame();
         if self.traffic.carries_packets() {
             Decoded::Damaged { id, fault }
         } else {
@@ -231,41 +232,41 @@ impl IdentifierState {
 
 /// The class of a frame, and the numbers and classes of earlier frames of its identifier that are settled now. A
 /// [`Decoded::Segment`] is itself pending.
-type Classified = (Decoded, Vec<(u64, Decoded)>);
+type ClassifiedFrames = (Decoded, Vec<(u64, Decoded)>);
 
 impl Classifier {
     /// Classifies the frame with this number.
-    fn classify(&mut self, number: u64, received: &FrameWithPacket<'_>) -> Classified {
+    fn classify(&mut self, number: u64, received: &FrameWithPacket<'_>) -> ClassifiedFrames {
         let id = match received.packet {
             Ok((packet, message)) => {
-                let settled = self.packet(&packet);
+                let settled = self.settle_packet(&packet);
                 return match message {
                     Ok(message) => (Decoded::Message(message), settled),
                     Err(error) => (Decoded::Meaningless { packet, error }, settled),
                 };
             }
-            Err(NoPacket::NotData) => return (classify_non_data(received.frame), Vec::new()),
-            Err(NoPacket::Segment(id) | NoPacket::AfterLost(id)) => id,
-            Err(NoPacket::Damaged(id, fault)) => {
+            Err(NoPacketReason::NotData) => return (classify_non_data(received.frame), Vec::new()),
+            Err(NoPacketReason::Segment(id) | NoPacketReason::AfterLost(id)) => id,
+            Err(NoPacketReason::Damaged(id, fault)) => {
                 let (slot, mut settled) = (self.ids.entry(id), Vec::new());
                 if fault == PacketError::Ambiguous {
-                    slot.refuse_older(0, id, &mut settled);
+                    slot.refuse_older_segments(0, id, &mut settled);
                 }
                 return (slot.classify_unreadable(id, fault), settled);
             }
         };
         let (slot, mut settled) = (self.ids.entry(id), Vec::new());
         slot.waiting.push_back(number);
-        slot.refuse_older(received.pending.after, id, &mut settled);
+        slot.refuse_older_segments(received.pending.after, id, &mut settled);
         (Decoded::Segment { id }, settled)
     }
 
     /// Counts a packet, and settles its pending segments. Returns the numbers and classes of the frames that are
     /// settled.
-    fn packet(&mut self, packet: &Packet) -> Vec<(u64, Decoded)> {
+    fn settle_packet(&mut self, packet: &Packet) -> Vec<(u64, Decoded)> {
         let id = packet.id;
         let (slot, mut settled) = (self.ids.entry(id), Vec::new());
-        slot.refuse_older(packet.words.length().segments() - 1, id, &mut settled);
+        slot.refuse_older_segments(packet.words.length().segments() - 1, id, &mut settled);
         settled.extend(slot.waiting.drain(..).map(|number| (number, Decoded::Segment { id })));
         slot.traffic.count_packet();
         settled
@@ -286,8 +287,8 @@ impl Decoder {
     }
 
     /// Classifies the frame with this number. Also returns the number of its bus.
-    fn classify(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> (u64, Classified) {
-        if data_id(frame).is_err() {
+    fn classify(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> (u64, ClassifiedFrames) {
+        if data_frame_id(frame).is_err() {
             return (0, (classify_non_data(frame), Vec::new()));
         }
         let bus = self.bus(bus);

@@ -127,7 +127,7 @@ fn fields_to_write(
         .fields
         .iter()
         .filter(follows)
-        .flat_map(|field| field.written_names().into_iter().map(move |name| (field, name)))
+        .flat_map(|field| field.command_line_names().into_iter().map(move |name| (field, name)))
 }
 
 /// Returns the word of a field's value.
@@ -139,11 +139,11 @@ pub fn parse_value(field: &Field, text: &str) -> Result<i16, String> {
     let known = |number: &i16| match field.range {
         FieldRange::Within(min, max) => (i32::from(min)..=i32::from(max)).contains(&i32::from(*number)),
         FieldRange::All | FieldRange::NotNegative | FieldRange::NotNegativeAtCommit => {
-            field.name_of(i64::from(*number)).is_some()
+            field.value_name(i64::from(*number)).is_some()
         }
     };
     match field.format {
-        FieldFormat::Choice => field.value_of(text).ok_or_else(allowed),
+        FieldFormat::Choice => field.value_from_name(text).ok_or_else(allowed),
         FieldFormat::Ports(..) => parse_ports(text).ok_or_else(allowed),
         FieldFormat::Hex => u16::from_str_radix(text, 16).map(u16::cast_signed).map_err(|_| allowed()),
         FieldFormat::Word | FieldFormat::Unsigned(_) => {

@@ -4,7 +4,7 @@ use core::str::FromStr;
 
 use protocol::can::{EXTENDED_MASK, Frame, STANDARD_MASK};
 use protocol::id::{Command, Id, Kind, Node};
-use protocol::packet::data_id;
+use protocol::packet::data_frame_id;
 use protocol::skin::split_bus;
 use thiserror::Error;
 
@@ -12,7 +12,7 @@ use super::Decoded;
 
 /// A class of frames to show.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Selector {
+pub enum FrameSelector {
     /// A kind of packet.
     Kind(Kind),
     /// A command of one kind.
@@ -31,15 +31,15 @@ pub enum Selector {
     "{got:?} is not a kind of frame: allowed are command, sum, torque, sensors, network, configure, \
      configured, stimulus; halt, joints, sync, resume, report; wire, foreign and damaged"
 )]
-pub struct UnknownSelector {
+pub struct UnknownFrameSelector {
     /// The given word.
     pub got: String,
 }
 
-impl FromStr for Selector {
-    type Err = UnknownSelector;
+impl FromStr for FrameSelector {
+    type Err = UnknownFrameSelector;
 
-    fn from_str(word: &str) -> Result<Self, UnknownSelector> {
+    fn from_str(word: &str) -> Result<Self, UnknownFrameSelector> {
         let kind = Kind::ALL.into_iter().find(|kind| kind.name() == word).map(Self::Kind);
         let command = || Command::ALL.into_iter().find(|command| command.name() == word).map(Self::Command);
         let other = || match word {
@@ -48,7 +48,7 @@ impl FromStr for Selector {
             "damaged" => Some(Self::Damaged),
             _ => None,
         };
-        kind.or_else(command).or_else(other).ok_or_else(|| UnknownSelector { got: word.to_owned() })
+        kind.or_else(command).or_else(other).ok_or_else(|| UnknownFrameSelector { got: word.to_owned() })
     }
 }
 
@@ -138,7 +138,7 @@ impl FromStr for IdMask {
 #[derive(Clone, Debug, Default)]
 pub struct FrameFilter {
     /// Shows any of these kinds; all if empty.
-    pub kinds: Vec<Selector>,
+    pub kinds: Vec<FrameSelector>,
     /// Shows frames with any of these senders or addressees; all if empty. Commands are from the gateway.
     pub parties: Vec<NodeSelector>,
     /// Shows frames of these buses; of all if empty.
@@ -157,12 +157,12 @@ impl FrameFilter {
     #[must_use]
     pub fn matches(&self, origin: u64, nanos: u64, bus: &str, frame: &Frame, decoded: &Decoded) -> bool {
         let is_foreign = matches!(decoded, Decoded::Foreign(_));
-        let id = data_id(frame).ok().filter(|_| !is_foreign);
+        let id = data_frame_id(frame).ok().filter(|_| !is_foreign);
         self.matches_time(origin, nanos)
             && (self.buses.is_empty() || self.buses.iter().any(|it| it == bus))
             && (self.ids.is_empty() || self.ids.iter().any(|it| it.matches(frame)))
             && self.matches_kind(id, decoded)
-            && self.matches_party(id, bus)
+            && self.matches_node(id, bus)
     }
 
     /// Returns the buses that the filters name, with repetitions.
@@ -175,7 +175,7 @@ impl FrameFilter {
     ///
     /// # Errors
     /// Returns a sentence that names the node and the buses, if the filters exclude each other.
-    pub fn check(&self) -> Result<(), String> {
+    pub fn check_consistency(&self) -> Result<(), String> {
         let is_out = |party: &&NodeSelector| party.bus.as_ref().is_some_and(|bus| !self.buses.contains(bus));
         match self.parties.iter().find(is_out).filter(|_| !self.buses.is_empty()) {
             Some(NodeSelector { bus: Some(bus), node }) => {
@@ -198,15 +198,15 @@ impl FrameFilter {
         let is_damaged = matches!(decoded, Decoded::Damaged { .. });
         self.kinds.is_empty()
             || self.kinds.iter().any(|selector| match selector {
-                Selector::Kind(kind) => id.is_some_and(|id| id.kind == *kind),
-                Selector::Command(command) => id == Some(Id::command(*command)),
-                Selector::Foreign => is_damaged || matches!(decoded, Decoded::Foreign(_)),
-                Selector::Damaged => is_damaged,
-                Selector::Wire => matches!(decoded, Decoded::Wire(..)),
+                FrameSelector::Kind(kind) => id.is_some_and(|id| id.kind == *kind),
+                FrameSelector::Command(command) => id == Some(Id::command(*command)),
+                FrameSelector::Foreign => is_damaged || matches!(decoded, Decoded::Foreign(_)),
+                FrameSelector::Damaged => is_damaged,
+                FrameSelector::Wire => matches!(decoded, Decoded::Wire(..)),
             })
     }
 
-    fn matches_party(&self, id: Option<Id>, bus: &str) -> bool {
+    fn matches_node(&self, id: Option<Id>, bus: &str) -> bool {
         let node = id.map(|id| match id.kind {
             Kind::Command => Node::Gateway,
             Kind::Sum
@@ -325,7 +325,7 @@ mod tests {
 
     #[test]
     fn unknown_words_are_errors_that_list_the_known_ones() {
-        let kind = "torqe".parse::<Selector>().unwrap_err().to_string();
+        let kind = "torqe".parse::<FrameSelector>().unwrap_err().to_string();
         assert!(
             kind.starts_with("\"torqe\" is not a kind of frame: allowed are command, sum, torque, "),
             "{kind}"

@@ -26,7 +26,7 @@ const REORDER_TOLERANCE: Span = Span::from_millis(100);
 #[derive(Debug)]
 pub struct OrderedDecoder<T> {
     decoder: Decoder,
-    waiting: VecDeque<Entry<T>>,
+    waiting: VecDeque<FrameEntry<T>>,
     /// Number of the oldest pending frame.
     oldest: u64,
     /// The current time: the arrival time of the last frame, or later.
@@ -35,7 +35,7 @@ pub struct OrderedDecoder<T> {
 }
 
 #[derive(Debug)]
-struct Entry<T> {
+struct FrameEntry<T> {
     item: T,
     at: Micros,
     state: EntryState,
@@ -78,7 +78,7 @@ impl<T> OrderedDecoder<T> {
         };
         self.now = at;
         self.is_at_end = false;
-        self.waiting.push_back(Entry { item, at, state });
+        self.waiting.push_back(FrameEntry { item, at, state });
     }
 
     /// Advances the current time while no frame arrives, so that pending segments can time out.
@@ -99,7 +99,7 @@ impl<T> OrderedDecoder<T> {
 
     /// Removes and returns the oldest frame with its class; `None` if that class is still open.
     pub fn pop(&mut self) -> Option<(T, Decoded)> {
-        if let Entry { at, state: EntryState::Pending(bus, id), .. } = *self.waiting.front()? {
+        if let FrameEntry { at, state: EntryState::Pending(bus, id), .. } = *self.waiting.front()? {
             let is_in_time =
                 self.now.elapsed_since(at) <= Span(Reassembler::max_gap(id).0 + REORDER_TOLERANCE.0);
             if is_in_time && !self.is_at_end && self.waiting.len() < MAX_PENDING_FRAMES {
@@ -108,7 +108,7 @@ impl<T> OrderedDecoder<T> {
             let decoded = self.decoder.classify_incomplete(self.oldest, bus, id);
             self.waiting.front_mut()?.state = EntryState::Settled(decoded);
         }
-        let Entry { item, state, .. } = self.waiting.pop_front()?;
+        let FrameEntry { item, state, .. } = self.waiting.pop_front()?;
         self.oldest += 1;
         match state {
             EntryState::Settled(decoded) => Some((item, decoded)),

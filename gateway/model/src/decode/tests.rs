@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use protocol::candump::{self, CandumpLine, Timestamp};
 use protocol::fixed::TorqueFormat;
 use protocol::id::{Command, Kind};
-use protocol::schema::Units;
+use protocol::schema::BusUnits;
 use protocol::skin::JointKind;
 
 const DOCUMENT: &str = include_str!("../../../../protocol/tests/golden/document.log");
@@ -297,15 +297,15 @@ fn with_an_identifier_that_carries_packets_it_is_damaged() {
 
 #[test]
 fn chance_makes_no_identifier_ours() {
-    let mut traffic = IdentifierTraffic::default();
+    let mut traffic = IdentifierFrameCounts::default();
     traffic.count_packet();
     assert!(!traffic.carries_packets(), "one packet may be chance");
     traffic.count_packet();
-    for _ in 0..2 * IdentifierTraffic::MAX_OTHERS_PER_PACKET {
+    for _ in 0..2 * IdentifierFrameCounts::MAX_OTHER_FRAMES_PER_PACKET {
         assert!(traffic.carries_packets());
-        traffic.count_other();
+        traffic.count_other_frame();
     }
-    traffic.count_other();
+    traffic.count_other_frame();
     assert!(!traffic.carries_packets(), "two packets among many frames may be, too");
 }
 
@@ -334,7 +334,7 @@ fn segments_are_reassembled_by_bus_and_identifier() {
     let mut decoder = Decoder::new(None);
     let [first, second] =
         ["20C#001000F801000000", "20C#00000000070175D6"].map(|text| candump::parse_frame(text).unwrap());
-    let mut verdict = |bus: &str, frame| decoder.decode(Micros(0), bus, frame).verdict();
+    let mut verdict = |bus: &str, frame| decoder.decode(Micros(0), bus, frame).verdict_word();
     assert_eq!(
         [verdict("a", &first), verdict("b", &second), verdict("a", &second), verdict("b", &first)],
         ["segment", "segment", "ok", "segment"]
@@ -427,17 +427,17 @@ fn contact_is_a_frame_that_shows_a_touch() {
     for (text, expected) in frames {
         let frame = candump::parse_frame(text).unwrap();
         let decoded = Decoder::new(None).decode(Micros(0), "vcan0", &frame);
-        assert_eq!((decoded.verdict(), decoded.is_contact()), ("ok", expected), "{text}");
+        assert_eq!((decoded.verdict_word(), decoded.is_contact()), ("ok", expected), "{text}");
     }
 }
 
 #[test]
 fn joints_and_torques_are_in_the_units_of_their_bus() {
-    let mut skin = crate::testing::skin();
+    let mut skin = crate::testing::one_cell_skin();
     skin.buses[0].torque_format = TorqueFormat::Q5_10;
     skin.robot.joints[1].kind = JointKind::Prismatic;
-    let units = Units::for_bus(&skin, 0);
-    assert_eq!(Units::for_bus(&skin, 9).torque_format(), TorqueFormat::Q3_12);
+    let units = BusUnits::for_bus(&skin, 0);
+    assert_eq!(BusUnits::for_bus(&skin, 9).torque_format(), TorqueFormat::Q3_12);
     let words: [i16; protocol::packet::WORDS] = [1024, -8192, 16384, 0, i16::MAX, i16::MIN];
     let said = |id, count| {
         let epoch = protocol::packet::Epoch(7);
@@ -451,7 +451,7 @@ fn joints_and_torques_are_in_the_units_of_their_bus() {
         };
         let decoded = Decoder::new(None).decode(Micros(0), "vcan0", &frame);
         let mut line = Vec::new();
-        json::write(&mut line, &record, &decoded, units).unwrap();
+        json::write_json_line(&mut line, &record, &decoded, units).unwrap();
         let object: serde_json::Value = serde_json::from_slice(&line).unwrap();
         (decoded.in_units(units).to_string(), decoded.to_string(), object["values"].clone())
     };

@@ -18,11 +18,11 @@ use protocol::skin::DenavitHartenberg;
 use super::GenerateError;
 
 /// Distance between the centres of adjacent cells, in mm, as on the published skin.
-const PITCH_MM: usize = 28;
+const CELL_PITCH_MM: usize = 28;
 /// The smallest distance in mm that is plausible for hardware.
-const MIN_PITCH_MM: usize = 3;
+const MIN_CELL_PITCH_MM: usize = 3;
 /// Number of ports of a cell.
-const PORTS: usize = 4;
+const PORTS_PER_CELL: usize = 4;
 
 /// An arm that can carry a skin.
 #[derive(Debug)]
@@ -56,12 +56,12 @@ pub(super) struct Limb {
 pub(super) const UR5: ArmShape = ArmShape {
     name: "UR5",
     joints: [
-        row(0.0, core::f64::consts::FRAC_PI_2, 0.089_159),
-        row(-0.425, 0.0, 0.0),
-        row(-0.392_25, 0.0, 0.0),
-        row(0.0, core::f64::consts::FRAC_PI_2, 0.109_15),
-        row(0.0, -core::f64::consts::FRAC_PI_2, 0.094_65),
-        row(0.0, 0.0, 0.082_3),
+        denavit_hartenberg_row(0.0, core::f64::consts::FRAC_PI_2, 0.089_159),
+        denavit_hartenberg_row(-0.425, 0.0, 0.0),
+        denavit_hartenberg_row(-0.392_25, 0.0, 0.0),
+        denavit_hartenberg_row(0.0, core::f64::consts::FRAC_PI_2, 0.109_15),
+        denavit_hartenberg_row(0.0, -core::f64::consts::FRAC_PI_2, 0.094_65),
+        denavit_hartenberg_row(0.0, 0.0, 0.082_3),
     ],
     limbs: [
         Limb { name: "upper arm", joint: 2, middle: [0.2125, 0.135_85], length: 0.285, radius: 0.065 },
@@ -69,7 +69,7 @@ pub(super) const UR5: ArmShape = ArmShape {
     ],
 };
 
-const fn row(a: f64, alpha: f64, d: f64) -> DenavitHartenberg {
+const fn denavit_hartenberg_row(a: f64, alpha: f64, d: f64) -> DenavitHartenberg {
     DenavitHartenberg { a, alpha, d, theta_offset: 0.0 }
 }
 
@@ -92,19 +92,21 @@ pub(super) struct PlacedCell {
     /// Angle of the cell around the limb in rad, from the z axis to the y axis.
     pub(super) turn: f64,
     /// For each port, the neighbour at it, as an index on the bus.
-    pub(super) wires: [Option<usize>; PORTS],
+    pub(super) wires: [Option<usize>; PORTS_PER_CELL],
     pub(super) root: bool,
 }
 
 /// Places the cells in rings around the limbs, at the distance of the published skin, or closer if they do not fit.
 pub(super) fn place_cells(arm: &ArmShape, cells: usize, buses: usize) -> Result<CoveredArm, GenerateError> {
-    let (pitch_mm, shares) = (MIN_PITCH_MM..=PITCH_MM)
+    let (pitch_mm, shares) = (MIN_CELL_PITCH_MM..=CELL_PITCH_MM)
         .rev()
-        .find_map(|pitch_mm| Some((pitch_mm, divide_cells(&arm.limbs, metres(pitch_mm), cells, buses)?)))
-        .ok_or(GenerateError::NoRoom { cells, min_mm: MIN_PITCH_MM })?;
+        .find_map(|pitch_mm| {
+            Some((pitch_mm, divide_cells(&arm.limbs, mm_to_metres(pitch_mm), cells, buses)?))
+        })
+        .ok_or(GenerateError::NoRoom { cells, min_mm: MIN_CELL_PITCH_MM })?;
     let mut on_buses = Vec::with_capacity(buses);
     for (limb, share) in arm.limbs.iter().zip(&shares) {
-        let rings = Rings::for_limb(limb, metres(pitch_mm));
+        let rings = CellRings::for_limb(limb, mm_to_metres(pitch_mm));
         for bus in 0..share.buses {
             let from = bus * share.cells / share.buses;
             on_buses.push(rings.wired_cells(limb, share.cells, from..(bus + 1) * share.cells / share.buses));
@@ -131,7 +133,7 @@ struct LimbShare {
 /// Divides the cells by the limbs' capacity. A bus stays on one limb, unless there is only one bus. Returns `None` if
 /// the cells do not fit.
 fn divide_cells(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Option<[LimbShare; 2]> {
-    let [upper, lower] = limbs.each_ref().map(|limb| Rings::for_limb(limb, pitch).capacity());
+    let [upper, lower] = limbs.each_ref().map(|limb| CellRings::for_limb(limb, pitch).capacity());
     let nearest = |whole: usize, part: usize, of: usize| (2 * whole * part + of) / (2 * of);
     let shares = if buses == 1 {
         let cells_upper = nearest(cells, upper, upper + lower);
@@ -149,7 +151,7 @@ fn divide_cells(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Op
 
 /// The rings of cells that fit around a limb.
 #[derive(Clone, Copy, Debug)]
-struct Rings {
+struct CellRings {
     /// Number of cells in a ring, at least 3.
     cells_per_ring: usize,
     /// Number of rings that fit on the limb.
@@ -157,7 +159,7 @@ struct Rings {
     pitch: f64,
 }
 
-impl Rings {
+impl CellRings {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "small and positive")]
     fn for_limb(limb: &Limb, pitch: f64) -> Self {
         let around = (TAU * limb.radius / pitch).ceil() as usize;
@@ -183,7 +185,7 @@ impl Rings {
     }
 
     /// Returns the number of the cell at a place, given as ring and index in the ring.
-    const fn number(&self, (ring, place): (usize, usize)) -> usize {
+    const fn cell_number(&self, (ring, place): (usize, usize)) -> usize {
         ring * self.cells_per_ring + if ring % 2 == 0 { place } else { self.cells_per_ring - 1 - place }
     }
 
@@ -199,7 +201,7 @@ impl Rings {
                 ring.checked_sub(1).map(|ring| (ring, place)),
                 Some((ring + 1, place)),
             ];
-            let within = |spot| Some(self.number(spot)).filter(|number| numbers.contains(number));
+            let within = |spot| Some(self.cell_number(spot)).filter(|number| numbers.contains(number));
             let turn = TAU * (count_to_f64(place) + count_to_f64(ring % 2) / 2.0)
                 / count_to_f64(self.cells_per_ring);
             let radius = count_to_f64(self.cells_per_ring) * self.pitch / TAU;
@@ -236,14 +238,14 @@ fn join_limbs(upper: &mut Vec<PlacedCell>, lower: &mut Vec<PlacedCell>) {
 /// Wires the gateway to a central cell of a bus: the first one with the fewest wires to its farthest cell, so that sums
 /// have the shortest path.
 fn choose_root(places: &mut [PlacedCell]) {
-    let nearest = (0..places.len()).min_by_key(|&from| depth(places, from));
+    let nearest = (0..places.len()).min_by_key(|&from| tree_depth_from(places, from));
     if let Some(root) = nearest.and_then(|at| places.get_mut(at)) {
         root.root = true;
     }
 }
 
 /// Returns the number of wires from a cell to the farthest cell that it can reach.
-pub(super) fn depth(places: &[PlacedCell], from: usize) -> usize {
+pub(super) fn tree_depth_from(places: &[PlacedCell], from: usize) -> usize {
     let mut distance = vec![None; places.len()];
     let mut next = VecDeque::from([(from, 0)]);
     let mut deepest = 0;
@@ -258,7 +260,7 @@ pub(super) fn depth(places: &[PlacedCell], from: usize) -> usize {
     deepest
 }
 
-fn metres(pitch_mm: usize) -> f64 {
+fn mm_to_metres(pitch_mm: usize) -> f64 {
     count_to_f64(pitch_mm) / 1e3
 }
 

@@ -24,7 +24,7 @@ pub struct SkinRequest {
     /// Joint broadcasts per second; must divide the control loop's 500 Hz.
     pub broadcast_hz: f64,
     /// Kind of reply that the cells send to joints.
-    pub reply: Reply,
+    pub reply: ReplyMode,
     /// Frame format of the cells' packets.
     pub format: Format,
 }
@@ -36,7 +36,7 @@ impl Default for SkinRequest {
             cells: 253,
             buses: 1,
             broadcast_hz: 62.5,
-            reply: Reply::Torque,
+            reply: ReplyMode::Torque,
             format: Format::Fd,
         }
     }
@@ -51,7 +51,7 @@ pub enum RobotModel {
 
 /// The kind of reply that the cells send to joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Reply {
+pub enum ReplyMode {
     /// Each cell its own torque
     Torque,
     /// Sums along the tree
@@ -116,7 +116,7 @@ pub fn generate(target: &SkinRequest) -> Result<String, GenerateError> {
     let arm = match target.robot {
         RobotModel::Ur5 => arm::place_cells(&arm::UR5, cells, buses)?,
     };
-    let text = text::toml(target, &arm);
+    let text = text::skin_toml(target, &arm);
     Skin::parse("generated skin", &text)?;
     Ok(text)
 }

@@ -106,7 +106,7 @@ fn more_cells_than_the_arm_has_room_for_lie_closer() {
 #[test]
 fn the_reply_and_the_format_are_the_requested_ones() {
     let target = SkinRequest {
-        reply: Reply::Sum,
+        reply: ReplyMode::Sum,
         format: Format::Classic,
         broadcast_hz: 50.0,
         buses: 2,

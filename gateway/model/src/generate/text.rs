@@ -4,19 +4,19 @@ use protocol::skin::DenavitHartenberg;
 use protocol::skin::file::{CellFacing, DraftBus, DraftCell, SkinDraft, Value};
 
 use super::arm::{self, CoveredArm, PlacedCell};
-use super::{Format, Reply, SkinRequest};
+use super::{Format, ReplyMode, SkinRequest};
 
 /// Maximum share of the broadcast period that the slots of sums may take.
-const MAX_SLOTS_SHARE: f64 = 0.75;
+const MAX_SLOT_PERIOD_SHARE: f64 = 0.75;
 
-pub(super) fn toml(target: &SkinRequest, arm: &CoveredArm) -> String {
+pub(super) fn skin_toml(target: &SkinRequest, arm: &CoveredArm) -> String {
     let SkinRequest { robot: _, cells, buses, broadcast_hz, reply, format } = target;
     let usual = SkinRequest::default();
     let [(upper, on_upper), (lower, on_lower)] = arm.limbs;
     let options = [
         (*buses != usual.buses, format!(" --buses {buses}")),
         (broadcast_hz.to_bits() != usual.broadcast_hz.to_bits(), format!(" --broadcast-hz {broadcast_hz}")),
-        (*reply == Reply::Sum, " --reply sum".to_owned()),
+        (*reply == ReplyMode::Sum, " --reply sum".to_owned()),
         (*format == Format::Classic, " --format classic".to_owned()),
     ];
     let options: String =
@@ -46,10 +46,10 @@ pub(super) fn toml(target: &SkinRequest, arm: &CoveredArm) -> String {
         let values = [("a", a), ("alpha", alpha), ("d", d), ("theta_offset", theta_offset)];
         values.map(|(key, value)| (key, Value::Number(value))).to_vec()
     });
-    draft.set_rows("joints", Some("standard Denavit-Hartenberg, base to tip; m, rad"), rows);
+    draft.set_table_rows("joints", Some("standard Denavit-Hartenberg, base to tip; m, rad"), rows);
     draft.add_paper_settings(*broadcast_hz);
     for (bus, places) in arm.buses.iter().enumerate() {
-        let slot_us = (*reply == Reply::Sum).then(|| slot_us(places, *broadcast_hz));
+        let slot_us = (*reply == ReplyMode::Sum).then(|| slot_duration_us(places, *broadcast_hz));
         draft.add_bus(&DraftBus { name: &bus_name(bus), chain: None, slot_us, format: *format });
     }
     draft.add_table_header("[controller]", Some("M q'' + D q' = tau, joint by joint"));
@@ -60,7 +60,7 @@ pub(super) fn toml(target: &SkinRequest, arm: &CoveredArm) -> String {
     for (bus, places) in arm.buses.iter().enumerate() {
         places.iter().zip(1..).for_each(|(place, node)| add_cell(&mut draft, bus, place, node));
     }
-    draft.text()
+    draft.into_text()
 }
 
 fn bus_name(bus: usize) -> String {
@@ -71,7 +71,7 @@ fn bus_name(bus: usize) -> String {
 fn add_cell(draft: &mut SkinDraft, bus: usize, place: &PlacedCell, node: usize) {
     // A rotation about x, the limb's direction: the cell's z axis points away from the limb.
     let (sin, cos) = (-place.turn / 2.0).sin_cos();
-    let [qx, qw] = [sin, cos].map(|value| round(value, 1e9));
+    let [qx, qw] = [sin, cos].map(|value| round_to_step(value, 1e9));
     draft.add_cell(&DraftCell {
         remark: None,
         bus: &bus_name(bus),
@@ -79,7 +79,7 @@ fn add_cell(draft: &mut SkinDraft, bus: usize, place: &PlacedCell, node: usize) 
         serial: Some(100_000 * (bus + 1) + node),
         joint: place.joint.into(),
         row: None,
-        position: place.position.map(|value| round(value, 1e6)),
+        position: place.position.map(|value| round_to_step(value, 1e6)),
         facing: CellFacing::Orientation([qx, 0.0, 0.0, qw]),
         neighbors: Some(place.wires.map(|wire| wire.map_or(0, |at| u8::try_from(at + 1).unwrap_or(u8::MAX)))),
         root: place.root,
@@ -94,13 +94,13 @@ fn add_cell(draft: &mut SkinDraft, bus: usize, place: &PlacedCell, node: usize) 
     clippy::cast_sign_loss,
     reason = "small and positive; the skin's check refuses what is not"
 )]
-fn slot_us(places: &[PlacedCell], broadcast_hz: f64) -> u64 {
+fn slot_duration_us(places: &[PlacedCell], broadcast_hz: f64) -> u64 {
     let root = places.iter().position(|place| place.root).unwrap_or_default();
-    let slots = arm::depth(places, root) + 1;
-    (1e5 * MAX_SLOTS_SHARE / broadcast_hz / slots as f64).floor().max(1.0) as u64 * 10
+    let slots = arm::tree_depth_from(places, root) + 1;
+    (1e5 * MAX_SLOT_PERIOD_SHARE / broadcast_hz / slots as f64).floor().max(1.0) as u64 * 10
 }
 
 /// Rounds to a step of `1 / steps`; never returns minus zero.
-fn round(value: f64, steps: f64) -> f64 {
+fn round_to_step(value: f64, steps: f64) -> f64 {
     (value * steps).round() / steps + 0.0
 }

@@ -21,7 +21,7 @@ use protocol::packet::{self, Epoch, PacketError, Reassembler};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
-use crate::packets::{ByIdentifier, NoPacket, PacketReader};
+use crate::packets::{ByIdentifier, NoPacketReason, PacketReader};
 use crate::tracker::{AddressClaim, ContactState, HeartbeatKind, PerCell};
 
 /// A frame that was received from the bus.
@@ -46,7 +46,7 @@ type SharedPacket = Option<Arc<PlacedPacket>>;
 
 /// A sensors page that a cell has latched. It is kept with the joints before it and the joints at which it was latched.
 #[derive(Clone, Debug)]
-struct ContactPage {
+struct LatchedSensorPage {
     placed_packet: Arc<PlacedPacket>,
     before: SharedPacket,
     since: SharedPacket,
@@ -70,7 +70,7 @@ struct LatchedCell {
     /// The last write of each parameter since the last commit, and a commit that has not been answered yet.
     staged: BTreeMap<u8, Arc<PlacedPacket>>,
     requested: SharedPacket,
-    contact: ContactState<ContactPage>,
+    contact: ContactState<LatchedSensorPage>,
     /// The packet with which the cell proved that all its stimuli are on the bus: its counters, or its answer to a
     /// write of its mode.
     shown: SharedPacket,
@@ -118,10 +118,10 @@ impl LatchedCell {
 
     /// Passes to the contact state a page that may prove that all stimuli were received here. Keeps the packet if the
     /// page proves it.
-    fn apply_proof(
+    fn apply_stimulus_proof(
         &mut self,
-        contact_page: ContactPage,
-        show: impl FnOnce(&mut ContactState<ContactPage>, ContactPage),
+        contact_page: LatchedSensorPage,
+        show: impl FnOnce(&mut ContactState<LatchedSensorPage>, LatchedSensorPage),
     ) {
         let placed_packet = Arc::clone(&contact_page.placed_packet);
         let before = self.contact.certain_skin().is_some();
@@ -143,7 +143,7 @@ impl LatchedCell {
             self.staged.clear();
             self.requested = None;
         }
-        if heartbeat.state.has(State::CLAIMING) {
+        if heartbeat.state.has(State::CLAIMING_NODE_ID) {
             let [first, last] = &mut self.starts;
             if heartbeat.sent == 0 {
                 *first = Some(Arc::clone(placed_packet));
@@ -168,7 +168,7 @@ impl LatchedCell {
     }
 
     /// Marks as active the parameters that were written before the last requested commit.
-    fn commit(&mut self) {
+    fn activate_committed(&mut self) {
         let Some(requested) = self.requested.take() else { return };
         let staged = std::mem::take(&mut self.staged).into_iter();
         let (mut taken, later): (BTreeMap<_, _>, _) =
@@ -178,11 +178,11 @@ impl LatchedCell {
     }
 
     /// Applies the cell's own report of its sensors, which counts only if the contact state is not known otherwise.
-    fn apply_sensor_report(&mut self, page: SensorPage, contact_page: ContactPage) {
+    fn apply_sensor_report(&mut self, page: SensorPage, contact_page: LatchedSensorPage) {
         let joints = contact_page.before.as_ref().map_or(0, |joints| joints.place);
         if !self
             .contact
-            .pending()
+            .pending_stimuli()
             .iter()
             .any(|(_, _, contact_page)| contact_page.placed_packet.place < joints)
         {
@@ -195,9 +195,9 @@ impl LatchedCell {
             .into_iter()
             .chain(&self.starts);
         let written = self.switches.values().chain(self.committed.values()).chain(self.staged.values());
-        let waiting = self.contact.pending().iter().map(|(_, _, contact_page)| contact_page);
-        let contact_page = self.contact.latched().map(|(_, contact_page)| contact_page).chain(waiting);
-        let contact_page = contact_page.flat_map(|ContactPage { placed_packet, before, since }| {
+        let waiting = self.contact.pending_stimuli().iter().map(|(_, _, contact_page)| contact_page);
+        let contact_page = self.contact.latched_pages().map(|(_, contact_page)| contact_page).chain(waiting);
+        let contact_page = contact_page.flat_map(|LatchedSensorPage { placed_packet, before, since }| {
             core::iter::once(placed_packet).chain(before).chain(since)
         });
         placed_packet.flatten().chain(written).chain(contact_page)
@@ -207,17 +207,19 @@ impl LatchedCell {
 impl LatchedPackets {
     /// Applies a frame from the bus; ignores frames that are not packets. Bounded work.
     pub fn receive(&mut self, seen: LatchedFrame) {
-        let Ok(id) = packet::data_id(&seen.frame) else { return };
+        let Ok(id) = packet::data_frame_id(&seen.frame) else { return };
         match id.kind {
             Kind::Command | Kind::Network | Kind::Stimulus | Kind::Configure => {}
             Kind::Sensors | Kind::Configured => {}
             Kind::Sum | Kind::Torque => return,
         }
-        let (packet, pending) = self.packets.packet(Micros(seen.at_nanos / 1_000), &seen.frame);
+        let (packet, pending) = self.packets.read_packet(Micros(seen.at_nanos / 1_000), &seen.frame);
         let packet = match packet {
             Ok(packet) => packet,
             Err(
-                NoPacket::Segment(_) | NoPacket::AfterLost(_) | NoPacket::Damaged(_, PacketError::Ambiguous),
+                NoPacketReason::Segment(_)
+                | NoPacketReason::AfterLost(_)
+                | NoPacketReason::Damaged(_, PacketError::Ambiguous),
             ) => {
                 let waiting = self.waiting.entry(id);
                 waiting.push(seen);
@@ -227,7 +229,7 @@ impl LatchedPackets {
                 }
                 return;
             }
-            Err(NoPacket::NotData | NoPacket::Damaged(..)) => return,
+            Err(NoPacketReason::NotData | NoPacketReason::Damaged(..)) => return,
         };
         // Exactly as much memory as the packet needs: many packets are kept.
         let frames = if seen.frame.format() == Format::Fd {
@@ -256,7 +258,7 @@ impl LatchedPackets {
 
     fn apply_message(&mut self, message: &Message, placed_packet: &Arc<PlacedPacket>) {
         let last = self.joints.as_ref().map(|(epoch, _)| *epoch);
-        let contact_page = || ContactPage {
+        let contact_page = || LatchedSensorPage {
             placed_packet: Arc::clone(placed_packet),
             before: self.joints.as_ref().map(|(_, joints)| Arc::clone(joints)),
             since: None,
@@ -265,8 +267,9 @@ impl LatchedPackets {
             // Cells drop joints of the last epoch.
             if last != Some(epoch) {
                 for (_, cell) in self.cells.iter_mut() {
-                    cell.contact
-                        .latch(epoch, |contact_page| contact_page.since = Some(Arc::clone(placed_packet)));
+                    cell.contact.latch_due_stimuli(epoch, |contact_page| {
+                        contact_page.since = Some(Arc::clone(placed_packet))
+                    });
                 }
             }
             self.joints = Some((epoch, Arc::clone(placed_packet)));
@@ -279,7 +282,9 @@ impl LatchedPackets {
             } else if let NetworkPage::Tree(_) = page {
                 cell.tree = Some(Arc::clone(placed_packet));
             } else if let NetworkPage::Received(heard) = page {
-                cell.apply_proof(contact_page(), |contact, tag| contact.compare_count(heard.stimuli, tag));
+                cell.apply_stimulus_proof(contact_page(), |contact, tag| {
+                    contact.compare_stimulus_count(heard.stimuli, tag)
+                });
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             let obeys = words.first() == Some(&1);
@@ -295,16 +300,16 @@ impl LatchedPackets {
         {
             let Some(cell) = self.cells.get_mut(from) else { return };
             if number == Parameter::Commit.number() {
-                cell.commit();
+                cell.activate_committed();
             } else if number == Parameter::Mode.number() && words.first() == Some(&1) {
-                cell.apply_proof(contact_page(), ContactState::confirm_mode);
+                cell.apply_stimulus_proof(contact_page(), ContactState::confirm_mode);
             }
         } else if let Message::Stimulus { to, from, page } = *message {
             let contact_page = contact_page();
             self.cells
                 .addressed_mut(to)
                 .iter_mut()
-                .for_each(|cell| cell.contact.push(from, page, contact_page.clone(), last));
+                .for_each(|cell| cell.contact.add_stimulus(from, page, contact_page.clone(), last));
         } else if let Message::Sensors { from, epoch, page } = *message {
             let contact_page = contact_page();
             if let Some(cell) = self.cells.get_mut(from).filter(|_| last.is_none_or(|last| last == epoch)) {
@@ -430,7 +435,7 @@ mod tests {
         let taken = Answer::Value { number: Parameter::Commit.number(), written: true, words: [0; WORDS] };
         let taken = Message::Configured { from: CellId::new(3).unwrap(), tag: 0, answer: taken };
         let claims = |sent| {
-            let beat = Heartbeat { state: State::CLAIMING, sent, ..Heartbeat::default() };
+            let beat = Heartbeat { state: State::CLAIMING_NODE_ID, sent, ..Heartbeat::default() };
             Message::Network { from: to, epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
         };
         let placed_packet = [write(1, 1), write(127, 9), taken, write(2, 1), write(1, 2), write(7, 1)];
@@ -472,7 +477,7 @@ mod tests {
         let mut force = LatchedPackets::default();
         (0..).zip(&placed_packet).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
         let before = force.frames();
-        say(&mut force, 9, Format::Fd, &beat(9, 0, State::CLAIMING));
+        say(&mut force, 9, Format::Fd, &beat(9, 0, State::CLAIMING_NODE_ID));
         assert_eq!(force.frames(), before);
     }
 }

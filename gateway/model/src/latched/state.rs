@@ -25,30 +25,30 @@ use crate::tracker::{AddressClaim, ContactState, HeartbeatKind, PerCell};
 const MAX_PENDING_MESSAGES: usize = 16_384;
 
 /// The contact state of one cell, without data for each stimulus.
-type KnownContact = ContactState<()>;
+type CellContactState = ContactState<()>;
 
 /// Resets the contact state to no contact; `obeys` is true for a cell in test mode.
-fn reset_contact(contact_state: &mut KnownContact, obeys: bool) {
+fn reset_contact(contact_state: &mut CellContactState, obeys: bool) {
     contact_state.reset();
     contact_state.set_obeys_stimuli(obeys);
 }
 
 /// Returns true if the cell is in contact at the joints of `epoch` and later; `None` if unknown.
-fn is_touched_from(contact_state: &KnownContact, epoch: Epoch) -> Option<bool> {
+fn is_touched_from(contact_state: &CellContactState, epoch: Epoch) -> Option<bool> {
     let touches =
         |(skin, ()): &(SkinSensors, ())| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
-    if contact_state.pending().is_empty() {
+    if contact_state.pending_stimuli().is_empty() {
         return contact_state.presumed_skin().map(touches);
     }
     let mut then = contact_state.clone();
-    then.latch(epoch, |()| {});
+    then.latch_due_stimuli(epoch, |()| {});
     then.presumed_skin().map(touches)
 }
 
 /// Returns the latched sensors pages that differ from those of a cell that has just started.
-fn pages(contact_state: &KnownContact) -> impl Iterator<Item = SensorPage> {
-    let nothing = SensorReadings::default().pages();
-    contact_state.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
+fn changed_sensor_pages(contact_state: &CellContactState) -> impl Iterator<Item = SensorPage> {
+    let nothing = SensorReadings::default().simulated_pages();
+    contact_state.latched_pages().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
 }
 
 /// The state of a bus before its last joints.
@@ -57,7 +57,7 @@ struct StateBeforeJoints {
     /// Parameter writes in order, without those that later writes replaced.
     writes: Vec<(Node, u8, Message)>,
     halted: bool,
-    cells: PerCell<KnownContact>,
+    cells: PerCell<CellContactState>,
 }
 
 /// The state of one bus.
@@ -74,11 +74,11 @@ pub struct LatchedState {
 
 impl StateBeforeJoints {
     /// Applies a message that was sent after the joints with the epoch `last`.
-    fn apply(&mut self, message: &Message, last: Option<Epoch>) {
+    fn apply_after_joints(&mut self, message: &Message, last: Option<Epoch>) {
         if let Message::Halt | Message::Resume = message {
             self.halted = *message == Message::Halt;
         } else if let Message::Stimulus { to, from, page } = *message {
-            self.cells.addressed_mut(to).iter_mut().for_each(|cell| cell.push(from, page, (), last));
+            self.cells.addressed_mut(to).iter_mut().for_each(|cell| cell.add_stimulus(from, page, (), last));
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             self.record_write(to, number, *message);
             if number == Parameter::Mode.number() {
@@ -119,7 +119,7 @@ fn is_volatile(number: u8) -> bool {
 
 impl LatchedState {
     /// Applies the next message of the bus.
-    pub fn apply(&mut self, message: &Message) {
+    pub fn apply_message(&mut self, message: &Message) {
         if let Message::Joints { epoch, joints } = *message {
             // Cells drop joints of the last epoch.
             if self.joints.is_none_or(|(last, _)| last != epoch) {
@@ -137,7 +137,7 @@ impl LatchedState {
             self.messages_since.push(*message);
         } else if let Message::Sensors { from, epoch, page } = *message {
             // The cell's own report counts if its contact state is not known otherwise.
-            let cell = self.before.cells.get_mut(from).filter(|cell| cell.pending().is_empty());
+            let cell = self.before.cells.get_mut(from).filter(|cell| cell.pending_stimuli().is_empty());
             if let Some(cell) = cell.filter(|_| self.joints.is_none_or(|(last, _)| last == epoch)) {
                 cell.apply_reported_page(page, ());
             }
@@ -165,16 +165,16 @@ impl LatchedState {
     fn fold_pending_messages(&mut self) {
         let last = self.joints.map(|(epoch, _)| epoch);
         if let Some(epoch) = last {
-            self.before.cells.iter_mut().for_each(|(_, cell)| cell.latch(epoch, |()| {}));
+            self.before.cells.iter_mut().for_each(|(_, cell)| cell.latch_due_stimuli(epoch, |()| {}));
         }
         for message in self.messages_since.drain(..) {
-            self.before.apply(&message, last);
+            self.before.apply_after_joints(&message, last);
         }
     }
 
     /// Returns the owner of a node id.
     #[must_use]
-    pub fn claim(&self, cell: CellId) -> Option<&AddressClaim> {
+    pub fn node_id_claim(&self, cell: CellId) -> Option<&AddressClaim> {
         self.claims.get(cell)
     }
 
@@ -186,7 +186,7 @@ impl LatchedState {
 
     /// Returns the cells that are in contact since the last joints, by the messages before these joints.
     #[must_use]
-    pub fn touched(&self) -> KnownContacts {
+    pub fn cells_in_contact(&self) -> KnownContacts {
         let mut touched = KnownContacts::default();
         let Some((epoch, _)) = self.joints else { return touched };
         for (cell, contact_state) in self.before.cells.iter() {
@@ -199,10 +199,11 @@ impl LatchedState {
 
     /// Returns true if a cell in its state after a start needs no messages to reach this state.
     #[must_use]
-    pub fn is_fresh(&self) -> bool {
+    pub fn is_start_state(&self) -> bool {
         let StateBeforeJoints { writes, halted, cells } = &self.before;
-        let contact =
-            cells.iter().any(|(_, cell)| pages(cell).next().is_some() || !cell.pending().is_empty());
+        let contact = cells.iter().any(|(_, cell)| {
+            changed_sensor_pages(cell).next().is_some() || !cell.pending_stimuli().is_empty()
+        });
         !contact && writes.is_empty() && !halted && self.joints.is_none() && self.messages_since.is_empty()
     }
 
@@ -235,12 +236,12 @@ impl LatchedState {
         let contact: Vec<_> = known
             .iter()
             .flat_map(|(cell, contact_state)| {
-                pages(contact_state).map(|page| stimulus(*cell, StimulusStart::Next, page))
+                changed_sensor_pages(contact_state).map(|page| stimulus(*cell, StimulusStart::Next, page))
             })
             .collect();
-        let pending = known
-            .iter()
-            .flat_map(|(cell, it)| it.pending().iter().map(|&(from, page, ())| stimulus(*cell, from, page)));
+        let pending = known.iter().flat_map(|(cell, it)| {
+            it.pending_stimuli().iter().map(|&(from, page, ())| stimulus(*cell, from, page))
+        });
         let pending: Vec<_> = pending.collect();
         let steps_before = |steps: u8, (epoch, joints): (Epoch, Joints)| Message::Joints {
             epoch: epoch.advanced_by(0_u8.wrapping_sub(steps)),
@@ -297,7 +298,7 @@ mod tests {
     fn restored(messages: &[Message]) -> Vec<Message> {
         let mut state = LatchedState::default();
         for message in messages {
-            state.apply(message);
+            state.apply_message(message);
         }
         state.restoring_messages(|_| true, None)
     }
@@ -346,7 +347,7 @@ mod tests {
 
     #[test]
     fn a_released_restarted_or_measuring_cell_is_not_in_contact() {
-        let heartbeat = Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() };
+        let heartbeat = Heartbeat { state: Flags::CLAIMING_NODE_ID, ..Heartbeat::default() };
         let page = NetworkPage::Heartbeat(heartbeat);
         let restarted = Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page };
         for end in [to(1, StimulusStart::Next, 0.0), restarted] {
@@ -418,7 +419,8 @@ mod tests {
             joints(1),
         ];
         assert_eq!(restored(&said), expected);
-        let page = NetworkPage::Heartbeat(Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() });
+        let page =
+            NetworkPage::Heartbeat(Heartbeat { state: Flags::CLAIMING_NODE_ID, ..Heartbeat::default() });
         let restarted = Message::Network { from: one, epoch: Epoch(0), page };
         let expected = [write(all, 7, 2), commit, write(all, 6, 0), mode(all, 1), Message::Resume, joints(1)];
         assert_eq!(restored(&[&said[..], &[restarted]].concat()), expected);
@@ -437,7 +439,7 @@ mod tests {
     #[test]
     fn a_bus_without_joints_makes_cells_drop_another_epoch() {
         let state = LatchedState::default();
-        assert!(state.is_fresh());
+        assert!(state.is_start_state());
         let next = Some((Epoch(0), Joints::default()));
         assert_eq!(state.restoring_messages(|_| true, next), [Message::Resume, joints(255)]);
     }
@@ -445,8 +447,12 @@ mod tests {
     #[test]
     fn only_cells_that_are_there_are_pressed() {
         let mut state = LatchedState::default();
-        state.apply(&Message::Stimulus { to: Node::Everyone, from: StimulusStart::Next, page: press(1.0) });
-        state.apply(&joints(1));
+        state.apply_message(&Message::Stimulus {
+            to: Node::Everyone,
+            from: StimulusStart::Next,
+            page: press(1.0),
+        });
+        state.apply_message(&joints(1));
         let messages = state.restoring_messages(|it| it.get() == 7, None);
         assert_eq!(
             messages,
@@ -460,7 +466,7 @@ mod tests {
             let page = NetworkPage::Heartbeat(Heartbeat { serial, sent, state, ..Heartbeat::default() });
             Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }
         };
-        let (owner, claim) = (says(7, 40, Flags::CONFIGURED), says(9, 0, Flags::CLAIMING));
+        let (owner, claim) = (says(7, 40, Flags::CONFIGURED), says(9, 0, Flags::CLAIMING_NODE_ID));
         let write = |number| Message::Configure {
             to: Node::Cell(cell(1)),
             tag: 0,

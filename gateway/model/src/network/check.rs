@@ -8,10 +8,10 @@ use std::fmt;
 use protocol::id::CellId;
 use protocol::message::{Heartbeat, PortsPage, State, TreePage, VERSION};
 use protocol::port::PORTS;
-use protocol::skin::Wires;
+use protocol::skin::BusWires;
 use thiserror::Error;
 
-use super::tree::{ReportedTree, tree_places};
+use super::tree::{ReportedTree, tree_from_reports};
 
 /// The reports of one cell, and the description of the cell.
 #[derive(Clone, Copy, Debug)]
@@ -203,14 +203,14 @@ impl Difference {
 
 /// Returns all differences between the wires and cells of a network and the description, each once.
 #[must_use]
-pub fn differences(wires: &Wires, cells: &[ObservedCell]) -> Vec<Difference> {
+pub fn differences(wires: &BusWires, cells: &[ObservedCell]) -> Vec<Difference> {
     let mut found: Vec<_> = cells.iter().flat_map(|cell| cell_differences(cell, cells)).collect();
     let versions = differing_versions(wires, cells);
     found.extend(versions.iter().map(|(&cell, &version)| Difference::Version { cell, version }));
     let network = PortMap::new(wires, cells, &versions);
     network.wire_differences(&mut found);
     let ReportedTree { cycles: circles, unreachable, .. } =
-        tree_places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
+        tree_from_reports(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
     let circling: BTreeSet<_> = circles.iter().flatten().copied().collect();
     found.extend(circles.into_iter().map(Difference::Circle));
     let described = |node: &CellId| cells.iter().any(|cell| cell.node == *node && cell.serial.is_some());
@@ -246,7 +246,7 @@ fn cell_differences(cell: &ObservedCell, all: &[ObservedCell]) -> Vec<Difference
 }
 
 /// Returns the cells with another version of the protocol, by their own reports or by those of their neighbours.
-fn differing_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId, Option<u16>> {
+fn differing_versions(wires: &BusWires, cells: &[ObservedCell]) -> BTreeMap<CellId, Option<u16>> {
     let alive = || cells.iter().filter(|cell| cell.alive && cell.serial.is_some());
     let mut versions = BTreeMap::new();
     for cell in alive() {
@@ -271,13 +271,13 @@ fn differing_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId,
 
 /// The reported neighbours at all ports of a bus, beside the described ones.
 struct PortMap<'a> {
-    wires: &'a Wires,
+    wires: &'a BusWires,
     /// The cells whose ports can be compared: present, with a unique node id, and of this program's version.
     comparable: BTreeMap<CellId, &'a PortsPage>,
 }
 
 impl<'a> PortMap<'a> {
-    fn new(wires: &'a Wires, cells: &'a [ObservedCell], versions: &BTreeMap<CellId, Option<u16>>) -> Self {
+    fn new(wires: &'a BusWires, cells: &'a [ObservedCell], versions: &BTreeMap<CellId, Option<u16>>) -> Self {
         let sound = |cell: &&ObservedCell| {
             let single = cell.heartbeat.is_some_and(|heartbeat| !heartbeat.state.has(State::DUPLICATE));
             cell.alive && single && !versions.contains_key(&cell.node)
@@ -291,27 +291,27 @@ impl<'a> PortMap<'a> {
         self.wires.other_end(end.cell, end.port).map(|(cell, port)| WireEnd { cell, port })
     }
 
-    fn state(&self, end: WireEnd) -> Option<protocol::message::PortState> {
+    fn port_state(&self, end: WireEnd) -> Option<protocol::message::PortState> {
         self.comparable.get(&end.cell)?.ports.get(end.port).copied()
     }
 
     /// Returns the end to which a port leads; `None` if the cell receives nothing there.
     fn actual_end(&self, end: WireEnd) -> Option<WireEnd> {
-        let state = self.state(end).filter(|state| state.receives)?;
+        let state = self.port_state(end).filter(|state| state.receives)?;
         let cell = CellId::new(state.number.into()).ok()?;
         Some(WireEnd { cell, port: state.port.into() })
     }
 
-    fn ends(&self) -> impl Iterator<Item = WireEnd> {
+    fn wire_ends(&self) -> impl Iterator<Item = WireEnd> {
         self.comparable.keys().flat_map(|&cell| (0..PORTS).map(move |port| WireEnd { cell, port }))
     }
 
     fn wire_differences(&self, found: &mut Vec<Difference>) {
         let mut named = BTreeSet::new();
         let mut elsewhere = BTreeSet::new();
-        for end in self.ends() {
+        for end in self.wire_ends() {
             let described = self.described_end(end);
-            let state = self.state(end).filter(|state| state.receives);
+            let state = self.port_state(end).filter(|state| state.receives);
             if state.is_some_and(|state| state.number == 0 && !state.other_version) {
                 found.push(Difference::Unnumbered(end));
                 elsewhere.insert(end);
@@ -335,9 +335,11 @@ impl<'a> PortMap<'a> {
                 (None, None) => Difference::ExtraWire(end.min(leads), end.max(leads)),
             });
         }
-        for first in self.ends() {
+        for first in self.wire_ends() {
             let Some(second) = self.described_end(first).filter(|&second| first < second) else { continue };
-            let (Some(here), Some(there)) = (self.state(first), self.state(second)) else { continue };
+            let (Some(here), Some(there)) = (self.port_state(first), self.port_state(second)) else {
+                continue;
+            };
             if elsewhere.contains(&first) || elsewhere.contains(&second) || (here.works && there.works) {
                 continue;
             }

@@ -29,7 +29,7 @@ impl ReportedTree {
 
 /// Computes the tree from each cell's node id, a flag that is true if the cell sends now, and the cell's report of its
 /// place.
-pub fn tree_places(cells: impl Iterator<Item = (CellId, bool, Option<TreePage>)>) -> ReportedTree {
+pub fn tree_from_reports(cells: impl Iterator<Item = (CellId, bool, Option<TreePage>)>) -> ReportedTree {
     let alive: BTreeMap<_, _> =
         cells.filter(|(_, alive, _)| *alive).map(|(node, _, tree)| (node, tree)).collect();
     let parent = |node: &CellId| {
@@ -90,12 +90,12 @@ mod tests {
     #[test]
     fn depths_are_counted_along_parents() {
         let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 1), says(3, Some(2), 1, 2)];
-        let found = tree_places(cells.into_iter());
+        let found = tree_from_reports(cells.into_iter());
         assert_eq!((found.max_depth(), found.agree), (Some(2), true));
         assert_eq!((found.unreachable, found.cycles), (vec![], vec![]));
         // A report with another depth is out of date.
         let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 2)];
-        assert!(!tree_places(cells.into_iter()).agree);
+        assert!(!tree_from_reports(cells.into_iter()).agree);
     }
 
     #[test]
@@ -114,7 +114,7 @@ mod tests {
             says(10, Some(12), 0, 1),
             says(13, Some(12), 0, 2),
         ];
-        let found = tree_places(cells.into_iter());
+        let found = tree_from_reports(cells.into_iter());
         let without: Vec<_> = found.unreachable.iter().map(|cell| cell.get()).collect();
         assert_eq!(without, [2, 3, 4, 6, 7, 8, 10, 11, 12, 13]);
         assert_eq!(found.cycles, [vec![cell(10), cell(12), cell(11)]]);

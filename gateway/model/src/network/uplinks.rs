@@ -72,7 +72,7 @@ impl Uplinks {
     }
 
     /// Marks a node id as used by a cell on the bus.
-    pub fn mark_used(&mut self, cell: CellId) {
+    pub fn mark_node_id_used(&mut self, cell: CellId) {
         self.used_node_ids.insert(cell.get());
     }
 
@@ -92,7 +92,7 @@ impl Uplinks {
 
     /// Returns true if a root sends its sums to the gateway; otherwise it sends them to another cell.
     #[must_use]
-    pub fn is_child(&self, root: usize) -> bool {
+    pub fn is_gateway_child(&self, root: usize) -> bool {
         self.wires.get(root).is_some_and(|wire| wire.is_child)
     }
 
@@ -106,7 +106,7 @@ impl Uplinks {
                 wire.last_hello = Some((hello, now));
                 // Only the root knows whether a grant arrived, and whether one from an earlier gateway is still valid.
                 wire.is_child = hello.is_parent;
-                if hello.is_parent && hello.rank.is_some_and(|own| own.is_better_than(rank.child())) {
+                if hello.is_parent && hello.rank.is_some_and(|own| own.is_better_than(rank.child_rank())) {
                     self.start_round_after(now, hello.rank.map_or(self.round, |own| own.round));
                 } else if is_new || !hello.receives {
                     self.send_hello(now, root);
@@ -188,7 +188,9 @@ impl Uplinks {
         if self.active_walk.is_some() || now < self.next_walk {
             return;
         }
-        let Some((root, (first, last))) = self.root_needing_node_ids().zip(self.free_range()) else { return };
+        let Some((root, (first, last))) = self.root_needing_node_ids().zip(self.free_node_id_range()) else {
+            return;
+        };
         self.last_walk_number = self.last_walk_number.wrapping_add(1);
         let walk = NodeIdWalk { walk: self.last_walk_number, first, last };
         self.active_walk = Some(ActiveWalk { root, walk, since: now });
@@ -196,7 +198,7 @@ impl Uplinks {
     }
 
     /// Returns the first and last node id of the first range of free node ids.
-    fn free_range(&self) -> Option<(u8, u8)> {
+    fn free_node_id_range(&self) -> Option<(u8, u8)> {
         let first = (1..=CellId::MAX.get()).find(|number| !self.used_node_ids.contains(number))?;
         let last =
             (first..=CellId::MAX.get()).take_while(|number| !self.used_node_ids.contains(number)).last()?;
@@ -261,21 +263,21 @@ mod tests {
     fn a_root_is_a_child_as_long_as_its_hellos_say_so() {
         let mut uplinks = Uplinks::new(2, 0, Micros(0));
         uplinks.handle_message(Micros(0), 1, hello_up(false));
-        assert_eq!([0, 1, 2].map(|root| uplinks.is_child(root)), [false, true, false]);
+        assert_eq!([0, 1, 2].map(|root| uplinks.is_gateway_child(root)), [false, true, false]);
         uplinks.handle_time(Micros(600 * MS));
-        assert!(uplinks.is_child(1));
+        assert!(uplinks.is_gateway_child(1));
         uplinks.handle_time(Micros(1_000 * MS));
-        assert!(!uplinks.is_child(1), "silent");
+        assert!(!uplinks.is_gateway_child(1), "silent");
         uplinks.handle_message(Micros(1_000 * MS), 1, hello_up(false));
         uplinks.handle_message(Micros(1_000 * MS), 1, PortMessage::Leave);
-        assert!(!uplinks.is_child(1), "left");
+        assert!(!uplinks.is_gateway_child(1), "left");
     }
 
     #[test]
     fn a_walk_has_the_first_range_of_free_node_ids() {
         let mut uplinks = Uplinks::new(1, 7, Micros(0));
         for used in [1, 2, 5] {
-            uplinks.mark_used(CellId::new(used).unwrap());
+            uplinks.mark_node_id_used(CellId::new(used).unwrap());
         }
         uplinks.handle_message(Micros(0), 0, hello_up(true));
         let walk = |walk, first, last| PortMessage::NodeId(NodeIdWalk { walk, first, last });

@@ -7,25 +7,25 @@ use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 use protocol::time::Span;
 
 use super::names::NameTable;
-use super::times::{DurationS, check_duration};
+use super::times::{ScenarioDuration, check_duration};
 use super::{ModeChange, Motion, MotionKind, Scenario, TorqueSource, Touch, faults, pressed, raw, sensors};
 
 pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     if raw.version != 1 {
         return Err(KeyPath::top_level_key("version").fault(raw.version, "this program reads version 1"));
     }
-    let end = DurationS(raw.duration_s());
+    let end = ScenarioDuration(raw.duration_s());
     let duration = check_duration(&KeyPath::top_level_key("duration_s"), end.0)?;
     let negative = |_| KeyPath::top_level_key("seed").fault(raw.seed, "must not be negative");
     let seed = u64::try_from(raw.seed).map_err(negative)?;
     let motion = motion(&raw.motion, skin)?;
     let modes = modes(&raw.mode, end)?;
     let names = NameTable::new(skin);
-    let touches = pressed::touches(&raw.touch, end, &names)?;
+    let touches = pressed::check_touches(&raw.touch, end, &names)?;
     let touches_repeat =
         raw.touches_repeat_s.map(|seconds| check_repeat(&raw.touch, &touches, seconds)).transpose()?;
     let faults = faults::faults(&raw.fault, end, &names)?;
-    let sensors = sensors::sensors(&raw.sensors, end)?;
+    let sensors = sensors::check_sensor_errors(&raw.sensors, end)?;
     Ok(Scenario { duration, seed, motion, modes, touches, touches_repeat, faults, sensors })
 }
 
@@ -35,11 +35,11 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
     let joints = |key, values: &[f64]| {
         if values.len() != robot.joints.len() {
             let why = format!("one value for each of the robot's {} joints is needed", robot.joints.len());
-            return Err(at.key(key).fault(format_args!("{} values", values.len()), why));
+            return Err(at.with_key(key).fault(format_args!("{} values", values.len()), why));
         }
         Ok(core::array::from_fn(|joint| values.get(joint).copied().unwrap_or(0.0)))
     };
-    let (start_key, start) = with_former_key(&at, ("start", &raw.start), ("start_rad", &raw.start_rad))?;
+    let (start_key, start) = value_or_former_key(&at, ("start", &raw.start), ("start_rad", &raw.start_rad))?;
     // The value in range nearest to zero.
     let mut nearest = [0.0; MAX_ROBOT_JOINTS];
     for (start, joint) in nearest.iter_mut().zip(&robot.joints) {
@@ -47,21 +47,22 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
     }
     let start = start.map_or(Ok(nearest), |it| joints(start_key, it))?;
     let (key, amplitude) =
-        with_former_key(&at, ("amplitude", &raw.amplitude), ("amplitude_rad", &raw.amplitude_rad))?;
+        value_or_former_key(&at, ("amplitude", &raw.amplitude), ("amplitude_rad", &raw.amplitude_rad))?;
     let kinds =
         [("hold", Some(MotionKind::Hold)), ("sine", None), ("kinesthetic", Some(MotionKind::Kinesthetic))];
     let needed = "needed with kind = \"sine\"";
     let only = "only with kind = \"sine\"";
-    let (kind, reach) = match (at.key("kind").parse_choice(&raw.kind, &kinds)?, amplitude, raw.period_s) {
+    let (kind, reach) = match (at.with_key("kind").parse_choice(&raw.kind, &kinds)?, amplitude, raw.period_s)
+    {
         (Some(kind), None, None) => (kind, [0.0; MAX_ROBOT_JOINTS]),
-        (Some(_), Some(_), _) => return Err(at.key(key).fault("", only)),
-        (Some(_), None, Some(got)) => return Err(at.key("period_s").fault(got, only)),
-        (None, None, _) => return Err(at.key(key).fault("", needed)),
-        (None, Some(_), None) => return Err(at.key("period_s").fault("", needed)),
+        (Some(_), Some(_), _) => return Err(at.with_key(key).fault("", only)),
+        (Some(_), None, Some(got)) => return Err(at.with_key("period_s").fault(got, only)),
+        (None, None, _) => return Err(at.with_key(key).fault("", needed)),
+        (None, Some(_), None) => return Err(at.with_key("period_s").fault("", needed)),
         (None, Some(amplitude), Some(period_s)) => {
             let amplitude = joints(key, amplitude)?;
-            check_duration(&at.key("period_s"), period_s)?;
-            check_speeds(&at.key(key), skin, &amplitude, period_s)?;
+            check_duration(&at.with_key("period_s"), period_s)?;
+            check_speeds(&at.with_key(key), skin, &amplitude, period_s)?;
             (MotionKind::Sine { amplitude, period_s }, amplitude.map(f64::abs))
         }
     };
@@ -72,21 +73,21 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
             let swings =
                 if reach > 0.0 { format!(", and it swings by {reach} {unit}") } else { String::new() };
             let why = format!("{} is limited to {min:.4} to {max:.4} {unit}{swings}", joint.name);
-            return Err(at.key(start_key).element(index).fault(format_args!("{start} {unit}"), why));
+            return Err(at.with_key(start_key).with_index(index).fault(format_args!("{start} {unit}"), why));
         }
     }
     Ok(Motion { start, kind })
 }
 
 /// Returns the value under a key or under the key's former name, with the name that the file uses.
-fn with_former_key<'a, T>(
+fn value_or_former_key<'a, T>(
     at: &KeyPath,
     (key, value): (&'static str, &'a Option<T>),
     (former, given): (&'static str, &'a Option<T>),
 ) -> Checked<(&'static str, Option<&'a T>)> {
     match (value, given) {
         (Some(_), Some(_)) => {
-            Err(at.key(former).fault("", format_args!("the former name of {key}: give one of them")))
+            Err(at.with_key(former).fault("", format_args!("the former name of {key}: give one of them")))
         }
         (None, Some(given)) => Ok((former, Some(given))),
         (value, None) => Ok((key, value.as_ref())),
@@ -108,22 +109,22 @@ fn check_speeds(
                 "with a period of {period_s} s this needs {speed:.3} {unit}/s, but the limit of joint {} is {max}",
                 index + 1
             );
-            return Err(at.element(index).fault(amplitude, why));
+            return Err(at.with_index(index).fault(amplitude, why));
         }
     }
     Ok(())
 }
 
-fn modes(raw: &[raw::Mode], end: DurationS) -> Checked<Vec<ModeChange>> {
+fn modes(raw: &[raw::Mode], end: ScenarioDuration) -> Checked<Vec<ModeChange>> {
     let mut modes: Vec<ModeChange> = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let path = KeyPath::top_level_key("mode").element(index);
-        let at = end.time_before_end(&path.key("at_s"), raw.at_s)?;
+        let path = KeyPath::top_level_key("mode").with_index(index);
+        let at = end.check_time_before_end(&path.with_key("at_s"), raw.at_s)?;
         if modes.last().is_some_and(|last| last.at >= at) {
-            return Err(path.key("at_s").fault(raw.at_s, "modes must be in order of time"));
+            return Err(path.with_key("at_s").fault(raw.at_s, "modes must be in order of time"));
         }
         let kinds = [TorqueSource::Compare, TorqueSource::Distributed].map(|mode| (mode.name(), mode));
-        modes.push(ModeChange { at, mode: path.key("kind").parse_choice(&raw.kind, &kinds)? });
+        modes.push(ModeChange { at, mode: path.with_key("kind").parse_choice(&raw.kind, &kinds)? });
     }
     Ok(modes)
 }
@@ -139,7 +140,7 @@ fn check_repeat(raw: &[raw::Touch], touches: &[Touch], seconds: f64) -> Checked<
             let got = raw.for_s.unwrap_or(raw.at_s);
             let why =
                 format_args!("the touch must end before touches_repeat_s = {seconds}, when all begin again");
-            return Err(KeyPath::top_level_key("touch").element(index).key(key).fault(got, why));
+            return Err(KeyPath::top_level_key("touch").with_index(index).with_key(key).fault(got, why));
         }
     }
     Ok(period)

@@ -21,7 +21,7 @@ const CREEP_TIME_CONSTANTS_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
 
 /// The true input of a cell's sensors, before sensor errors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct TrueInput {
+pub(super) struct TrueSensorInput {
     /// Total force of all touches on the cell, in N.
     pub(super) force_n: f64,
     /// The values set by touches besides the force.
@@ -91,7 +91,7 @@ impl ImperfectSensors {
     }
 
     /// Resets the sensors to their state before the first epoch.
-    pub(super) fn restart(&mut self) {
+    pub(super) fn reset_sensors(&mut self) {
         for (cell, index) in self.cells.iter_mut().zip(0..) {
             *cell = CellSensors::new(core::mem::take(&mut cell.neighbours), self.seed, index);
         }
@@ -100,7 +100,7 @@ impl ImperfectSensors {
     }
 
     /// Computes the next epoch, at `time`, from the true inputs of the cells.
-    pub(super) fn step(&mut self, time: Micros, there: &[TrueInput]) {
+    pub(super) fn compute_next_epoch(&mut self, time: Micros, there: &[TrueSensorInput]) {
         let ambient = self.sensors.temperature_at(time).unwrap_or(REFERENCE_TEMPERATURE_C);
         for ((cell, there_is), words) in self.cells.iter_mut().zip(there).zip(&mut self.words) {
             let beside: f64 =
@@ -112,8 +112,12 @@ impl ImperfectSensors {
             let [temperature, _] = readings.skin.temperature;
             let errors = &self.sensors.force;
             let force_n = there_is.force_n + errors.crosstalk * beside;
-            let read_n =
-                cell.read(force_n, temperature.to_f64() - REFERENCE_TEMPERATURE_C, errors, self.period_s);
+            let read_n = cell.sensor_reading_n(
+                force_n,
+                temperature.to_f64() - REFERENCE_TEMPERATURE_C,
+                errors,
+                self.period_s,
+            );
             if !there_is.is_stuck {
                 let contact = contact_words(read_n + there_is.added_n);
                 *words = SensorReadings { skin: SkinSensors { contact, ..readings.skin }, ..readings };
@@ -143,7 +147,7 @@ impl CellSensors {
 
     /// Returns the reading in N for a true force in N. It is `period_s` s after the previous reading, at `degrees` °C
     /// above the reference temperature.
-    fn read(&mut self, force_n: f64, degrees: f64, errors: &ForceErrors, period_s: f64) -> f64 {
+    fn sensor_reading_n(&mut self, force_n: f64, degrees: f64, errors: &ForceErrors, period_s: f64) -> f64 {
         // Hysteresis as a play between the curves of a rising and of a falling force.
         let falling = force_n * (1.0 + errors.hysteresis);
         self.read_n = self.read_n.clamp(force_n.min(falling), force_n.max(falling));

@@ -7,7 +7,7 @@ use protocol::port::PORTS;
 use protocol::skin::{CellName, Skin, SkinReply};
 
 use super::raw;
-use crate::listing::ranges;
+use crate::listing::node_id_ranges;
 
 /// Maximum number of node id ranges in an error.
 const MAX_LISTED_RANGES: usize = 8;
@@ -49,25 +49,27 @@ impl<'a> NameTable<'a> {
 
     /// Returns the index of the bus with this name. Errors show `at` and `value` as the key and its value.
     fn bus_named(&self, at: &KeyPath, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
-        let wrong = || at.fault(value, format_args!("no such bus; there is {}", self.buses()));
-        self.skin.bus_named(name).ok_or_else(wrong)
+        let wrong = || at.fault(value, format_args!("no such bus; there is {}", self.bus_names_text()));
+        self.skin.bus_index(name).ok_or_else(wrong)
     }
 
-    fn buses(&self) -> String {
+    fn bus_names_text(&self) -> String {
         let names = self.skin.buses.iter().map(|bus| format!("{:?}", bus.name));
         names.collect::<Vec<_>>().join(", ")
     }
 
     /// Returns the index of the bus that the key `bus` names. The key may be omitted if the skin has only one bus.
     fn bus_of_key(&self, given: CellSelection<'_>) -> Checked<usize> {
-        let at = given.at.key("bus");
+        let at = given.at.with_key("bus");
         match given.bus {
             Some(name) => self.bus_named(&at, &format_args!("{name:?}"), name),
             None if self.skin.buses.len() == 1 => Ok(0),
             None => {
                 let first = self.bus_name(0);
-                let why =
-                    format_args!("which bus? there is {}; a cell of one is also \"{first}:1\"", self.buses());
+                let why = format_args!(
+                    "which bus? there is {}; a cell of one is also \"{first}:1\"",
+                    self.bus_names_text()
+                );
                 Err(at.fault("", why))
             }
         }
@@ -77,7 +79,7 @@ impl<'a> NameTable<'a> {
     pub(super) fn bus(&self, given: CellSelection<'_>) -> Checked<usize> {
         match given.cells {
             Some([first, ..]) if given.bus.is_none() => {
-                let cell = self.cell(&given.at.key("cells").element(0), first, given)?;
+                let cell = self.cell(&given.at.with_key("cells").with_index(0), first, given)?;
                 Ok(self.skin.cells.get(cell).map_or(0, |cell| cell.bus))
             }
             _ => self.bus_of_key(given),
@@ -108,7 +110,7 @@ impl<'a> NameTable<'a> {
     fn node_ids_text(&self, bus: usize) -> String {
         let mut nodes: Vec<_> = self.skin.cells_on_bus(bus).map(|cell| cell.node.get()).collect();
         nodes.sort_unstable();
-        let all = ranges(&nodes);
+        let all = node_id_ranges(&nodes);
         match all.get(..MAX_LISTED_RANGES) {
             _ if all.is_empty() => "it has no cells".to_owned(),
             Some(few) if all.len() > MAX_LISTED_RANGES => format!("it has {}, ...", few.join(", ")),
@@ -121,10 +123,10 @@ impl<'a> NameTable<'a> {
         if given.bus.is_some() {
             self.bus_of_key(given)?;
         }
-        let path = given.at.key("cells");
+        let path = given.at.with_key("cells");
         let mut cells = Vec::with_capacity(named.len());
         for (index, named) in named.iter().enumerate() {
-            let at = path.element(index);
+            let at = path.with_index(index);
             let cell = self.cell(&at, named, given)?;
             if let Some(first) = cells.iter().position(|&before| before == cell) {
                 return Err(at.fault(named, format_args!("cells[{first}] is the same cell")));
@@ -136,7 +138,7 @@ impl<'a> NameTable<'a> {
 
     /// Returns the indices of the cells that a table lists, or of all cells; sorted.
     pub(super) fn cells(&self, given: CellSelection<'_>) -> Checked<Vec<usize>> {
-        let path = given.at.key("cells");
+        let path = given.at.with_key("cells");
         match given.cells {
             Some(_) if given.all => Err(path.fault("", "give either cells or all = true, not both")),
             None if !given.all => Err(path.fault("", "which cells? give their node ids, or all = true")),
@@ -156,12 +158,12 @@ impl<'a> NameTable<'a> {
     }
 
     /// Returns the indices of the cells that a table lists, sorted. All of them must be on the given bus.
-    pub(super) fn cells_on(&self, given: CellSelection<'_>, bus: usize) -> Checked<Vec<usize>> {
+    pub(super) fn listed_cells_on_bus(&self, given: CellSelection<'_>, bus: usize) -> Checked<Vec<usize>> {
         let cells = self.cells(given)?;
         let is_here = |cell: usize| self.skin.cells.get(cell).is_some_and(|cell| cell.bus == bus);
-        let path = given.at.key("cells");
+        let path = given.at.with_key("cells");
         for (index, named) in given.cells.unwrap_or_default().iter().enumerate() {
-            let at = path.element(index);
+            let at = path.with_index(index);
             if !is_here(self.cell(&at, named, given)?) {
                 let why = format_args!(
                     "this fault is on one bus, {:?}: use another table for this cell",
@@ -176,14 +178,14 @@ impl<'a> NameTable<'a> {
     /// Returns the indices of the two cells that a table lists, in the file's order. Both must be on one bus, and a
     /// wire must connect them.
     pub(super) fn wired_pair(&self, given: CellSelection<'_>) -> Checked<(usize, usize)> {
-        let path = given.at.key("cells");
+        let path = given.at.with_key("cells");
         self.cells(given)?;
         let named = given.cells.unwrap_or_default();
         let [one, other] = named else {
             return Err(path.fault(format_args!("{} cells", named.len()), "a wire connects two cells"));
         };
         let bus = self.bus(given)?;
-        self.cells_on(given, bus)?;
+        self.listed_cells_on_bus(given, bus)?;
         let described = self.skin.buses.get(bus);
         if described.is_some_and(|bus| bus.reply == SkinReply::Torque) {
             return Err(path.fault("", "wires are used on a bus with reply = \"sum\" only"));
@@ -194,7 +196,8 @@ impl<'a> NameTable<'a> {
             let (Some(from), Some(to)) = (node(from), node(to)) else { return false };
             (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
         };
-        let pair = (self.cell(&path.element(0), one, given)?, self.cell(&path.element(1), other, given)?);
+        let pair =
+            (self.cell(&path.with_index(0), one, given)?, self.cell(&path.with_index(1), other, given)?);
         let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire connects these two cells");
         Some(pair).filter(leads).ok_or_else(wrong)
     }
@@ -203,13 +206,13 @@ impl<'a> NameTable<'a> {
 #[cfg(test)]
 mod tests {
     use crate::scenario::{FaultKind, Scenario};
-    use crate::testing::SKIN;
+    use crate::testing::ONE_CELL_SKIN_TOML;
     use protocol::skin::Skin;
 
     /// Cells 1 to 3 of `vcan0`, and 1 and 5 of `vcan1`: indices 0 to 4.
     fn two_buses() -> Skin {
         let second = "[[bus]]\nname = \"vcan1\"\nreply = \"torque\"\nformat = \"fd\"\n\n[controller]";
-        let (head, cell) = SKIN.split_at(SKIN.find("[[cell]]").unwrap());
+        let (head, cell) = ONE_CELL_SKIN_TOML.split_at(ONE_CELL_SKIN_TOML.find("[[cell]]").unwrap());
         let cells =
             [("vcan0", 1), ("vcan0", 2), ("vcan0", 3), ("vcan1", 1), ("vcan1", 5)].map(|(bus, node)| {
                 cell.replace("node = 1", &format!("node = {node}")).replace("\"vcan0\"", &format!("{bus:?}"))

@@ -5,29 +5,38 @@ use protocol::time::Span;
 
 use super::force::MAX_FORCE_N;
 use super::names::{CellSelection, NameTable};
-use super::times::{DurationS, MAX_DURATION_S, check_duration};
+use super::times::{MAX_DURATION_S, ScenarioDuration, check_duration};
 use super::{ForceProfile, Touch, TouchValues, raw};
 
 /// Checks the touches; returns them in the file's order.
-pub(super) fn touches(raw: &[raw::Touch], end: DurationS, names: &NameTable<'_>) -> Checked<Vec<Touch>> {
+pub(super) fn check_touches(
+    raw: &[raw::Touch],
+    end: ScenarioDuration,
+    names: &NameTable<'_>,
+) -> Checked<Vec<Touch>> {
     let mut touches = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let at = KeyPath::top_level_key("touch").element(index);
-        touches.push(touch(&at, raw, end, names)?);
+        let at = KeyPath::top_level_key("touch").with_index(index);
+        touches.push(check_touch(&at, raw, end, names)?);
         check_total_force(&at, &touches, names)?;
     }
     Ok(touches)
 }
 
-fn touch(at: &KeyPath, raw: &raw::Touch, end: DurationS, names: &NameTable<'_>) -> Checked<Touch> {
+fn check_touch(
+    at: &KeyPath,
+    raw: &raw::Touch,
+    end: ScenarioDuration,
+    names: &NameTable<'_>,
+) -> Checked<Touch> {
     let (profile, length, force_n) = match &raw.profile {
-        raw::Profile::Word(word) => named_profile(at, raw, word)?,
-        raw::Profile::Points(points) => point_profile(at, raw, points)?,
+        raw::TouchProfile::Word(word) => profile_from_name(at, raw, word)?,
+        raw::TouchProfile::Points(points) => profile_from_points(at, raw, points)?,
     };
     let values = TouchValues::check(at, raw)?;
     let given = CellSelection { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all };
     Ok(Touch {
-        at: end.time_before_end(&at.key("at_s"), raw.at_s)?,
+        at: end.check_time_before_end(&at.with_key("at_s"), raw.at_s)?,
         length,
         cells: names.cells(given)?,
         force_n,
@@ -37,50 +46,54 @@ fn touch(at: &KeyPath, raw: &raw::Touch, end: DurationS, names: &NameTable<'_>) 
 }
 
 /// Returns the profile that a touch names with a word, the duration of the touch, and its peak force in N.
-fn named_profile(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(ForceProfile, Span, f64)> {
+fn profile_from_name(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(ForceProfile, Span, f64)> {
     let profiles = [ForceProfile::HalfSine, ForceProfile::Step, ForceProfile::Ramp]
         .map(|profile| (profile.name(), profile));
     let Some((_, profile)) = profiles.iter().find(|(name, _)| *name == word).cloned() else {
         let words = profiles.map(|(name, _)| format!("{name:?}")).join(", ");
         let why = format!("{words} or points [[t_s, force_n], ...]");
-        return Err(at.key("profile").fault(format_args!("{word:?}"), why));
+        return Err(at.with_key("profile").fault(format_args!("{word:?}"), why));
     };
-    let at_force = at.key("force_n");
+    let at_force = at.with_key("force_n");
     let Some(force_n) = raw.force_n else {
         return Err(at_force.fault("", format_args!("needed with profile = {word:?}")));
     };
     check_force(&at_force, force_n)?;
     let length = match (raw.for_s, &profile) {
-        (Some(seconds), _) => check_duration(&at.key("for_s"), seconds)?,
+        (Some(seconds), _) => check_duration(&at.with_key("for_s"), seconds)?,
         (None, ForceProfile::Step) => Span(u64::MAX),
         (None, ForceProfile::HalfSine | ForceProfile::Ramp | ForceProfile::Points(_)) => {
-            return Err(at.key("for_s").fault("", format_args!("needed with profile = {word:?}")));
+            return Err(at.with_key("for_s").fault("", format_args!("needed with profile = {word:?}")));
         }
     };
     Ok((profile, length, force_n))
 }
 
 /// Returns the profile that a touch gives as points, the duration of the touch, and its peak force in N.
-fn point_profile(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(ForceProfile, Span, f64)> {
-    let path = at.key("profile");
+fn profile_from_points(
+    at: &KeyPath,
+    raw: &raw::Touch,
+    given: &[Vec<f64>],
+) -> Checked<(ForceProfile, Span, f64)> {
+    let path = at.with_key("profile");
     let mut points: Vec<(Span, f64)> = Vec::with_capacity(given.len() + 1);
     let mut peak_n = 0.0_f64;
     for (index, given) in given.iter().enumerate() {
-        let point = path.element(index);
+        let point = path.with_index(index);
         let &[seconds, force_n] = given.as_slice() else {
             let why = format_args!("a point is two numbers, [t_s, force_n], not {}", given.len());
             return Err(point.fault("", why));
         };
         if !(0.0..=MAX_DURATION_S).contains(&seconds) {
             let why = format!("must be 0 to {MAX_DURATION_S:e} s after the start of the touch");
-            return Err(point.element(0).fault(seconds, why));
+            return Err(point.with_index(0).fault(seconds, why));
         }
         let moment = span_from_seconds(seconds);
         if points.last().is_some_and(|(last, _)| *last >= moment) {
             let why = "the times of points must increase, by at least 1e-6 s";
-            return Err(point.element(0).fault(seconds, why));
+            return Err(point.with_index(0).fault(seconds, why));
         }
-        check_force(&point.element(1), force_n)?;
+        check_force(&point.with_index(1), force_n)?;
         if points.is_empty() && moment > Span(0) {
             points.push((Span(0), 0.0));
         }
@@ -97,12 +110,12 @@ fn point_profile(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<
         raw.for_s.filter(|seconds| !(*seconds >= 0.0 && span_from_seconds(*seconds) == length))
     {
         let why = format!("the points of the profile end at {} s: omit for_s", length.seconds());
-        return Err(at.key("for_s").fault(for_s, why));
+        return Err(at.with_key("for_s").fault(for_s, why));
     }
     #[expect(clippy::float_cmp, reason = "two numbers of the same file")]
     if let Some(force_n) = raw.force_n.filter(|force_n| *force_n != peak_n) {
         let why = format!("the largest force of the profile's points is {peak_n} N: omit force_n");
-        return Err(at.key("force_n").fault(force_n, why));
+        return Err(at.with_key("force_n").fault(force_n, why));
     }
     Ok((ForceProfile::Points(points), length, peak_n))
 }
@@ -137,10 +150,10 @@ fn check_total_force(at: &KeyPath, touches: &[Touch], names: &NameTable<'_>) -> 
                 );
                 return Err(match last.profile {
                     ForceProfile::Points(_) => {
-                        at.key("profile").fault(format_args!("up to {} N", last.force_n), why)
+                        at.with_key("profile").fault(format_args!("up to {} N", last.force_n), why)
                     }
                     ForceProfile::HalfSine | ForceProfile::Step | ForceProfile::Ramp => {
-                        at.key("force_n").fault(last.force_n, why)
+                        at.with_key("force_n").fault(last.force_n, why)
                     }
                 });
             }
@@ -156,11 +169,11 @@ mod tests {
 
     use super::*;
     use crate::scenario::{Scenario, Touches, contact_words};
-    use crate::testing::skin;
+    use crate::testing::one_cell_skin;
 
     fn read(touch: &str) -> Result<Scenario, String> {
         let text = format!("[[touch]]\nat_s = 1.0\ncells = [1]\n{touch}\n");
-        Scenario::parse("s.toml", &text, &skin()).map_err(|error| error.to_string())
+        Scenario::parse("s.toml", &text, &one_cell_skin()).map_err(|error| error.to_string())
     }
 
     fn one(touch: &str) -> Touch {
@@ -187,7 +200,7 @@ mod tests {
         assert_eq!(flat.duration, Span(22_000_000), "a second after the last point");
         let step = read("for_s = 20.0\nforce_n = 3.0").unwrap();
         let words = |scenario: &Scenario| {
-            let touches = Touches::new(scenario, &skin());
+            let touches = Touches::new(scenario, &one_cell_skin());
             (0..1_400).map(|epoch| touches.sensors(0, epoch)).collect::<Vec<_>>()
         };
         assert_eq!(words(&flat), words(&step));
@@ -251,7 +264,7 @@ mod tests {
 
     #[test]
     fn a_profile_below_the_thresholds_is_remarked() {
-        let remarks = read("profile = [[1.0, 0.01]]").unwrap().warnings(&skin());
+        let remarks = read("profile = [[1.0, 0.01]]").unwrap().warnings(&one_cell_skin());
         let said = "the touch at 1 s: the largest force of its profile, 0.01 N, is below the thresholds of its cells";
         assert!(remarks[0].starts_with(said), "{remarks:?}");
     }

@@ -36,38 +36,38 @@ const fn one() -> i64 {
 
 /// The course of a touch's force, as given in the file.
 #[derive(Debug)]
-pub(super) enum Profile {
+pub(super) enum TouchProfile {
     Word(String),
     /// Times in s after the start of the touch, and forces in N; each point must have two numbers.
     Points(Vec<Vec<f64>>),
 }
 
-impl Default for Profile {
+impl Default for TouchProfile {
     fn default() -> Self {
         Self::Word(super::ForceProfile::Step.name().to_owned())
     }
 }
 
-impl<'de> Deserialize<'de> for Profile {
+impl<'de> Deserialize<'de> for TouchProfile {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
         struct RawValueVisitor;
         impl<'de> Visitor<'de> for RawValueVisitor {
-            type Value = Profile;
+            type Value = TouchProfile;
 
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.write_str("either a word in quotes or a list of points [[t_s, force_n], ...]")
             }
 
-            fn visit_str<E: Error>(self, word: &str) -> Result<Profile, E> {
-                Ok(Profile::Word(word.to_owned()))
+            fn visit_str<E: Error>(self, word: &str) -> Result<TouchProfile, E> {
+                Ok(TouchProfile::Word(word.to_owned()))
             }
 
-            fn visit_seq<A: SeqAccess<'de>>(self, mut all: A) -> Result<Profile, A::Error> {
+            fn visit_seq<A: SeqAccess<'de>>(self, mut all: A) -> Result<TouchProfile, A::Error> {
                 let mut points = Vec::new();
                 while let Some(point) = all.next_element()? {
                     points.push(point);
                 }
-                Ok(Profile::Points(points))
+                Ok(TouchProfile::Points(points))
             }
         }
         from.deserialize_any(RawValueVisitor)
@@ -119,7 +119,7 @@ impl Scenario {
     /// an event if that is later.
     pub(super) fn duration_s(&self) -> f64 {
         let end = |at_s: f64, for_s: Option<f64>| at_s + for_s.unwrap_or(0.0);
-        let touches = self.touch.iter().map(|touch| end(touch.at_s, touch.for_s()));
+        let touches = self.touch.iter().map(|touch| end(touch.at_s, touch.touch_duration_s()));
         let faults = self.fault.iter().map(|fault| end(fault.at_s, fault.for_s));
         let ends = touches.chain(faults).chain(self.mode.iter().map(|mode| mode.at_s));
         let last = || ends.fold(0.0, f64::max) + 1.0;
@@ -170,7 +170,7 @@ pub(super) struct Touch {
     pub(super) all: bool,
     pub(super) force_n: Option<f64>,
     #[serde(default)]
-    pub(super) profile: Profile,
+    pub(super) profile: TouchProfile,
     #[serde(default)]
     pub(super) proximity: f64,
     pub(super) temperature_c: Option<[f64; 2]>,
@@ -178,10 +178,10 @@ pub(super) struct Touch {
 
 impl Touch {
     /// Returns the duration of the touch in s, if the file gives one; for points, the time of the last point.
-    fn for_s(&self) -> Option<f64> {
+    fn touch_duration_s(&self) -> Option<f64> {
         match &self.profile {
-            Profile::Points(points) => points.last()?.first().copied(),
-            Profile::Word(_) => self.for_s,
+            TouchProfile::Points(points) => points.last()?.first().copied(),
+            TouchProfile::Word(_) => self.for_s,
         }
     }
 }

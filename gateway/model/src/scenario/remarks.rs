@@ -5,19 +5,19 @@ use protocol::skin::{ControllerKind, Skin};
 use protocol::time::Span;
 
 use super::{ForceProfile, MotionKind, Scenario, Touch, contact_words};
-use crate::central::force;
+use crate::central::contact_force;
 
 impl Scenario {
     /// Returns one warning for each part of the scenario that will have no effect on this skin.
     #[must_use]
     pub fn warnings(&self, skin: &Skin) -> Vec<String> {
-        let controller = unused_controller(self.motion.kind, skin);
-        let touches = self.touches.iter().filter_map(|touch| weak_touch(touch, skin));
+        let controller = unused_controller_warning(self.motion.kind, skin);
+        let touches = self.touches.iter().filter_map(|touch| weak_touch_warning(touch, skin));
         controller.into_iter().chain(touches).collect()
     }
 }
 
-fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
+fn unused_controller_warning(motion: MotionKind, skin: &Skin) -> Option<String> {
     let ControllerKind::External { socket, .. } = &skin.controller.kind else { return None };
     let unused = !matches!(motion, MotionKind::Kinesthetic);
     unused.then(|| {
@@ -30,12 +30,12 @@ fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
 }
 
 /// Returns a warning if the force and the proximity of a touch are below the thresholds of all its cells.
-fn weak_touch(touch: &Touch, skin: &Skin) -> Option<String> {
+fn weak_touch_warning(touch: &Touch, skin: &Skin) -> Option<String> {
     let mut readings = SensorReadings::default();
     touch.values.apply(&mut readings);
     let sensors = SkinSensors { contact: contact_words(touch.force_n), ..readings.skin };
     let mut cells = touch.cells.iter().filter_map(|&cell| skin.cells.get(cell));
-    let in_vain = touch.force_n > 0.0 && cells.all(|cell| force(&cell.contact, &sensors) <= 0.0);
+    let in_vain = touch.force_n > 0.0 && cells.all(|cell| contact_force(&cell.contact, &sensors) <= 0.0);
     in_vain.then(|| {
         let at_s = Span(touch.at.0).seconds();
         let peak = match touch.profile {

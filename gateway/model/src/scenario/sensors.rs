@@ -6,7 +6,7 @@ use protocol::time::Micros;
 
 use super::curve::interpolate;
 use super::raw;
-use super::times::DurationS;
+use super::times::ScenarioDuration;
 use crate::accelerometer::sensor::DataSheet;
 
 /// The reference temperature of data sheet errors, in °C.
@@ -98,35 +98,44 @@ impl ForceErrors {
 }
 
 /// Checks the table `[sensors]`.
-pub(super) fn sensors(raw: &raw::Sensors, end: DurationS) -> Checked<SensorErrors> {
+pub(super) fn check_sensor_errors(raw: &raw::Sensors, end: ScenarioDuration) -> Checked<SensorErrors> {
     let at = KeyPath::top_level_key("sensors");
-    let temperature = temperature(&at.key("temperature_c"), &raw.temperature_c, end)?;
-    let force = raw.force.as_ref().map_or(Ok(ForceErrors::PERFECT), |raw| force(&at.key("force"), raw))?;
-    let acceleration = raw.acceleration.as_ref().map(|raw| raw.sheet(&at.key("acceleration"))).transpose()?;
+    let temperature = check_temperature_course(&at.with_key("temperature_c"), &raw.temperature_c, end)?;
+    let force = raw
+        .force
+        .as_ref()
+        .map_or(Ok(ForceErrors::PERFECT), |raw| check_force_errors(&at.with_key("force"), raw))?;
+    let acceleration =
+        raw.acceleration.as_ref().map(|raw| raw.data_sheet(&at.with_key("acceleration"))).transpose()?;
     Ok(SensorErrors { temperature, force, acceleration })
 }
 
-fn temperature(at: &KeyPath, points: &[[f64; 2]], end: DurationS) -> Checked<Vec<(Micros, f64)>> {
+fn check_temperature_course(
+    at: &KeyPath,
+    points: &[[f64; 2]],
+    end: ScenarioDuration,
+) -> Checked<Vec<(Micros, f64)>> {
     let mut temperature: Vec<(Micros, f64)> = Vec::with_capacity(points.len());
     for (index, &[seconds, degrees]) in points.iter().enumerate() {
-        let at = at.element(index);
-        let moment = end.time_to_end(&at.element(0), seconds)?;
+        let at = at.with_index(index);
+        let moment = end.check_time_up_to_end(&at.with_index(0), seconds)?;
         if temperature.last().is_some_and(|(last, _)| *last >= moment) {
-            return Err(at.element(0).fault(seconds, "times must increase"));
+            return Err(at.with_index(0).fault(seconds, "times must increase"));
         }
-        at.element(1).to_fixed(degrees, Q9_6::try_nearest)?;
+        at.with_index(1).to_fixed(degrees, Q9_6::try_nearest)?;
         temperature.push((moment, degrees));
     }
     Ok(temperature)
 }
 
-fn force(at: &KeyPath, raw: &raw::ForceErrors) -> Checked<ForceErrors> {
+fn check_force_errors(at: &KeyPath, raw: &raw::ForceErrors) -> Checked<ForceErrors> {
     let kinds = [
         ("perfect", ForceErrors::PERFECT),
         ("piezoresistive", ForceErrors::PIEZORESISTIVE),
         ("resistive", ForceErrors::RESISTIVE),
     ];
-    let mut errors = at.key("kind").parse_choice(raw.kind.as_deref().unwrap_or("piezoresistive"), &kinds)?;
+    let mut errors =
+        at.with_key("kind").parse_choice(raw.kind.as_deref().unwrap_or("piezoresistive"), &kinds)?;
     let keys = [
         ("offset_n", raw.offset_n, &mut errors.offset_n, 30.0),
         ("gain", raw.gain, &mut errors.gain, 0.9),
@@ -141,7 +150,7 @@ fn force(at: &KeyPath, raw: &raw::ForceErrors) -> Checked<ForceErrors> {
     for (key, given, error, max) in keys {
         let Some(given) = given else { continue };
         if !(0.0..=max).contains(&given) {
-            return Err(at.key(key).fault(given, format_args!("0 to {max} are possible")));
+            return Err(at.with_key(key).fault(given, format_args!("0 to {max} are possible")));
         }
         *error = given;
     }
@@ -153,11 +162,11 @@ fn force(at: &KeyPath, raw: &raw::ForceErrors) -> Checked<ForceErrors> {
 mod tests {
     use super::*;
     use crate::scenario::Scenario;
-    use crate::testing::skin;
+    use crate::testing::one_cell_skin;
 
     fn read(text: &str) -> Result<SensorErrors, String> {
         let text = format!("duration_s = 600.0\n{text}");
-        Scenario::parse("s.toml", &text, &skin())
+        Scenario::parse("s.toml", &text, &one_cell_skin())
             .map(|scenario| scenario.sensors)
             .map_err(|error| error.to_string())
     }

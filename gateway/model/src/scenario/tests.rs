@@ -3,7 +3,7 @@ use proptest::prelude::*;
 mod repeat;
 
 use super::*;
-use crate::testing::{SKIN, skin};
+use crate::testing::{ONE_CELL_SKIN_TOML, one_cell_skin};
 
 const GOOD: &str = r#"version = 1
 duration_s = 12.0
@@ -55,9 +55,9 @@ cells = [1]
 
 /// Returns a skin with three cells on one bus.
 fn three() -> Skin {
-    let cell = SKIN.get(SKIN.find("[[cell]]").unwrap()..).unwrap();
+    let cell = ONE_CELL_SKIN_TOML.get(ONE_CELL_SKIN_TOML.find("[[cell]]").unwrap()..).unwrap();
     let text = [2, 3].map(|node| cell.replace("node = 1", &format!("node = {node}")));
-    Skin::parse("skin.toml", &format!("{SKIN}\n{}", text.concat())).unwrap()
+    Skin::parse("skin.toml", &format!("{ONE_CELL_SKIN_TOML}\n{}", text.concat())).unwrap()
 }
 
 fn good() -> Scenario {
@@ -118,17 +118,17 @@ fn a_good_scenario_is_read() {
 
 #[test]
 fn most_keys_have_defaults() {
-    let scenario = Scenario::parse("s.toml", "version = 1\nduration_s = 2.5\n", &skin()).unwrap();
+    let scenario = Scenario::parse("s.toml", "version = 1\nduration_s = 2.5\n", &one_cell_skin()).unwrap();
     assert_eq!(scenario, Scenario::idle(Span(2_500_000)));
     assert_eq!(scenario.mode_at(Micros(0)), TorqueSource::Compare);
-    let parse = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap();
+    let parse = |text: &str| Scenario::parse("s.toml", text, &one_cell_skin()).unwrap();
     assert_eq!(parse(""), Scenario::idle(DEFAULT_DURATION));
     // The shortest file with an effect: a constant force on one cell, until the end.
     let short = parse("[[touch]]\ncells = [1]\nforce_n = 3.0\n");
     let touch = &short.touches[0];
     assert_eq!((short.duration, touch.at, touch.length), (DEFAULT_DURATION, Micros(0), Span(u64::MAX)));
     assert_eq!((&touch.profile, touch.cells.as_slice()), (&ForceProfile::Step, [0].as_slice()));
-    let pressed = Touches::new(&short, &skin()).sensors(0, 1_000_000);
+    let pressed = Touches::new(&short, &one_cell_skin()).sensors(0, 1_000_000);
     assert_eq!(pressed.contact, contact_words(3.0), "also when the run is longer");
     let later = "[[touch]]\nat_s = 12.5\nfor_s = 1.0\nall = true\nforce_n = 3.0\nprofile = \"ramp\"\n";
     assert_eq!(parse(later).duration, Span(14_500_000), "a second after the last touch");
@@ -184,7 +184,7 @@ fn what_has_no_effect_is_remarked() {
         remarks(&touch("0.01"), &skin),
         ["the touch at 0.5 s: force_n = 0.01 is below the thresholds of its cells, so they send no torque"]
     );
-    let external = SKIN.replace("\"kinesthetic\"", "\"external\"\nsocket = \"arm.sock\"");
+    let external = ONE_CELL_SKIN_TOML.replace("\"kinesthetic\"", "\"external\"\nsocket = \"arm.sock\"");
     let external =
         external.lines().filter(|line| !line.starts_with("inertia") && !line.starts_with("damping"));
     let external = Skin::parse("skin.toml", &external.collect::<Vec<_>>().join("\n")).unwrap();
@@ -198,11 +198,11 @@ fn what_has_no_effect_is_remarked() {
 
 #[test]
 fn what_comes_and_goes_needs_a_length_and_a_skin_is_no_scenario() {
-    let said = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap_err().to_string();
+    let said = |text: &str| Scenario::parse("s.toml", text, &one_cell_skin()).unwrap_err().to_string();
     let endless = "[[touch]]\nall = true\nforce_n = 3.0\nprofile = \"half-sine\"\n";
     assert_eq!(said(endless), "s.toml:1:1: touch[0].for_s: needed with profile = \"half-sine\"");
     let taken = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
-    assert_eq!(said(SKIN), format!("s.toml: {taken}"));
+    assert_eq!(said(ONE_CELL_SKIN_TOML), format!("s.toml: {taken}"));
 }
 
 #[test]
@@ -292,7 +292,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
 
 #[test]
 fn with_several_buses_the_bus_must_be_named() {
-    let more = SKIN.replacen(
+    let more = ONE_CELL_SKIN_TOML.replacen(
         "[controller]",
         "[[bus]]\nname = \"vcan1\"\nreply = \"torque\"\nformat = \"fd\"\n\n[controller]",
         1,
@@ -406,7 +406,7 @@ proptest! {
         let mut known = [protocol::message::SkinSensors::default(); 3];
         let (mut before, mut epoch) = (None, 0);
         for step in steps {
-            for stimulus in touches.changes(before, epoch) {
+            for stimulus in touches.stimuli_between(before, epoch) {
                 prop_assert_ne!(known[stimulus.cell], stimulus.readings.skin);
                 known[stimulus.cell] = stimulus.readings.skin;
             }
@@ -427,7 +427,7 @@ fn words_saturate_outside_their_range() {
 
 #[test]
 fn a_link_between_two_wired_cells_goes_down_and_comes_up_in_time() {
-    let (head, cell) = SKIN.split_at(SKIN.find("[[cell]]").unwrap());
+    let (head, cell) = ONE_CELL_SKIN_TOML.split_at(ONE_CELL_SKIN_TOML.find("[[cell]]").unwrap());
     let cell = cell.split("[[cell]]").nth(1).unwrap();
     let described = |reply: &str, neighbors: [&str; 3]| {
         let cells = (1..).zip(neighbors).map(|(node, neighbors)| {

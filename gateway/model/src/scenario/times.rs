@@ -5,11 +5,11 @@ use protocol::time::{Micros, Span};
 
 /// The duration of a scenario in s, which limits the times in its file.
 #[derive(Clone, Copy)]
-pub(super) struct DurationS(pub(super) f64);
+pub(super) struct ScenarioDuration(pub(super) f64);
 
-impl DurationS {
+impl ScenarioDuration {
     /// Checks that a time in s is from 0 to before the end of the scenario.
-    pub(super) fn time_before_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
+    pub(super) fn check_time_before_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         if (0.0..self.0).contains(&seconds) {
             return Ok(Micros(span_from_seconds(seconds).0));
         }
@@ -17,7 +17,7 @@ impl DurationS {
     }
 
     /// Checks that a time in s is from 0 to the end of the scenario, the end included.
-    pub(super) fn time_to_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
+    pub(super) fn check_time_up_to_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         if (0.0..=self.0).contains(&seconds) {
             return Ok(Micros(span_from_seconds(seconds).0));
         }

@@ -11,7 +11,7 @@ use protocol::time::{Micros, Span};
 
 use super::curve::seconds;
 use super::force::contact_words;
-use super::measured::{ImperfectSensors, TrueInput};
+use super::measured::{ImperfectSensors, TrueSensorInput};
 use super::{FaultKind, Scenario, SensorFault, Touch};
 
 /// The sensor words of a cell, valid from an epoch on.
@@ -26,13 +26,17 @@ pub struct Stimulus {
     /// Its readings.
     pub readings: SensorReadings,
     /// The pages to send, by [`SensorPage::simulated`].
-    sent: [bool; SensorPage::SIMULATED.len()],
+    sent: [bool; SensorPage::SIMULATED_PAGE_NAMES.len()],
 }
 
 impl Stimulus {
     /// Returns the pages to send: those that changed.
     pub fn pages(&self) -> impl Iterator<Item = SensorPage> {
-        self.readings.pages().into_iter().zip(self.sent).filter_map(|(page, is_sent)| is_sent.then_some(page))
+        self.readings
+            .simulated_pages()
+            .into_iter()
+            .zip(self.sent)
+            .filter_map(|(page, is_sent)| is_sent.then_some(page))
     }
 }
 
@@ -53,10 +57,10 @@ pub struct Touches {
     measured: Option<ImperfectSensors>,
     /// Scratch memory of [`Touches::changes`]; the next two fields are, too.
     changed: Vec<Stimulus>,
-    there: Vec<TrueInput>,
+    there: Vec<TrueSensorInput>,
     before: Vec<SensorReadings>,
     /// The pages that touches set: the skin's, and others that differ from their default in some touch.
-    set: [bool; SensorPage::SIMULATED.len()],
+    set: [bool; SensorPage::SIMULATED_PAGE_NAMES.len()],
 }
 
 /// A cell with touches or sensor faults.
@@ -130,7 +134,7 @@ impl Touches {
 
     /// Returns the cells whose words in `epoch` differ from those in the previous epoch.
     pub fn stimuli_for(&mut self, epoch: u64) -> impl Iterator<Item = Stimulus> {
-        self.changes(epoch.checked_sub(1), epoch)
+        self.stimuli_between(epoch.checked_sub(1), epoch)
     }
 
     /// Returns the cells whose words in `epoch` differ from their words in the earlier epoch `before`. A loop that
@@ -138,52 +142,52 @@ impl Touches {
     /// at most once, in the skin's order.
     ///
     /// Work grows with the number of cells that are ever touched. No allocation.
-    pub fn changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
+    pub fn stimuli_between(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
         let mut changed = core::mem::take(&mut self.changed);
         changed.clear();
         if self.measured.is_some() {
-            self.measured_changes(before, epoch, &mut changed);
+            self.collect_measured_stimuli(before, epoch, &mut changed);
         } else {
-            changed.extend(self.perfect_changes(before, epoch));
+            changed.extend(self.perfect_sensor_stimuli(before, epoch));
         }
         self.changed = changed;
         self.changed.iter().copied()
     }
 
-    fn measured_changes(&mut self, before: Option<u64>, epoch: u64, changed: &mut Vec<Stimulus>) {
+    fn collect_measured_stimuli(&mut self, before: Option<u64>, epoch: u64, changed: &mut Vec<Stimulus>) {
         let Some(mut measured) = self.measured.take() else { return };
         self.before.clear();
         if let Some(before) = before {
-            self.advance_to(&mut measured, before);
+            self.advance_sensors_to(&mut measured, before);
             self.before.extend(measured.readings());
         } else {
             self.before.resize(self.cells.len(), SensorReadings::default());
         }
-        self.advance_to(&mut measured, epoch);
+        self.advance_sensors_to(&mut measured, epoch);
         let words = self.cells.iter().zip(&self.before).zip(measured.readings());
-        changed.extend(words.filter_map(|((touched, before), now)| touched.stimulus(before, now)));
+        changed.extend(words.filter_map(|((touched, before), now)| touched.stimulus_for_change(before, now)));
         self.measured = Some(measured);
     }
 
     /// Computes the readings of imperfect sensors up to an epoch. If that epoch is earlier than the last computed one,
     /// the computation starts again from the first.
-    fn advance_to(&mut self, measured: &mut ImperfectSensors, epoch: u64) {
+    fn advance_sensors_to(&mut self, measured: &mut ImperfectSensors, epoch: u64) {
         if measured.next_epoch() > epoch + 1 {
-            measured.restart();
+            measured.reset_sensors();
         }
         let mut there = core::mem::take(&mut self.there);
         while measured.next_epoch() <= epoch {
             let time = self.time_of(measured.next_epoch());
             there.clear();
             there.extend(self.cells.iter().map(|touched| self.true_input(touched, time)));
-            measured.step(time, &there);
+            measured.compute_next_epoch(time, &there);
         }
         self.there = there;
     }
 
     /// Returns the true input of a cell's sensors.
-    fn true_input(&self, touched: &AffectedCell, time: Micros) -> TrueInput {
-        let mut there = TrueInput::default();
+    fn true_input(&self, touched: &AffectedCell, time: Micros) -> TrueSensorInput {
+        let mut there = TrueSensorInput::default();
         for touch in touched.touches.iter().filter_map(|&index| self.touches.get(index)) {
             let Some(level) = self.force_at(touch, time) else { continue };
             there.force_n += level;
@@ -201,7 +205,7 @@ impl Touches {
         there
     }
 
-    fn perfect_changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
+    fn perfect_sensor_stimuli(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
         let times = [before.map(|before| self.time_of(before)), Some(self.time_of(epoch))];
         let phases = times.map(|time| time.map(|time| self.time_in_cycle(time)));
         for (levels, touch) in self.levels.iter_mut().zip(&self.touches) {
@@ -210,18 +214,18 @@ impl Touches {
         let this = &*self;
         this.cells.iter().filter_map(move |touched| {
             let [before, now] = if touched.faults.is_empty() {
-                this.scratch_words(touched)?
+                this.readings_before_and_now(touched)?
             } else {
                 times.map(|time| {
                     time.map_or_else(SensorReadings::default, |time| this.words_at(touched, time))
                 })
             };
-            touched.stimulus(&before, &now)
+            touched.stimulus_for_change(&before, &now)
         })
     }
 
     /// Returns the cells that the scenario touches at any time, by index in the skin.
-    pub fn cells(&self) -> impl Iterator<Item = usize> + '_ {
+    pub fn touched_cells(&self) -> impl Iterator<Item = usize> + '_ {
         self.cells.iter().map(|touched| touched.cell)
     }
 
@@ -233,7 +237,7 @@ impl Touches {
 
     /// Returns all pages of a cell in an epoch that touches set, for a cell that has restarted.
     pub fn pages(&self, cell: usize, epoch: u64) -> impl Iterator<Item = SensorPage> {
-        let pages = self.readings(cell, epoch).pages().into_iter();
+        let pages = self.readings(cell, epoch).simulated_pages().into_iter();
         pages.zip(self.set).filter_map(|(page, is_set)| is_set.then_some(page))
     }
 
@@ -243,7 +247,7 @@ impl Touches {
                 return measured.readings().get(cell).copied().unwrap_or_default();
             }
             let (mut this, mut again) = (self.clone(), measured.clone());
-            this.advance_to(&mut again, epoch);
+            this.advance_sensors_to(&mut again, epoch);
             return again.readings().get(cell).copied().unwrap_or_default();
         }
         match self.cells.binary_search_by_key(&cell, |touched| touched.cell) {
@@ -281,13 +285,13 @@ impl Touches {
     }
 
     /// Returns the words before and now, from the scratch memory; `None` if no touch of this cell changed.
-    fn scratch_words(&self, touched: &AffectedCell) -> Option<[SensorReadings; 2]> {
+    fn readings_before_and_now(&self, touched: &AffectedCell) -> Option<[SensorReadings; 2]> {
         let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
         if levels().all(|(_, [before, now])| before == now) {
             return None;
         }
-        let before = self.words(levels().map(|(index, [before, _])| (index, *before)), 0.0);
-        let now = self.words(levels().map(|(index, [_, now])| (index, *now)), 0.0);
+        let before = self.combine_touches(levels().map(|(index, [before, _])| (index, *before)), 0.0);
+        let now = self.combine_touches(levels().map(|(index, [_, now])| (index, *now)), 0.0);
         Some([before, now])
     }
 
@@ -307,11 +311,15 @@ impl Touches {
             .touches
             .iter()
             .filter_map(|&index| Some((index, self.force_at(self.touches.get(index)?, time))));
-        self.words(levels, drift.sum())
+        self.combine_touches(levels, drift.sum())
     }
 
     /// Combines touches: forces add up, the other values as by [`super::TouchValues`].
-    fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> SensorReadings {
+    fn combine_touches(
+        &self,
+        levels: impl Iterator<Item = (usize, Option<f64>)>,
+        mut force_n: f64,
+    ) -> SensorReadings {
         let mut readings = SensorReadings::default();
         for (index, level) in levels {
             let (Some(touch), Some(level)) = (self.touches.get(index), level) else { continue };
@@ -325,7 +333,7 @@ impl Touches {
 
 impl AffectedCell {
     /// Returns the stimulus for a change of readings, if there is one.
-    fn stimulus(&self, before: &SensorReadings, now: &SensorReadings) -> Option<Stimulus> {
+    fn stimulus_for_change(&self, before: &SensorReadings, now: &SensorReadings) -> Option<Stimulus> {
         let &Self { cell, bus, node, .. } = self;
         (before != now).then(|| Stimulus {
             cell,
@@ -338,9 +346,13 @@ impl AffectedCell {
 }
 
 /// Returns the pages that differ, by [`SensorPage::simulated`].
-fn differing_pages(before: &SensorReadings, now: &SensorReadings) -> [bool; SensorPage::SIMULATED.len()] {
-    let mut differ = [false; SensorPage::SIMULATED.len()];
-    for ((differ, before), now) in differ.iter_mut().zip(before.pages()).zip(now.pages()) {
+fn differing_pages(
+    before: &SensorReadings,
+    now: &SensorReadings,
+) -> [bool; SensorPage::SIMULATED_PAGE_NAMES.len()] {
+    let mut differ = [false; SensorPage::SIMULATED_PAGE_NAMES.len()];
+    for ((differ, before), now) in differ.iter_mut().zip(before.simulated_pages()).zip(now.simulated_pages())
+    {
         *differ = before != now;
     }
     differ

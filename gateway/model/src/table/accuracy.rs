@@ -17,7 +17,7 @@ pub struct RoundingErrors {
 }
 
 impl RoundingErrors {
-    fn add(&mut self, format: TorqueFormat, torque: f64) {
+    fn add_rounding_error(&mut self, format: TorqueFormat, torque: f64) {
         let word = format.nearest_word(torque);
         if is_saturated(word) {
             self.beyond += 1;
@@ -33,7 +33,7 @@ impl RoundingErrors {
 
 /// Errors of distributed torques. A cell's torque is compared only on the joints that a contact on it loads.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
-pub struct Accuracy {
+pub struct TorqueAccuracy {
     /// Errors of single cells against the central computation with the same quantised words.
     pub single: TorqueErrors,
     /// Errors of single cells against the central computation with unrounded angles, lengths and poses.
@@ -58,10 +58,10 @@ pub struct Accuracy {
     pub whole_by_joint: [TorqueErrors; MAX_JOINTS],
 }
 
-impl Accuracy {
+impl TorqueAccuracy {
     /// Compares one cell's torque with the central one, and adds the errors to those of the cell, too. Returns the
     /// distributed minus the central torque of each joint; zero for saturated words.
-    pub(super) fn compare(
+    pub(super) fn compare_cell_torque(
         &mut self,
         joint: usize,
         format: TorqueFormat,
@@ -76,7 +76,7 @@ impl Accuracy {
             joints.zip(words.as_slice()).zip(both).take(joint)
         {
             for (rounded, format) in self.formats.iter_mut().zip(TorqueFormat::ALL) {
-                rounded.add(format, *quantised);
+                rounded.add_rounding_error(format, *quantised);
             }
             if is_saturated(word) {
                 self.saturated += 1;
@@ -133,7 +133,9 @@ mod tests {
     #[test]
     fn torques_beyond_the_range_of_a_format_are_counted_apart() {
         let (format, mut rounded) = (TorqueFormat::Q3_12, RoundingErrors::default());
-        [1.0, 1.0 + 0.25 / 4_096.0, 8.0, -9.0].into_iter().for_each(|torque| rounded.add(format, torque));
+        [1.0, 1.0 + 0.25 / 4_096.0, 8.0, -9.0]
+            .into_iter()
+            .for_each(|torque| rounded.add_rounding_error(format, torque));
         assert_eq!((rounded.errors.count(), rounded.errors.max(), rounded.beyond), (2, 0.25 / 4_096.0, 2));
         assert_eq!(rounded.merged(rounded).beyond, 4);
     }

@@ -10,14 +10,14 @@ use protocol::skin::{self, SafetyLimits};
 use protocol::time::Micros;
 
 use super::errors::TorqueErrors;
-use super::held::{HeldTorque, SumChange};
+use super::held::{HeldTorque, TorqueSumChange};
 use super::replies::{OutstandingReplies, Replies, ReplyExpectation};
 use super::root_totals::RootSums;
 use super::sensed::SensorFrames;
-use super::sent::SentJoints;
+use super::sent::SentJointCounts;
 use super::status::CellStatus;
-use super::switched::{SWITCHES, Switch, SwitchStates};
-use crate::tracker::{CellTracker, CellUpdate, ContactState, HeartbeatKind, Uplink};
+use super::switched::{SWITCH_COUNT, SwitchStates, SwitchTarget};
+use crate::tracker::{CellTracker, CellUpdate, ContactState, HeartbeatKind, UplinkCounts};
 
 /// The packets that a cell has sent since they were requested.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -63,7 +63,7 @@ pub struct CellState {
     contact: ContactState<()>,
     switched: SwitchStates,
     halt: HaltState,
-    sent: SentJoints,
+    sent: SentJointCounts,
     pub(super) outstanding: OutstandingReplies,
     pub(super) answered: Option<u64>,
     held_torque: HeldTorque,
@@ -93,7 +93,7 @@ impl CellState {
             contact: ContactState::default(),
             switched,
             halt: HaltState::default(),
-            sent: SentJoints::default(),
+            sent: SentJointCounts::default(),
             outstanding: OutstandingReplies::default(),
             answered: None,
             held_torque: HeldTorque::default(),
@@ -121,8 +121,8 @@ impl CellState {
 
     /// Returns the kinds of words (`torque`, `skin`, `acceleration`) that stayed constant while the expected words
     /// changed, each with the longest run in words.
-    pub fn stuck(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        self.outstanding.stuck.longest()
+    pub fn stuck_word_runs(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        self.outstanding.stuck.longest_stuck_runs()
     }
 
     /// Returns true if the cell now sends constant words although the expected words change.
@@ -139,7 +139,7 @@ impl CellState {
 
     /// Returns the counts of packets that the cell sent and that arrived.
     #[must_use]
-    pub const fn uplink(&self) -> Uplink {
+    pub const fn uplink(&self) -> UplinkCounts {
         self.tracked.account.uplink()
     }
 
@@ -153,10 +153,10 @@ impl CellState {
 
     /// Records the cell's receive counters. `passed` is the number of joints that were sent while the page was on its
     /// way. Later pages are compared with the first one since a start.
-    pub(super) fn record_counters(&mut self, passed: u64) {
+    pub(super) fn record_receive_counters(&mut self, passed: u64) {
         let heard = self.pages().received;
-        self.sent.report(heard, passed);
-        heard.iter().for_each(|heard| self.contact.compare_count(heard.stimuli, ()));
+        self.sent.record_counters_page(heard, passed);
+        heard.iter().for_each(|heard| self.contact.compare_stimulus_count(heard.stimuli, ()));
     }
 
     /// Applies a heartbeat of the cell. Returns the change of the running sum.
@@ -165,11 +165,11 @@ impl CellState {
         update: &CellUpdate,
         heartbeat: &Heartbeat,
         epoch: Epoch,
-    ) -> SumChange {
+    ) -> TorqueSumChange {
         // Ignores heartbeats of a cell that does not own the node id.
         let of_owner =
             |word: &HeartbeatKind| !matches!(word, HeartbeatKind::Claimant | HeartbeatKind::Outsider);
-        let Some(word) = update.word.filter(of_owner) else { return SumChange::default() };
+        let Some(word) = update.word.filter(of_owner) else { return TorqueSumChange::default() };
         let started = matches!(word, HeartbeatKind::Started { .. } | HeartbeatKind::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
         if word != HeartbeatKind::Overtaken {
@@ -184,7 +184,7 @@ impl CellState {
         }
         if word == HeartbeatKind::First && self.tracked.claim().previous().is_some() {
             // An earlier claimant had counters of its own.
-            self.sent = SentJoints::default();
+            self.sent = SentJointCounts::default();
         }
         if started {
             if word == HeartbeatKind::Shared {
@@ -192,23 +192,23 @@ impl CellState {
             } else {
                 self.contact.record_start(());
             }
-            self.sensed.restart();
-            self.switched.restart();
-            self.restart(word, update.taken_back, heartbeat.sent);
+            self.sensed.record_restart();
+            self.switched.reset_to_start_values();
+            self.record_restart(word, update.taken_back, heartbeat.sent);
             (self.reply, self.ports_down) = (None, 0);
         } else if !self.tracked.account.is_start_in_doubt() {
             self.sent.confirm_start();
         }
         // A heartbeat does not release a sum, which may hold torques of other cells.
         if self.sums.is_some() || !started && heartbeat.state.has(State::ACTIVE) {
-            return SumChange::default();
+            return TorqueSumChange::default();
         }
         self.release_torque()
     }
 
     /// Returns the requested packets that the cell has sent.
     #[must_use]
-    pub const fn responded(&self) -> ResponseFlags {
+    pub const fn response_flags(&self) -> ResponseFlags {
         self.said
     }
 
@@ -230,16 +230,18 @@ impl CellState {
 
     /// Records a stimulus on the bus; `last` is the epoch of the last joints.
     pub(super) fn stimulate(&mut self, from: StimulusStart, page: SensorPage, last: Option<Epoch>) {
-        self.contact.push(from, page, (), last);
+        self.contact.add_stimulus(from, page, (), last);
     }
 
     /// Records a sensors frame of the cell. `is_newest` is true if the cell had the newest joints when it sent the
     /// frame.
     pub(super) fn record_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
-        self.sensed.record(at, page, events);
+        self.sensed.record_frame(at, page, events);
         self.switched.subtracts_baseline |= matches!(page, SensorPage::Baseline(_));
         if self.sensors().is_some() {
-            self.contact.latched().for_each(|(right, _)| self.outstanding.stuck.compare_page(page, &right));
+            self.contact
+                .latched_pages()
+                .for_each(|(right, _)| self.outstanding.stuck.compare_page(page, &right));
         }
         if is_newest {
             self.contact.apply_reported_page(*page, ());
@@ -261,25 +263,25 @@ impl CellState {
 
     /// Returns the switches that the cell should have but has not confirmed.
     #[must_use]
-    pub fn unconfirmed_switches(&self) -> [Option<Switch>; SWITCHES] {
+    pub fn unconfirmed_switches(&self) -> [Option<SwitchTarget>; SWITCH_COUNT] {
         self.switched.unconfirmed()
     }
 
     /// Returns the sensor words with which the cell computes. Returns `None` if they are unknown: the cell measures,
     /// subtracts its own zero, may be off the bus, or may have received stimuli that did not arrive here.
     pub(super) fn sensors(&self) -> Option<SkinSensors> {
-        self.contact.certain_skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
+        self.contact.certain_skin().filter(|_| self.torque_follows_stimuli()).map(|(skin, ())| *skin)
     }
 
     /// Returns the sensor words of the cell for display, from the stimuli and pages that arrived. Older stimuli that
     /// did not arrive may have changed them.
     #[must_use]
     pub fn presumed_sensors(&self) -> Option<SkinSensors> {
-        self.contact.presumed_skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
+        self.contact.presumed_skin().filter(|_| self.torque_follows_stimuli()).map(|(skin, ())| *skin)
     }
 
     /// Returns true if the cell's torques follow from stimuli alone: it neither measures nor subtracts a zero.
-    fn computes_with_stimuli(&self) -> bool {
+    fn torque_follows_stimuli(&self) -> bool {
         self.tracked.claim().has_state(State::TEST_MODE)
             && !self.switched.subtracts_baseline
             && !self.tracked.account.is_interrupted()
@@ -289,12 +291,12 @@ impl CellState {
     /// write of the cell's mode clears such stimuli.
     #[must_use]
     pub fn has_unseen_stimuli(&self) -> bool {
-        self.is_ready() && self.computes_with_stimuli() && self.contact.certain_skin().is_none()
+        self.is_ready() && self.torque_follows_stimuli() && self.contact.certain_skin().is_none()
     }
 
     /// Returns the sensor words of the cell from the joints of this epoch on; `None` if unknown.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
-        self.contact.latch(epoch, |()| {});
+        self.contact.latch_due_stimuli(epoch, |()| {});
         self.sensors()
     }
 
@@ -305,7 +307,7 @@ impl CellState {
         number: u64,
         in_contact: bool,
         safety: &SafetyLimits,
-    ) -> (SumChange, u32) {
+    ) -> (TorqueSumChange, u32) {
         self.sent.count_broadcast();
         let due = in_contact && self.is_ready();
         let is_known = self.sensors().is_some();
@@ -318,12 +320,12 @@ impl CellState {
             }
             self.replies.due += u64::from(due);
         }
-        if !self.held_torque.is_some() {
-            return (SumChange::default(), 0);
+        if !self.held_torque.has_torque() {
+            return (TorqueSumChange::default(), 0);
         }
         let answered = self.answered.unwrap_or(number);
         let unanswered = u32::try_from(number.saturating_sub(answered + 1)).unwrap_or(u32::MAX);
-        (self.held_torque.decay(unanswered, safety, self.sums.is_some()), unanswered)
+        (self.held_torque.decay_torque(unanswered, safety, self.sums.is_some()), unanswered)
     }
 
     /// Records a repeated broadcast, which the cell receives and drops; no reply is due.
@@ -332,13 +334,14 @@ impl CellState {
     }
 
     /// Returns true if the running sum contains a torque of the cell.
-    pub(super) const fn contributes(&self) -> bool {
-        self.held_torque.contributes()
+    pub(super) const fn contributes_to_sum(&self) -> bool {
+        self.held_torque.contributes_to_sum()
     }
 
     /// Returns true if the cell is in contact. If its sensors are unknown, its own report decides.
     fn is_in_contact(&self) -> bool {
-        self.outstanding.is_due() || self.sensors().is_none() && self.tracked.claim().has_state(State::ACTIVE)
+        self.outstanding.is_reply_due()
+            || self.sensors().is_none() && self.tracked.claim().has_state(State::ACTIVE)
     }
 
     /// Records a torque that answers the broadcast `number`, which is `lag` broadcasts before the newest. `is_zero` is
@@ -359,36 +362,36 @@ impl CellState {
 
     /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next sum. A sum for an older
     /// broadcast than that of the held sum changes nothing. Returns the change of the running sum.
-    pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; MAX_JOINTS]) -> SumChange {
+    pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; MAX_JOINTS]) -> TorqueSumChange {
         if self.answered.is_some_and(|last| number < last) {
-            return SumChange::default();
+            return TorqueSumChange::default();
         }
         self.answered = Some(number);
         self.held_torque.hold_sum(words, count)
     }
 
     /// Returns true if the held torque is older than the broadcast before `number`.
-    pub(super) fn is_outdated(&self, number: u64) -> bool {
-        self.held_torque.is_some() && self.answered.is_some_and(|last| last + 1 < number)
+    pub(super) fn is_torque_outdated(&self, number: u64) -> bool {
+        self.held_torque.has_torque() && self.answered.is_some_and(|last| last + 1 < number)
     }
 
     /// Returns the number of cells in the held torque.
     pub(super) fn held_cells(&self) -> u32 {
-        self.held_torque.cells()
+        self.held_torque.held_cell_count()
     }
 
     /// Holds a torque in steps of Q3.12 until the next one; zeros end a contact. Returns the change of the running sum.
-    pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> SumChange {
-        self.held_torque.hold(words)
+    pub(super) fn hold_torque(&mut self, words: [i32; MAX_JOINTS]) -> TorqueSumChange {
+        self.held_torque.hold_torque(words)
     }
 
     /// Releases the held torque. Returns the change of the running sum.
-    pub(super) fn release_torque(&mut self) -> SumChange {
+    pub(super) fn release_torque(&mut self) -> TorqueSumChange {
         self.held_torque.release_torque()
     }
 
     /// Records a halt on the bus: the cell stops answering. Returns the change of the running sum.
-    pub(super) fn halt(&mut self) -> SumChange {
+    pub(super) fn halt(&mut self) -> TorqueSumChange {
         self.halt = HaltState { halted: true, commanded: true };
         self.release_torque()
     }
@@ -401,8 +404,8 @@ impl CellState {
     /// Returns two counts of unanswered joints: those that the cell reports as skipped because they were old, and those
     /// sent to the cell that it does not report as received. Returns `None` before the cell's first report.
     #[must_use]
-    pub fn unanswered(&self) -> Option<(u64, u64)> {
-        self.sent.unanswered(self.pages().received)
+    pub fn unanswered_joint_counts(&self) -> Option<(u64, u64)> {
+        self.sent.unanswered_joint_counts(self.pages().received)
     }
 
     /// Records that the bus was lost: replies that were due may have been sent and lost.
@@ -418,17 +421,17 @@ impl CellState {
     }
 
     /// Records a write of a parameter that changes how the cell answers from now on.
-    pub(super) fn record_write(&mut self, number: u8) {
+    pub(super) fn record_parameter_write(&mut self, number: u8) {
         self.mark_replies_in_doubt();
         if number == Parameter::Mode.number() {
             self.contact.record_mode_write();
         } else {
-            self.contact.mark_unknown();
+            self.contact.mark_state_unknown();
         }
     }
 
     fn mark_replies_in_doubt(&mut self) {
-        let due = self.outstanding.clear();
+        let due = self.outstanding.clear_outstanding();
         // On a bus with sums, the sum counts a missing contribution.
         self.replies.count_missing(if self.sums.is_some() { 0 } else { due }, true);
     }
@@ -437,7 +440,7 @@ impl CellState {
     pub(super) fn finish_counts(&mut self) {
         self.tracked.account.finish();
         if self.sums.is_none() {
-            let due = self.outstanding.clear();
+            let due = self.outstanding.clear_outstanding();
             self.replies.count_missing(due, self.tracked.is_dead());
         }
     }
@@ -445,10 +448,10 @@ impl CellState {
     /// Records a restart: outstanding replies will never arrive, and the counters of the cell can no longer explain
     /// missing ones. If `taken_back`, the cell had not started: its counters continue, and explain all but the
     /// outstanding replies.
-    fn restart(&mut self, word: HeartbeatKind, taken_back: bool, sent: u16) {
-        let due = self.outstanding.clear();
+    fn record_restart(&mut self, word: HeartbeatKind, taken_back: bool, sent: u16) {
+        let due = self.outstanding.clear_outstanding();
         let outstanding = if self.sums.is_some() { 0 } else { due };
-        let in_doubt = self.sent.restart(word, taken_back, sent, (outstanding, self.replies.in_doubt));
+        let in_doubt = self.sent.record_restart(word, taken_back, sent, (outstanding, self.replies.in_doubt));
         if self.sums.is_some() {
             // Its contribution is missing in a sum, and its own held sum decays.
             return;
@@ -467,10 +470,10 @@ impl CellState {
             return CellStatus::Dead;
         }
         match (self.answered, newest) {
-            _ if !self.held_torque.is_some() && self.sums.is_some() && self.is_in_contact() => {
+            _ if !self.held_torque.has_torque() && self.sums.is_some() && self.is_in_contact() => {
                 CellStatus::Active
             }
-            _ if !self.held_torque.is_some() => CellStatus::Quiet,
+            _ if !self.held_torque.has_torque() => CellStatus::Quiet,
             (Some(answered), Some(newest)) if answered + 1 < newest => CellStatus::Stale,
             _ => CellStatus::Active,
         }

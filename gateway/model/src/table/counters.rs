@@ -6,7 +6,7 @@ use protocol::packet::PacketError;
 /// An unusual property of a received frame. Each has a counter and a name.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[repr(usize)]
-pub enum Event {
+pub enum FrameEvent {
     /// Wrong length or format.
     Length,
     /// Wrong CRC.
@@ -35,7 +35,7 @@ pub enum Event {
     OtherWriter,
 }
 
-impl From<PacketError> for Event {
+impl From<PacketError> for FrameEvent {
     fn from(error: PacketError) -> Self {
         match error {
             PacketError::Length { .. } => Self::Length,
@@ -46,7 +46,7 @@ impl From<PacketError> for Event {
     }
 }
 
-impl Event {
+impl FrameEvent {
     /// All events, in the order of their counters.
     pub const ALL: [Self; 13] = [
         Self::Length,
@@ -90,7 +90,7 @@ impl Event {
 pub struct Counters {
     received: [u64; Kind::ALL.len()],
     sent: [u64; Kind::ALL.len()],
-    events: [u64; Event::ALL.len()],
+    events: [u64; FrameEvent::ALL.len()],
     /// Number of epochs that have ended.
     pub epochs: u64,
     /// Number of ended epochs in which some reply was due.
@@ -107,7 +107,7 @@ impl Counters {
         }
     }
 
-    pub(super) fn count(&mut self, event: Event) {
+    pub(super) fn count_event(&mut self, event: FrameEvent) {
         if let Some(counter) = self.events.get_mut(event as usize) {
             *counter += 1;
         }
@@ -121,19 +121,19 @@ impl Counters {
 
     /// Returns the number of packets of a kind that other senders sent.
     #[must_use]
-    pub fn received(&self, kind: Kind) -> u64 {
+    pub fn received_count(&self, kind: Kind) -> u64 {
         self.received.get(kind as usize).copied().unwrap_or(0)
     }
 
     /// Returns the number of packets of a kind that this gateway sent, as read back from the bus.
     #[must_use]
-    pub fn sent(&self, kind: Kind) -> u64 {
+    pub fn sent_count(&self, kind: Kind) -> u64 {
         self.sent.get(kind as usize).copied().unwrap_or(0)
     }
 
     /// Returns the number of occurrences of an event.
     #[must_use]
-    pub fn events(&self, event: Event) -> u64 {
+    pub fn event_count(&self, event: FrameEvent) -> u64 {
         self.events.get(event as usize).copied().unwrap_or(0)
     }
 }
@@ -152,7 +152,7 @@ mod tests {
         counters.count_frame(Kind::Torque, false);
         counters.count_frame(Kind::Torque, false);
         counters.count_frame(Kind::Command, true);
-        let of = |kind| (counters.received(kind), counters.sent(kind));
+        let of = |kind| (counters.received_count(kind), counters.sent_count(kind));
         assert_eq!([Kind::Torque, Kind::Command].map(of), [(2, 0), (0, 1)]);
     }
 }

@@ -21,15 +21,15 @@ impl Default for Delays {
 
 // Recording cannot fail: the histograms resize themselves.
 impl Delays {
-    pub(super) fn record_last_reply(&mut self, span: Span) {
+    pub(super) fn record_last_reply_delay(&mut self, span: Span) {
         let _ = self.last_reply.record(span.0);
     }
 
-    pub(super) fn record_reply(&mut self, span: Span) {
+    pub(super) fn record_reply_delay(&mut self, span: Span) {
         let _ = self.reply.record(span.0);
     }
 
-    pub(super) fn record_pending_joints(&mut self, span: Span) {
+    pub(super) fn record_pending_joints_age(&mut self, span: Span) {
         let _ = self.joints_pending.record(span.0);
     }
 
@@ -41,20 +41,20 @@ impl Delays {
 
     /// Returns the delays in µs from a broadcast to its last reply in time, one for each epoch with a reply.
     #[must_use]
-    pub const fn last_replies(&self) -> &Histogram<u64> {
+    pub const fn last_reply_delays(&self) -> &Histogram<u64> {
         &self.last_reply
     }
 
     /// Returns the delays in µs from a broadcast to each reply, late replies included; empty on a bus with sums.
     #[must_use]
-    pub const fn replies(&self) -> &Histogram<u64> {
+    pub const fn reply_delays(&self) -> &Histogram<u64> {
         &self.reply
     }
 
     /// Returns for each heartbeat the age in µs of the oldest joints on the bus that the cell had not received when it
     /// sent the heartbeat; 0 if it had received all.
     #[must_use]
-    pub const fn pending_joints(&self) -> &Histogram<u64> {
+    pub const fn pending_joints_ages(&self) -> &Histogram<u64> {
         &self.joints_pending
     }
 }

@@ -39,12 +39,12 @@ impl Broadcast {
         // If these are all broadcasts, the cell has received none.
         let recent = || self.recent.iter().flatten().count();
         let all = || usize::try_from(self.number + 1).ok().filter(|&all| all == recent());
-        self.lag(heard).or_else(all).map_or(0, |passed| passed as u64)
+        self.lag_in_broadcasts(heard).or_else(all).map_or(0, |passed| passed as u64)
     }
 
     /// Returns how many broadcasts before the newest one an epoch was sent, if cells may still answer it. A difference
     /// of epoch numbers would be wrong: broadcasts may be lost or reordered on their way back to the gateway.
-    pub(super) fn lag(&self, epoch: Epoch) -> Option<usize> {
+    pub(super) fn lag_in_broadcasts(&self, epoch: Epoch) -> Option<usize> {
         self.recent.iter().flatten().position(|&(recent, _)| recent == epoch)
     }
 
@@ -57,7 +57,7 @@ impl Broadcast {
     /// joints that it has received. Only the most recent broadcasts are searched.
     pub(super) fn pending_joints_age(&self, taken: Epoch, now: Micros) -> Span {
         let recent = self.recent.iter().flatten().count();
-        self.lag(taken)
+        self.lag_in_broadcasts(taken)
             .unwrap_or(recent)
             .checked_sub(1)
             .map_or(Span(0), |first| now.elapsed_since(self.broadcast_time(first)))
@@ -94,30 +94,30 @@ impl BusTable {
             *newest = Some((epoch, at));
         }
         self.close_epoch();
-        self.release_decayed(epoch);
+        self.release_decayed_torques(epoch);
         let frames = self.is_comparing.then(|| {
-            let q = q.unwrap_or_else(|| self.central.positions(&joints.positions));
-            (self.central.frames(&joints.positions), self.unquantised.frames_at_positions(&q))
+            let q = q.unwrap_or_else(|| self.central.joint_positions(&joints.positions));
+            (self.central.link_frames(&joints.positions), self.unquantised.frames_at_positions(&q))
         });
         let (mut due, mut stale, mut age, mut known) = (0, 0, 0, true);
         let mut whole = frames.as_ref().map(|_| ExpectedSum { constant: true, ..ExpectedSum::default() });
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let skin = cell.latch(epoch);
-            let force = skin.map_or(0.0, |skin| self.central.force(place, &skin));
+            let force = skin.map_or(0.0, |skin| self.central.cell_force(place, &skin));
             known &= skin.is_some() || !cell.is_ready();
             let (change, unanswered) = cell.open_epoch(number, force > 0.0, &self.safety);
-            due += u32::from(cell.outstanding.is_due());
+            due += u32::from(cell.outstanding.is_reply_due());
             stale += if unanswered > 0 { cell.held_cells() } else { 0 };
-            age = age.max(if cell.contributes() { unanswered } else { 0 });
+            age = age.max(if cell.contributes_to_sum() { unanswered } else { 0 });
             if let (Some((frames, exact)), Some(whole), Some(skin)) = (&frames, &mut whole, skin) {
                 if cell.sums.is_none() {
-                    let quantised = self.central.torque(place, frames, force);
-                    let plain = self.unquantised.force(place, &skin);
-                    let unquantised = self.unquantised.torque(place, exact, plain);
-                    cell.outstanding.expect(Reply { number, quantised, unquantised });
-                } else if cell.outstanding.is_due() {
-                    whole.add(self.central.torque(place, frames, force), cell.joint);
+                    let quantised = self.central.cell_torque(place, frames, force);
+                    let plain = self.unquantised.cell_force(place, &skin);
+                    let unquantised = self.unquantised.cell_torque(place, exact, plain);
+                    cell.outstanding.expect_torques(Reply { number, quantised, unquantised });
+                } else if cell.outstanding.is_reply_due() {
+                    whole.add_cell_torque(self.central.cell_torque(place, frames, force), cell.joint);
                 }
                 if let Some(sensors) = self.snapshot.sensors.get_mut(place) {
                     whole.constant &= core::mem::replace(sensors, skin) == skin;
@@ -147,7 +147,7 @@ impl BusTable {
     pub(super) fn close_epoch(&mut self) {
         let Some(before) = self.broadcast else { return };
         if let Some(last) = before.last_reply {
-            self.delays.record_last_reply(last.elapsed_since(before.at));
+            self.delays.record_last_reply_delay(last.elapsed_since(before.at));
         }
         if let Some(root_totals) = &mut self.root_totals {
             let (due, complete) = root_totals.close_epoch();
@@ -188,7 +188,7 @@ impl BusTable {
 
     /// Releases the torques that decayed in the control loop while the bus carried no joints, so that they do not
     /// return to the sum.
-    fn release_decayed(&mut self, epoch: Epoch) {
+    fn release_decayed_torques(&mut self, epoch: Epoch) {
         // Broadcasts may change order on the way back: the last one to arrive is not always the newest.
         let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());
         let gap = recent.map(|(before, _)| epoch.epochs_since(before)).min().unwrap_or(0);

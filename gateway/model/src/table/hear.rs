@@ -8,37 +8,37 @@ use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use super::cell::CellState;
-use super::held::SumChange;
+use super::held::TorqueSumChange;
 use super::replies::ReplyExpectation;
-use super::root_totals::{RootSum, RootTotals, SumUse};
-use super::{BusTable, Event, Notice, PositionLookup};
-use crate::packets::{FrameWithPacket, NoPacket, PendingSegments};
+use super::root_totals::{RootSum, RootSumUse, RootTotals};
+use super::{BusTable, FrameEvent, Notice, PositionLookup};
+use crate::packets::{FrameWithPacket, NoPacketReason, PendingSegments};
 use crate::tracker::{CellUpdate, HeartbeatKind};
 
 /// Parameters whose write changes at once how a cell answers.
 const REPLY_PARAMETERS: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
 impl BusTable {
-    /// Reassembles and decodes a frame of this bus, for [`receive`](Self::receive) and other consumers.
-    pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> FrameWithPacket<'f> {
+    /// Reassembles and decodes a frame of this bus, for [`receive`](Self::handle_read_frame) and other consumers.
+    pub fn read_frame<'f>(&mut self, at: Micros, frame: &'f Frame) -> FrameWithPacket<'f> {
         self.packets.read(at, frame)
     }
 
     /// Handles a frame that was on the bus at `at`; `own` is true if this gateway sent it. For a broadcast of this
     /// gateway, `positions` returns the positions in rad or m from which its words were rounded, if they are known.
     pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut PositionLookup<'_>) {
-        let (packet, pending) = self.packets.packet(at, frame);
+        let (packet, pending) = self.packets.read_packet(at, frame);
         match packet {
             Ok(packet) => {
                 let message = self.packets.decode(&packet);
                 self.receive_packet(at, own, packet.id, message.as_ref().ok(), positions);
             }
-            Err(no_packet) => self.count_non_packet(own, frame, no_packet, pending),
+            Err(no_packet) => self.count_frame_without_packet(own, frame, no_packet, pending),
         }
     }
 
-    /// Does [`handle_frame`](Self::handle_frame) for a frame that has been [`read`](Self::read).
-    pub fn receive(
+    /// Does [`handle_frame`](Self::handle_frame) for a frame that has been [`read`](Self::read_frame).
+    pub fn handle_read_frame(
         &mut self,
         at: Micros,
         own: bool,
@@ -49,7 +49,9 @@ impl BusTable {
             Ok((packet, message)) => {
                 self.receive_packet(at, own, packet.id, message.as_ref().ok(), positions);
             }
-            Err(no_packet) => self.count_non_packet(own, received.frame, *no_packet, received.pending),
+            Err(no_packet) => {
+                self.count_frame_without_packet(own, received.frame, *no_packet, received.pending)
+            }
         }
     }
 
@@ -64,34 +66,44 @@ impl BusTable {
     ) {
         self.counters.count_frame(id.kind, own);
         match message {
-            Some(message) if own => self.receive_own(at, message, positions),
-            Some(message) => self.receive_foreign(at, id, message),
-            None => self.count_unusable_frame(id, own, Event::Meaning),
+            Some(message) if own => self.handle_own_message(at, message, positions),
+            Some(message) => self.handle_foreign_message(at, id, message),
+            None => self.count_unusable_frame(id, own, FrameEvent::Meaning),
         }
     }
 
     /// Counts a frame that neither is nor completes a packet.
-    fn count_non_packet(&mut self, own: bool, frame: &Frame, no_packet: NoPacket, pending: PendingSegments) {
+    fn count_frame_without_packet(
+        &mut self,
+        own: bool,
+        frame: &Frame,
+        no_packet: NoPacketReason,
+        pending: PendingSegments,
+    ) {
         let (id, event) = match no_packet {
-            NoPacket::NotData => {
+            NoPacketReason::NotData => {
                 let is_error = frame.is_error();
-                return self.counters.count(if is_error { Event::ErrorFrame } else { Event::Foreign });
+                return self.counters.count_event(if is_error {
+                    FrameEvent::ErrorFrame
+                } else {
+                    FrameEvent::Foreign
+                });
             }
-            NoPacket::Segment(id) if pending.before == 0 || self.is_used(id) => return,
+            NoPacketReason::Segment(id) if pending.before == 0 || self.is_sender_in_skin(id) => return,
             // Each foreign frame counts as such, not as an incomplete packet.
-            NoPacket::Segment(id) => (id, Event::Foreign),
-            NoPacket::AfterLost(id) => (id, Event::Incomplete),
-            NoPacket::Damaged(id, error) => (id, Event::from(error)),
+            NoPacketReason::Segment(id) => (id, FrameEvent::Foreign),
+            NoPacketReason::AfterLost(id) => (id, FrameEvent::Incomplete),
+            NoPacketReason::Damaged(id, error) => (id, FrameEvent::from(error)),
         };
-        if !own && !self.is_used(id) {
-            return self.counters.count(Event::Foreign);
+        if !own && !self.is_sender_in_skin(id) {
+            return self.counters.count_event(FrameEvent::Foreign);
         }
         self.counters.count_frame(id.kind, own);
         self.count_unusable_frame(id, own, event);
     }
 
     /// Returns true if the skin describes a sender with this identifier on this bus.
-    fn is_used(&self, id: Id) -> bool {
+    fn is_sender_in_skin(&self, id: Id) -> bool {
         let is_cell = |cell: CellId| self.index_of(cell).is_some();
         match (id.kind, Node::from_byte(id.node)) {
             (Kind::Command, _) => Command::from_byte(id.node).is_some(),
@@ -102,22 +114,27 @@ impl BusTable {
     }
 
     /// Counts an unusable frame, for the bus and for the cell with its identifier.
-    fn count_unusable_frame(&mut self, id: Id, own: bool, event: Event) {
-        self.counters.count(event);
-        if let (false, Some(cell)) = (own, self.sender(id)) {
+    fn count_unusable_frame(&mut self, id: Id, own: bool, event: FrameEvent) {
+        self.counters.count_event(event);
+        if let (false, Some(cell)) = (own, self.sender_mut(id)) {
             cell.tracked.account.count_rejected();
         }
     }
 
     /// Handles a frame of this gateway, read back from the bus.
-    pub(super) fn receive_own(&mut self, at: Micros, message: &Message, positions: &mut PositionLookup<'_>) {
+    pub(super) fn handle_own_message(
+        &mut self,
+        at: Micros,
+        message: &Message,
+        positions: &mut PositionLookup<'_>,
+    ) {
         if let Message::Joints { epoch, joints } = *message {
             self.open_epoch(at, epoch, &joints, positions(epoch));
         } else if let Message::Stimulus { to, from, page } = *message {
             self.record_stimulus(to, from, page);
         } else if let Message::Configure { to, request: Request::Write { number, .. }, .. } = *message {
             if number == Parameter::Mode.number() {
-                self.record_write(to, number);
+                self.record_parameter_write(to, number);
             }
         } else if *message == Message::Halt {
             self.change_all_cells(CellState::halt);
@@ -129,18 +146,20 @@ impl BusTable {
     }
 
     /// Handles a frame of another sender.
-    pub(super) fn receive_foreign(&mut self, at: Micros, id: Id, message: &Message) {
+    pub(super) fn handle_foreign_message(&mut self, at: Micros, id: Id, message: &Message) {
         // A command-line tool may also send a gateway's messages.
         match *message {
             Message::Joints { .. } => {
-                self.counters.count(Event::OtherGateway);
+                self.counters.count_event(FrameEvent::OtherGateway);
                 // A gateway sends joints continuously; a single frame may come from any sender.
                 if self.outsiders.record_joints(at) {
                     self.snapshot.sums.other_gateways += 1;
                     self.notices.push_back(Notice::OtherGateway);
                 }
             }
-            Message::Network { from: Node::Gateway, .. } => self.counters.count(Event::OtherGateway),
+            Message::Network { from: Node::Gateway, .. } => {
+                self.counters.count_event(FrameEvent::OtherGateway)
+            }
             Message::Halt => {
                 self.snapshot.sums.halts += 1;
                 self.change_all_cells(CellState::halt);
@@ -153,8 +172,8 @@ impl BusTable {
             Message::Configure { to, request: Request::Write { number, .. }, .. }
                 if REPLY_PARAMETERS.iter().any(|parameter| parameter.number() == number) =>
             {
-                self.counters.count(Event::OtherWriter);
-                self.record_write(to, number);
+                self.counters.count_event(FrameEvent::OtherWriter);
+                self.record_parameter_write(to, number);
             }
             Message::Sync | Message::Report | Message::Configure { .. } => {}
             Message::Sum { .. }
@@ -167,21 +186,21 @@ impl BusTable {
 
     fn record_stimulus(&mut self, to: Node, from: StimulusStart, page: SensorPage) {
         let last = self.broadcast.map(|broadcast| broadcast.epoch);
-        for cell in self.cells.iter_mut().filter(|cell| to.addresses(cell.node)) {
+        for cell in self.cells.iter_mut().filter(|cell| to.addresses_cell(cell.node)) {
             cell.stimulate(from, page, last);
         }
     }
 
-    fn record_write(&mut self, to: Node, number: u8) {
+    fn record_parameter_write(&mut self, to: Node, number: u8) {
         self.cells
             .iter_mut()
-            .filter(|cell| to.addresses(cell.node))
-            .for_each(|cell| cell.record_write(number));
+            .filter(|cell| to.addresses_cell(cell.node))
+            .for_each(|cell| cell.record_parameter_write(number));
     }
 
     fn receive_from_cell(&mut self, at: Micros, id: Id, message: &Message) {
         let Some(place) = self.places.get(usize::from(id.node).wrapping_sub(1)).copied().flatten() else {
-            self.counters.count(Event::UnknownNode);
+            self.counters.count_event(FrameEvent::UnknownNode);
             if let Message::Network {
                 from: Node::Cell(node), page: NetworkPage::Heartbeat(heartbeat), ..
             } = *message
@@ -191,13 +210,14 @@ impl BusTable {
             return;
         };
         let Some(cell) = self.cells.get_mut(place) else { return };
-        let update = cell.tracked.receive(at, message, self.broadcast.map(|broadcast| broadcast.number));
+        let update =
+            cell.tracked.record_packet(at, message, self.broadcast.map(|broadcast| broadcast.number));
         if update.revived {
             self.snapshot.sums.dead -= 1;
             self.notices.push_back(Notice::Revived(cell.node));
         }
         let is_answer = if let Message::Network { page, .. } = message {
-            page.is_only_reported()
+            page.is_sent_only_on_request()
         } else {
             matches!(message, Message::Sensors { .. })
         };
@@ -209,7 +229,7 @@ impl BusTable {
                 self.receive_heartbeat(at, place, &update, &heartbeat, epoch);
             } else if let NetworkPage::Received(_) = page {
                 cell.sensed.begin_report();
-                cell.record_counters(
+                cell.record_receive_counters(
                     self.broadcast.as_ref().map_or(0, |newest| newest.broadcasts_since(epoch)),
                 );
             } else if let NetworkPage::Rejected(_) = page {
@@ -243,13 +263,13 @@ impl BusTable {
     ) {
         let Some(cell) = self.cells.get_mut(place) else { return };
         let takes_joints = update.word == Some(HeartbeatKind::Continued)
-            && !heartbeat.state.has(State::CLAIMING)
+            && !heartbeat.state.has(State::CLAIMING_NODE_ID)
             && !heartbeat.state.has(State::HALTED);
         if takes_joints && let Some(broadcast) = &self.broadcast {
-            self.delays.record_pending_joints(broadcast.pending_joints_age(epoch, at));
+            self.delays.record_pending_joints_age(broadcast.pending_joints_age(epoch, at));
         }
         if heartbeat.state.has(State::DUPLICATE) {
-            self.counters.count(Event::Duplicate);
+            self.counters.count_event(FrameEvent::Duplicate);
             self.notices.push_back(Notice::Duplicate(cell.node));
         }
         if matches!(update.word, Some(HeartbeatKind::Started { again: true } | HeartbeatKind::Shared)) {
@@ -264,40 +284,45 @@ impl BusTable {
 
     fn receive_torque(&mut self, at: Micros, place: usize, epoch: Epoch, torque: &Words) {
         if self.root_totals.is_some() {
-            return self.counters.count(Event::UnknownNode);
+            return self.counters.count_event(FrameEvent::UnknownNode);
         }
         let Some(broadcast) = &mut self.broadcast else {
-            return self.counters.count(Event::StaleTorque);
+            return self.counters.count_event(FrameEvent::StaleTorque);
         };
         let Some(cell) = self.cells.get_mut(place) else { return };
-        let Some(lag) = broadcast.lag(epoch) else {
+        let Some(lag) = broadcast.lag_in_broadcasts(epoch) else {
             cell.replies.too_late += 1;
-            return self.counters.count(Event::StaleTorque);
+            return self.counters.count_event(FrameEvent::StaleTorque);
         };
         let number = broadcast.number - lag as u64;
         if cell.answered.is_some_and(|last| number <= last) {
             if cell.answered == Some(number) {
-                return self.counters.count(Event::RepeatedTorque);
+                return self.counters.count_event(FrameEvent::RepeatedTorque);
             }
             cell.replies.too_late += 1;
-            return self.counters.count(Event::StaleTorque);
+            return self.counters.count_event(FrameEvent::StaleTorque);
         }
         if torque.is_saturated() {
-            self.counters.count(Event::Saturated);
+            self.counters.count_event(FrameEvent::Saturated);
         }
         let format = self.carried.torque_format;
         let is_zero = torque.as_slice().iter().all(|&word| word == 0);
         let asked = cell.record_reply(number, lag, is_zero);
-        self.delays.record_reply(at.elapsed_since(broadcast.broadcast_time(lag)));
+        self.delays.record_reply_delay(at.elapsed_since(broadcast.broadcast_time(lag)));
         if lag == 0 {
             broadcast.last_reply = Some(at);
             broadcast.in_time += u32::from(asked == ReplyExpectation::Due);
             broadcast.is_whole &=
                 asked == ReplyExpectation::Due || is_zero && asked == ReplyExpectation::NotDue;
         }
-        if let (ReplyExpectation::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
-            let error =
-                self.accuracy.compare(cell.joint, format, torque, &expected, &mut cell.outstanding.errors);
+        if let (ReplyExpectation::Due, Some(expected)) = (asked, cell.outstanding.expected_torques(number)) {
+            let error = self.accuracy.compare_cell_torque(
+                cell.joint,
+                format,
+                torque,
+                &expected,
+                &mut cell.outstanding.errors,
+            );
             cell.outstanding.stuck.compare_torque(
                 torque.padded(),
                 expected.quantised.map(|torque| format.nearest_word(torque)),
@@ -308,13 +333,13 @@ impl BusTable {
                 }
             }
         }
-        let change = cell.hold(torque.padded().map(|word| format.finest_steps(word)));
+        let change = cell.hold_torque(torque.padded().map(|word| format.to_finest_steps(word)));
         self.apply(change);
     }
 
     fn receive_sum(&mut self, at: Micros, place: usize, epoch: Epoch, sum: RootSum) {
         let (Some(root_totals), Some(cell)) = (&mut self.root_totals, self.cells.get_mut(place)) else {
-            return self.counters.count(Event::UnknownNode);
+            return self.counters.count_event(FrameEvent::UnknownNode);
         };
         root_totals.counts.received += 1;
         let Some(sums) = cell.sums.as_mut().filter(|sums| sums.is_for_gateway) else {
@@ -322,14 +347,14 @@ impl BusTable {
             return;
         };
         let found = self.broadcast.as_mut().and_then(|broadcast| {
-            let lag = broadcast.lag(epoch)?;
+            let lag = broadcast.lag_in_broadcasts(epoch)?;
             Some((lag, sums.epochs.get_mut(lag)?, broadcast))
         });
         let Some((lag, best, broadcast)) = found else {
             root_totals.counts.stale += 1;
             return;
         };
-        if root_totals.record_sum(lag, best, sum) == SumUse::Resent {
+        if root_totals.record_sum(lag, best, sum) == RootSumUse::Resent {
             return;
         }
         if lag == 0 {
@@ -337,7 +362,7 @@ impl BusTable {
         }
         let number = broadcast.number - lag as u64;
         if sum.is_saturated() {
-            self.counters.count(Event::Saturated);
+            self.counters.count_event(FrameEvent::Saturated);
         }
         // In the steps of the running sum.
         let change = cell.hold_sum(number, sum.count, sum.words_in_q3_12());
@@ -347,10 +372,14 @@ impl BusTable {
 
     /// Releases the held sum of a silent root once the sum of another root contains its cells.
     fn release_duplicate_sums(&mut self, number: u64) {
-        let Some(due) = self.root_totals.as_ref().and_then(RootTotals::cells_due) else { return };
+        let Some(due) = self.root_totals.as_ref().and_then(RootTotals::due_cell_count) else { return };
         if self.snapshot.sums.contributing > due {
             self.change_all_cells(|cell| {
-                if cell.is_outdated(number) { cell.release_torque() } else { SumChange::default() }
+                if cell.is_torque_outdated(number) {
+                    cell.release_torque()
+                } else {
+                    TorqueSumChange::default()
+                }
             });
         }
     }

@@ -6,7 +6,7 @@ use protocol::skin::SafetyLimits;
 
 /// A change of the running sum: steps by joint, and cells.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(super) struct SumChange {
+pub(super) struct TorqueSumChange {
     pub(super) torque: [i32; MAX_JOINTS],
     pub(super) contributing: i32,
 }
@@ -25,28 +25,33 @@ pub(super) struct HeldTorque {
 impl HeldTorque {
     /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact. Returns the change of the running
     /// sum.
-    pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> SumChange {
+    pub(super) fn hold_torque(&mut self, words: [i32; MAX_JOINTS]) -> TorqueSumChange {
         self.torque = (words != [0; MAX_JOINTS]).then_some((words, 1));
         self.set_contribution(words, u8::from(self.torque.is_some()))
     }
 
     /// Holds a sum of `count` cells; a sum of zero cells ends all contacts. Returns the change of the running sum.
-    pub(super) fn hold_sum(&mut self, words: [i32; MAX_JOINTS], count: u8) -> SumChange {
+    pub(super) fn hold_sum(&mut self, words: [i32; MAX_JOINTS], count: u8) -> TorqueSumChange {
         // Even with cells in contact, all words may round to 0.
         self.torque = (count > 0).then_some((words, count));
         self.set_contribution(words, count)
     }
 
     /// Releases the torque. Returns the change of the running sum.
-    pub(super) fn release_torque(&mut self) -> SumChange {
+    pub(super) fn release_torque(&mut self) -> TorqueSumChange {
         self.torque = None;
         self.set_contribution([0; MAX_JOINTS], 0)
     }
 
     /// Keeps the torque or lets it decay, after this number of unanswered epochs. Returns the change of the running
     /// sum.
-    pub(super) fn decay(&mut self, unanswered: u32, safety: &SafetyLimits, is_sum: bool) -> SumChange {
-        let Some((held, cells)) = self.torque else { return SumChange::default() };
+    pub(super) fn decay_torque(
+        &mut self,
+        unanswered: u32,
+        safety: &SafetyLimits,
+        is_sum: bool,
+    ) -> TorqueSumChange {
+        let Some((held, cells)) = self.torque else { return TorqueSumChange::default() };
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(unanswered);
         if left == 0 && unanswered > 0 {
             // The contribution has decayed to zero, although the cell has not reported the end of its contact.
@@ -60,34 +65,34 @@ impl HeldTorque {
         self.set_contribution(rest, if counts { cells } else { 0 })
     }
 
-    fn set_contribution(&mut self, words: [i32; MAX_JOINTS], cells: u8) -> SumChange {
+    fn set_contribution(&mut self, words: [i32; MAX_JOINTS], cells: u8) -> TorqueSumChange {
         let counted = core::mem::replace(&mut self.contributing, cells);
         let before = core::mem::replace(&mut self.contribution, words);
         let mut torque = words;
         for (torque, before) in torque.iter_mut().zip(before) {
             *torque -= before;
         }
-        SumChange { torque, contributing: i32::from(cells) - i32::from(counted) }
+        TorqueSumChange { torque, contributing: i32::from(cells) - i32::from(counted) }
     }
 
     /// Returns the number of cells in the held torque; 0 if nothing is held.
-    pub(super) fn cells(&self) -> u32 {
+    pub(super) fn held_cell_count(&self) -> u32 {
         self.torque.map_or(0, |(_, cells)| cells.into())
     }
 
     /// Returns true if a torque is held.
-    pub(super) const fn is_some(&self) -> bool {
+    pub(super) const fn has_torque(&self) -> bool {
         self.torque.is_some()
     }
 
     /// Returns true if the torque is part of the running sum.
-    pub(super) const fn contributes(&self) -> bool {
+    pub(super) const fn contributes_to_sum(&self) -> bool {
         self.contributing > 0
     }
 }
 
 /// Converts a sum of Q3.12 words to Nm.
 #[expect(clippy::cast_precision_loss, reason = "sums of 254 words of 16 bits are exact")]
-pub(super) fn to_nm(steps: i64) -> f64 {
+pub(super) fn q3_12_to_nm(steps: i64) -> f64 {
     steps as f64 / 4_096.0
 }

@@ -41,15 +41,15 @@ use crate::network::check::ObservedCell;
 use crate::packets::PacketReader;
 
 use epoch::Broadcast;
-use held::{SumChange, to_nm};
-use outsiders::Outsiders;
+use held::{TorqueSumChange, q3_12_to_nm};
+use outsiders::UnknownSenders;
 use root_totals::RootTotals;
 use switched::SwitchStates;
 
-pub use crate::tracker::Uplink;
-pub use accuracy::{Accuracy, RoundingErrors};
+pub use crate::tracker::UplinkCounts;
+pub use accuracy::{RoundingErrors, TorqueAccuracy};
 pub use cell::{CellState, ResponseFlags};
-pub use counters::{Counters, Event};
+pub use counters::{Counters, FrameEvent};
 pub use delays::Delays;
 pub use epoch::PositionLookup;
 pub use errors::TorqueErrors;
@@ -57,7 +57,7 @@ pub use replies::Replies;
 pub use root_totals::{Contributions, SumCounts};
 pub use sensed::SensorFrames;
 pub use status::CellStatus;
-pub use switched::{SWITCHES, Switch};
+pub use switched::{SWITCH_COUNT, SwitchTarget};
 
 /// The totals of a bus that a tick of the control loop needs. Their size does not depend on the number of cells.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -134,14 +134,14 @@ pub struct BusTable {
     broadcast: Option<Broadcast>,
     /// The sums along the tree, if the cells answer with sums.
     root_totals: Option<RootTotals>,
-    outsiders: Outsiders,
+    outsiders: UnknownSenders,
     /// True if the bus was lost since the last broadcast.
     interrupted: bool,
     /// The running sum in integer steps, so that it never drifts.
     sum: [i64; MAX_JOINTS],
     snapshot: Snapshot,
     counters: Counters,
-    accuracy: Accuracy,
+    accuracy: TorqueAccuracy,
     /// The difference of the last closed epoch, see [`Table::difference`].
     difference: Option<[f64; MAX_JOINTS]>,
     delays: Delays,
@@ -182,19 +182,19 @@ impl BusTable {
             safety: skin.safety,
             events: skin.events,
             central: CentralComputation::new(&part),
-            unquantised: CentralComputation::unquantised(&part),
+            unquantised: CentralComputation::without_quantisation(&part),
             is_comparing: false,
             cells,
             places,
             packets: PacketReader::for_bus(skin, bus),
             broadcast: None,
             root_totals: summed.then(RootTotals::default),
-            outsiders: Outsiders::default(),
+            outsiders: UnknownSenders::default(),
             interrupted: false,
             sum: [0; MAX_JOINTS],
             snapshot,
             counters: Counters::default(),
-            accuracy: Accuracy::default(),
+            accuracy: TorqueAccuracy::default(),
             difference: None,
             delays: Delays::default(),
             notices: VecDeque::new(),
@@ -204,13 +204,16 @@ impl BusTable {
     /// Declares that the gateway receives only the sums of roots. The sums that other cells send then cannot be
     /// counted.
     pub fn receive_root_sums_only(&mut self) {
-        self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.tracked.account.exclude_sums());
+        self.cells
+            .iter_mut()
+            .filter(|cell| !cell.root)
+            .for_each(|cell| cell.tracked.account.exclude_unreceived_sums());
     }
 
     /// Declares that [`set_root_feeds_gateway`](Self::set_root_feeds_gateway) tells for each root whether it sends its
     /// sums to the gateway; until then none does. Without this, all roots do until a tree page of theirs names another
     /// parent.
-    pub fn follow_root_wires(&mut self) {
+    pub fn use_root_wires_not_tree_pages(&mut self) {
         self.root_totals.iter_mut().for_each(|totals| totals.follows_wires = true);
         self.cells
             .iter_mut()
@@ -231,7 +234,7 @@ impl BusTable {
     }
 
     /// Starts or stops the comparison of distributed torques with central ones, from the next epoch on.
-    pub const fn set_comparing(&mut self, comparing: bool) {
+    pub const fn set_torque_comparison(&mut self, comparing: bool) {
         self.is_comparing = comparing;
     }
 
@@ -243,7 +246,7 @@ impl BusTable {
 
     /// Returns the counts of packets that all cells sent and that arrived.
     #[must_use]
-    pub fn uplink(&self) -> Uplink {
+    pub fn uplink(&self) -> UplinkCounts {
         self.cells.iter().map(CellState::uplink).sum()
     }
 
@@ -267,10 +270,10 @@ impl BusTable {
 
     /// Returns the errors of distributed torques compared with central ones.
     #[must_use]
-    pub fn accuracy(&self) -> Accuracy {
+    pub fn accuracy(&self) -> TorqueAccuracy {
         let Some(root_totals) = &self.root_totals else { return self.accuracy };
         let error = &root_totals.error;
-        Accuracy {
+        TorqueAccuracy {
             sums: error.single,
             sums_averaged: error.averaged,
             saturated: error.saturated,
@@ -280,13 +283,13 @@ impl BusTable {
 
     /// Returns the counts of sums, and of the cells due in sums; `None` on a bus whose cells answer with torques.
     #[must_use]
-    pub fn sums(&self) -> Option<(SumCounts, Contributions)> {
+    pub fn sum_counts(&self) -> Option<(SumCounts, Contributions)> {
         self.root_totals.as_ref().map(|root_totals| (root_totals.counts, root_totals.contributions))
     }
 
     /// Returns the counts of due and received replies of all cells; on a bus with sums, of the cells in sums.
     #[must_use]
-    pub fn replies(&self) -> Replies {
+    pub fn reply_counts(&self) -> Replies {
         let Some(root_totals) = &self.root_totals else {
             return Replies::total(self.cells.iter().map(|cell| cell.replies));
         };
@@ -296,7 +299,7 @@ impl BusTable {
 
     /// Returns the number of times that cells changed their parent in the tree, by the cells' own counters.
     #[must_use]
-    pub fn parent_changes(&self) -> u64 {
+    pub fn parent_change_count(&self) -> u64 {
         self.cells.iter().filter_map(|cell| cell.pages().ports).map(|ports| u64::from(ports.changes)).sum()
     }
 
@@ -312,12 +315,12 @@ impl BusTable {
     }
 
     /// Removes and returns the notices, oldest first.
-    pub fn notices(&mut self) -> impl Iterator<Item = Notice> {
+    pub fn drain_notices(&mut self) -> impl Iterator<Item = Notice> {
         self.notices.drain(..)
     }
 
     /// Returns the cell that sends frames with this identifier.
-    fn sender(&mut self, id: Id) -> Option<&mut CellState> {
+    fn sender_mut(&mut self, id: Id) -> Option<&mut CellState> {
         self.cell_mut(id.sender()?)
     }
 
@@ -335,7 +338,7 @@ impl BusTable {
         if let Some(root_totals) = &mut self.root_totals {
             *root_totals = RootTotals::default();
         }
-        (self.counters, self.accuracy) = (Counters::default(), Accuracy::default());
+        (self.counters, self.accuracy) = (Counters::default(), TorqueAccuracy::default());
         self.delays.reset();
         self.notices.clear();
     }
@@ -358,14 +361,14 @@ impl BusTable {
         self.close_epoch();
         self.broadcast = None;
         if let Some(root_totals) = &mut self.root_totals {
-            root_totals.finish();
+            root_totals.finish_epochs();
         }
         for cell in &mut self.cells {
             cell.finish_counts();
         }
     }
 
-    fn change_all_cells(&mut self, change: impl Fn(&mut CellState) -> SumChange) {
+    fn change_all_cells(&mut self, change: impl Fn(&mut CellState) -> TorqueSumChange) {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let change = change(cell);
@@ -374,12 +377,12 @@ impl BusTable {
     }
 
     /// Adds the change of a cell's contribution to the running sum.
-    fn apply(&mut self, change: SumChange) {
+    fn apply(&mut self, change: TorqueSumChange) {
         for ((sum, torque), difference) in
             self.sum.iter_mut().zip(&mut self.snapshot.sums.torque).zip(change.torque)
         {
             *sum += i64::from(difference);
-            *torque = to_nm(*sum);
+            *torque = q3_12_to_nm(*sum);
         }
         self.snapshot.sums.contributing =
             self.snapshot.sums.contributing.saturating_add_signed(change.contributing);

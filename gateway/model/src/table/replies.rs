@@ -101,7 +101,7 @@ impl OutstandingReplies {
     }
 
     /// Returns true if the cell must answer the newest broadcast.
-    pub(super) const fn is_due(&self) -> bool {
+    pub(super) const fn is_reply_due(&self) -> bool {
         self.due & 1 != 0
     }
 
@@ -121,14 +121,14 @@ impl OutstandingReplies {
 
     /// Clears the outstanding replies, and marks the contact at their broadcasts as unknown. Returns the number of
     /// replies that were outstanding.
-    pub(super) const fn clear(&mut self) -> u32 {
+    pub(super) const fn clear_outstanding(&mut self) -> u32 {
         let due = self.due.count_ones();
         (self.due, self.known) = (0, 0);
         due
     }
 
     /// Sets the torques that are expected in answer to the newest broadcast.
-    pub(super) fn expect(&mut self, expected: ExpectedTorques) {
+    pub(super) fn expect_torques(&mut self, expected: ExpectedTorques) {
         self.expected.rotate_right(1);
         if let Some(newest) = self.expected.first_mut() {
             *newest = Some(expected);
@@ -136,7 +136,7 @@ impl OutstandingReplies {
     }
 
     /// Returns the torques that are expected in answer to the broadcast with this number, if known.
-    pub(super) fn expected(&self, number: u64) -> Option<ExpectedTorques> {
+    pub(super) fn expected_torques(&self, number: u64) -> Option<ExpectedTorques> {
         self.expected.iter().flatten().find(|expected| expected.number == number).copied()
     }
 }
@@ -151,12 +151,12 @@ mod tests {
         use ReplyExpectation::{Due, NotDue, Unknown};
         let broadcasts = [(false, false), (true, true), (false, true), (true, true)];
         broadcasts.into_iter().for_each(|(due, is_known)| _ = outstanding.open_broadcast(due, is_known));
-        assert!(outstanding.is_due());
+        assert!(outstanding.is_reply_due());
         let answers = [0, 0, 1, 2, 2, 3].map(|lag| outstanding.record_answer(lag));
         assert_eq!(answers, [Due, NotDue, NotDue, Due, NotDue, Unknown]);
-        assert_eq!(outstanding.clear(), 0);
+        assert_eq!(outstanding.clear_outstanding(), 0);
         (0..5).for_each(|_| _ = outstanding.open_broadcast(true, true));
-        assert_eq!(outstanding.clear(), 4, "the newest, and three before it");
+        assert_eq!(outstanding.clear_outstanding(), 4, "the newest, and three before it");
         assert_eq!(outstanding.record_answer(0), Unknown, "what was known is in doubt");
     }
 }

@@ -117,7 +117,7 @@ pub(super) struct ExpectedSum {
 
 impl ExpectedSum {
     /// Adds the torque of a cell that sits on the joint `joint`.
-    pub(super) fn add(&mut self, torque: [f64; MAX_JOINTS], joint: usize) {
+    pub(super) fn add_cell_torque(&mut self, torque: [f64; MAX_JOINTS], joint: usize) {
         for (sum, torque) in self.torque.iter_mut().zip(torque) {
             *sum += torque;
         }
@@ -187,7 +187,7 @@ pub(super) struct RootTotals {
 
 /// The classification of a root's sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum SumUse {
+pub(super) enum RootSumUse {
     /// The sum has the most cells so far for its epoch, and is used.
     Best,
     /// An earlier sum for the same epoch has at least as many cells; this one is not used.
@@ -197,14 +197,14 @@ pub(super) enum SumUse {
 impl RootTotals {
     /// Records a root's sum for the epoch `lag` before the newest; `best` is the root's sum with the most cells for
     /// that epoch so far.
-    pub(super) fn record_sum(&mut self, lag: usize, best: &mut Option<RootSum>, sum: RootSum) -> SumUse {
+    pub(super) fn record_sum(&mut self, lag: usize, best: &mut Option<RootSum>, sum: RootSum) -> RootSumUse {
         let before = *best;
         match before {
             Some(_) => self.counts.resent += 1,
             None => self.counts.first += 1,
         }
         if before.is_some_and(|before| sum.count <= before.count) {
-            return SumUse::Resent;
+            return RootSumUse::Resent;
         }
         *best = Some(sum);
         if let Some(Some(open)) = self.epochs.get_mut(lag) {
@@ -215,11 +215,11 @@ impl RootTotals {
             }
             open.saturated |= sum.is_saturated();
         }
-        SumUse::Best
+        RootSumUse::Best
     }
 
     /// Returns the number of cells due in the sum of the newest epoch; `None` if the contact of some cell is unknown.
-    pub(super) fn cells_due(&self) -> Option<u32> {
+    pub(super) fn due_cell_count(&self) -> Option<u32> {
         self.epochs.first().copied().flatten().filter(|open| open.known).map(|open| open.due)
     }
 
@@ -261,7 +261,7 @@ impl RootTotals {
     }
 
     /// Ends the run: ends the counting of all epochs.
-    pub(super) fn finish(&mut self) {
+    pub(super) fn finish_epochs(&mut self) {
         for open in &mut self.epochs {
             self.contributions.count_epoch(open.take());
         }

@@ -42,7 +42,7 @@ impl SensorFrames {
     }
 
     /// Records a sensors frame.
-    pub(super) fn record(&mut self, at: Micros, page: &SensorPage, events: &Events) {
+    pub(super) fn record_frame(&mut self, at: Micros, page: &SensorPage, events: &Events) {
         self.frames += 1;
         let bit = 1 << page.number();
         let is_requested = self.requested & bit != 0;
@@ -60,7 +60,7 @@ impl SensorFrames {
     }
 
     /// Records a restart: the cell is not in contact, and this does not count as a release.
-    pub(super) const fn restart(&mut self) {
+    pub(super) const fn record_restart(&mut self) {
         self.contact = TouchState::Free;
     }
 
@@ -87,7 +87,7 @@ mod tests {
         for (&bits, ms) in steps.iter().zip(0..) {
             let contact = [Q5_10::from_bits(bits), Q5_10::ZERO, Q5_10::ZERO];
             let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-            sensed.record(Micros(ms * 1_000), &page, &Events::default());
+            sensed.record_frame(Micros(ms * 1_000), &page, &Events::default());
         }
         sensed
     }
@@ -97,7 +97,7 @@ mod tests {
         let sensed = after(&[0, 101, 102, 300, 60, 51, 50, 30, 0, 200, 0]);
         assert_eq!((sensed.touches, sensed.releases, sensed.frames), (2, 2, 11));
         let mut sensed = after(&[500]);
-        sensed.restart();
+        sensed.record_restart();
         assert_eq!((sensed.touches, sensed.releases), (1, 0), "no release was reported");
     }
 
@@ -106,7 +106,7 @@ mod tests {
         let rate = |times_us: &[u64]| {
             let mut sensed = SensorFrames::default();
             for (&at, page) in times_us.iter().zip([skin(), ACCELERATION].iter().cycle()) {
-                sensed.record(Micros(at), page, &Events::default());
+                sensed.record_frame(Micros(at), page, &Events::default());
             }
             sensed.rate_hz()
         };
@@ -122,16 +122,16 @@ mod tests {
         for second in 0..10 {
             let at = Micros(second * 1_000_000);
             sensed.begin_report();
-            sensed.record(at, &skin(), &Events::default());
-            sensed.record(Micros(at.0 + 1), &ACCELERATION, &Events::default());
+            sensed.record_frame(at, &skin(), &Events::default());
+            sensed.record_frame(Micros(at.0 + 1), &ACCELERATION, &Events::default());
         }
         assert_eq!((sensed.rate_hz(), sensed.frames), (None, 20));
         // The acceleration of the answer was lost, and the next one does not belong to it.
         sensed.begin_report();
-        sensed.record(Micros(0), &skin(), &Events::default());
+        sensed.record_frame(Micros(0), &skin(), &Events::default());
         sensed.end_report();
         for at in [0, 1_000_000, 2_000_000] {
-            sensed.record(Micros(at), &ACCELERATION, &Events::default());
+            sensed.record_frame(Micros(at), &ACCELERATION, &Events::default());
         }
         assert!(sensed.rate_hz().is_some_and(|hz| (hz - 1.0).abs() < 1e-9));
     }

@@ -6,22 +6,22 @@ use crate::tracker::HeartbeatKind;
 
 /// The number of joints sent to one cell, and the cell's own count to compare it with.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct SentJoints {
-    since: CountsSince,
+pub(super) struct SentJointCounts {
+    since: CountsSinceStart,
     /// The counts before the cell's last start, and its replies then in doubt; kept while that start may still be taken
     /// back.
-    before: Option<(CountsSince, u64)>,
+    before: Option<(CountsSinceStart, u64)>,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
-struct CountsSince {
+struct CountsSinceStart {
     /// The first page of receive counters since the cell or the gateway started.
     first: Option<ReceivedCounts>,
     /// Number of broadcasts since that first page.
     joints: u64,
 }
 
-impl SentJoints {
+impl SentJointCounts {
     /// Counts a broadcast.
     pub(super) const fn count_broadcast(&mut self) {
         self.since.joints += 1;
@@ -34,9 +34,9 @@ impl SentJoints {
 
     /// Records a page of receive counters. `passed` is the number of joints that were sent while the page was on its
     /// way. Later pages are compared with the first one.
-    pub(super) fn report(&mut self, heard: Option<ReceivedCounts>, passed: u64) {
+    pub(super) fn record_counters_page(&mut self, heard: Option<ReceivedCounts>, passed: u64) {
         if self.since.first.is_none() {
-            self.since = CountsSince { first: heard, joints: passed };
+            self.since = CountsSinceStart { first: heard, joints: passed };
         }
     }
 
@@ -48,7 +48,7 @@ impl SentJoints {
     /// Records a start of the cell; `sent` is its counter of sent packets, and `of` has the numbers of replies
     /// outstanding and in doubt. If `taken_back`, the apparent start was none: the earlier counts continue, and the
     /// returned number of replies is in doubt.
-    pub(super) fn restart(
+    pub(super) fn record_restart(
         &mut self,
         word: HeartbeatKind,
         taken_back: bool,
@@ -66,14 +66,14 @@ impl SentJoints {
         }
         let before = self.before.take_if(|_| taken_back);
         // The cell counts from zero; without its first heartbeat, compare from the next page on.
-        let restarted = CountsSince { first: (sent == 0).then(ReceivedCounts::default), joints: 0 };
+        let restarted = CountsSinceStart { first: (sent == 0).then(ReceivedCounts::default), joints: 0 };
         self.since = before.map_or(restarted, |(since, _)| since);
         before.map(|(_, in_doubt)| in_doubt)
     }
 
     /// Returns two counts of joints: those that the cell reports as skipped because they were old, and those that it
     /// does not report as received.
-    pub(super) fn unanswered(&self, last: Option<ReceivedCounts>) -> Option<(u64, u64)> {
+    pub(super) fn unanswered_joint_counts(&self, last: Option<ReceivedCounts>) -> Option<(u64, u64)> {
         let first = self.since.first?;
         let last = last.unwrap_or(first);
         let since = |count: fn(&ReceivedCounts) -> u16| count(&last).wrapping_sub(count(&first));

@@ -13,7 +13,7 @@
 //! measured words, cannot be judged.
 
 use protocol::message::SensorPage;
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 use protocol::parameters::MAX_JOINTS;
 
 /// Number of equal words in a row from which a cell counts as stuck.
@@ -24,18 +24,18 @@ const MIN_EXPECTED_CHANGES: u32 = 4;
 const MIN_CHANGE_STEPS: u16 = 16;
 
 /// Name of the torques in [`Stuck::longest`]; pages have their own.
-const TORQUE: &str = "torque";
+const TORQUE_NAME: &str = "torque";
 
 /// The words that a cell sends in torques and sensors pages, compared with the expected ones.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct StuckDetector {
-    torque: WordRun,
-    pages: [WordRun; SensorPage::SIMULATED.len()],
+    torque: StuckWordRun,
+    pages: [StuckWordRun; SensorPage::SIMULATED_PAGE_NAMES.len()],
 }
 
 /// The words of one kind that a cell sends, compared with the expected ones.
 #[derive(Clone, Copy, Debug, Default)]
-struct WordRun {
+struct StuckWordRun {
     sent: Option<[i16; MAX_JOINTS]>,
     /// Number of words in a row that are equal to `sent`.
     run_length: u64,
@@ -46,7 +46,7 @@ struct WordRun {
     longest_run: u64,
 }
 
-impl WordRun {
+impl StuckWordRun {
     fn compare(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
         if self.sent.replace(sent) != Some(sent) {
             (self.run_length, self.expected, self.changes) = (1, right, 0);
@@ -79,19 +79,20 @@ impl StuckDetector {
     pub(super) fn compare_page(&mut self, sent: &SensorPage, right: &SensorPage) {
         let page = sent.simulated_index().filter(|page| right.simulated_index() == Some(*page));
         if let Some(words) = page.and_then(|page| self.pages.get_mut(page)) {
-            words.compare(padded(&sent.words()), padded(&right.words()));
+            words.compare(pad_with_defaults(&sent.words()), pad_with_defaults(&right.words()));
         }
     }
 
     /// Returns true if the cell counts as stuck now.
     pub(super) fn is_stuck(&self) -> bool {
-        self.torque.is_stuck() || self.pages.iter().any(WordRun::is_stuck)
+        self.torque.is_stuck() || self.pages.iter().any(StuckWordRun::is_stuck)
     }
 
     /// Returns the kinds of words that were stuck, each with its longest run in words.
-    pub(super) fn longest(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        let pages = SensorPage::SIMULATED.into_iter().zip(self.pages.map(|words| words.longest_run));
-        let all = [(TORQUE, self.torque.longest_run)].into_iter().chain(pages);
+    pub(super) fn longest_stuck_runs(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        let pages =
+            SensorPage::SIMULATED_PAGE_NAMES.into_iter().zip(self.pages.map(|words| words.longest_run));
+        let all = [(TORQUE_NAME, self.torque.longest_run)].into_iter().chain(pages);
         all.filter(|(_, longest)| *longest > 0)
     }
 }
@@ -107,8 +108,10 @@ mod tests {
 
     /// Returns the longest run of stuck words, for pairs of sent and expected words.
     fn longest(words: impl Iterator<Item = (i16, i16)>) -> u64 {
-        let mut all = WordRun::default();
-        words.for_each(|(sent, right)| all.compare(padded(&[0, sent]), padded(&[0, right])));
+        let mut all = StuckWordRun::default();
+        words.for_each(|(sent, right)| {
+            all.compare(pad_with_defaults(&[0, sent]), pad_with_defaults(&[0, right]))
+        });
         all.longest_run
     }
 
@@ -134,11 +137,11 @@ mod tests {
     #[test]
     fn words_that_change_again_end_it_and_it_is_remembered() {
         let mut stuck = StuckDetector::default();
-        (0..40).for_each(|n| stuck.compare_torque(padded(&[9]), padded(&[n * MANY])));
+        (0..40).for_each(|n| stuck.compare_torque(pad_with_defaults(&[9]), pad_with_defaults(&[n * MANY])));
         assert!(stuck.is_stuck());
-        stuck.compare_torque(padded(&[10]), padded(&[10]));
+        stuck.compare_torque(pad_with_defaults(&[10]), pad_with_defaults(&[10]));
         assert!(!stuck.is_stuck());
-        assert_eq!(stuck.longest().collect::<Vec<_>>(), [("torque", 40)]);
+        assert_eq!(stuck.longest_stuck_runs().collect::<Vec<_>>(), [("torque", 40)]);
     }
 
     #[test]
@@ -155,6 +158,6 @@ mod tests {
             stuck.compare_page(&acceleration(n), &acceleration(n));
             stuck.compare_page(&skin(64), &skin(n * MANY));
         }
-        assert_eq!(stuck.longest().collect::<Vec<_>>(), [("skin", 40)]);
+        assert_eq!(stuck.longest_stuck_runs().collect::<Vec<_>>(), [("skin", 40)]);
     }
 }

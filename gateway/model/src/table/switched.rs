@@ -8,16 +8,16 @@ use protocol::packet::WORDS;
 use protocol::parameters::{Baseline, Events, Parameter, Sensing};
 
 /// A parameter's number and its target words.
-pub type Switch = (u8, [i16; WORDS]);
+pub type SwitchTarget = (u8, [i16; WORDS]);
 
 /// Number of switches.
-pub const SWITCHES: usize = 3;
+pub const SWITCH_COUNT: usize = 3;
 
 /// The switches of one cell, in the order in which they are written: thresholds before the mode that needs them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SwitchStates {
-    target: [Switch; SWITCHES],
-    confirmed: [bool; SWITCHES],
+    target: [SwitchTarget; SWITCH_COUNT],
+    confirmed: [bool; SWITCH_COUNT],
     /// True if the cell has a baseline, so that it subtracts a zero from its force sensor.
     pub(super) subtracts_baseline: bool,
 }
@@ -30,13 +30,13 @@ impl SwitchStates {
             (Parameter::Sensing.number(), sensing.words()),
             (Parameter::Baseline.number(), baseline.words()),
         ];
-        let mut switched = Self { target, confirmed: [false; SWITCHES], subtracts_baseline: false };
-        switched.restart();
+        let mut switched = Self { target, confirmed: [false; SWITCH_COUNT], subtracts_baseline: false };
+        switched.reset_to_start_values();
         switched
     }
 
     /// Resets the switches to their values after a start of the cell.
-    pub(super) fn restart(&mut self) {
+    pub(super) fn reset_to_start_values(&mut self) {
         let start = [Events::default().words(), Sensing::default().words(), Baseline::default().words()];
         for ((confirmed, (_, target)), start) in self.confirmed.iter_mut().zip(self.target).zip(start) {
             *confirmed = target == start;
@@ -49,9 +49,10 @@ impl SwitchStates {
         let (of, words) = match *answer {
             Answer::Value { number, written: true, words } => (number, Some(words)),
             // A cell without the option can only have zeros.
-            Answer::Refused { number, reason: Answer::UNKNOWN_PARAMETER | Answer::INVALID_WORDS } => {
-                (number, None)
-            }
+            Answer::Refused {
+                number,
+                reason: Answer::REFUSED_UNKNOWN_PARAMETER | Answer::REFUSED_INVALID_WORDS,
+            } => (number, None),
             Answer::Value { .. } | Answer::Refused { .. } => return,
         };
         if let (Some(words), true) = (words, of == Parameter::Baseline.number()) {
@@ -65,7 +66,7 @@ impl SwitchStates {
     }
 
     /// Returns the switches that must still be written to the cell.
-    pub(super) fn unconfirmed(&self) -> [Option<Switch>; SWITCHES] {
+    pub(super) fn unconfirmed(&self) -> [Option<SwitchTarget>; SWITCH_COUNT] {
         let mut lacks = self.target.map(Some);
         for (lacks, confirmed) in lacks.iter_mut().zip(self.confirmed) {
             *lacks = lacks.filter(|_| !confirmed);
@@ -98,9 +99,9 @@ mod tests {
         assert_eq!(lacks(&switched), [8, MODE], "it was only read");
         switched.record_answer(&Answer::Value { number, written: true, words });
         assert_eq!(lacks(&switched), [8]);
-        switched.record_answer(&Answer::Refused { number: 8, reason: Answer::UNKNOWN_PARAMETER });
+        switched.record_answer(&Answer::Refused { number: 8, reason: Answer::REFUSED_UNKNOWN_PARAMETER });
         assert_eq!(lacks(&switched), [0_u8; 0], "an unknown parameter");
-        switched.restart();
+        switched.reset_to_start_values();
         assert_eq!(lacks(&switched), [8, MODE]);
     }
 
@@ -118,7 +119,7 @@ mod tests {
         assert!(!switched.subtracts_baseline);
         switched.record_answer(&Answer::Value { number, written: true, words });
         assert!(switched.subtracts_baseline && lacks(&switched).is_empty());
-        switched.restart();
+        switched.reset_to_start_values();
         assert!(!switched.subtracts_baseline && lacks(&switched) == [11]);
     }
 
@@ -128,7 +129,7 @@ mod tests {
         let words = Sensing::Continuous { period_ms: 16 }.words();
         switched.record_answer(&Answer::Value { number: MODE, written: true, words });
         assert_eq!(lacks(&switched), [0_u8; 0]);
-        switched.restart();
+        switched.reset_to_start_values();
         assert_eq!(switched.unconfirmed()[1], Some((MODE, words)));
     }
 }

@@ -9,7 +9,7 @@ use protocol::parameters::Parameter;
 
 /// Returns a table that received these messages in the frames of the bus, from the gateway itself or from a cell.
 fn table(heard: &[(bool, Message)]) -> BusTable {
-    let mut table = BusTable::new(&crate::testing::skin(), 0);
+    let mut table = BusTable::new(&crate::testing::one_cell_skin(), 0);
     for (own, message) in heard {
         let packet: Packet = message.encode();
         for frame in packet.frames(Format::Fd) {
@@ -21,7 +21,7 @@ fn table(heard: &[(bool, Message)]) -> BusTable {
 
 #[test]
 fn what_is_no_packet_is_rejected_with_a_cells_identifier_and_foreign_with_an_unused_one() {
-    let mut skin = crate::testing::skin();
+    let mut skin = crate::testing::one_cell_skin();
     for format in [Format::Fd, Format::Classic] {
         skin.buses[0].format = format;
         let mut table = BusTable::new(&skin, 0);
@@ -37,8 +37,8 @@ fn what_is_no_packet_is_rejected_with_a_cells_identifier_and_foreign_with_an_unu
                 hear(id, at, 1_000 * u64::from(at));
             }
         }
-        let of = |event| table.counters().events(event);
-        let events = [Event::Foreign, Event::Crc, Event::Incomplete].map(of);
+        let of = |event| table.counters().event_count(event);
+        let events = [FrameEvent::Foreign, FrameEvent::Crc, FrameEvent::Incomplete].map(of);
         // Segments: eight of nine were dropped of each; an incomplete packet counts once.
         assert_eq!(events, if format == Format::Fd { [18, 18, 0] } else { [16, 0, 8] }, "{format:?}");
     }
@@ -76,7 +76,7 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
         (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } })
     };
     let heartbeat = |sent| {
-        let state = State::CONFIGURED.with(State::TEST_MODE, true);
+        let state = State::CONFIGURED.with_flags(State::TEST_MODE, true);
         let page = NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() });
         (false, Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page })
     };
@@ -108,9 +108,9 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
     table.handle_bus_loss();
     // The cell may return later than the bus, and so may have missed this stimulus.
     assert_eq!(hear(&mut table, &[joints(3), press, joints(4)]), (2, 2, 2));
-    assert_eq!(table.notices().count(), 0);
+    assert_eq!(table.drain_notices().count(), 0);
     assert_eq!(hear(&mut table, &[heartbeat(9), joints(5)]), (2, 2, 2), "its sensors are unknown");
-    assert_eq!(table.notices().collect::<Vec<_>>(), [Notice::Returned(cell)]);
+    assert_eq!(table.drain_notices().collect::<Vec<_>>(), [Notice::Returned(cell)]);
     assert_eq!(hear(&mut table, &[press, joints(6)]), (2, 2, 2), "others may wait in it");
     let (number, words) = (Parameter::Mode.number(), packet::padded_words([1]));
     let write = (
@@ -121,7 +121,7 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
     let confirm = (false, Message::Configured { from: cell, tag: 0, answer });
     assert_eq!(hear(&mut table, &[write, press, joints(7)]), (2, 2, 2), "it has not confirmed");
     assert_eq!(hear(&mut table, &[confirm, joints(8), heartbeat(11), joints(9)]), (4, 2, 2));
-    assert_eq!(table.notices().count(), 0, "reported once");
+    assert_eq!(table.drain_notices().count(), 0, "reported once");
     let uplink = table.cells().first().unwrap().uplink();
     assert_eq!((uplink.lost, uplink.outage), (6, 6));
 }
@@ -134,7 +134,7 @@ fn a_start_that_was_none_takes_no_counters_that_explain_missing_replies() {
     };
     let network = |page| (false, Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page });
     let heartbeat = |sent| {
-        let state = State::CONFIGURED.with(State::TEST_MODE, true);
+        let state = State::CONFIGURED.with_flags(State::TEST_MODE, true);
         network(NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() }))
     };
     let heard = |joints, joints_late| {
@@ -156,7 +156,7 @@ fn a_start_that_was_none_takes_no_counters_that_explain_missing_replies() {
             }
         }
         let cell = table.cells().first().unwrap();
-        (cell.replies.missing, cell.replies.in_doubt, cell.unanswered())
+        (cell.replies.missing, cell.replies.in_doubt, cell.unanswered_joint_counts())
     };
     // It receives two of six joints, and answers none of them.
     let before = [
@@ -187,7 +187,7 @@ fn lost_joints_that_passed_a_report_on_its_way_are_counted() {
         let page = NetworkPage::Received(ReceivedCounts { joints, ..ReceivedCounts::default() });
         (false, Message::Network { from: Node::Cell(CellId::new(1).unwrap()), epoch: Epoch(epoch), page })
     };
-    let unanswered = |heard: &[_]| table(heard).cells().first().unwrap().unanswered();
+    let unanswered = |heard: &[_]| table(heard).cells().first().unwrap().unanswered_joint_counts();
     // The cell did not receive the first joints, or joints before its first report.
     assert_eq!(unanswered(&[report(0, 0), joints(1), joints(2), report(2, 1)]), Some((0, 1)));
     assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 1)]), Some((0, 1)));
@@ -204,7 +204,7 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
         let page = NetworkPage::Heartbeat(Heartbeat { serial, sent, state, ..Heartbeat::default() });
         (false, Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page })
     };
-    let settled = State::CONFIGURED.with(State::TEST_MODE, true);
+    let settled = State::CONFIGURED.with_flags(State::TEST_MODE, true);
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
     let press =
         Message::Stimulus { to: Node::Cell(cell), from: protocol::message::StimulusStart::Next, page };
@@ -218,10 +218,10 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
         let mut said = vec![says(7, 40, settled), (false, untouched), (true, press), joints(1)];
         said.extend([joints(2), says(7, 44, settled), joints(3)]);
         if intruded {
-            said.insert(4, says(9, 0, State::CLAIMING));
+            said.insert(4, says(9, 0, State::CLAIMING_NODE_ID));
         }
         let mut table = table(&said);
-        assert_eq!(table.notices().count(), 0, "no restart");
+        assert_eq!(table.drain_notices().count(), 0, "no restart");
         let cell = table.cells().first().unwrap();
         let uplink = cell.uplink();
         (
@@ -242,13 +242,13 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
 fn heartbeats_say_for_how_long_joints_were_not_taken() {
     let cell = CellId::new(1).unwrap();
     let joints = |epoch| Message::Joints { epoch, joints: Joints { in_use: 6, ..Joints::default() } };
-    let mut table = BusTable::new(&crate::testing::skin(), 0);
+    let mut table = BusTable::new(&crate::testing::one_cell_skin(), 0);
     let mut hear = |at_ms: u64, message: Message| {
         let own = matches!(message, Message::Joints { .. });
         for frame in message.encode().frames(Format::Fd) {
             table.handle_frame(Micros(at_ms * 1_000), own, &frame, &mut |_| None);
         }
-        let delays = table.delays().pending_joints();
+        let delays = table.delays().pending_joints_ages();
         // A histogram has three significant digits.
         (delays.len(), delays.max() / 1_000)
     };
@@ -301,8 +301,8 @@ impl There {
 
     fn new(stimuli: u16) -> Self {
         let mut there = Self { table: table(&[]), epoch: 10 };
-        there.table.set_comparing(true);
-        let state = State::CONFIGURED.with(State::TEST_MODE, true);
+        there.table.set_torque_comparison(true);
+        let state = State::CONFIGURED.with_flags(State::TEST_MODE, true);
         there.says(NetworkPage::Heartbeat(Heartbeat { sent: 70, state, ..Heartbeat::default() }));
         there.says(NetworkPage::Received(ReceivedCounts {
             stimuli,

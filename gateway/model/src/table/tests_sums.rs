@@ -14,7 +14,8 @@ use crate::tracker::DEAD_AFTER;
 
 /// Returns a skin with four cells on one bus, of which 1 and 2 are roots.
 fn skin() -> Skin {
-    let head = crate::testing::SKIN.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 1500");
+    let head =
+        crate::testing::ONE_CELL_SKIN_TOML.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 1500");
     let (head, cell) = head.split_at(head.find("[[cell]]").unwrap());
     let cells = (1..=4).map(|node| {
         let root = if node <= 2 { "root = true\n" } else { "" };
@@ -39,7 +40,7 @@ impl Bench {
     /// All cells are ready, some of them pressed with 1 N in each contact word.
     fn new(pressed: &[i64]) -> Self {
         let mut bench = Self { table: BusTable::new(&skin(), 0), at: 0 };
-        bench.table.set_comparing(true);
+        bench.table.set_torque_comparison(true);
         for node in 1..=4 {
             bench.heartbeat(node, 0, State::default());
         }
@@ -62,7 +63,7 @@ impl Bench {
     }
 
     fn heartbeat(&mut self, node: i64, sent: u16, more: State) {
-        let state = State::CONFIGURED.with(State::TEST_MODE, true).with(more, true);
+        let state = State::CONFIGURED.with_flags(State::TEST_MODE, true).with_flags(more, true);
         let configuration = self.table.cells().first().unwrap().configuration;
         let page = NetworkPage::Heartbeat(Heartbeat { serial: 1, configuration, sent, rejected: 0, state });
         self.say(false, Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page });
@@ -88,11 +89,11 @@ impl Bench {
     }
 
     fn counts(&self) -> SumCounts {
-        self.table.sums().unwrap().0
+        self.table.sum_counts().unwrap().0
     }
 
     fn contributions(&self) -> Contributions {
-        self.table.sums().unwrap().1
+        self.table.sum_counts().unwrap().1
     }
 }
 
@@ -178,8 +179,8 @@ fn a_restarted_root_keeps_its_childrens_torque() {
     let mut bench = Bench::new(&[1, 3, 4]);
     bench.joints(0);
     bench.sum(1, 0, 3, 64);
-    bench.heartbeat(1, 0, State::CLAIMING);
-    assert_eq!(bench.table.notices().collect::<Vec<_>>(), [Notice::Restarted(cell(1))]);
+    bench.heartbeat(1, 0, State::CLAIMING_NODE_ID);
+    assert_eq!(bench.table.drain_notices().collect::<Vec<_>>(), [Notice::Restarted(cell(1))]);
     assert_eq!(first(&bench.table.snapshot().sums), (64.0, 3));
     let all = skin().safety;
     let last =
@@ -236,7 +237,7 @@ fn a_root_that_found_a_parent_before_the_gateway_is_not_counted_twice() {
             Message::Network { from: Node::Cell(cell(2)), epoch: Epoch(0), page }
         };
         if by_wire {
-            bench.table.follow_root_wires();
+            bench.table.use_root_wires_not_tree_pages();
             bench.table.set_root_feeds_gateway(cell(1), true);
         }
         bench.say(false, tree(3));
@@ -278,8 +279,8 @@ fn the_error_of_whole_sums_is_taken_of_complete_epochs_only_and_averaged_over_32
     let skin = skin();
     let central = CentralComputation::new(&skin);
     let page = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
-    let frames = central.frames(&[Q1_14::ZERO; 6]);
-    let one = central.torque(0, &frames, central.force(0, &page));
+    let frames = central.link_frames(&[Q1_14::ZERO; 6]);
+    let one = central.cell_torque(0, &frames, central.cell_force(0, &page));
     // Errors alternate between half a step too high and too low, so that the average is smaller than each.
     let off = |up| {
         let word = |nm: f64| ((nm * 2.0 * 256.0) + if up { 0.6 } else { -0.4 }).floor() as i16;
@@ -294,7 +295,7 @@ fn the_error_of_whole_sums_is_taken_of_complete_epochs_only_and_averaged_over_32
         );
     }
     bench.joints(33);
-    let Accuracy { sums, sums_averaged, single, whole, .. } = bench.table.accuracy();
+    let TorqueAccuracy { sums, sums_averaged, single, whole, .. } = bench.table.accuracy();
     assert_eq!((sums.count(), sums_averaged.count()), (32 * 3, 3), "joints 1 to 3 are loaded");
     assert!(sums.max() < 1.0 / 256.0 && sums_averaged.max() <= sums.max(), "{sums:?} {sums_averaged:?}");
     assert_eq!((single.count(), whole.count()), (0, 0));

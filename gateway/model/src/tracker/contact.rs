@@ -23,7 +23,7 @@ pub struct ContactState<T> {
     pending: Vec<(StimulusStart, SensorPage, T)>,
     skin: Option<(SkinSensors, T)>,
     /// The other pages, by [`SensorPage::simulated`].
-    others: [Option<(SensorPage, T)>; SensorPage::SIMULATED.len()],
+    others: [Option<(SensorPage, T)>; SensorPage::SIMULATED_PAGE_NAMES.len()],
     obeys: Option<bool>,
     /// True if `skin` reflects all stimuli that the cell has received.
     is_known: bool,
@@ -52,7 +52,7 @@ const HALF_OF_EPOCHS: u8 = 1 << 7;
 
 impl UnseenStimuli {
     /// Removes the stimuli that the joints of an epoch latch: for this epoch, and for the half of all epochs before it.
-    fn latch(&mut self, epoch: Epoch) {
+    fn remove_latched_stimuli(&mut self, epoch: Epoch) {
         *self = match *self {
             Self::None => Self::None,
             Self::Any => Self::Ahead { last: epoch, ahead: HALF_OF_EPOCHS },
@@ -71,7 +71,7 @@ impl<T> Default for ContactState<T> {
         Self {
             pending: Vec::new(),
             skin: None,
-            others: [const { None }; SensorPage::SIMULATED.len()],
+            others: [const { None }; SensorPage::SIMULATED_PAGE_NAMES.len()],
             obeys: None,
             is_known: false,
             unseen: UnseenStimuli::Any,
@@ -85,17 +85,21 @@ impl<T> Default for ContactState<T> {
 impl<T> ContactState<T> {
     /// Adds a stimulus to the pending ones, unless the cell measures or has too many pending; `last` is the epoch of
     /// the last joints.
-    pub fn push(&mut self, from: StimulusStart, page: SensorPage, tag: T, last: Option<Epoch>) {
+    pub fn add_stimulus(&mut self, from: StimulusStart, page: SensorPage, tag: T, last: Option<Epoch>) {
         self.received_stimuli = self.received_stimuli.map(|came| came.wrapping_add(1));
         if self.obeys != Some(false) && self.pending.len() < MAX_PENDING_STIMULI {
-            self.pending.push((if is_late(from, last) { StimulusStart::Next } else { from }, page, tag));
+            self.pending.push((
+                if is_stimulus_late(from, last) { StimulusStart::Next } else { from },
+                page,
+                tag,
+            ));
         }
     }
 
     /// Latches the stimuli whose time has come at the joints of this epoch, calling `latched` for each. If several set
     /// the same page, the newest counts.
-    pub fn latch(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
-        self.unseen.latch(epoch);
+    pub fn latch_due_stimuli(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
+        self.unseen.remove_latched_stimuli(epoch);
         self.has_missed_stimuli &= self.unseen != UnseenStimuli::None;
         let is_due = move |(from, _, _): &mut (StimulusStart, SensorPage, T)| match from {
             StimulusStart::Next => true,
@@ -129,9 +133,9 @@ impl<T> ContactState<T> {
 
     /// Compares the number of stimuli that the cell has counted since its start with those received here. If they are
     /// equal, there are no others.
-    pub fn compare_count(&mut self, stimuli: u16, tag: T) {
+    pub fn compare_stimulus_count(&mut self, stimuli: u16, tag: T) {
         if self.received_stimuli == Some(stimuli) {
-            self.mark_known(tag);
+            self.mark_state_known(tag);
         } else if self.received_stimuli.is_some() {
             self.has_missed_stimuli = self.unseen != UnseenStimuli::None;
         }
@@ -140,7 +144,7 @@ impl<T> ContactState<T> {
     /// Records a start of the cell: it is not in contact, and has no pending stimulus.
     pub fn record_start(&mut self, tag: T) {
         self.reset();
-        self.mark_known(tag);
+        self.mark_state_known(tag);
     }
 
     /// Records a write of the mode. Once the cell has received it, the cell has no contact state and no pending
@@ -153,12 +157,12 @@ impl<T> ContactState<T> {
     /// Records that the cell confirmed the write of its mode: all stimuli since then were received here.
     pub fn confirm_mode(&mut self, tag: T) {
         if self.mode_pending {
-            self.mark_known(tag);
+            self.mark_state_known(tag);
         }
     }
 
     /// Marks the state as known: all stimuli that matter were received here.
-    fn mark_known(&mut self, tag: T) {
+    fn mark_state_known(&mut self, tag: T) {
         self.skin.get_or_insert_with(|| (SkinSensors::default(), tag));
         (self.is_known, self.unseen, self.has_missed_stimuli, self.mode_pending) =
             (true, UnseenStimuli::None, false, false);
@@ -178,7 +182,7 @@ impl<T> ContactState<T> {
     }
 
     /// Returns all sensors pages of the cell, latched from stimuli or reported by the cell.
-    pub fn latched(&self) -> impl Iterator<Item = (SensorPage, &T)> {
+    pub fn latched_pages(&self) -> impl Iterator<Item = (SensorPage, &T)> {
         let skin = self.skin.iter().map(|(skin, tag)| (SensorPage::Skin(*skin), tag));
         skin.chain(self.others.iter().flatten().map(|(page, tag)| (*page, tag)))
     }
@@ -187,27 +191,27 @@ impl<T> ContactState<T> {
     #[must_use]
     pub fn readings(&self) -> SensorReadings {
         let mut readings = SensorReadings::default();
-        self.latched().for_each(|(page, _)| readings.set(&page));
+        self.latched_pages().for_each(|(page, _)| readings.set_page(&page));
         readings
     }
 
     /// Returns the pending stimuli in order, each with the joints at which the cell latches it.
     #[must_use]
-    pub fn pending(&self) -> &[(StimulusStart, SensorPage, T)] {
+    pub fn pending_stimuli(&self) -> &[(StimulusStart, SensorPage, T)] {
         &self.pending
     }
 
     /// Forgets the contact state and the pending stimuli: stimuli may have been lost, or sent by others.
     pub fn reset(&mut self) {
         self.pending.clear();
-        (self.skin, self.others) = (None, [const { None }; SensorPage::SIMULATED.len()]);
+        (self.skin, self.others) = (None, [const { None }; SensorPage::SIMULATED_PAGE_NAMES.len()]);
         (self.is_known, self.unseen, self.received_stimuli) = (false, UnseenStimuli::Any, None);
         (self.has_missed_stimuli, self.mode_pending) = (false, false);
     }
 
     /// Marks the contact state as unknown until the next stimulus; stimuli stay pending in the cell.
-    pub fn mark_unknown(&mut self) {
-        (self.skin, self.others) = (None, [const { None }; SensorPage::SIMULATED.len()]);
+    pub fn mark_state_unknown(&mut self) {
+        (self.skin, self.others) = (None, [const { None }; SensorPage::SIMULATED_PAGE_NAMES.len()]);
         (self.is_known, self.received_stimuli) = (false, None);
     }
 
@@ -235,7 +239,7 @@ fn other_page_slot<'a, T>(
 /// Returns true if the joints from which a stimulus should apply have passed, so that it applies from the next ones.
 /// `last` is the epoch of the last joints.
 #[must_use]
-pub fn is_late(from: StimulusStart, last: Option<Epoch>) -> bool {
+pub fn is_stimulus_late(from: StimulusStart, last: Option<Epoch>) -> bool {
     matches!((from, last), (StimulusStart::Epoch(first), Some(last)) if last.epochs_since(first) >= 0)
 }
 
@@ -249,7 +253,7 @@ mod tests {
     }
 
     fn latch(contact: &mut ContactState<u64>, epoch: u8) -> Option<(f64, u64)> {
-        contact.latch(Epoch(epoch), |_| {});
+        contact.latch_due_stimuli(Epoch(epoch), |_| {});
         contact.presumed_skin().map(|(skin, tag)| (skin.contact[0].to_f64(), *tag))
     }
 
@@ -257,8 +261,8 @@ mod tests {
     fn stimuli_wait_for_their_epoch_and_late_ones_for_the_next() {
         let mut contact = ContactState::default();
         assert_eq!(latch(&mut contact, 253), None, "not known");
-        contact.push(StimulusStart::Epoch(Epoch(1)), press(2.0), 5, Some(Epoch(253)));
-        contact.push(StimulusStart::Epoch(Epoch(253)), press(1.0), 6, Some(Epoch(253)));
+        contact.add_stimulus(StimulusStart::Epoch(Epoch(1)), press(2.0), 5, Some(Epoch(253)));
+        contact.add_stimulus(StimulusStart::Epoch(Epoch(253)), press(1.0), 6, Some(Epoch(253)));
         assert_eq!(latch(&mut contact, 254), Some((1.0, 6)), "late, so from the next on");
         assert_eq!(latch(&mut contact, 0), Some((1.0, 6)));
         assert_eq!(latch(&mut contact, 1), Some((2.0, 5)));
@@ -270,12 +274,12 @@ mod tests {
     fn the_ninth_waiting_stimulus_is_refused_whatever_its_page() {
         let mut contact = ContactState::default();
         for _ in 0..MAX_PENDING_STIMULI {
-            contact.push(StimulusStart::Next, SensorPage::Acceleration([Q3_12::ZERO; 3]), 0, None);
+            contact.add_stimulus(StimulusStart::Next, SensorPage::Acceleration([Q3_12::ZERO; 3]), 0, None);
         }
-        contact.push(StimulusStart::Next, press(1.0), 0, None);
-        assert_eq!(contact.pending().len(), MAX_PENDING_STIMULI);
+        contact.add_stimulus(StimulusStart::Next, press(1.0), 0, None);
+        assert_eq!(contact.pending_stimuli().len(), MAX_PENDING_STIMULI);
         assert_eq!(latch(&mut contact, 0), None);
-        assert_eq!(contact.latched().count(), 1);
+        assert_eq!(contact.latched_pages().count(), 1);
     }
 
     #[test]
@@ -283,7 +287,7 @@ mod tests {
         let mut contact = ContactState::default();
         contact.apply_reported_page(press(3.0), 1);
         assert_eq!(latch(&mut contact, 0), Some((3.0, 1)));
-        contact.push(StimulusStart::Next, press(1.0), 2, None);
+        contact.add_stimulus(StimulusStart::Next, press(1.0), 2, None);
         assert_eq!(latch(&mut contact, 1), Some((1.0, 2)));
         contact.apply_reported_page(press(3.0), 3);
         assert_eq!(latch(&mut contact, 2), Some((1.0, 2)), "an old page");
@@ -297,26 +301,26 @@ mod tests {
     fn a_contact_is_known_from_a_start_a_confirmed_mode_or_equal_counts_on() {
         let mut contact = ContactState::default();
         contact.apply_reported_page(press(3.0), 1);
-        contact.push(StimulusStart::Next, press(1.0), 1, None);
+        contact.add_stimulus(StimulusStart::Next, press(1.0), 1, None);
         assert_eq!((latch(&mut contact, 1), known(&contact)), (Some((1.0, 1)), None), "others may wait");
-        contact.compare_count(2, 1);
+        contact.compare_stimulus_count(2, 1);
         assert_eq!(known(&contact), None, "it has taken one that did not come here");
-        contact.compare_count(1, 1);
+        contact.compare_stimulus_count(1, 1);
         assert_eq!(known(&contact), Some(1.0));
         contact.reset();
-        contact.compare_count(1, 1);
+        contact.compare_stimulus_count(1, 1);
         assert_eq!(known(&contact), None, "the count is of stimuli that are forgotten");
         contact.record_start(1);
         assert_eq!(known(&contact), Some(0.0));
         contact.record_mode_write();
-        contact.push(StimulusStart::Next, press(2.0), 1, None);
+        contact.add_stimulus(StimulusStart::Next, press(2.0), 1, None);
         assert_eq!((latch(&mut contact, 2), known(&contact)), (Some((2.0, 1)), None), "not confirmed");
         contact.confirm_mode(1);
         assert_eq!(known(&contact), Some(2.0), "the stimulus came after the write");
-        contact.mark_unknown();
+        contact.mark_state_unknown();
         contact.confirm_mode(1);
         assert_eq!(known(&contact), None, "nothing was written");
-        contact.push(StimulusStart::Next, press(1.0), 1, None);
+        contact.add_stimulus(StimulusStart::Next, press(1.0), 1, None);
         assert_eq!((latch(&mut contact, 3), known(&contact)), (Some((1.0, 1)), Some(1.0)));
         contact.reset();
         contact.confirm_mode(1);
@@ -332,7 +336,7 @@ mod tests {
             let mut waiting: Vec<u8> = (0..=255).collect();
             let (mut epoch, mut joints) = (77_u8, 0);
             while contact.unseen != UnseenStimuli::None {
-                contact.latch(Epoch(epoch), |_| {});
+                contact.latch_due_stimuli(Epoch(epoch), |_| {});
                 waiting.retain(|&first| Epoch(epoch).epochs_since(Epoch(first)) < 0);
                 let ahead = match contact.unseen {
                     UnseenStimuli::Any => 256,
@@ -354,10 +358,10 @@ mod tests {
     #[test]
     fn a_page_of_a_cell_that_counted_other_stimuli_tells_nothing() {
         let mut contact = ContactState::default();
-        contact.compare_count(1, 1);
+        contact.compare_stimulus_count(1, 1);
         contact.apply_reported_page(press(0.0), 1);
         assert_eq!(latch(&mut contact, 1), None, "the other one may wait");
-        contact.push(StimulusStart::Next, press(1.0), 2, None);
+        contact.add_stimulus(StimulusStart::Next, press(1.0), 2, None);
         assert_eq!(latch(&mut contact, 2), Some((1.0, 2)));
     }
 
@@ -367,17 +371,18 @@ mod tests {
         assert_eq!(contact.obeys_stimuli(), None);
         contact.set_obeys_stimuli(false);
         assert_eq!(contact.obeys_stimuli(), Some(false));
-        contact.push(StimulusStart::Next, press(1.0), 1, None);
+        contact.add_stimulus(StimulusStart::Next, press(1.0), 1, None);
         assert_eq!(latch(&mut contact, 0), None);
     }
 
     #[test]
     fn a_stimulus_is_late_at_its_own_joints_and_after_them() {
-        let of = |first, last: Option<u8>| is_late(StimulusStart::Epoch(Epoch(first)), last.map(Epoch));
+        let of =
+            |first, last: Option<u8>| is_stimulus_late(StimulusStart::Epoch(Epoch(first)), last.map(Epoch));
         assert_eq!(
             [of(5, Some(4)), of(5, Some(5)), of(255, Some(1)), of(5, None)],
             [false, true, true, false]
         );
-        assert!(!is_late(StimulusStart::Next, Some(Epoch(5))));
+        assert!(!is_stimulus_late(StimulusStart::Next, Some(Epoch(5))));
     }
 }

@@ -21,9 +21,9 @@ use protocol::message::{Message, NetworkPage, NetworkPages};
 use protocol::time::{Micros, Span};
 
 pub use claim::{AddressClaim, HeartbeatKind};
-pub use contact::{ContactState, MAX_PENDING_STIMULI, is_late};
+pub use contact::{ContactState, MAX_PENDING_STIMULI, is_stimulus_late};
 pub use per_cell::PerCell;
-pub use uplink::{Uplink, UplinkAccount};
+pub use uplink::{UplinkAccount, UplinkCounts};
 
 /// The time of silence after which a cell counts as dead: two periods of its heartbeat plus the jitter of a busy
 /// machine, so that one lost frame is tolerated.
@@ -58,7 +58,7 @@ pub struct CellTracker {
 
 impl CellTracker {
     /// Records a packet that arrived at `at`, and returns its effect; `joints` is the number of the newest joints.
-    pub fn receive(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> CellUpdate {
+    pub fn record_packet(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> CellUpdate {
         let is_first = self.last_packet.replace(at).is_none();
         let revived = core::mem::take(&mut self.dead);
         self.account.count_packet();
@@ -66,7 +66,7 @@ impl CellTracker {
             return CellUpdate { revived, ..CellUpdate::default() };
         };
         let NetworkPage::Heartbeat(heartbeat) = page else {
-            self.pages.record(page);
+            self.pages.record_page(page);
             if let NetworkPage::Tree(tree) = page {
                 self.account.record_sums_sent(tree.sent, joints);
             }
@@ -93,8 +93,8 @@ impl CellTracker {
                 self.account.record_start(heartbeat.sent, again);
                 self.pages = NetworkPages::default();
             }
-            HeartbeatKind::Overtaken => self.account.count_overtaken(),
-            HeartbeatKind::Claimant | HeartbeatKind::Outsider => self.account.count_outsider(),
+            HeartbeatKind::Overtaken => self.account.count_overtaken_heartbeat(),
+            HeartbeatKind::Claimant | HeartbeatKind::Outsider => self.account.count_foreign_heartbeat(),
         }
         self.account.set_joints_at_heartbeat(joints);
         let returned = away

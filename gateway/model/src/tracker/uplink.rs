@@ -4,7 +4,7 @@ use derive_more::{Add, Sum};
 
 /// Counts of one cell's packets as of its last heartbeat: sent = delivered + rejected + unheard + lost - surplus.
 #[derive(Add, Clone, Copy, Debug, Default, Eq, PartialEq, Sum)]
-pub struct Uplink {
+pub struct UplinkCounts {
     /// Packets sent, by the cell's own count.
     pub sent: u64,
     /// Packets that arrived and were decoded.
@@ -31,21 +31,21 @@ pub struct Uplink {
     pub unsettled: u64,
 }
 
-/// Computes a cell's [`Uplink`].
+/// Computes a cell's [`UplinkCounts`].
 ///
 /// A heartbeat contains the number of packets that the cell sent before it. A bus keeps the order of each sender, so
 /// packets that are missing by then are lost.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct UplinkAccount {
-    now: Counts,
+    now: CountsSinceStart,
     /// The counts before the cell's last start; [`Account::take_back`] restores them.
-    before: Option<Counts>,
+    before: Option<CountsSinceStart>,
 }
 
 /// The counts of a cell since its last start, and what its next heartbeat is compared with.
 #[derive(Clone, Copy, Debug, Default)]
-struct Counts {
-    total: Uplink,
+struct CountsSinceStart {
+    total: UplinkCounts,
     /// The cell's counter of sent packets in its last heartbeat, modulo 2^16.
     reported: Option<u16>,
     /// Number of packets that arrived since the last heartbeat, and of those refused among them.
@@ -74,8 +74,8 @@ struct UnreceivedSums {
 impl UplinkAccount {
     /// Returns the counts so far.
     #[must_use]
-    pub const fn uplink(&self) -> Uplink {
-        Uplink { unsettled: self.now.arrived, ..self.now.total }
+    pub const fn uplink(&self) -> UplinkCounts {
+        UplinkCounts { unsettled: self.now.arrived, ..self.now.total }
     }
 
     /// Records that the bus was lost: packets of the cell do not arrive until its next heartbeat.
@@ -103,7 +103,7 @@ impl UplinkAccount {
     }
 
     /// Declares that the gateway does not receive this cell's sums.
-    pub fn exclude_sums(&mut self) {
+    pub fn exclude_unreceived_sums(&mut self) {
         self.change_counts(|counts| _ = counts.sums.get_or_insert_default());
     }
 
@@ -131,19 +131,19 @@ impl UplinkAccount {
         if again {
             self.before.get_or_insert(self.now);
         }
-        self.before.iter_mut().for_each(Counts::count_outsider);
+        self.before.iter_mut().for_each(CountsSinceStart::count_foreign_heartbeat);
         self.now.record_start(sent, again);
     }
 
     /// Records a further heartbeat; the cell had sent `sent` packets before it, modulo 2^16.
     pub(super) fn record_heartbeat(&mut self, sent: u16) {
-        self.before.iter_mut().for_each(Counts::count_outsider);
+        self.before.iter_mut().for_each(CountsSinceStart::count_foreign_heartbeat);
         self.now.record_heartbeat(sent);
     }
 
     /// Records a heartbeat that is older than the last one, since the cell's last start.
-    pub(super) fn count_overtaken(&mut self) {
-        self.before.iter_mut().for_each(Counts::count_outsider);
+    pub(super) fn count_overtaken_heartbeat(&mut self) {
+        self.before.iter_mut().for_each(CountsSinceStart::count_foreign_heartbeat);
     }
 
     /// Confirms the last start, which can no longer be taken back.
@@ -172,17 +172,17 @@ impl UplinkAccount {
     }
 
     /// Records that the last heartbeat is from another sender with this node id.
-    pub(super) fn count_outsider(&mut self) {
-        self.change_counts(Counts::count_outsider);
+    pub(super) fn count_foreign_heartbeat(&mut self) {
+        self.change_counts(CountsSinceStart::count_foreign_heartbeat);
     }
 
-    fn change_counts(&mut self, change: impl Fn(&mut Counts)) {
+    fn change_counts(&mut self, change: impl Fn(&mut CountsSinceStart)) {
         change(&mut self.now);
         self.before.iter_mut().for_each(change);
     }
 }
 
-impl Counts {
+impl CountsSinceStart {
     fn record_sums_sent(&mut self, reported: u16, joints: Option<u64>) {
         let Some(sums) = &mut self.sums else { return };
         let before = sums.reported.replace(reported).unwrap_or(reported);
@@ -234,7 +234,7 @@ impl Counts {
         self.reported = Some(reported);
     }
 
-    fn count_outsider(&mut self) {
+    fn count_foreign_heartbeat(&mut self) {
         self.arrived -= 1;
         self.total.delivered += 1;
         self.total.surplus += 1;
@@ -255,7 +255,7 @@ mod tests {
         account.count_packet();
         account.count_rejected();
         account.count_packet();
-        account.count_outsider();
+        account.count_foreign_heartbeat();
         account.count_packet(); // the heartbeat itself
         account.record_heartbeat(3); // four were sent in between, and this one
         let uplink = account.uplink();
@@ -314,7 +314,7 @@ mod tests {
         #[test]
         fn an_account_always_adds_up(said in proptest::collection::vec((any::<u16>(), 0_u64..9, 0_u64..9, 0_u8..3, any::<Option<(u16, Option<u64>)>>()), 0..20), takes_sums: bool) {
             let mut account = UplinkAccount::default();
-            if !takes_sums { account.exclude_sums(); }
+            if !takes_sums { account.exclude_unreceived_sums(); }
             for (said, arrived, rejected, what, sums) in said {
                 for _ in 0..arrived { account.count_packet(); }
                 for _ in 0..rejected { account.count_rejected(); }

@@ -1,8 +1,10 @@
 //! Writes the section on benches of up to ten thousand cells.
 
-use super::{ACTIVE_SHARE, BenchFigures, MIN_IN_TIME_SHARE, ScaleMeasurements, SizeFigures, cells_of};
+use super::{
+    ACTIVE_SHARE, BenchFigures, MIN_IN_TIME_SHARE, ScaleMeasurements, SizeFigures, cell_count_as_float,
+};
 use crate::distributed::{self, TickTimes};
-use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table, number};
+use analysis::report::figure::{Axis, Figure, Finding, Section, SeriesShape, Table, format_number};
 
 /// The limits for the verdicts: the time to start in s, the gateway's memory in MB, and the time of a tick with the
 /// most cells. The latter is relative to a tick with the fewest cells, on their own buses and on as many as the most
@@ -14,44 +16,44 @@ const MAX_TICK_RATIO_SAME_BUSES: f64 = 1.2;
 
 /// Writes the section with figures, findings and a table.
 #[must_use]
-pub fn section(measured: &ScaleMeasurements) -> Section {
+pub fn scale_section(measured: &ScaleMeasurements) -> Section {
     let ScaleMeasurements { sizes, ticks, beside } = measured;
     let most = sizes.last();
     Section::new("scale", "A bench over its cells")
-        .text(format!(
+        .with_paragraph(format!(
             "Whole benches on as few embedded buses as have enough node ids, with one process for all cells of a bus: first \
              with {} % of the cells touched, at half the rate if fewer than {} % of the replies come in time, and if necessary once more \
              at half of that; then with none touched, at the same rate.",
             ACTIVE_SHARE * 100.0,
             MIN_IN_TIME_SHARE * 100.0
         ))
-        .text(
+        .with_paragraph(
             "A tick of a bench is the median of those that computed nothing centrally. Ticks over cells are those of a loop \
              without threads, with every cell active, on as many buses for all numbers of cells; the central computation is \
              timed in the same rounds.",
         )
-        .figures(bench_figures(sizes))
-        .figures([over_cells(ticks)])
-        .findings(most.map(largest_bench_findings).into_iter().flatten())
-        .findings(tick_findings(sizes, beside))
-        .findings(distributed::slope_findings("active cell", ticks))
-        .tables([table(sizes)])
+        .with_figures(bench_figures(sizes))
+        .with_figures([tick_time_figure(ticks)])
+        .with_findings(most.map(largest_bench_findings).into_iter().flatten())
+        .with_findings(tick_findings(sizes, beside))
+        .with_findings(distributed::slope_findings("active cell", ticks))
+        .with_tables([bench_table(sizes)])
 }
 
 /// The caption of a curve, and the function that returns its value for a bench.
-type Curve<'a> = (&'a str, fn(&SizeFigures) -> f64);
+type BenchCurve<'a> = (&'a str, fn(&SizeFigures) -> f64);
 
 /// Returns a figure over the number of cells, with one curve for each element of the array.
 fn figure_over_cells<const N: usize>(
     (name, title): (&str, &str),
     y: Axis,
     sizes: &[SizeFigures],
-    series: [Curve<'_>; N],
+    series: [BenchCurve<'_>; N],
 ) -> Figure {
-    let figure = Figure::new(format!("scale-{name}"), title, Axis::new("cells", ""), y).half_width();
+    let figure = Figure::new(format!("scale-{name}"), title, Axis::new("cells", ""), y).with_half_width();
     series.into_iter().fold(figure, |figure, (caption, value)| {
-        let points = sizes.iter().map(|size| (cells_of(size), value(size)));
-        figure.draw(caption, Shape::Line, points.collect())
+        let points = sizes.iter().map(|size| (cell_count_as_float(size), value(size)));
+        figure.draw_series(caption, SeriesShape::Line, points.collect())
     })
 }
 
@@ -105,7 +107,7 @@ fn bench_figures(sizes: &[SizeFigures]) -> [Figure; 7] {
             ("replies", "Replies in time, 5 % active, at the highest rate that holds"),
             Axis::new("replies in time", "%").with_ends(0.0, 100.0),
             sizes,
-            [("", |size| size.active.share() * 100.0)],
+            [("", |size| size.active.in_time_share() * 100.0)],
         ),
         figure_over_cells(
             ("rate", "The highest rate that holds, or the lowest tried"),
@@ -116,14 +118,19 @@ fn bench_figures(sizes: &[SizeFigures]) -> [Figure; 7] {
     ]
 }
 
-fn over_cells(over: &TickTimes) -> Figure {
+fn tick_time_figure(over: &TickTimes) -> Figure {
     let micros = |place: fn(&[f64; 3]) -> f64| {
         over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
     };
     let title = "Ticks over cells, all active, on as many buses";
-    Figure::new("scale-loop", title, Axis::new("cells", ""), Axis::new("time in a tick", "µs").log())
-        .draw("central T_skin", Shape::Points, micros(|point| point[2]))
-        .draw("distributed: the whole tick", Shape::Points, micros(|point| point[1]))
+    Figure::new(
+        "scale-loop",
+        title,
+        Axis::new("cells", ""),
+        Axis::new("time in a tick", "µs").with_log_scale(),
+    )
+    .draw_series("central T_skin", SeriesShape::Points, micros(|point| point[2]))
+    .draw_series("distributed: the whole tick", SeriesShape::Points, micros(|point| point[1]))
 }
 
 /// Returns the findings on the bench with the largest number of cells.
@@ -131,11 +138,11 @@ fn largest_bench_findings(size: &SizeFigures) -> Vec<Finding> {
     let SizeFigures { cells, hz, holds, quiet, active, .. } = size;
     let of = |what: &str| format!("{what}, {cells} cells");
     let BenchFigures { start_s, memory_mb, .. } = active;
-    let at = format!("replies in time at {} Hz, 5 % active", number(*hz));
+    let at = format!("replies in time at {} Hz, 5 % active", format_number(*hz));
     let bar = format!("at least {} %, none missing for no known reason", MIN_IN_TIME_SHARE * 100.0);
     vec![
         Finding::new_unrated(of("from the start to the first joints"), (*start_s, "s")).at_most(MAX_START_S),
-        Finding::new_unrated(of(&at), (active.share() * 100.0, "%")).with_requirement(bar, *holds),
+        Finding::new_unrated(of(&at), (active.in_time_share() * 100.0, "%")).with_requirement(bar, *holds),
         Finding::new_unrated(
             of("replies and packets missing for no known reason"),
             active.unknown + quiet.unknown,
@@ -168,15 +175,16 @@ fn tick_findings(sizes: &[SizeFigures], [few, few_on_as_many, most]: &[f64; 3]) 
     ]
 }
 
-fn table(sizes: &[SizeFigures]) -> Table {
+fn bench_table(sizes: &[SizeFigures]) -> Table {
     let row = |size: &SizeFigures| {
         let SizeFigures { cells, buses, hz, holds, quiet, active } = size;
-        let both =
-            |value: fn(&BenchFigures) -> f64| format!("{}; {}", number(value(quiet)), number(value(active)));
+        let both = |value: fn(&BenchFigures) -> f64| {
+            format!("{}; {}", format_number(value(quiet)), format_number(value(active)))
+        };
         [
             cells.to_string(),
             buses.to_string(),
-            format!("{}{}", number(*hz), if *holds { "" } else { " (does not hold)" }),
+            format!("{}{}", format_number(*hz), if *holds { "" } else { " (does not hold)" }),
             both(|figures| figures.start_s),
             both(|figures| figures.cores.iter().sum()),
             both(|figures| figures.memory_mb[0]),

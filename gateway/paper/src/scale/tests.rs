@@ -3,7 +3,7 @@
 use std::cell::Cell;
 
 use super::*;
-use crate::arm::Reply;
+use crate::arm::ReplyMode;
 use crate::moving::BenchRun;
 use analysis::report::figure::FindingVerdict;
 use model::scenario::Scenario;
@@ -18,15 +18,15 @@ struct FakeLab {
     clock: Cell<u64>,
 }
 
-impl Lab for FakeLab {
+impl ExperimentLab for FakeLab {
     type Error = &'static str;
 
-    fn now(&self) -> u64 {
+    fn now_ns(&self) -> u64 {
         self.clock.set(self.clock.get() + 1);
         self.clock.get()
     }
 
-    fn run_bench(&mut self, _: Reply, _: Effort) -> Result<BenchRun, &'static str> {
+    fn run_bench(&mut self, _: ReplyMode, _: Effort) -> Result<BenchRun, &'static str> {
         Err("no bench of the moving arm is asked for")
     }
 
@@ -65,9 +65,9 @@ fn made(most: f64) -> FakeLab {
 fn every_bench_has_a_skin_and_a_scenario_that_fits_it_and_a_name_of_its_own() {
     for (cells, buses, active, touched) in [(24, 1, true, 2), (300, 2, true, 15), (300, 2, false, 0)] {
         let bench = ScaleBench { cells, buses, hz: 31.25, active, seconds: 2.0 };
-        let skin = Skin::parse("skin.toml", &bench.skin()).unwrap();
+        let skin = Skin::parse("skin.toml", &bench.skin_toml()).unwrap();
         assert_eq!((skin.cells.len(), skin.buses.len()), (cells, buses));
-        let scenario = Scenario::parse("scenario.toml", &bench.scenario(), &skin).unwrap();
+        let scenario = Scenario::parse("scenario.toml", &bench.scenario_toml(), &skin).unwrap();
         let touches: usize = scenario.touches.iter().map(|touch| touch.cells.len()).sum();
         assert_eq!((touches, scenario.duration.seconds().to_string()), (touched, "2".to_owned()));
         assert!(!bench.name().contains(' '));
@@ -77,7 +77,7 @@ fn every_bench_has_a_skin_and_a_scenario_that_fits_it_and_a_name_of_its_own() {
 #[test]
 fn rates_are_tried_from_the_highest_until_one_holds() {
     let mut lab = made(500.0 * 62.5);
-    let found = |lab: &mut FakeLab, cells| measure_size(lab, cells, FULL).unwrap();
+    let found = |lab: &mut FakeLab, cells| measure_bench_size(lab, cells, FULL_PLAN).unwrap();
     let small = found(&mut lab, 253);
     assert_eq!((small.buses, small.hz.to_string(), small.holds), (1, "62.5".to_owned(), true));
     assert_eq!(lab.ran.len(), 2, "one active and one quiet");
@@ -85,7 +85,7 @@ fn rates_are_tried_from_the_highest_until_one_holds() {
     assert_eq!((larger.buses, larger.hz.to_string(), larger.holds), (4, "15.625".to_owned(), true));
     let most = found(&mut lab, 10_000);
     assert_eq!((most.buses, most.hz.to_string(), most.holds), (40, "15.625".to_owned(), false));
-    assert!((most.active.share() - 0.5).abs() < 1e-9 && most.quiet.share().is_nan());
+    assert!((most.active.in_time_share() - 0.5).abs() < 1e-9 && most.quiet.in_time_share().is_nan());
     assert!(lab.ran.last().is_some_and(|bench| !bench.active));
 }
 
@@ -93,7 +93,7 @@ fn rates_are_tried_from_the_highest_until_one_holds() {
 fn a_summary_is_added_up_over_its_buses() {
     let bench = ScaleBench { cells: 300, buses: 2, hz: 20.0, active: true, seconds: 1.0 };
     let figures = BenchFigures::from_summary(&summary(&bench, true));
-    assert!((figures.due - 300.0).abs() < 1e-9 && (figures.share() - 1.0).abs() < 1e-9);
+    assert!((figures.due - 300.0).abs() < 1e-9 && (figures.in_time_share() - 1.0).abs() < 1e-9);
     assert!(figures.done && figures.holds_rate());
     assert!((figures.memory_mb[0] - 102.4).abs() < 1e-9);
     let mut lost = summary(&bench, true);
@@ -105,9 +105,9 @@ fn a_summary_is_added_up_over_its_buses() {
 
 #[test]
 fn bars_are_rated_by_what_was_measured() {
-    let mut measured = measure(&mut made(1e9), Effort::Quick).unwrap();
+    let mut measured = measure_scale(&mut made(1e9), Effort::Quick).unwrap();
     let rated = |measured: &ScaleMeasurements, what: &str| {
-        let section = section(measured);
+        let section = scale_section(measured);
         let found = section.findings.iter().find(|finding| finding.what.contains(what)).unwrap();
         (found.ours.value, found.verdict)
     };

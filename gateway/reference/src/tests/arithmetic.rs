@@ -3,9 +3,9 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use cell_node::contact::{Force, Torque};
-use cell_node::sum::{EpochStart, Sum, SumWords};
+use cell_node::sum::{EpochStart, SubtreeSum, SumWords};
 use protocol::fixed::{Q, Q1_14, TorqueFormat};
-use protocol::packet::{Epoch, WORDS, padded};
+use protocol::packet::{Epoch, WORDS, pad_with_defaults};
 use protocol::parameters::{Parameter, Parameters, SumSchedule};
 use protocol::time::{Micros, Span};
 use serde_json::Value;
@@ -43,7 +43,7 @@ fn forces_and_torques_are_those_of_the_other_program() {
         assert_eq!(Some(i64::from(force)), row["force"].as_i64(), "{row}");
         let (jacobian, force) = jacobian_and_force(&row);
         let torque = Torque::new(&jacobian, force);
-        assert_eq!(torque.words(TorqueFormat::Q3_12)[..6], words::<6>(&row["torque"]), "{row}");
+        assert_eq!(torque.torque_words(TorqueFormat::Q3_12)[..6], words::<6>(&row["torque"]), "{row}");
     }
 }
 
@@ -51,9 +51,9 @@ fn forces_and_torques_are_those_of_the_other_program() {
 #[test]
 fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
     for row in rows("sums") {
-        let mut sum = Sum::default();
+        let mut sum = SubtreeSum::default();
         let carry = row["carry"] == 1;
-        sum.set_slots(Some(SumSchedule { slot_us: 1_000, deepest: 1, carry }));
+        sum.set_schedule(Some(SumSchedule { slot_us: 1_000, deepest: 1, carry }));
         let mut epoch = Epoch(253);
         for (index, step) in (0..).zip(row["epochs"].as_array().unwrap()) {
             epoch = epoch.next();
@@ -71,22 +71,25 @@ fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
                 let (jacobian, force) = jacobian_and_force(&step["own"]);
                 Torque::new(&jacobian, force).exact_torques()
             });
-            sum.begin(&begin, own.as_ref());
+            sum.begin_epoch(&begin, own.as_ref());
             for (port, child) in children.iter().enumerate() {
                 let count = u8::try_from(child["count"].as_u64().unwrap()).unwrap();
-                sum.handle_state(at, port, epoch);
-                sum.receive(
+                sum.handle_state_message(at, port, epoch);
+                sum.receive_sum(
                     at,
                     port,
                     epoch,
-                    SumWords { torque: padded(&words::<WORDS>(&child["words"])).map(Q::from_bits), count },
+                    SumWords {
+                        torque: pad_with_defaults(&words::<WORDS>(&child["words"])).map(Q::from_bits),
+                        count,
+                    },
                 );
             }
             let sent = sum.poll_sum(at + Span(PERIOD / 2));
             let sent = sent.map(|(_, SumWords { torque, count }, _)| (torque.map(Q::to_bits), count));
             let expected = step["sends"].as_object().map(|sends| {
                 (
-                    padded(&words::<WORDS>(&sends["words"])),
+                    pad_with_defaults(&words::<WORDS>(&sends["words"])),
                     u8::try_from(sends["count"].as_u64().unwrap()).unwrap(),
                 )
             });

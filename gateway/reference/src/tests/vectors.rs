@@ -16,7 +16,7 @@ use protocol::candump::{self, CandumpLine, Record};
 use protocol::message::VERSION;
 use protocol::packet::Packet;
 use protocol::parameters::Parameter;
-use protocol::schema::Units;
+use protocol::schema::BusUnits;
 use protocol::time::Micros;
 use serde_json::{Map, Value, json};
 
@@ -40,7 +40,7 @@ fn convert_log<T>(log: &str, tell: impl Fn(&Record<'_>, Map<String, Value>) -> T
         if let CandumpLine::Frame(record) = candump::parse(line).unwrap() {
             let decoded = Decoder::new(Some(Format::Fd)).decode(Micros(0), record.interface, &record.frame);
             let mut text = Vec::new();
-            json::write(&mut text, &record, &decoded, Units::default()).unwrap();
+            json::write_json_line(&mut text, &record, &decoded, BusUnits::default()).unwrap();
             let mut object: Map<String, Value> = serde_json::from_slice(&text).unwrap();
             object.retain(|key, _| {
                 !matches!(key.as_str(), "time_ns" | "bus" | "raw" | "id" | "verdict" | "crc")

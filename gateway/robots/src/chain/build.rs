@@ -10,7 +10,7 @@ use protocol::skin::{MAX_REACH, max_frame_distance};
 use super::path::{CarriedLink, frames_after_joints, motion_kind, path};
 use super::{ChainJoint, LinkFrame, NotCarried, UrdfChain};
 use crate::error::{RobotError, RobotProblem};
-use crate::residual::{self, Residual};
+use crate::residual::{self, LargestResidual};
 use crate::rows::{self, Axis, DhRow, MAX_LENGTH_M, MAX_RESIDUAL, frames};
 use crate::urdf::{Urdf, UrdfJoint, UrdfJointKind};
 
@@ -21,7 +21,7 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<UrdfCh
     let path = path(urdf, root, urdf.index(tip)?)?;
     let joints = joints(urdf, urdf.link_name(root), tip, &path)?;
     let build = |row_cost| build_with_row_cost(urdf, root, tip, &path, &joints, row_cost);
-    let [usual, smallest] = rows::ROW_COSTS_M;
+    let [usual, smallest] = rows::FIXED_ROW_COSTS_M;
     build(usual).or_else(|error| {
         let is_long = matches!(*error.problem, RobotProblem::Reach { .. } | RobotProblem::Length { .. });
         if is_long { build(smallest) } else { Err(error) }
@@ -66,7 +66,7 @@ fn build_with_row_cost(
             return Err(urdf.error(RobotProblem::Reach { link: link.clone(), reach }));
         }
     }
-    let Residual { residual, link } = residual::residual(&chain, path, &hanging);
+    let LargestResidual { residual, link } = residual::largest_residual(&chain, path, &hanging);
     if residual.is_nan() || residual > MAX_RESIDUAL {
         return Err(urdf.error(RobotProblem::Residual { link, residual }));
     }
@@ -183,7 +183,7 @@ fn carried_links(
                 break Some(found);
             }
             let Some(joint) = urdf.joints_above(at).next() else { break None };
-            mover = mover.filter(|_| joint.kind == UrdfJointKind::Fixed).or_else(|| joint.moving_name());
+            mover = mover.filter(|_| joint.kind == UrdfJointKind::Fixed).or_else(|| joint.name_if_moving());
             behind = joint.origin * behind;
             at = joint.parent;
         };

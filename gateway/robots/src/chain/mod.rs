@@ -8,7 +8,7 @@ use protocol::parameters::RowKind;
 use protocol::skin::{ChainRow, JointKind};
 
 use crate::error::{RobotError, RobotProblem};
-use crate::nearest::nearest;
+use crate::nearest::nearest_names;
 use crate::rows::{DhRow, frames};
 use crate::urdf::Urdf;
 
@@ -91,7 +91,7 @@ impl UrdfChain {
         let problem = match apart {
             None => {
                 let names = self.carried.iter().map(|(name, _)| name.as_str());
-                RobotProblem::NoSuchLink { nearest: nearest(&link, names), link }
+                RobotProblem::NoSuchLink { nearest: nearest_names(&link, names), link }
             }
             Some(NotCarried::Still) => {
                 let joint = self.joints.first().map_or_else(String::new, |joint| joint.name.clone());

@@ -1,6 +1,6 @@
 //! Files that are not quite XML, or not quite URDF: those that are accepted, and the errors for those that are not.
 
-use crate::{Urdf, text};
+use crate::{Urdf, decode_text};
 
 use super::written::wrap;
 
@@ -131,12 +131,12 @@ fn a_declared_encoding_is_read() {
         |text: &str| text.chars().map(|letter| u8::try_from(u32::from(letter)).unwrap()).collect::<Vec<_>>();
     let mut expected = read(&declared("UTF-8"));
     for bytes in [latin(&declared("ISO-8859-1")), latin(&declared("windows-1252"))] {
-        let decoded = text("t.urdf", &bytes).unwrap();
+        let decoded = decode_text("t.urdf", &bytes).unwrap();
         assert_eq!(decoded, declared("UTF-8"), "the declaration is of the text, too");
         expected.file = "t.urdf".to_owned();
         assert_eq!(read(&decoded), expected);
     }
-    let message = text("t.urdf", &latin(&declared("UTF-8"))).unwrap_err().to_string();
+    let message = decode_text("t.urdf", &latin(&declared("UTF-8"))).unwrap_err().to_string();
     assert!(
         message.starts_with("t.urdf:2: it is not UTF-8, declared as utf-8: save it as UTF-8"),
         "{message}"
@@ -150,14 +150,14 @@ fn utf_16_is_refused_as_by_ros_with_a_command_that_repairs_it() {
     for (mark, name) in [("\u{feff}", "utf-16"), ("", "utf-16le")] {
         let wide: Vec<_> = format!("{mark}{declared}").encode_utf16().flat_map(u16::to_le_bytes).collect();
         assert_eq!(
-            text("t.urdf", &wide).unwrap_err().to_string(),
+            decode_text("t.urdf", &wide).unwrap_err().to_string(),
             format!(
                 "t.urdf: it is UTF-16, which ROS does not read either: save it as UTF-8, for example with `iconv -f {name} -t utf-8 FILE > NEW`"
             )
         );
     }
     // The command leaves the declaration unchanged.
-    assert_eq!(text("t.urdf", declared.as_bytes()).unwrap(), declared);
+    assert_eq!(decode_text("t.urdf", declared.as_bytes()).unwrap(), declared);
     read(&declared);
 }
 

@@ -232,7 +232,7 @@ fn what_the_skins_check_refuses_has_the_line_of_its_cell() {
     let refused = |cells: &[CellOnLink]| {
         let import = SkinImport { name: "t", command: "", urdf: None, chains: &chains, cells };
         let error = import.toml().unwrap_err();
-        assert!(error.is_in_cells());
+        assert!(error.is_error_in_cells());
         error.to_string()
     };
     let cell = |line: usize, bus: Option<String>, node: Option<u8>| CellOnLink {

@@ -1,6 +1,6 @@
 //! Tests that the URDF written for a skin has the same kinematics as the rows of the skin.
 
-use crate::{DhRow, Isometry3, SkinImport, Urdf, frames, pose_of, write_urdf};
+use crate::{DhRow, Isometry3, SkinImport, Urdf, chain_base_pose, frames, write_urdf};
 use protocol::skin::Skin;
 
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples");
@@ -37,7 +37,7 @@ fn check(skin: &Skin) -> Urdf {
             assert_eq!(links.len(), chain.joints.len());
             let rows: Vec<_> = chain.rows.iter().map(DhRow::from).collect();
             let of_chain: Vec<_> = chain.joints.iter().map(|&joint| q[joint]).collect();
-            let expected = *frames(&pose_of(&chain.base), &rows, &of_chain).last().unwrap();
+            let expected = *frames(&chain_base_pose(&chain.base), &rows, &of_chain).last().unwrap();
             let prefix = if text.links.len() > 1 { format!("{}_", chain.name) } else { String::new() };
             let tip = urdf.pose(&format!("{prefix}tip"), &position).unwrap();
             assert!(apart(&tip, &expected) < 1e-9, "{} {}", chain.name, apart(&tip, &expected));
@@ -66,7 +66,7 @@ fn chains_share_the_links_that_they_begin_with() {
     assert_eq!(left[..2], right[..2], "the waist");
     assert_ne!(left[2], right[2]);
     assert!(!text.xml.contains("<mimic"));
-    assert_eq!(urdf.link_of(&skin.robot.joints[0].name), Ok(left[0].as_str()));
+    assert_eq!(urdf.link_moved_by(&skin.robot.joints[0].name), Ok(left[0].as_str()));
 }
 
 #[test]
@@ -108,9 +108,9 @@ normal = [0.0, 1.0, 0.0]
     .unwrap();
     let urdf = check(&skin);
     assert!(write_urdf(&skin).xml.contains("<mimic joint=\"a\"/>"));
-    assert_eq!(urdf.link_of("<b & c>"), Ok("one_link2"));
+    assert_eq!(urdf.link_moved_by("<b & c>"), Ok("one_link2"));
     let poses = urdf.link_poses(&["a", "<b & c>"]).unwrap();
-    assert_eq!(poses.iter().filter(|pose| pose.moves()).count(), 3);
+    assert_eq!(poses.iter().filter(|pose| pose.is_moved_by_joint()).count(), 3);
     // Two names map to the same word.
     let mut skin = skin;
     for (chain, name) in skin.robot.chains.iter_mut().zip(["le ft", "le_ft"]) {

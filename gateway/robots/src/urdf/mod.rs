@@ -8,10 +8,10 @@ mod xml;
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
 use crate::error::{RobotError, RobotProblem};
-use crate::nearest::nearest;
+use crate::nearest::nearest_names;
 
 pub use shape::{Geometry, Shape};
-pub use xml::text;
+pub use xml::decode_text;
 
 /// A checked URDF. Its links form one tree, and each joint moves one link.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,14 +29,14 @@ pub struct Urdf {
 }
 
 /// The shapes of a link. If one of them is invalid, this is the error, which is returned only when the shapes are used.
-type Shapes = Result<Vec<Shape>, RobotError>;
+type ParsedShapes = Result<Vec<Shape>, RobotError>;
 
 /// A link of the robot.
 #[derive(Clone, Debug, PartialEq)]
 struct UrdfLink {
     name: String,
-    visuals: Shapes,
-    collisions: Shapes,
+    visuals: ParsedShapes,
+    collisions: ParsedShapes,
     /// Index of the joint that moves the link; `None` for the root.
     parent: Option<usize>,
 }
@@ -98,13 +98,13 @@ impl UrdfJoint {
     }
 
     /// Returns the name of the joint if it moves; `None` if it is fixed.
-    pub(crate) fn moving_name(&self) -> Option<String> {
+    pub(crate) fn name_if_moving(&self) -> Option<String> {
         (self.kind != UrdfJointKind::Fixed).then(|| self.name.clone())
     }
 }
 
 impl Urdf {
-    /// Parses the text of a file. `file` names the file in errors. [`text`] decodes bytes to text.
+    /// Parses the text of a file. `file` names the file in errors. [`decode_text`] decodes bytes to text.
     ///
     /// # Errors
     /// Returns [`RobotError`] if the text is not XML or not a URDF, if a value is not allowed, or if the links do not
@@ -136,7 +136,7 @@ impl Urdf {
     /// # Errors
     /// Returns [`RobotError`] if the link does not exist, or if one of its shapes is invalid.
     pub fn visuals(&self, link: &str) -> Result<&[Shape], RobotError> {
-        self.link(link)?.1.visuals.as_deref().map_err(Clone::clone)
+        self.find_link(link)?.1.visuals.as_deref().map_err(Clone::clone)
     }
 
     /// Returns the collision shapes of a link.
@@ -144,13 +144,13 @@ impl Urdf {
     /// # Errors
     /// Returns [`RobotError`] if the link does not exist, or if one of its shapes is invalid.
     pub fn collisions(&self, link: &str) -> Result<&[Shape], RobotError> {
-        self.link(link)?.1.collisions.as_deref().map_err(Clone::clone)
+        self.find_link(link)?.1.collisions.as_deref().map_err(Clone::clone)
     }
 
     /// Returns the name of a link's parent; `None` for the root and for a link that does not exist.
     #[must_use]
     pub fn parent(&self, link: &str) -> Option<&str> {
-        let (index, _) = self.link(link).ok()?;
+        let (index, _) = self.find_link(link).ok()?;
         self.joints_above(index).next().map(|joint| self.link_name(joint.parent))
     }
 
@@ -172,7 +172,7 @@ impl Urdf {
     /// # Errors
     /// Returns [`RobotError`] if the link does not exist.
     pub fn pose(&self, link: &str, position: &dyn Fn(&str) -> f64) -> Result<Isometry3<f64>, RobotError> {
-        let (index, _) = self.link(link)?;
+        let (index, _) = self.find_link(link)?;
         let transform = |joint: &UrdfJoint| match &joint.mimic {
             None => joint.transform(position(&joint.name)),
             Some(Mimic { joint: of, multiplier, offset }) => {
@@ -183,12 +183,12 @@ impl Urdf {
     }
 
     /// Returns a link and its index, by its name.
-    fn link(&self, name: &str) -> Result<(usize, &UrdfLink), RobotError> {
+    fn find_link(&self, name: &str) -> Result<(usize, &UrdfLink), RobotError> {
         let found = self.links.iter().enumerate().find(|(_, link)| link.name == name);
         found.ok_or_else(|| {
             self.error(RobotProblem::NoSuchLink {
                 link: name.to_owned(),
-                nearest: nearest(name, self.links()),
+                nearest: nearest_names(name, self.links()),
             })
         })
     }
@@ -200,7 +200,7 @@ impl Urdf {
 
     /// Returns the index of the link with this name.
     pub(crate) fn index(&self, link: &str) -> Result<usize, RobotError> {
-        Ok(self.link(link)?.0)
+        Ok(self.find_link(link)?.0)
     }
 
     /// Returns the name of the link with this index.

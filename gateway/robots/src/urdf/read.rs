@@ -5,7 +5,7 @@ use roxmltree::{Document, Node};
 
 use super::shape::{Geometry, Shape};
 use super::tree::{self, LinkWithLine, UnlinkedJoint};
-use super::{Mimic, Shapes, Urdf, UrdfJoint, UrdfJointKind, UrdfLink, xml};
+use super::{Mimic, ParsedShapes, Urdf, UrdfJoint, UrdfJointKind, UrdfLink, xml};
 use crate::error::{RobotError, RobotProblem};
 
 /// Minimum length of an axis vector. A shorter one has no direction.
@@ -37,14 +37,16 @@ impl<'a> UrdfParser<'a> {
         if outermost != "robot" {
             let kind = protocol::xml::format_of_root_element(outermost).map(|kind| format!(" ({kind})"));
             let element = format!("{outermost:?}{}", kind.unwrap_or_default());
-            return Err(self.error(robot, RobotProblem::NotARobot(element)));
+            return Err(self.error_at_node(robot, RobotProblem::NotARobot(element)));
         }
         let links = self.children(robot, "link").map(|node| self.link(node));
         let links = links.collect::<Result<Vec<_>, _>>()?;
         if links.is_empty() {
             let of_srdf = ["group", "group_state", "disable_collisions", "virtual_joint", "end_effector"];
             let is_srdf = of_srdf.iter().any(|name| self.child(robot, name).is_some());
-            return Err(self.error(robot, if is_srdf { RobotProblem::Srdf } else { RobotProblem::NoLinks }));
+            return Err(
+                self.error_at_node(robot, if is_srdf { RobotProblem::Srdf } else { RobotProblem::NoLinks })
+            );
         }
         let joints = self.children(robot, "joint").map(|node| self.joint(node));
         let joints = joints.collect::<Result<Vec<_>, _>>()?;
@@ -56,7 +58,7 @@ impl<'a> UrdfParser<'a> {
     /// definitions are accepted.
     fn refuse_xacro(&self, robot: Node<'a, 'a>) -> Result<(), RobotError> {
         // Only the prefix is decisive: files bind it to arbitrary namespaces, and many bind it without using it.
-        let is_xacro = |node: &Node<'a, 'a>| self.source(node).starts_with("<xacro:");
+        let is_xacro = |node: &Node<'a, 'a>| self.source_text(node).starts_with("<xacro:");
         let defines =
             |node: &Node<'a, 'a>| is_xacro(node) && matches!(node.tag_name().name(), "property" | "arg");
         let mut any = None;
@@ -74,7 +76,7 @@ impl<'a> UrdfParser<'a> {
         for node in robot.descendants().filter(kept) {
             let text = node.is_text().then(|| node.text()).flatten();
             let values = node.attributes().map(|attribute| attribute.value());
-            if let Some(expression) = values.chain(text).find_map(expression) {
+            if let Some(expression) = values.chain(text).find_map(xacro_expression) {
                 return Err(self.xacro_error(node, format!("expression {expression}")));
             }
         }
@@ -82,7 +84,7 @@ impl<'a> UrdfParser<'a> {
     }
 
     fn xacro_error(&self, node: Node<'a, 'a>, what: String) -> RobotError {
-        self.error(node, RobotProblem::Xacro { what, file: self.file.to_owned() })
+        self.error_at_node(node, RobotProblem::Xacro { what, file: self.file.to_owned() })
     }
 
     fn link(&self, node: Node<'a, 'a>) -> Result<LinkWithLine, RobotError> {
@@ -90,7 +92,7 @@ impl<'a> UrdfParser<'a> {
         let thing = format!("link {name:?}");
         let shapes = |element| {
             let shapes = self.children(node, element).map(|node| self.shape(node, &thing));
-            shapes.filter_map(Result::transpose).collect::<Shapes>()
+            shapes.filter_map(Result::transpose).collect::<ParsedShapes>()
         };
         let (visuals, collisions) = (shapes("visual"), shapes("collision"));
         Ok((UrdfLink { name, visuals, collisions, parent: None }, self.line(node)))
@@ -98,19 +100,22 @@ impl<'a> UrdfParser<'a> {
 
     /// Parses a visual or collision shape; returns `None` if it has no geometry.
     fn shape(&self, node: Node<'a, 'a>, thing: &str) -> Result<Option<Shape>, RobotError> {
-        let origin = self.origin(node, thing)?;
+        let origin = self.parse_origin(node, thing)?;
         let geometry = self.child(node, "geometry").and_then(|node| node.first_element_child());
         let Some(node) = geometry else { return Ok(None) };
         let size = |attribute| {
             let [size] = self.parse_numbers(node, thing, attribute, "a length in m")?.ok_or_else(|| {
-                self.error(node, RobotProblem::Missing { thing: thing.to_owned(), missing: attribute })
+                self.error_at_node(
+                    node,
+                    RobotProblem::Missing { thing: thing.to_owned(), missing: attribute },
+                )
             })?;
             Ok(size)
         };
         let geometry = match node.tag_name().name() {
             "mesh" => {
                 let path = self.required_attribute(node, thing, "filename")?;
-                if let Some(expression) = expression(&path) {
+                if let Some(expression) = xacro_expression(&path) {
                     return Err(self.xacro_error(node, format!("expression {expression}")));
                 }
                 let allowed = "three factors, as in \"0.001 0.001 0.001\"";
@@ -120,7 +125,7 @@ impl<'a> UrdfParser<'a> {
             "box" => {
                 let size = self.parse_numbers(node, thing, "size", "three lengths in m")?;
                 let missing = || RobotProblem::Missing { thing: thing.to_owned(), missing: "size" };
-                Geometry::Box { size: size.ok_or_else(|| self.error(node, missing()))? }
+                Geometry::Box { size: size.ok_or_else(|| self.error_at_node(node, missing()))? }
             }
             "cylinder" => Geometry::Cylinder { radius: size("radius")?, length: size("length")? },
             "sphere" => Geometry::Sphere { radius: size("radius")? },
@@ -146,7 +151,7 @@ impl<'a> UrdfParser<'a> {
         };
         let link = |role: &'static str| {
             let missing = || RobotProblem::Missing { thing: thing.clone(), missing: role };
-            let found = self.child(node, role).ok_or_else(|| self.error(node, missing()))?;
+            let found = self.child(node, role).ok_or_else(|| self.error_at_node(node, missing()))?;
             self.required_attribute(found, &format!("the {role} of {thing}"), "link")
         };
         let (parent, child) = (link("parent")?, link("child")?);
@@ -156,12 +161,12 @@ impl<'a> UrdfParser<'a> {
             None => Ok(None),
         };
         let joint = UrdfJoint {
-            origin: self.origin(node, &thing)?,
-            axis: self.axis(node, &thing, kind)?,
+            origin: self.parse_origin(node, &thing)?,
+            axis: self.parse_axis(node, &thing, kind)?,
             has_limit: limit.is_some_and(|it| it.has_attribute("lower") || it.has_attribute("upper")),
             limits: [read("lower")?.unwrap_or_default(), read("upper")?.unwrap_or_default()],
             velocity: read("velocity")?,
-            mimic: self.child(node, "mimic").map(|node| self.mimic(node, &thing)).transpose()?,
+            mimic: self.child(node, "mimic").map(|node| self.parse_mimic(node, &thing)).transpose()?,
             line: self.line(node),
             parent: 0,
             child: 0,
@@ -171,7 +176,7 @@ impl<'a> UrdfParser<'a> {
         Ok(UnlinkedJoint { joint, parent, child })
     }
 
-    fn axis(
+    fn parse_axis(
         &self,
         node: Node<'a, 'a>,
         thing: &str,
@@ -193,14 +198,14 @@ impl<'a> UrdfParser<'a> {
         })
     }
 
-    fn mimic(&self, node: Node<'a, 'a>, thing: &str) -> Result<Mimic, RobotError> {
+    fn parse_mimic(&self, node: Node<'a, 'a>, thing: &str) -> Result<Mimic, RobotError> {
         let joint = self.required_attribute(node, &format!("the mimic of {thing}"), "joint")?;
         let multiplier = self.parse_number(node, thing, "multiplier")?.unwrap_or(1.0);
         let offset = self.parse_number(node, thing, "offset")?.unwrap_or_default();
         Ok(Mimic { joint, multiplier, offset })
     }
 
-    fn origin(&self, node: Node<'a, 'a>, thing: &str) -> Result<Isometry3<f64>, RobotError> {
+    fn parse_origin(&self, node: Node<'a, 'a>, thing: &str) -> Result<Isometry3<f64>, RobotError> {
         let Some(node) = self.child(node, "origin") else { return Ok(Isometry3::identity()) };
         if let Some(got) = node.attribute("quat_xyzw") {
             return Err(self.value_error(
@@ -240,7 +245,7 @@ impl<'a> UrdfParser<'a> {
     ) -> Result<String, RobotError> {
         let text = node.attribute(attribute).map(str::trim).filter(|text| !text.is_empty());
         let missing = || RobotProblem::Missing { thing: thing.to_owned(), missing: attribute };
-        text.map(str::to_owned).ok_or_else(|| self.error(node, missing()))
+        text.map(str::to_owned).ok_or_else(|| self.error_at_node(node, missing()))
     }
 
     /// Parses an optional attribute that consists of `N` finite numbers.
@@ -280,7 +285,7 @@ impl<'a> UrdfParser<'a> {
         value: &str,
         allowed: &'static str,
     ) -> RobotError {
-        if let Some(expression) = expression(value) {
+        if let Some(expression) = xacro_expression(value) {
             return self.xacro_error(node, format!("expression {expression}"));
         }
         let commas = if value.contains([',', ';']) && allowed.starts_with("three") {
@@ -289,10 +294,10 @@ impl<'a> UrdfParser<'a> {
             ""
         };
         let (thing, value, allowed) = (thing.to_owned(), value.to_owned(), format!("{allowed}{commas}"));
-        self.error(node, RobotProblem::Value { thing, attribute, value, allowed })
+        self.error_at_node(node, RobotProblem::Value { thing, attribute, value, allowed })
     }
 
-    fn source(&self, node: &Node<'a, 'a>) -> &'a str {
+    fn source_text(&self, node: &Node<'a, 'a>) -> &'a str {
         self.document.input_text().get(node.range()).unwrap_or_default()
     }
 
@@ -302,13 +307,13 @@ impl<'a> UrdfParser<'a> {
         u32::try_from(line).unwrap_or(u32::MAX)
     }
 
-    fn error(&self, node: Node<'a, 'a>, problem: RobotProblem) -> RobotError {
+    fn error_at_node(&self, node: Node<'a, 'a>, problem: RobotProblem) -> RobotError {
         RobotError::new(self.file, Some(self.line(node)), problem)
     }
 }
 
 /// Returns the first xacro expression in a value, as it is written; `None` if it contains none.
-fn expression(value: &str) -> Option<&str> {
+fn xacro_expression(value: &str) -> Option<&str> {
     let begin = [value.find("${"), value.find("$(")].into_iter().flatten().min()?;
     let rest = value.get(begin..)?;
     let end = rest.find(['}', ')']).map_or(rest.len(), |end| end + 1);

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{Urdf, UrdfJoint, UrdfLink};
 use crate::error::{RobotError, RobotProblem};
-use crate::nearest::nearest;
+use crate::nearest::nearest_names;
 
 /// A joint that is not connected yet: its links are given by name.
 pub(super) struct UnlinkedJoint {
@@ -44,7 +44,7 @@ pub(super) fn build_tree(
         }
         let find = |role, link: String| {
             names.get(&link).copied().ok_or_else(|| {
-                let nearest = nearest(&link, names.keys().map(String::as_str));
+                let nearest = nearest_names(&link, names.keys().map(String::as_str));
                 error(line, RobotProblem::JointWithoutLink { joint: joint.name.clone(), role, link, nearest })
             })
         };
@@ -65,14 +65,14 @@ pub(super) fn build_tree(
         return Err(error(None, RobotProblem::TwoRoots { first, second }));
     }
     let urdf = Urdf { file: file.to_owned(), name, links, joints, root: root.map_or(0, |(index, _)| index) };
-    match cycle(&urdf) {
+    match find_cycle(&urdf) {
         None => Ok(urdf),
         Some(link) => Err(error(None, RobotProblem::Cycle(link.name.clone()))),
     }
 }
 
 /// Returns a link that is its own ancestor; `None` if there is no cycle.
-fn cycle(urdf: &Urdf) -> Option<&UrdfLink> {
+fn find_cycle(urdf: &Urdf) -> Option<&UrdfLink> {
     // For each link met on a path to the root: the link from which that path began.
     let mut walked = vec![None; urdf.links.len()];
     for start in 0..urdf.links.len() {

@@ -3,7 +3,9 @@
 use std::borrow::Cow;
 
 use protocol::usage::printable;
-use protocol::xml::{ForeignFile, PreparedXml, XmlFault, detect_foreign, prepare, utf16_encoding_name};
+use protocol::xml::{
+    PreparedXml, UnexpectedFileKind, XmlFault, detect_unexpected_file, prepare, utf16_encoding_name,
+};
 use roxmltree::{Document, Error};
 
 use crate::error::{RobotError, RobotProblem};
@@ -14,20 +16,20 @@ use crate::error::{RobotError, RobotProblem};
 /// # Errors
 /// Returns [`RobotError`] if the file has another encoding, or is a placeholder for another file (a Git LFS pointer, a
 /// saved web page).
-pub fn text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError> {
-    refuse_foreign(file, bytes)?;
+pub fn decode_text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError> {
+    refuse_foreign_format(file, bytes)?;
     if let Some(name) = utf16_encoding_name(bytes) {
         let what = format!(
             "it is UTF-16, which ROS does not read either: save it as UTF-8, for example with `iconv -f {name} -t utf-8 FILE > NEW`"
         );
-        return Err(error(file, XmlFault { line: None, what }));
+        return Err(xml_error(file, XmlFault { line: None, what }));
     }
-    protocol::xml::decode(bytes).map_err(|fault| error(file, fault))
+    protocol::xml::decode(bytes).map_err(|fault| xml_error(file, fault))
 }
 
 pub(super) fn prepare_text<'a>(file: &str, text: &'a str) -> Result<PreparedXml<'a>, RobotError> {
-    refuse_foreign(file, text.as_bytes())?;
-    let prepared = prepare(text).map_err(|fault| error(file, fault))?;
+    refuse_foreign_format(file, text.as_bytes())?;
+    let prepared = prepare(text).map_err(|fault| xml_error(file, fault))?;
     if prepared.text.is_empty() {
         return Err(RobotError::new(file, None, RobotProblem::Empty));
     }
@@ -47,17 +49,17 @@ pub(super) fn parse_document<'a>(
             matches!(reason, Error::UnclosedRootNode | Error::UnexpectedEndOfStream | Error::NoRootNode);
         let row = usize::try_from(reason.pos().row).unwrap_or_default();
         let row = if is_cut { prepared.text.lines().count() } else { row };
-        error(file, XmlFault { line: Some(prepared.lines_before + row), what: description(&reason) })
+        xml_error(file, XmlFault { line: Some(prepared.lines_before + row), what: description(&reason) })
     })
 }
 
-fn refuse_foreign(file: &str, bytes: &[u8]) -> Result<(), RobotError> {
-    let Some(ForeignFile { line, what, hint }) = detect_foreign(bytes) else { return Ok(()) };
+fn refuse_foreign_format(file: &str, bytes: &[u8]) -> Result<(), RobotError> {
+    let Some(UnexpectedFileKind { line, what, hint }) = detect_unexpected_file(bytes) else { return Ok(()) };
     let line = line.and_then(|line| u32::try_from(line).ok());
     Err(RobotError::new(file, line, RobotProblem::Xml(format!("{what}: {hint}"))))
 }
 
-fn error(file: &str, XmlFault { line, what }: XmlFault) -> RobotError {
+fn xml_error(file: &str, XmlFault { line, what }: XmlFault) -> RobotError {
     let line = line.and_then(|line| u32::try_from(line).ok());
     RobotError::new(file, line, RobotProblem::Xml(what))
 }

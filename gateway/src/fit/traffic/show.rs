@@ -3,10 +3,10 @@
 use std::io::{self, Write};
 
 use analysis::fit::traffic::BenchFrames;
-use analysis::fit::verdict::percent;
+use analysis::fit::verdict::format_percent;
 use analysis::shadow::{
-    Answering, BusShadow, BusyStretches, Delays, FrameTiming, Identifier, Loads, Peak, Replies, Shadow,
-    ShadowReport, StartUp,
+    AnsweringCounts, BusShadow, BusyStretches, DelayQuantiles, FrameTiming, Identifier, Loads, Peak,
+    ReplyStatistics, Shadow, ShadowReport, StartUpFigures,
 };
 
 use trace::capture::seconds_since;
@@ -63,7 +63,7 @@ pub(super) fn format_report(name: &str, what: &str, missing: u64, report: &Shado
     for bus in &report.buses {
         bus_rows(&mut rows, bus, report);
     }
-    rows.row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
+    rows.add_row_unless_zero("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     rows.to_text()
 }
 
@@ -81,7 +81,7 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
         add_operation_rows(rows, bus);
     }
     if let Some(start_up) = &bus.start_up {
-        start_up_rows(rows, bus, start_up);
+        add_start_up_rows(rows, bus, start_up);
     }
     if bit_error_rate > 0.0 {
         let each = format!("bit error rate {bit_error_rate:e}");
@@ -90,14 +90,18 @@ fn bus_rows(rows: &mut KeyValueTable, bus: &BusShadow, report: &ShadowReport) {
     add_bench_traffic_row(rows, bus);
     let of_all =
         |count: u64| format!("{:.1} % of the frames", 100.0 * count as f64 / bus.frames.max(1) as f64);
-    rows.row_unless_zero("left out: error frames", bus.counts.error_frames, "of a driver, never on a wire");
-    rows.row_unless_zero(
+    rows.add_row_unless_zero(
+        "left out: error frames",
+        bus.counts.error_frames,
+        "of a driver, never on a wire",
+    );
+    rows.add_row_unless_zero(
         "out of order, and sorted",
         bus.counts.out_of_order,
         of_all(bus.counts.out_of_order),
     );
-    rows.row_unless_zero("  too far for that", bus.counts.too_late_to_sort, "they count at a later time");
-    rows.row_unless_zero("never sent", bus.counts.no_room, "4 million frames waited already");
+    rows.add_row_unless_zero("  too far for that", bus.counts.too_late_to_sort, "they count at a later time");
+    rows.add_row_unless_zero("never sent", bus.counts.no_room, "4 million frames waited already");
 }
 
 /// Adds rows on whether the traffic fits on the bus, in the worst case and in this run.
@@ -114,18 +118,18 @@ fn add_fit_rows(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
         None => rows.add_row("this run", "no joints in it", ""),
     }
     match bus.answering {
-        Some(Answering { epochs, epochs_halted: 0, mean: Some(mean), .. }) => {
+        Some(AnsweringCounts { epochs, epochs_halted: 0, mean: Some(mean), .. }) => {
             rows.add_row(
                 "  cells that answered",
                 format!("{mean:.1} on average"),
                 format!("{epochs} joints"),
             );
         }
-        Some(Answering { epochs, epochs_halted, mean: Some(mean), .. }) => {
+        Some(AnsweringCounts { epochs, epochs_halted, mean: Some(mean), .. }) => {
             let beside = format!("{epochs} joints; {epochs_halted} more while halted are left out");
             rows.add_row("  cells that answered", format!("{mean:.1} on average"), beside);
         }
-        Some(Answering { epochs_halted: halted @ 1.., mean: None, .. }) => {
+        Some(AnsweringCounts { epochs_halted: halted @ 1.., mean: None, .. }) => {
             rows.add_row("  cells that answered", "halted all the time", format!("{halted} joints"));
         }
         _ => {}
@@ -134,13 +138,13 @@ fn add_fit_rows(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
 
 fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
     add_load_rows(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
-    rows.add_row("  bus taken", share(bus.load.busy), "");
+    rows.add_row("  bus taken", format_share(bus.load.busy), "");
     add_busy_stretch_row(rows, bus, &bus.stretches);
     rows.add_row("delay, µs", "50 % / 99 % / max", "until it is sent");
-    rows.add_row("  all frames", delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
+    rows.add_row("  all frames", format_delays(&bus.delay_us), format!("{} frames", bus.delay_us.count));
     for kind in &bus.kinds {
         let (name, delay) = (kind.kind, &kind.delay_us);
-        rows.add_row(format!("  {name}"), delays(delay), format!("{} frames", delay.count));
+        rows.add_row(format!("  {name}"), format_delays(delay), format!("{} frames", delay.count));
     }
     if let Some(replies) = &bus.replies {
         add_answer_rows(rows, replies);
@@ -153,11 +157,11 @@ fn add_operation_rows(rows: &mut KeyValueTable, bus: &BusShadow) {
 }
 
 /// Adds rows on the start-up, for which no limits apply.
-fn start_up_rows(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUp) {
+fn add_start_up_rows(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUpFigures) {
     let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
     add_load_rows(rows, bus, &start_up.load, ("start-up: average load", &beside));
     add_busy_stretch_row(rows, bus, &start_up.stretches);
-    rows.add_row("  delay, µs", delays(&start_up.delay_us), "50 % / 99 % / max");
+    rows.add_row("  delay, µs", format_delays(&start_up.delay_us), "50 % / 99 % / max");
 }
 
 fn add_bench_traffic_row(rows: &mut KeyValueTable, bus: &BusShadow) {
@@ -172,15 +176,15 @@ fn add_bench_traffic_row(rows: &mut KeyValueTable, bus: &BusShadow) {
 }
 
 fn add_load_rows(rows: &mut KeyValueTable, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
-    rows.add_row(name, share(load.mean), beside);
+    rows.add_row(name, format_share(load.mean), beside);
     rows.add_row(
         "  most in any 16 ms",
-        percent(load.worst_16_ms.value),
+        format_percent(load.worst_16_ms.value),
         format_peak_time(bus, load.worst_16_ms),
     );
     rows.add_row(
         "  most in any second",
-        percent(load.worst_1_s.value),
+        format_percent(load.worst_1_s.value),
         format_peak_time(bus, load.worst_1_s),
     );
 }
@@ -192,13 +196,13 @@ fn add_busy_stretch_row(rows: &mut KeyValueTable, bus: &BusShadow, stretches: &B
     rows.add_row("  no pause for 16 ms", times, beside);
 }
 
-fn share(share: Option<f64>) -> String {
-    or_else_text(share.map(percent), "?")
+fn format_share(share: Option<f64>) -> String {
+    or_else_text(share.map(format_percent), "?")
 }
 
-fn add_answer_rows(rows: &mut KeyValueTable, replies: &Replies) {
-    let Replies { count, late_before, late, late_when_ready, after_joints_us } = replies;
-    rows.add_row("answers after joints, µs", delays(after_joints_us), "50 % / 99 % / max");
+fn add_answer_rows(rows: &mut KeyValueTable, replies: &ReplyStatistics) {
+    let ReplyStatistics { count, late_before, late, late_when_ready, after_joints_us } = replies;
+    rows.add_row("answers after joints, µs", format_delays(after_joints_us), "50 % / 99 % / max");
     let beside = [
         Some("after the next joints".to_owned()),
         (*late_when_ready > 0).then(|| format!("{late_when_ready} not caused by the bus")),
@@ -207,8 +211,8 @@ fn add_answer_rows(rows: &mut KeyValueTable, replies: &Replies) {
     rows.add_row("  late", format!("{late} of {count}"), comma_separated(beside.into_iter().flatten()));
 }
 
-fn delays(delays: &Delays) -> String {
-    let Delays { p50, p99, max, .. } = delays;
+fn format_delays(delays: &DelayQuantiles) -> String {
+    let DelayQuantiles { p50, p99, max, .. } = delays;
     format!("{p50:.0} / {p99:.0} / {max:.0}")
 }
 

@@ -38,7 +38,7 @@ fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
     rows.add_row("packets sent by cells", up.sent, "by their own count");
     rows.add_row("  delivered", up.delivered, format!("{} rejected", up.rejected));
-    rows.row_unless_zero("  for other cells", up.unheard, "sums that the gateway does not take");
+    rows.add_row_unless_zero("  for other cells", up.unheard, "sums that the gateway does not take");
     let reasons = [
         (up.dropped, "dropped by the bus"),
         (up.backlog, "by the kernel's backlog"),
@@ -46,9 +46,9 @@ fn add_packet_rows(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
         (up.hosts, "between hosts"),
     ];
     add_unexplained_row(rows, "  lost", lost, reasons_text(&reasons, up.unknown), up.unknown);
-    rows.row_unless_zero("  surplus", up.surplus, "");
-    rows.row_unless_zero("  of other senders", up.outsiders, "");
-    rows.row_unless_zero("  in doubt", up.in_doubt, "");
-    rows.row_unless_zero("  after the last heartbeat", up.unsettled, "");
-    rows.row_unless_zero("  restarts of cells", up.restarts, "what they sent last is in doubt");
+    rows.add_row_unless_zero("  surplus", up.surplus, "");
+    rows.add_row_unless_zero("  of other senders", up.outsiders, "");
+    rows.add_row_unless_zero("  in doubt", up.in_doubt, "");
+    rows.add_row_unless_zero("  after the last heartbeat", up.unsettled, "");
+    rows.add_row_unless_zero("  restarts of cells", up.restarts, "what they sent last is in doubt");
 }

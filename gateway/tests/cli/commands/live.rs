@@ -6,7 +6,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use bench::bus::listen::{Listener, send};
+use bench::bus::listen::{Listener, send_message};
 use model::decode::Decoded;
 use protocol::bus::{Bus, BusKind, BusOptions, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
@@ -76,7 +76,7 @@ impl Bench {
                     let mut answers =
                         vec![Message::Network { from: Node::Cell(from), epoch: Epoch(0), page }];
                     cell.receive(Duration::from_millis(20)).unwrap();
-                    for (_, decoded) in cell.decoded() {
+                    for (_, decoded) in cell.decoded_frames() {
                         let Decoded::Message(Message::Configure { tag, request, .. }) = decoded else {
                             continue;
                         };
@@ -94,7 +94,7 @@ impl Bench {
                         };
                         answers.push(Message::Configured { from, tag, answer });
                     }
-                    answers.iter().for_each(|it| send(cell.bus(), it, format).unwrap());
+                    answers.iter().for_each(|it| send_message(cell.bus(), it, format).unwrap());
                 }
             });
             let _over = Over(&over);
@@ -286,7 +286,7 @@ fn what_shows_a_live_bus_ends_when_its_reader_has_enough() {
                 break status;
             }
             assert!(began.elapsed() < Duration::from_secs(60), "{command} goes on");
-            send(&bus, &resume, Format::Fd).unwrap();
+            send_message(&bus, &resume, Format::Fd).unwrap();
             std::thread::sleep(Duration::from_millis(5));
         };
         assert_eq!(status.code(), Some(0), "{command}");

@@ -21,7 +21,7 @@ use trace::ros2::standard::JointState;
 use trace::ros2::{Header, Message};
 
 use super::mutate::{chunk, record, string};
-use protocol::packet::padded;
+use protocol::packet::pad_with_defaults;
 
 const BEGAN: u64 = 1_700_000_000_000_000_000;
 
@@ -169,7 +169,10 @@ pub(crate) fn run(skin: &str, options: WriteOptions, files_last: bool) -> Vec<u8
 
 fn joints(epoch: u8) -> Packet {
     let positions = [Q1_14::from_radians(0.1).unwrap_or_default(); 6];
-    Packet::Joints { epoch: Epoch(epoch), joints: Joints { positions: padded(&positions), in_use: 6 } }
+    Packet::Joints {
+        epoch: Epoch(epoch),
+        joints: Joints { positions: pad_with_defaults(&positions), in_use: 6 },
+    }
 }
 
 /// Frames as recorded by another bridge.

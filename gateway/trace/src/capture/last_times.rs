@@ -3,9 +3,9 @@
 
 /// Times of the last frames of the first `BUSES` buses.
 #[derive(Debug, Default)]
-pub(super) struct LastTimes<const BUSES: usize>(Vec<(String, u64)>);
+pub(super) struct LastFrameTimes<const BUSES: usize>(Vec<(String, u64)>);
 
-impl<const BUSES: usize> LastTimes<BUSES> {
+impl<const BUSES: usize> LastFrameTimes<BUSES> {
     /// Stores `nanos` as the time of the newest frame of `bus`. Returns the time of the frame before it on that bus, if
     /// known.
     pub(super) fn replace(&mut self, bus: &str, nanos: u64) -> Option<u64> {

@@ -11,25 +11,25 @@ use crate::container::{self, read_uninterrupted};
 
 /// The number of bytes at a file's beginning within which the header record of a recording must end.
 const HEADER_SEARCH_BYTES: usize = 4 << 10;
-const UNPACK: &str = "unpack it first";
-const EXPORT: &str = "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)";
+const UNPACK_ADVICE: &str = "unpack it first";
+const EXPORT_ADVICE: &str = "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)";
 
 /// The first bytes of known formats. Everything else is treated as text.
 const MAGIC: &[(&[u8], InputFormat)] = &[
     (b"\x89MCAP", InputFormat::Mcap),
-    (b"PK\x03\x04", InputFormat::Other("a zip archive", UNPACK)),
-    (b"PK\x05\x06", InputFormat::Other("an empty zip archive", UNPACK)),
-    (b"\x1F\x8B", InputFormat::Other("a gzip file", UNPACK)),
-    (b"\x28\xB5\x2F\xFD", InputFormat::Other("a zstd file", UNPACK)),
-    (b"\xFD7zXZ", InputFormat::Other("an xz file", UNPACK)),
-    (b"BZh", InputFormat::Other("a bzip2 file", UNPACK)),
-    (b"\x04\x22\x4D\x18", InputFormat::Other("an lz4 file", UNPACK)),
+    (b"PK\x03\x04", InputFormat::Other("a zip archive", UNPACK_ADVICE)),
+    (b"PK\x05\x06", InputFormat::Other("an empty zip archive", UNPACK_ADVICE)),
+    (b"\x1F\x8B", InputFormat::Other("a gzip file", UNPACK_ADVICE)),
+    (b"\x28\xB5\x2F\xFD", InputFormat::Other("a zstd file", UNPACK_ADVICE)),
+    (b"\xFD7zXZ", InputFormat::Other("an xz file", UNPACK_ADVICE)),
+    (b"BZh", InputFormat::Other("a bzip2 file", UNPACK_ADVICE)),
+    (b"\x04\x22\x4D\x18", InputFormat::Other("an lz4 file", UNPACK_ADVICE)),
     (b"\xD4\xC3\xB2\xA1", PCAP),
     (b"\xA1\xB2\xC3\xD4", PCAP),
     (b"\x4D\x3C\xB2\xA1", PCAP),
     (b"\xA1\xB2\x3C\x4D", PCAP),
     (b"\x0A\x0D\x0D\x0A", PCAP),
-    (b"LOGG", InputFormat::Other("a BLF file", EXPORT)),
+    (b"LOGG", InputFormat::Other("a BLF file", EXPORT_ADVICE)),
     (b"MDF  ", MDF),
     (b"UnFinMF ", MDF),
     (b"date ", InputFormat::Other(ASC_KIND.0, ASC_KIND.1)),
@@ -67,7 +67,7 @@ const MDF: InputFormat = InputFormat::Other(
     "an MDF file",
     "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can[mf4])",
 );
-const TRC: InputFormat = InputFormat::Other("a PEAK trace", EXPORT);
+const TRC: InputFormat = InputFormat::Other("a PEAK trace", EXPORT_ADVICE);
 const CSV: InputFormat = InputFormat::Other(
     "a table in CSV",
     "`can_logconvert FILE NEW.log` makes a candump log of python-can's tables; of others write lines like \
@@ -157,7 +157,7 @@ mod tests {
     fn files_are_told_by_their_first_bytes() {
         let kind = |bytes: &[u8]| detect_format(&mut Cursor::new(bytes)).unwrap();
         assert_eq!(kind(mcap::MAGIC).0, InputFormat::Mcap);
-        assert_eq!(kind(b"PK\x03\x04 and more").0, InputFormat::Other("a zip archive", UNPACK));
+        assert_eq!(kind(b"PK\x03\x04 and more").0, InputFormat::Other("a zip archive", UNPACK_ADVICE));
         assert_eq!(kind(b"(1.000000) can0 123#").0, InputFormat::Text);
         for text in [&b""[..], b"P", b"PK\x03", b"\n", b"#", b"#ROS", b"BZ"] {
             assert_eq!(kind(text), (InputFormat::Text, text.to_vec()));
@@ -198,7 +198,7 @@ mod tests {
         assert_eq!(detect_format(&mut Slow(b"(1")).unwrap(), (InputFormat::Text, b"(1".to_vec()));
         assert_eq!(
             detect_format(&mut Slow(b"PK\x03\x04")).unwrap().0,
-            InputFormat::Other("a zip archive", UNPACK)
+            InputFormat::Other("a zip archive", UNPACK_ADVICE)
         );
     }
 }

@@ -149,7 +149,7 @@ pub(super) fn in_reading_order(mut files: Vec<CaptureFile>) -> Result<Vec<PathBu
         (Some(part), Some(other)) => {
             return Err(PartsError::Mixed { part: part.path.clone(), other: other.path.clone() });
         }
-        (Some(_), None) => return ordered(files.into_iter().filter_map(|file| file.part).collect()),
+        (Some(_), None) => return order_parts(files.into_iter().filter_map(|file| file.part).collect()),
         (None, _) => {}
     }
     let of = |format| files.iter().find(|file| file.format == format).map(|file| file.path.clone());
@@ -165,7 +165,7 @@ pub(super) fn in_reading_order(mut files: Vec<CaptureFile>) -> Result<Vec<PathBu
 /// # Errors
 /// Returns [`PartsError`] if the parts belong to different recordings, if one is missing between two others, or if one
 /// occurs twice.
-fn ordered(mut parts: Vec<RecordingPart>) -> Result<Vec<PathBuf>, PartsError> {
+fn order_parts(mut parts: Vec<RecordingPart>) -> Result<Vec<PathBuf>, PartsError> {
     parts.sort_by_key(|part| part.number);
     for pair in parts.windows(2) {
         let [one, next] = pair else { continue };

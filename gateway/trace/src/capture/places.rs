@@ -13,12 +13,12 @@ use std::path::{Path, PathBuf};
 use ::mcap::records::op;
 use protocol::input;
 
-use super::log::{LogReader, MAX_LINE_BYTES as LONGEST_LINE, known_time};
+use super::log::{LogReader, MAX_LINE_BYTES as LONGEST_LINE, frame_time_in_line};
 use super::magic::is_mcap;
 use super::place::{IndexedFile, SeekIndex, SeekPoint};
 use super::{CaptureEntry, CaptureError, Reader};
 use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, seek_record};
-use crate::order::WINDOW_NS;
+use crate::order::REORDER_WINDOW_NS;
 
 /// The minimum distance between two indexed positions of a file, in bytes.
 const MIN_DISTANCE_BYTES: u64 = 64 << 10;
@@ -33,20 +33,20 @@ impl SeekIndex {
     /// Returns [`CaptureError`] if a file cannot be read or is not seekable, or if the files are not parts of one
     /// recording.
     pub fn open(paths: &[PathBuf]) -> Result<Self, CaptureError> {
-        Self::with_min_distance(paths, MIN_DISTANCE_BYTES)
+        Self::open_with_min_distance(paths, MIN_DISTANCE_BYTES)
     }
 
     /// Indexes the files with one position at least every `piece` bytes.
-    fn with_min_distance(paths: &[PathBuf], piece: u64) -> Result<Self, CaptureError> {
+    fn open_with_min_distance(paths: &[PathBuf], piece: u64) -> Result<Self, CaptureError> {
         let mut places = Self { parts: Vec::new(), marks: Vec::new(), min_distance: piece };
-        for path in Reader::ordered(paths)? {
+        for path in Reader::order_paths(paths)? {
             let name = path.display().to_string();
-            places.add(&path).map_err(|source| CaptureError::Io { name, source })?;
+            places.index_file(&path).map_err(|source| CaptureError::Io { name, source })?;
         }
         Ok(places)
     }
 
-    fn add(&mut self, path: &Path) -> io::Result<()> {
+    fn index_file(&mut self, path: &Path) -> io::Result<()> {
         let mut file = input::open(path)?;
         if !file.metadata()?.is_file() {
             let why = "it is not a regular file, and not seekable: write it to a file first";
@@ -116,10 +116,10 @@ impl SeekIndex {
         let mut last = SeekPoint::default();
         let mut at = 0;
         while at < length {
-            match line_at(&mut file, at)? {
-                Some((_, None)) => return self.add_by_reading(file),
+            match find_frame_line(&mut file, at)? {
+                Some((_, None)) => return self.index_by_reading(file),
                 Some((offset, Some(nanos))) if at > 0 => {
-                    self.add_point(last, nanos.saturating_add(WINDOW_NS));
+                    self.add_point(last, nanos.saturating_add(REORDER_WINDOW_NS));
                     last = SeekPoint { offset, ..SeekPoint::default() };
                 }
                 Some(_) | None => {}
@@ -129,13 +129,13 @@ impl SeekIndex {
         let mut end = Vec::new();
         file.seek(SeekFrom::Start(length.saturating_sub(LAST_FRAME_SEARCH_BYTES)))?;
         (&mut file).take(LAST_FRAME_SEARCH_BYTES).read_to_end(&mut end)?;
-        let latest = end.split(|&byte| is_line_end(byte)).filter_map(|line| known_time(line)?).max();
+        let latest = end.split(|&byte| is_line_end(byte)).filter_map(|line| frame_time_in_line(line)?).max();
         self.add_point(last, latest.unwrap_or(0));
         Ok(())
     }
 
     /// Indexes a log by reading all of it, because its times depend on all lines before them.
-    fn add_by_reading(&mut self, mut file: File) -> io::Result<()> {
+    fn index_by_reading(&mut self, mut file: File) -> io::Result<()> {
         file.rewind()?;
         let part = self.parts.len() - 1;
         self.marks.retain(|(_, place)| place.part != part);
@@ -160,7 +160,7 @@ const fn is_line_end(byte: u8) -> bool {
 
 /// Finds the first frame of a log at or after the offset `at`. Returns the offset of the line, and the time if the line
 /// holds an absolute one.
-fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, Option<u64>)>> {
+fn find_frame_line(file: &mut File, at: u64) -> io::Result<Option<(u64, Option<u64>)>> {
     file.seek(SeekFrom::Start(at))?;
     let mut piece = Vec::new();
     file.take(2 * LONGEST_LINE as u64).read_to_end(&mut piece)?;
@@ -168,7 +168,7 @@ fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, Option<u64>)>> {
     // The first line of a piece is incomplete, unless the piece begins the file.
     for (number, line) in piece.split_inclusive(|&byte| is_line_end(byte)).enumerate() {
         let text = line.trim_ascii_end();
-        if let Some(nanos) = known_time(text).filter(|_| number > 0 || at == 0) {
+        if let Some(nanos) = frame_time_in_line(text).filter(|_| number > 0 || at == 0) {
             return Ok(Some((from, nanos)));
         }
         from += line.len() as u64;

@@ -1,5 +1,7 @@
 //! Reads captures, which may be candump logs or MCAP recordings.
 
+mod source;
+
 use std::collections::VecDeque;
 use std::fmt;
 use std::fs::File;
@@ -8,14 +10,17 @@ use std::path::{Path, PathBuf};
 
 use protocol::input;
 
-use super::log::{Clock, LogReader, Remark};
-use super::magic::{self, InputFormat, is_mcap};
-use super::mcap::{ForeignBuses, LOG_ORIGIN, McapReader, McapState, ORIGIN_METADATA, ReadFault, TopicSurvey};
+use super::log::{Clock, LogReader, LogRemark};
+use super::magic::is_mcap;
+use super::mcap::{
+    ForeignBusNames, LOG_ORIGIN, McapReader, McapState, ORIGIN_METADATA, ReadFault, TopicSurvey,
+};
 use super::parts::{self, CaptureFile, PartsError};
 use super::place::{SeekIndex, SeekPoint};
-use super::text_kinds::kind_of;
+use super::text_kinds::detect_text_kind;
 use super::times::TimeChecks;
 use super::{CaptureEntry, CaptureError, CaptureFormat, FileWrapper, RecordingExtras, RecordingItem};
+use source::CaptureSource;
 
 /// Reads a capture from its beginning to its end in bounded memory. The parts of a split recording are one capture.
 pub struct Reader {
@@ -35,68 +40,12 @@ pub struct Reader {
     /// True if an earlier file has no end, because it was never finished.
     is_unfinished: bool,
     /// The bus names for frames of other programs, if they were found before reading.
-    buses: ForeignBuses,
+    buses: ForeignBusNames,
     times: TimeChecks,
     /// The name of the preceding file. `None` once the first frame of the current file has been read.
     before: Option<String>,
     /// Remarks on the logs that were read before the current file.
-    remarks: Vec<Remark>,
-}
-
-enum CaptureSource {
-    Log(LogReader),
-    Mcap(Box<McapReader>),
-}
-
-impl CaptureSource {
-    /// Opens one file. The attachments and metadata of a recording are read at once if it is a regular file.
-    fn open(
-        path: &Path,
-        through: &FileWrapper,
-        mut state: McapState,
-    ) -> Result<(String, Self), CaptureError> {
-        let name = path.display().to_string();
-        let failed = |source| CaptureError::Io { name: name.clone(), source };
-        let mut file = input::open(path).map_err(failed)?;
-        let about = file.metadata().map_err(failed)?;
-        let mut regular = None;
-        if about.is_file() && is_mcap(&mut file).map_err(failed)? {
-            state.read_extras_ahead(&mut file).and_then(|()| file.rewind()).map_err(failed)?;
-            regular = Some(file.try_clone().map_err(failed)?);
-        }
-        let source = Self::detect(&name, through(file), state, regular)?;
-        Ok((name, source))
-    }
-
-    fn detect(
-        name: &str,
-        input: impl Read + Send + 'static,
-        state: McapState,
-        file: Option<File>,
-    ) -> Result<Self, CaptureError> {
-        let (name, mut input) = (name.to_owned(), Box::new(input));
-        match magic::detect_format(&mut input) {
-            // The first bytes of the recording are damaged. The MCAP reader reports the damage when it reads them.
-            Ok((InputFormat::Text, head)) if file.is_some() => Ok(Self::mcap(&head, input, state, file)),
-            Ok((InputFormat::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
-            Ok((InputFormat::Mcap, head)) => Ok(Self::mcap(&head, input, state, file)),
-            Ok((InputFormat::Other(what, hint), _)) => Err(CaptureError::OtherFormat { name, what, hint }),
-            Err(source) => Err(CaptureError::Io { name, source }),
-        }
-    }
-
-    fn mcap(head: &[u8], input: Box<dyn Read + Send>, state: McapState, file: Option<File>) -> Self {
-        Self::Mcap(Box::new(McapReader::new(head, input, state, file)))
-    }
-
-    /// Returns true if there are no more entries in the file.
-    fn is_at_its_end(&mut self, name: &str, entries: u64) -> Result<bool, CaptureError> {
-        let at_its_end = match self {
-            Self::Log(log) => log.is_at_its_end().map_err(ReadFault::from),
-            Self::Mcap(mcap) => mcap.is_at_its_end(),
-        };
-        at_its_end.map_err(|fault| fault.into_capture_error(name, entries))
-    }
+    remarks: Vec<LogRemark>,
 }
 
 impl fmt::Debug for Reader {
@@ -126,8 +75,8 @@ impl Reader {
         input: impl Read + Send + 'static,
     ) -> Result<Self, CaptureError> {
         let name = name.into();
-        let source = CaptureSource::detect(&name, input, McapState::new(false, None), None)?;
-        Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), without_wrapper(), false))
+        let source = CaptureSource::detect_source(&name, input, McapState::new(false, None), None)?;
+        Ok(Self::from_first_source(name.clone(), (name, source), VecDeque::new(), identity_wrapper(), false))
     }
 
     /// Opens one or more files as one capture. The parts of a recording may be given in any order; other files are read
@@ -136,14 +85,14 @@ impl Reader {
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open`] does, and if several files are not one capture.
     pub fn open_all(paths: &[PathBuf]) -> Result<Self, CaptureError> {
-        Self::open_parts(paths, without_wrapper(), false)
+        Self::open_parts(paths, identity_wrapper(), false)
     }
 
     /// Opens a capture like [`Reader::open_all`], with each file wrapped by `through`.
     ///
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open_all`] does.
-    pub fn open_through(paths: &[PathBuf], through: FileWrapper) -> Result<Self, CaptureError> {
+    pub fn open_wrapped(paths: &[PathBuf], through: FileWrapper) -> Result<Self, CaptureError> {
         Self::open_parts(paths, through, false)
     }
 
@@ -152,7 +101,7 @@ impl Reader {
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open_all`] does.
     pub fn open_with_all_topics(paths: &[PathBuf]) -> Result<Self, CaptureError> {
-        Self::open_parts(paths, without_wrapper(), true)
+        Self::open_parts(paths, identity_wrapper(), true)
     }
 
     fn open_parts(paths: &[PathBuf], through: FileWrapper, others: bool) -> Result<Self, CaptureError> {
@@ -161,22 +110,29 @@ impl Reader {
         {
             let name = "standard input".to_owned();
             let file = input::open(one).map_err(|source| CaptureError::Io { name: name.clone(), source })?;
-            let source = CaptureSource::detect(&name, through(file), McapState::new(others, None), None)?;
-            return Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), through, others));
+            let source =
+                CaptureSource::detect_source(&name, through(file), McapState::new(others, None), None)?;
+            return Ok(Self::from_first_source(
+                name.clone(),
+                (name, source),
+                VecDeque::new(),
+                through,
+                others,
+            ));
         }
-        let ordered = Self::ordered(paths)?;
+        let ordered = Self::order_paths(paths)?;
         let name = parts::title(&ordered);
         let mut rest = VecDeque::from(ordered);
         let first = rest.pop_front().ok_or(PartsError::None)?;
-        let buses = Self::survey([&first].into_iter().chain(&rest));
+        let buses = Self::survey_bus_names([&first].into_iter().chain(&rest));
         let opened =
             CaptureSource::open(&first, &through, McapState::new(others, None).with_buses(buses.clone()))?;
-        Ok(Self { buses, ..Self::begin(name, opened, rest, through, others) })
+        Ok(Self { buses, ..Self::from_first_source(name, opened, rest, through, others) })
     }
 
     /// Finds the bus names for frames of other programs in all files. They are empty if the names do not depend on
     /// later frames. Files that cannot be read are skipped, because they are reported when they are read.
-    fn survey<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> ForeignBuses {
+    fn survey_bus_names<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> ForeignBusNames {
         let recording = |path: &&PathBuf| {
             let mut file = input::can_be_read_again(path).then(|| File::open(path).ok()).flatten()?;
             is_mcap(&mut file).is_ok_and(|is| is).then_some(file)
@@ -185,17 +141,17 @@ impl Reader {
         for mut file in paths.clone().filter_map(|path| recording(&path)) {
             let _ = survey.add_file(&mut file);
         }
-        if !survey.is_needed() {
-            return ForeignBuses::default();
+        if !survey.must_read_messages() {
+            return ForeignBusNames::default();
         }
         let files = paths.filter_map(|path| recording(&path));
         files
-            .fold(ForeignBuses::default(), |known, file| survey.buses_of(Box::new(file), known))
+            .fold(ForeignBusNames::default(), |known, file| survey.bus_names_of(Box::new(file), known))
             .renamed_with_all_pairs()
     }
 
     /// Returns the files of one capture in the order in which they are read.
-    pub(super) fn ordered(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CaptureError> {
+    pub(super) fn order_paths(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CaptureError> {
         if let [] | [_] = paths {
             return Ok(paths.to_vec());
         }
@@ -237,7 +193,7 @@ impl Reader {
         }
     }
 
-    fn begin(
+    fn from_first_source(
         name: String,
         (file, source): (String, CaptureSource),
         rest: VecDeque<PathBuf>,
@@ -254,7 +210,7 @@ impl Reader {
             remaining: rest,
             through,
             is_unfinished: false,
-            buses: ForeignBuses::default(),
+            buses: ForeignBusNames::default(),
             times: TimeChecks::default(),
             before: None,
             remarks: Vec::new(),
@@ -291,7 +247,7 @@ impl Reader {
 
     /// Returns the position of the next entry. A reader can go back to it only if the input is seekable.
     #[must_use]
-    pub const fn place(&self) -> SeekPoint {
+    pub const fn seek_point(&self) -> SeekPoint {
         let (offset, skip) = match &self.source {
             CaptureSource::Log(log) => {
                 let (offset, line, clock) = (log.offset(), log.lines(), log.clock());
@@ -395,7 +351,7 @@ impl Reader {
             if let Some(before) = before.take().filter(|_| record.time.nanos < times.latest_ns()) {
                 times.record_overlap(name, &before);
             }
-            times.check(record.interface, record.time.nanos);
+            times.check_frame_time(record.interface, record.time.nanos);
         }
         Ok(next)
     }
@@ -429,7 +385,7 @@ impl Reader {
     #[must_use]
     pub fn remarks_except_order(&self) -> Vec<String> {
         let shared = match &self.source {
-            CaptureSource::Mcap(mcap) => mcap.buses().is_shared(),
+            CaptureSource::Mcap(mcap) => mcap.buses().is_frame_id_shared(),
             CaptureSource::Log(_) => false,
         };
         let shared = shared.then(|| {
@@ -439,7 +395,7 @@ impl Reader {
         of_log.chain(self.times.remarks()).chain(shared).collect()
     }
 
-    fn log_remarks(&self) -> Vec<Remark> {
+    fn log_remarks(&self) -> Vec<LogRemark> {
         let mut remarks = self.remarks.clone();
         if let CaptureSource::Log(log) = &self.source {
             remarks.extend(log.remarks().iter().filter(|remark| !self.remarks.contains(remark)));
@@ -450,14 +406,14 @@ impl Reader {
     /// Returns false if any line so far had no time.
     #[must_use]
     pub fn has_times(&self) -> bool {
-        !self.log_remarks().contains(&Remark::NoTimes)
+        !self.log_remarks().contains(&LogRemark::NoTimes)
     }
 
     /// Returns the kind of a text that has no frames, judged by its first lines, and advice to the user.
     #[must_use]
     pub fn text_kind(&self) -> Option<(&'static str, &'static str)> {
         match &self.source {
-            CaptureSource::Log(log) => kind_of(log.sample()),
+            CaptureSource::Log(log) => detect_text_kind(log.first_lines_sample()),
             CaptureSource::Mcap(_) => None,
         }
     }
@@ -493,6 +449,6 @@ impl Reader {
 }
 
 /// Returns a wrapper that leaves files as they are.
-fn without_wrapper() -> FileWrapper {
+fn identity_wrapper() -> FileWrapper {
     Box::new(|file| Box::new(file))
 }

@@ -12,7 +12,7 @@ const SKIN_TABLES: [&str; 7] =
     ["[robot]", "[[chain]]", "[[bus]]", "[[cell]]", "[motion]", "[[touch]]", "[[fault]]"];
 
 /// Returns the kind of a text and advice to the user, or `None` if the kind is unknown.
-pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
+pub(super) fn detect_text_kind(text: &[u8]) -> Option<(&'static str, &'static str)> {
     let text = String::from_utf8_lossy(text);
     let lines: Vec<_> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
     let any = |is: &dyn Fn(&str) -> bool| lines.iter().any(|line| is(line));
@@ -33,7 +33,7 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
         (any(&|line| line.starts_with("base hex") || line.starts_with("base dec")), ASC_KIND),
         (any(&|line| line.starts_with("Begin Triggerblock") || line == "// version 7.0.0"), ASC_KIND),
         (
-            any(&|line| is_trc(&words(line))),
+            any(&|line| is_trc_line(&words(line))),
             (
                 "a PEAK trace",
                 "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)",
@@ -49,9 +49,9 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
             any(&|line| line.starts_with("Timestamp:") && line.contains(" DL:")),
             ("what python-can prints", "it is no log: let python-can write one with `can_logger -f NEW.log`"),
         ),
-        (any(&|line| is_kvaser(line)), ("a Kvaser log", EXPORT_ADVICE)),
-        (any(&|line| is_crtd(&words(line))), ("a CRTD log", EXPORT_ADVICE)),
-        (any(&is_canboat), ("a canboat log of NMEA 2000 messages", EXPORT_ADVICE)),
+        (any(&|line| is_kvaser_line(line)), ("a Kvaser log", EXPORT_ADVICE)),
+        (any(&|line| is_crtd_line(&words(line))), ("a CRTD log", EXPORT_ADVICE)),
+        (any(&is_canboat_line), ("a canboat log of NMEA 2000 messages", EXPORT_ADVICE)),
         (
             any(&|line| line.contains("]  ") && line.contains("  - '")),
             (
@@ -67,7 +67,7 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
             ),
         ),
         (
-            is_table(&lines),
+            is_separated_table(&lines),
             (
                 "a table in CSV",
                 "`can_logconvert FILE NEW.log` makes a candump log of python-can's tables; of others write lines like \
@@ -83,19 +83,19 @@ fn is_hex(word: &str) -> bool {
 }
 
 /// Matches `1)  1841  0001  8  00 ...`, with or without `Rx` before the identifier.
-fn is_trc(words: &[String]) -> bool {
+fn is_trc_line(words: &[String]) -> bool {
     let number = words.first().and_then(|word| word.strip_suffix(')'));
     let is_number = number.is_some_and(|word| word.parse::<u64>().is_ok());
     is_number && words.get(1).is_some_and(|word| word.parse::<f64>().is_ok()) && words.len() > 3
 }
 
 /// Matches `Chn Identifier Flg DLC ...` or a line with `Kvaser`.
-fn is_kvaser(line: &str) -> bool {
+fn is_kvaser_line(line: &str) -> bool {
     line.starts_with("Chn Identifier") || line.contains("Kvaser")
 }
 
 /// Matches `1320745424.002 1R11 402 FA 01`, and headers with `CXX`.
-fn is_crtd(words: &[String]) -> bool {
+fn is_crtd_line(words: &[String]) -> bool {
     let [time, kind, ..] = words else { return false };
     let kind = kind.trim_start_matches(|digit: char| digit.is_ascii_digit());
     let is_of_crtd = matches!(kind, "R11" | "R29" | "T11" | "T29" | "CXX" | "CEV");
@@ -103,7 +103,7 @@ fn is_crtd(words: &[String]) -> bool {
 }
 
 /// Matches `2016-02-28T19:57:02.364Z,6,129285,204,255,8,...`.
-fn is_canboat(line: &str) -> bool {
+fn is_canboat_line(line: &str) -> bool {
     let fields: Vec<_> = line.split(',').collect();
     let [time, rest @ ..] = fields.as_slice() else { return false };
     let (numbers, data) = rest.split_at(rest.len().min(5));
@@ -122,7 +122,7 @@ fn is_frame_of_cansend(line: &str) -> bool {
 }
 
 /// Returns true if at least three quarters of the lines have the same number of separators, three or more.
-fn is_table(lines: &[&str]) -> bool {
+fn is_separated_table(lines: &[&str]) -> bool {
     // The last line may be cut off.
     let lines = lines.get(..lines.len().saturating_sub(1)).filter(|lines| !lines.is_empty()).unwrap_or(lines);
     [',', ';', '\t'].iter().any(|separator| {
@@ -169,7 +169,7 @@ mod tests {
             ("#!/bin/sh\ncansend vcan0 1D0#0A\ncansend vcan0 1D0#\n", "a list of frames for cansend"),
             ("time;id;data;dlc\n1;2;3;4\n5;6;7;8\n", "a table in CSV"),
         ] {
-            assert_eq!(kind_of(text.as_bytes()).map(|(what, _)| what), Some(expected), "{text}");
+            assert_eq!(detect_text_kind(text.as_bytes()).map(|(what, _)| what), Some(expected), "{text}");
         }
     }
 
@@ -183,7 +183,7 @@ mod tests {
             "\u{1b}[31m\0\n",
             "[[test]]\nname = \"a\"\n",
         ] {
-            assert_eq!(kind_of(text.as_bytes()), None, "{text}");
+            assert_eq!(detect_text_kind(text.as_bytes()), None, "{text}");
         }
     }
 }

@@ -36,7 +36,7 @@ struct BusTimes {
 impl TimeChecks {
     /// Checks the time of the next frame of a bus.
     #[inline]
-    pub(super) fn check(&mut self, bus: &str, nanos: u64) {
+    pub(super) fn check_frame_time(&mut self, bus: &str, nanos: u64) {
         self.frames += 1;
         self.latest = self.latest.max(nanos);
         if self.buses.get(self.current).is_none_or(|current| current.name != bus) {
@@ -93,7 +93,7 @@ impl TimeChecks {
         let constant = constant.map(|BusTimes { name, first, frames, .. }| {
             format!(
                 "all {frames} frames of {name} have the time {}: rates, gaps and loads mean nothing",
-                Seconds(*first)
+                DisplayedSeconds(*first)
             )
         });
         overlap.into_iter().chain(constant)
@@ -101,9 +101,9 @@ impl TimeChecks {
 }
 
 /// A time in ns that is displayed in seconds, as in a log.
-struct Seconds(u64);
+struct DisplayedSeconds(u64);
 
-impl fmt::Display for Seconds {
+impl fmt::Display for DisplayedSeconds {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}.{:09}", self.0 / 1_000_000_000, self.0 % 1_000_000_000)
     }
@@ -115,7 +115,7 @@ mod tests {
 
     fn remarks(frames: &[(&str, u64)]) -> Vec<String> {
         let mut times = TimeChecks::default();
-        frames.iter().for_each(|(bus, nanos)| times.check(bus, *nanos));
+        frames.iter().for_each(|(bus, nanos)| times.check_frame_time(bus, *nanos));
         times.backwards_remark().into_iter().chain(times.remarks()).collect()
     }
 

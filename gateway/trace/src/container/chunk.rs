@@ -12,7 +12,7 @@ use super::{FormatError, MAX_RECORD_BYTES};
 /// The total size in bytes that the chunks of any file may decompress to, even if the file is short.
 const BASE_LIMIT_BYTES: u64 = 256 << 20;
 /// The number of decompressed bytes that are allowed for each byte of the file, in addition to [`FREE_BYTES`].
-const MAX_EXPANSION: u64 = 1_000;
+const MAX_EXPANSION_RATIO: u64 = 1_000;
 /// The total number of records that the chunks of any file may hold, even if the file is short.
 const BASE_LIMIT_RECORDS: u64 = 1 << 17;
 /// The number of records that are allowed for each byte of the file, in addition to [`FREE_RECORDS`]. A real recording
@@ -80,7 +80,7 @@ impl Chunk {
 
     /// Returns true if the current chunk has a checksum. [`Chunk::unpack`] has then found it correct.
     #[must_use]
-    pub const fn is_checked(&self) -> bool {
+    pub const fn has_checksum(&self) -> bool {
         self.is_checked
     }
 
@@ -105,7 +105,7 @@ impl Chunk {
                 limit: MAX_RECORD_BYTES,
             });
         }
-        let limit = BASE_LIMIT_BYTES.saturating_add(read.saturating_mul(MAX_EXPANSION));
+        let limit = BASE_LIMIT_BYTES.saturating_add(read.saturating_mul(MAX_EXPANSION_RATIO));
         self.total_bytes = self.total_bytes.saturating_add(claimed);
         if self.total_bytes > limit {
             return Err(FormatError::Bomb { read, limit, what: "bytes" });

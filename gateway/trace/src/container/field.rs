@@ -145,26 +145,26 @@ impl<'a> Fields<'a> {
         Self { record, bytes: body.len(), rest: body }
     }
 
-    fn short_error(&self, field: &'static str) -> FormatError {
+    fn too_short_error(&self, field: &'static str) -> FormatError {
         FormatError::Short { record: self.record, bytes: self.bytes, field }
     }
 
-    fn array<const N: usize>(&mut self, field: &'static str) -> Result<[u8; N], FormatError> {
-        let (head, rest) = self.rest.split_first_chunk().ok_or_else(|| self.short_error(field))?;
+    fn read_array<const N: usize>(&mut self, field: &'static str) -> Result<[u8; N], FormatError> {
+        let (head, rest) = self.rest.split_first_chunk().ok_or_else(|| self.too_short_error(field))?;
         self.rest = rest;
         Ok(*head)
     }
 
     fn u16(&mut self, field: &'static str) -> Result<u16, FormatError> {
-        self.array(field).map(u16::from_le_bytes)
+        self.read_array(field).map(u16::from_le_bytes)
     }
 
     pub(super) fn u32(&mut self, field: &'static str) -> Result<u32, FormatError> {
-        self.array(field).map(u32::from_le_bytes)
+        self.read_array(field).map(u32::from_le_bytes)
     }
 
     pub(super) fn u64(&mut self, field: &'static str) -> Result<u64, FormatError> {
-        self.array(field).map(u64::from_le_bytes)
+        self.read_array(field).map(u64::from_le_bytes)
     }
 
     /// Returns the next `count` bytes.
@@ -173,7 +173,7 @@ impl<'a> Fields<'a> {
     /// Returns [`Damage::Short`] if the record has fewer.
     pub(super) fn bytes(&mut self, count: u64, field: &'static str) -> Result<&'a [u8], FormatError> {
         let split = usize::try_from(count).ok().and_then(|count| self.rest.split_at_checked(count));
-        let (bytes, rest) = split.ok_or_else(|| self.short_error(field))?;
+        let (bytes, rest) = split.ok_or_else(|| self.too_short_error(field))?;
         self.rest = rest;
         Ok(bytes)
     }
@@ -184,7 +184,7 @@ impl<'a> Fields<'a> {
         std::str::from_utf8(bytes).map_err(|_| FormatError::Text { record: self.record, field })
     }
 
-    fn facts(&mut self, field: &'static str) -> Result<MetadataMap<'a>, FormatError> {
+    fn read_metadata_map(&mut self, field: &'static str) -> Result<MetadataMap<'a>, FormatError> {
         let bytes = self.u32(field)?;
         let facts = self.bytes(bytes.into(), field)?;
         let mut all = Self { rest: facts, ..*self };
@@ -224,7 +224,7 @@ pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, FormatError> {
             let mut from = description("channel")?;
             let (id, schema) = (from.u16("id")?, from.u16("schema id")?);
             let (topic, encoding) = (from.text("topic")?, from.text("message encoding")?);
-            Record::Channel { id, schema, topic, encoding, facts: from.facts("metadata")? }
+            Record::Channel { id, schema, topic, encoding, facts: from.read_metadata_map("metadata")? }
         }
         op::MESSAGE => {
             let mut from = Fields::new("message", body);
@@ -235,7 +235,7 @@ pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, FormatError> {
         op::ATTACHMENT => attachment(body)?,
         op::METADATA => {
             let mut from = description("metadata")?;
-            Record::Metadata { name: from.text("name")?, facts: from.facts("facts")? }
+            Record::Metadata { name: from.text("name")?, facts: from.read_metadata_map("facts")? }
         }
         op::FOOTER => {
             let mut from = Fields::new("footer", body);

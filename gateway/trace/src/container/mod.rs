@@ -15,7 +15,7 @@ mod source;
 
 pub use chunk::Chunk;
 pub use field::{MetadataMap, NameBudget, Record, parse};
-pub use search::{RECORD_HEADER_BYTES, first_record, is_record, length_by_fields};
+pub use search::{RECORD_HEADER_BYTES, can_begin_record, first_record, length_by_fields};
 pub use source::{FramedRecord, RecordReader, seek_record};
 
 use std::io::{self, Read};

@@ -14,17 +14,17 @@ use super::{MAGIC, MAX_RECORD_BYTES, read_uninterrupted};
 /// The length of a record's header in bytes: operation code and length.
 pub const RECORD_HEADER_BYTES: usize = 9;
 /// The number of bytes that are read and searched at once.
-const WINDOW_BYTES: usize = 1 << 20;
+const SEARCH_WINDOW_BYTES: usize = 1 << 20;
 /// The maximum number of bytes at the beginning of a record by which it is identified.
 const MAX_PREFIX_BYTES: usize = 512;
 /// The number of consecutive records that are not considered a coincidence.
-const MIN_ROW_RECORDS: usize = 4;
+const MIN_CONSECUTIVE_RECORDS: usize = 4;
 /// The length in bytes of the fields of a message record before the message itself.
 const MESSAGE_HEADER_BYTES: u64 = 22;
 
 /// Returns true if the operation code is defined by MCAP, or is free for applications (0x80 and above).
 #[must_use]
-pub(super) const fn is_known(opcode: u8) -> bool {
+pub(super) const fn is_known_opcode(opcode: u8) -> bool {
     matches!(opcode, 0x01..=0x0F | 0x80..)
 }
 
@@ -53,7 +53,7 @@ const fn min_length(opcode: u8) -> Option<u64> {
 ///
 /// # Errors
 /// Returns an error if the input fails.
-pub fn is_record(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<bool> {
+pub fn can_begin_record(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<bool> {
     Ok(at == size || read_record_header(input, at, size)?.is_some())
 }
 
@@ -74,9 +74,11 @@ pub fn first_record(
     while from < until.min(size) {
         input.seek(SeekFrom::Start(from))?;
         window.clear();
-        input.by_ref().take((WINDOW_BYTES + MAX_PREFIX_BYTES) as u64).read_to_end(&mut window)?;
-        let starts =
-            usize::try_from(until - from).unwrap_or(WINDOW_BYTES).min(WINDOW_BYTES).min(window.len());
+        input.by_ref().take((SEARCH_WINDOW_BYTES + MAX_PREFIX_BYTES) as u64).read_to_end(&mut window)?;
+        let starts = usize::try_from(until - from)
+            .unwrap_or(SEARCH_WINDOW_BYTES)
+            .min(SEARCH_WINDOW_BYTES)
+            .min(window.len());
         for start in 0..starts {
             let at = from + start as u64;
             let bytes = window.get(start..(start + MAX_PREFIX_BYTES).min(window.len())).unwrap_or_default();
@@ -182,7 +184,7 @@ pub(super) fn has_wrong_opcode(body: &[u8], length: u64) -> bool {
 
 /// Returns true if a message ends with several consecutive records. Its length field is then wrong and spans them.
 #[must_use]
-pub(super) fn has_records(message: &[u8]) -> bool {
+pub(super) fn ends_with_records(message: &[u8]) -> bool {
     let first = usize::try_from(MESSAGE_HEADER_BYTES).unwrap_or(usize::MAX);
     (first..message.len().saturating_sub(RECORD_HEADER_BYTES)).any(|start| {
         let mut rest = message.get(start..).unwrap_or_default();
@@ -194,14 +196,14 @@ pub(super) fn has_records(message: &[u8]) -> bool {
                 .and_then(|length| rest.get(RECORD_HEADER_BYTES + length..))
                 .unwrap_or_default();
         }
-        row >= MIN_ROW_RECORDS || (row > 0 && rest.is_empty())
+        row >= MIN_CONSECUTIVE_RECORDS || (row > 0 && rest.is_empty())
     })
 }
 
 /// Returns true if several consecutive records begin at `at`, or if records follow each other up to the end of the
 /// file.
 fn is_record_sequence(input: &mut (impl Read + Seek), mut at: u64, size: u64) -> io::Result<bool> {
-    for before in 0..MIN_ROW_RECORDS {
+    for before in 0..MIN_CONSECUTIVE_RECORDS {
         if before > 0 && at == size {
             return Ok(true);
         }

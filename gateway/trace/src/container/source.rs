@@ -6,7 +6,8 @@ use mcap::records::op;
 
 use super::field::{Record, attachment_name, parse};
 use super::search::{
-    RECORD_HEADER_BYTES, has_records, has_wrong_opcode, is_known, is_uncompressed, length_by_fields,
+    RECORD_HEADER_BYTES, ends_with_records, has_wrong_opcode, is_known_opcode, is_uncompressed,
+    length_by_fields,
 };
 use super::{FormatError, MAGIC, MAX_RECORD_BYTES, read_uninterrupted};
 
@@ -120,7 +121,7 @@ impl<R: Read> RecordReader<R> {
 
     /// Returns the offset of the record before the last one, if that is a message.
     #[must_use]
-    pub const fn message_before(&self) -> Option<u64> {
+    pub const fn offset_of_message_before(&self) -> Option<u64> {
         self.message_before
     }
 
@@ -167,7 +168,7 @@ impl<R: Read> RecordReader<R> {
         }
         match length_by_fields(code, &self.body) {
             Some(own) if own != bytes => Err(FormatError::Length { code, bytes, own }),
-            _ if code == op::MESSAGE && has_records(&self.body) => Err(FormatError::Swallowed(bytes)),
+            _ if code == op::MESSAGE && ends_with_records(&self.body) => Err(FormatError::Swallowed(bytes)),
             _ => Ok(()),
         }
     }
@@ -183,7 +184,7 @@ impl<R: Read> RecordReader<R> {
     ///
     /// # Errors
     /// Returns [`FormatError`] if the record or the checksum is wrong.
-    pub fn check_section(&mut self, code: u8) -> Result<(), FormatError> {
+    pub fn check_section_checksum(&mut self, code: u8) -> Result<(), FormatError> {
         let found = self.checksum.take().map(crc32fast::Hasher::finalize);
         let (Record::DataEnd { crc: saved } | Record::Footer { crc: saved }) = parse(code, &self.body)?
         else {
@@ -255,7 +256,7 @@ impl<R: Read> RecordReader<R> {
             there = self.skip(length - kept)?;
         }
         Ok(match limit {
-            _ if !is_known(opcode) => FramedRecord::Unknown(opcode, length),
+            _ if !is_known_opcode(opcode) => FramedRecord::Unknown(opcode, length),
             _ if !there => FramedRecord::Truncated(opcode, length),
             0 if opcode != op::ATTACHMENT => FramedRecord::Skipped(opcode, length),
             _ if is_long => FramedRecord::Oversized(opcode, length),

@@ -10,8 +10,9 @@ use protocol::stop::InterruptibleWriter;
 use rustix::fs::{Access, access};
 
 use super::target::{
-    OutputTarget, device_and_inode, lock_exclusively, open_no_follow, open_stream, still_names_file,
-    suffixed, sync_folder, temporary_name, with_exists_hint, with_hint, write_all_with_retries,
+    OutputTarget, device_and_inode, lock_exclusively, open_no_follow, open_stream, path_with_suffix,
+    still_names_file, sync_folder, temporary_name, with_creation_hint, with_exists_hint,
+    write_all_with_retries,
 };
 
 /// A log file. It has its name from the start and is locked against other writers. It always ends with a complete line.
@@ -41,18 +42,18 @@ impl LogFile {
     /// # Errors
     /// Returns an error, with advice to the user, if the file cannot be written.
     pub fn create(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
-        let state = match OutputTarget::inspect(path, force) {
+        let state = match OutputTarget::inspect_target(path, force) {
             Ok(OutputTarget::Stream) => {
                 LogTarget::Stream(InterruptibleWriter::new(open_stream(path, stopped)?))
             }
             Ok(OutputTarget::New) => LogTarget::Opened(create_locked(path)?),
             Ok(OutputTarget::Existing) => {
                 // If the file was replaced by a symlink meanwhile, the link is not followed.
-                let old = open_no_follow(path).map_err(with_hint)?;
+                let old = open_no_follow(path).map_err(with_creation_hint)?;
                 lock_log(&old)?;
                 // Missing write access to the folder is reported now, not when the first line is written.
                 let writes = access(parent_folder(path), Access::WRITE_OK | Access::EXEC_OK);
-                writes.map_err(|errno| with_hint(errno.into()))?;
+                writes.map_err(|errno| with_creation_hint(errno.into()))?;
                 LogTarget::ToReplace(old)
             }
             Err(error) => {
@@ -78,7 +79,7 @@ impl LogFile {
             match Self::create(&name, false, stopped) {
                 Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
                     number += 1;
-                    name = suffixed(path, format!("-{number}"), path.extension().unwrap_or_default());
+                    name = path_with_suffix(path, format!("-{number}"), path.extension().unwrap_or_default());
                 }
                 created => return created,
             }
@@ -222,7 +223,7 @@ fn is_same(one: &File, other: &File) -> bool {
 /// Creates and locks a new file.
 fn create_locked(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().append(true).create_new(true).open(path);
-    let file = file.map_err(|error| with_exists_hint(with_hint(error)))?;
+    let file = file.map_err(|error| with_exists_hint(with_creation_hint(error)))?;
     lock_log(&file)?;
     Ok(file)
 }

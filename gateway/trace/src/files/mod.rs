@@ -14,10 +14,13 @@ use std::sync::atomic::AtomicBool;
 pub use log::LogFile;
 pub use protocol::input::parent_folder;
 use target::{OutputTarget, open_stream, temporary_name, with_exists_hint};
-pub use target::{STANDARD_OUTPUT, check, check_regular, rename, suffixed, sync_folder, with_hint};
+pub use target::{
+    STANDARD_OUTPUT, check_writable, check_writable_regular_file, path_with_suffix, rename, sync_folder,
+    with_creation_hint,
+};
 pub(crate) use target::{
-    create_unnamed_file, device_and_inode, link, lock_exclusively, open_no_follow, still_names_file,
-    write_with_retries,
+    create_unnamed_file, device_and_inode, lock_exclusively, name_unnamed_file, open_no_follow,
+    still_names_file, write_with_retries,
 };
 
 /// A file that gets its name only when it is complete. Until then it is unnamed, and so disappears if the program is
@@ -43,24 +46,24 @@ impl AtomicFile {
     /// # Errors
     /// Returns an error, with advice to the user, if the file cannot be written.
     pub fn create(path: &Path, force: bool) -> io::Result<(Self, File)> {
-        Self::create_unless(path, force, &AtomicBool::new(false))
+        Self::create_unless_stopped(path, force, &AtomicBool::new(false))
     }
 
     /// Opens a file like [`AtomicFile::create`]. If it is a FIFO, waits until it has a reader or `stopped` is set.
     ///
     /// # Errors
     /// Returns an error, with advice to the user, if the file cannot be written.
-    pub fn create_unless(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<(Self, File)> {
+    pub fn create_unless_stopped(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<(Self, File)> {
         let begun = |file, is_part| Self { path: path.to_owned(), force, file, is_part };
-        if OutputTarget::inspect(path, force)? == OutputTarget::Stream {
-            let file = open_stream(path, stopped).map_err(with_hint)?;
+        if OutputTarget::inspect_target(path, force)? == OutputTarget::Stream {
+            let file = open_stream(path, stopped).map_err(with_creation_hint)?;
             return Ok((begun(None, false), file));
         }
         if let Ok(file) = create_unnamed_file(parent_folder(path), 0o666) {
             return Ok((begun(Some(file.try_clone()?), false), file));
         }
         let part = OpenOptions::new().write(true).create_new(true).open(temporary_name(path));
-        let file = part.map_err(with_hint)?;
+        let file = part.map_err(with_creation_hint)?;
         Ok((begun(Some(file.try_clone()?), true), file))
     }
 
@@ -87,7 +90,7 @@ impl AtomicFile {
             // Linking fails if the name exists. To replace a file, the new one therefore gets a temporary name and is
             // renamed.
             let name = if self.force { temporary_name(&self.path) } else { self.path.clone() };
-            link(file, &name).map_err(with_exists_hint)?;
+            name_unnamed_file(file, &name).map_err(with_exists_hint)?;
             self.is_part = self.force;
         }
         if self.is_part {

@@ -36,16 +36,16 @@ pub(super) enum OutputTarget {
 impl OutputTarget {
     /// Determines which kind of file exists under a name. Returns an error for a regular file unless `force` is true,
     /// and for a symlink to a regular file or to nothing.
-    pub(super) fn inspect(path: &Path, force: bool) -> io::Result<Self> {
+    pub(super) fn inspect_target(path: &Path, force: bool) -> io::Result<Self> {
         if path == Path::new(STANDARD_OUTPUT) {
             return Ok(Self::Stream);
         }
         let kind = match fs::symlink_metadata(path) {
             Ok(about) => about.file_type(),
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                return fs::metadata(parent_folder(path)).map(|_| Self::New).map_err(with_hint);
+                return fs::metadata(parent_folder(path)).map(|_| Self::New).map_err(with_creation_hint);
             }
-            Err(error) => return Err(with_hint(error)),
+            Err(error) => return Err(with_creation_hint(error)),
         };
         if kind.is_symlink() {
             let streams = fs::metadata(path).is_ok_and(|about| is_stream(about.file_type()));
@@ -61,8 +61,8 @@ impl OutputTarget {
         }
         match kind {
             _ if is_stream(kind) => Ok(Self::Stream),
-            _ if kind.is_dir() => Err(with_hint(io::ErrorKind::IsADirectory.into())),
-            _ if !kind.is_file() => Err(no_regular_file()),
+            _ if kind.is_dir() => Err(with_creation_hint(io::ErrorKind::IsADirectory.into())),
+            _ if !kind.is_file() => Err(not_regular_file_error()),
             _ if force => Ok(Self::Existing),
             _ => Err(exists_error()),
         }
@@ -73,22 +73,22 @@ impl OutputTarget {
 ///
 /// # Errors
 /// Returns an error, with advice to the user, if it may not.
-pub fn check(path: &Path, force: bool) -> io::Result<()> {
-    OutputTarget::inspect(path, force).map(|_| ())
+pub fn check_writable(path: &Path, force: bool) -> io::Result<()> {
+    OutputTarget::inspect_target(path, force).map(|_| ())
 }
 
 /// Checks that a file may be written and is not a FIFO or a device, before there is anything to write.
 ///
 /// # Errors
 /// Returns an error, with advice to the user, if it may not.
-pub fn check_regular(path: &Path, force: bool) -> io::Result<()> {
-    match OutputTarget::inspect(path, force)? {
+pub fn check_writable_regular_file(path: &Path, force: bool) -> io::Result<()> {
+    match OutputTarget::inspect_target(path, force)? {
         OutputTarget::New | OutputTarget::Existing => Ok(()),
-        OutputTarget::Stream => Err(no_regular_file()),
+        OutputTarget::Stream => Err(not_regular_file_error()),
     }
 }
 
-fn no_regular_file() -> io::Error {
+fn not_regular_file_error() -> io::Error {
     io::Error::new(io::ErrorKind::AlreadyExists, "it is not a regular file: name another one")
 }
 
@@ -143,7 +143,7 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
 
 /// Returns the path of a file with `suffix` after its stem and with the extension `end`, as in `run-1.mcap`.
 #[must_use]
-pub fn suffixed(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf {
+pub fn path_with_suffix(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf {
     let mut name = path.file_stem().unwrap_or_default().to_owned();
     name.push(suffix);
     if !end.is_empty() {
@@ -166,7 +166,7 @@ pub(crate) fn create_unnamed_file(folder: &Path, mode: u32) -> io::Result<File> 
 ///
 /// # Errors
 /// Returns an error if the name cannot be given.
-pub(crate) fn link(file: &File, path: &Path) -> io::Result<()> {
+pub(crate) fn name_unnamed_file(file: &File, path: &Path) -> io::Result<()> {
     let nameless = format!("/proc/self/fd/{}", file.as_raw_fd());
     Ok(linkat(CWD, nameless, CWD, path, AtFlags::SYMLINK_FOLLOW)?)
 }
@@ -281,7 +281,7 @@ pub fn sync_folder(path: &Path) {
 
 /// Adds advice to an error of creating a file, if the folder or the disk causes it.
 #[must_use]
-pub fn with_hint(error: io::Error) -> io::Error {
+pub fn with_creation_hint(error: io::Error) -> io::Error {
     if matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) {
         return io::Error::new(
             error.kind(),

@@ -72,7 +72,7 @@ fn what_is_there_is_not_overwritten_and_no_symlink_is_followed_to_a_file() {
 #[test]
 fn of_a_full_disk_the_hint_is_another_one() {
     // The folder of another file may be on the same full disk, so no other folder is advised.
-    let full = with_hint(io::ErrorKind::StorageFull.into());
+    let full = with_creation_hint(io::ErrorKind::StorageFull.into());
     assert!(full.to_string().ends_with("; free some space, or name a file on another disk"), "{full}");
     assert_eq!(full.kind(), io::ErrorKind::StorageFull);
 }

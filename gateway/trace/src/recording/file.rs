@@ -34,10 +34,10 @@ const MESSAGE_OVERHEAD: u64 = 31;
 /// Returns the options for the writer of the crate `mcap`. Seeking is off, so that flushed data stays readable even if
 /// the program is killed. Threads are off, because they cost more than they save. Chunk ends and the checksum of the
 /// data section are left to [`FileWriter`] and [`Output`].
-fn options() -> WriteOptions {
+fn mcap_write_options() -> WriteOptions {
     WriteOptions::new()
-        .profile(PROFILE)
-        .library(format!("{PROGRAM}{}", env!("CARGO_PKG_VERSION")))
+        .profile(MCAP_PROFILE)
+        .library(format!("{PROGRAM_PREFIX}{}", env!("CARGO_PKG_VERSION")))
         .compression(Some(mcap::Compression::Zstd))
         .compression_threads(0)
         .chunk_size(Some(2 * CHUNK_BYTES))
@@ -49,19 +49,19 @@ fn options() -> WriteOptions {
 /// than it stores.
 const IDENTITY_METADATA: &str = "recorder";
 /// The key of the file's inode in [`MARK`].
-const INODE: &str = "inode";
-const BORN: &str = "born_ns";
+const INODE_KEY: &str = "inode";
+const BIRTH_TIME_KEY: &str = "born_ns";
 /// The MCAP profile of a recording: the conventions that it follows.
-const PROFILE: &str = "ros2";
+const MCAP_PROFILE: &str = "ros2";
 /// The beginning of the name of the writing program; the version follows.
-const PROGRAM: &str = "skinbus ";
+const PROGRAM_PREFIX: &str = "skinbus ";
 
 /// Returns the values that distinguish a file from its copies: the inode, and the creation time if the file system
 /// stores it, because an inode can be reused.
 fn identity(about: &fs::Metadata) -> BTreeMap<String, String> {
     let born = about.created().ok().and_then(|at| at.duration_since(UNIX_EPOCH).ok());
-    let born = born.map(|born| (BORN.to_owned(), born.as_nanos().to_string()));
-    [(INODE.to_owned(), about.ino().to_string())].into_iter().chain(born).collect()
+    let born = born.map(|born| (BIRTH_TIME_KEY.to_owned(), born.as_nanos().to_string()));
+    [(INODE_KEY.to_owned(), about.ino().to_string())].into_iter().chain(born).collect()
 }
 
 /// Returns the first bytes of a recording: magic bytes, header, and a metadata record with the identity of the file
@@ -88,7 +88,7 @@ pub fn has_own_identity(file: &mut File) -> io::Result<bool> {
         return Ok(false);
     }
     let header = parse(op::HEADER, from.body());
-    let is_ours = matches!(header, Ok(Record::Header { library, .. }) if library.starts_with(PROGRAM));
+    let is_ours = matches!(header, Ok(Record::Header { library, .. }) if library.starts_with(PROGRAM_PREFIX));
     if !is_ours || from.next()? != FramedRecord::Record(op::METADATA) {
         return Ok(false);
     }
@@ -161,7 +161,7 @@ impl<W: Write> FileWriter<W> {
     /// # Errors
     /// Returns an error if the file cannot be written, as all methods below do.
     pub fn new(out: W) -> io::Result<Self> {
-        Self::with_profile(out, PROFILE)
+        Self::with_profile(out, MCAP_PROFILE)
     }
 
     /// Begins a file with another profile than that of a recording.
@@ -170,7 +170,7 @@ impl<W: Write> FileWriter<W> {
     /// Returns an error if the file cannot be written.
     pub(super) fn with_profile(out: W, profile: &str) -> io::Result<Self> {
         let output = SharedOutput::new(out);
-        let writer = options().profile(profile).create(output.clone()).map_err(io_error)?;
+        let writer = mcap_write_options().profile(profile).create(output.clone()).map_err(io_error)?;
         Ok(Self {
             writer,
             output,
@@ -365,7 +365,7 @@ impl<W: Write> FileWriter<W> {
     /// Returns an error if the file cannot be written.
     pub fn flush(&mut self) -> io::Result<()> {
         self.end_chunk()?;
-        self.output.flush_through()
+        self.output.flush_output()
     }
 
     /// Ends the file with indexes and statistics, which readers need for seeking.
@@ -376,7 +376,7 @@ impl<W: Write> FileWriter<W> {
         self.end_chunk()?;
         self.output.expect_data_end();
         self.writer.finish().map_err(io_error)?;
-        self.output.flush_through()
+        self.output.flush_output()
     }
 
     /// Returns the output. The file has no end unless [`FileWriter::finish`] wrote it.

@@ -10,7 +10,7 @@ use super::robot::RecordedRobot;
 use super::{BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX};
 
 /// The name of the frame in which positions are given if no robot description names one.
-const BASE: &str = "base";
+const DEFAULT_BASE_FRAME: &str = "base";
 /// The maximum rate of point clouds of a patch, in Hz.
 const MAX_CLOUD_HZ: f64 = 30.0;
 
@@ -60,7 +60,8 @@ impl Layout {
     pub fn new(skin: &Skin) -> Self {
         let buses: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
         let (chain_words, mut topics) = (chain_prefixes(skin), UniqueNames::default());
-        let bus_words = UniqueNames::default().assign_all(buses.iter().map(|bus| sanitized(bus)).collect());
+        let bus_words =
+            UniqueNames::default().assign_unique_names(buses.iter().map(|bus| sanitized(bus)).collect());
         let mut patches = Vec::new();
         for (index, chain) in skin.robot.chains.iter().enumerate() {
             let on_chain = |bus: &usize| skin.buses.get(*bus).is_some_and(|bus| bus.chain == index);
@@ -109,7 +110,7 @@ impl Layout {
     #[must_use]
     pub fn with_robot(mut self, robot: RecordedRobot) -> Self {
         for patch in &mut self.patches {
-            if let Some(link) = robot.link(patch.joint) {
+            if let Some(link) = robot.link_moved_by(patch.joint) {
                 link.clone_into(&mut patch.link);
             }
         }
@@ -123,9 +124,10 @@ impl Layout {
     pub fn bus_topics(&self, others: impl Iterator<Item = String>) -> [Vec<String>; 2] {
         let mut taken = UniqueNames::default();
         let points = |Patch { topic, .. }: &Patch| [topic.clone(), format!("{topic}/points")];
-        taken.assign_all(others.chain(self.patches.iter().flat_map(points)).collect());
-        [BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX]
-            .map(|before| taken.assign_all(self.buses.iter().map(|bus| format!("{before}{bus}")).collect()))
+        taken.assign_unique_names(others.chain(self.patches.iter().flat_map(points)).collect());
+        [BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX].map(|before| {
+            taken.assign_unique_names(self.buses.iter().map(|bus| format!("{before}{bus}")).collect())
+        })
     }
 
     /// Returns true if the poses of links are recorded at this tick.
@@ -136,8 +138,8 @@ impl Layout {
 
     /// Returns the name of the frame in which the positions of cells are given: the robot's base.
     #[must_use]
-    pub fn base(&self) -> &str {
-        self.robot.as_ref().map_or(BASE, RecordedRobot::base)
+    pub fn base_frame_name(&self) -> &str {
+        self.robot.as_ref().map_or(DEFAULT_BASE_FRAME, RecordedRobot::root_link_name)
     }
 
     /// Returns the positions of the joints in a bus's chain, taken from those of all joints of the robot.
@@ -161,7 +163,7 @@ mod tests {
 
     #[test]
     fn a_patch_is_the_cells_of_a_bus_on_a_link() {
-        let mut skin = testing::skin();
+        let mut skin = testing::one_cell_skin();
         skin.robot.name = "UR 5/e".to_owned();
         let layout = Layout::new(&skin);
         assert_eq!((layout.arm.as_str(), layout.joints.len()), ("UR_5_e", skin.robot.joints.len()));

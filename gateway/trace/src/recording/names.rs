@@ -19,8 +19,8 @@ use thiserror::Error;
 
 use super::file;
 use crate::files::{
-    create_unnamed_file, device_and_inode, link, lock_exclusively, open_no_follow, parent_folder, rename,
-    still_names_file, suffixed, with_hint,
+    create_unnamed_file, device_and_inode, lock_exclusively, name_unnamed_file, open_no_follow,
+    parent_folder, path_with_suffix, rename, still_names_file, with_creation_hint,
 };
 
 /// The extension of a file that is not complete yet.
@@ -52,13 +52,17 @@ pub fn final_name(part: &Path) -> PathBuf {
 /// Returns the name of a file of a recording: `run.mcap` for number 0, `run-1.mcap` for number 1, and so on.
 #[must_use]
 pub fn numbered_path(path: &Path, number: u32) -> PathBuf {
-    if number == 0 { path.to_owned() } else { suffixed(path, format!("-{number}"), MCAP_EXTENSION.as_ref()) }
+    if number == 0 {
+        path.to_owned()
+    } else {
+        path_with_suffix(path, format!("-{number}"), MCAP_EXTENSION.as_ref())
+    }
 }
 
 /// Returns a name for a recovered file that no other file has.
 #[must_use]
 pub fn recovered_name(goal: &Path) -> PathBuf {
-    let first = suffixed(goal, "-recovered", MCAP_EXTENSION.as_ref());
+    let first = path_with_suffix(goal, "-recovered", MCAP_EXTENSION.as_ref());
     (0..).map(|number| numbered_path(&first, number)).find(|path| !exists(path)).unwrap_or_default()
 }
 
@@ -118,7 +122,7 @@ impl PartFile {
             if error.kind() == io::ErrorKind::AlreadyExists {
                 return io::Error::new(io::ErrorKind::AlreadyExists, name_in_use_message(&path));
             }
-            with_hint(error)
+            with_creation_hint(error)
         };
         let file = create_linked(&path).unwrap_or_else(|| create_exclusive(&path)).map_err(taken)?;
         let is = device_and_inode(&file.metadata()?);
@@ -188,7 +192,7 @@ fn name_in_use_message(path: &Path) -> String {
 fn create_linked(path: &Path) -> Option<io::Result<File>> {
     let mut file = create_unnamed_file(parent_folder(path), 0o666).ok()?;
     lock_and_mark(&mut file).ok()?;
-    match link(&file, path) {
+    match name_unnamed_file(&file, path) {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists => None,
         linked => Some(linked.map(|()| file)),
     }

@@ -16,7 +16,7 @@ use mcap::records::op;
 const DATA_END_BYTES: usize = 13;
 
 /// The state that all handles of an output share.
-struct Inner<W> {
+struct SharedOutputState<W> {
     out: W,
     offset: u64,
     /// The checksum of all bytes of the data section.
@@ -26,7 +26,7 @@ struct Inner<W> {
     end: Option<Vec<u8>>,
 }
 
-impl<W: Write> Inner<W> {
+impl<W: Write> SharedOutputState<W> {
     fn write_checked(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.out.write_all(bytes)?;
         self.offset += bytes.len() as u64;
@@ -51,7 +51,7 @@ impl<W: Write> Inner<W> {
 }
 
 /// A handle of the output. It ignores requests to flush, because the crate flushes after each chunk.
-pub(super) struct SharedOutput<W>(Arc<Mutex<Inner<W>>>);
+pub(super) struct SharedOutput<W>(Arc<Mutex<SharedOutputState<W>>>);
 
 impl<W> Clone for SharedOutput<W> {
     fn clone(&self) -> Self {
@@ -62,26 +62,26 @@ impl<W> Clone for SharedOutput<W> {
 impl<W: Write> SharedOutput<W> {
     pub(super) fn new(out: W) -> Self {
         let checksum = crc32fast::Hasher::new();
-        Self(Arc::new(Mutex::new(Inner { out, offset: 0, checksum, end: None })))
+        Self(Arc::new(Mutex::new(SharedOutputState { out, offset: 0, checksum, end: None })))
     }
 
-    fn inner(&self) -> MutexGuard<'_, Inner<W>> {
+    fn lock_state(&self) -> MutexGuard<'_, SharedOutputState<W>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Inserts complete records. The crate must be between two records.
     pub(super) fn insert_records(&self, records: &[u8]) -> io::Result<()> {
-        self.inner().write_checked(records)
+        self.lock_state().write_checked(records)
     }
 
     /// Announces that the next bytes of the crate are the record that ends the data section.
     pub(super) fn expect_data_end(&self) {
-        self.inner().end = Some(Vec::new());
+        self.lock_state().end = Some(Vec::new());
     }
 
     /// Flushes the output.
-    pub(super) fn flush_through(&self) -> io::Result<()> {
-        self.inner().out.flush()
+    pub(super) fn flush_output(&self) -> io::Result<()> {
+        self.lock_state().out.flush()
     }
 
     /// Returns the underlying writer if this is the last handle.
@@ -93,7 +93,7 @@ impl<W: Write> SharedOutput<W> {
 
 impl<W: Write> Write for SharedOutput<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let mut inner = self.inner();
+        let mut inner = self.lock_state();
         match inner.replace_data_end(bytes)? {
             0 => inner.write_checked(bytes).map(|()| bytes.len()),
             taken => Ok(taken),
@@ -109,7 +109,7 @@ impl<W: Write> Seek for SharedOutput<W> {
     /// Returns the current offset. No other seek is supported.
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         match to {
-            SeekFrom::Current(0) => Ok(self.inner().offset),
+            SeekFrom::Current(0) => Ok(self.lock_state().offset),
             SeekFrom::Start(_) | SeekFrom::End(_) | SeekFrom::Current(_) => {
                 Err(io::ErrorKind::NotSeekable.into())
             }

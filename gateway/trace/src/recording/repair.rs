@@ -52,7 +52,7 @@ pub fn repair(
     let repaired = loop {
         attempts += 1;
         let path = goal();
-        match copy(from, &path, force, something) {
+        match recover_into_file(from, &path, force, something) {
             Err(RecoverError::Write(error))
                 if error.kind() == io::ErrorKind::AlreadyExists && attempts < MAX_ATTEMPTS => {}
             copied => {
@@ -70,7 +70,7 @@ pub fn repair(
 }
 
 /// Returns the error message for a file that was not finished and cannot be repaired.
-pub(super) fn unrepaired(PartFile { path, goal, .. }: &PartFile, error: &RecoverError) -> String {
+pub(super) fn unrepaired_message(PartFile { path, goal, .. }: &PartFile, error: &RecoverError) -> String {
     let path = path.display();
     let is = |kind: fn(&io::Error) -> bool| matches!(error, RecoverError::Write(error) if kind(error));
     let why = if is(|error| error.kind() == io::ErrorKind::AlreadyExists) {
@@ -87,15 +87,15 @@ pub(super) fn unrepaired(PartFile { path, goal, .. }: &PartFile, error: &Recover
 ///
 /// # Errors
 /// Returns [`RecoverError`] if nothing can be recovered or written.
-pub fn copy_unless_sound(
+pub fn recover_unless_sound(
     from: &File,
     to: &Path,
     force: bool,
 ) -> Result<(RecoveryResult, Option<u64>), RecoverError> {
-    copy(from, to, force, |recovered| !recovered.is_sound() && recovered.messages > 0)
+    recover_into_file(from, to, force, |recovered| !recovered.is_sound() && recovered.messages > 0)
 }
 
-fn copy(
+fn recover_into_file(
     from: &File,
     to: &Path,
     force: bool,
@@ -107,7 +107,7 @@ fn copy(
     let mut from = from;
     // The file is read twice. A pipe can be read only once, so it is copied first.
     let kept = if from.rewind().is_err() {
-        Some(buffered_pipe(from, parent_folder(to)).map_err(RecoverError::Read)?)
+        Some(pipe_to_unnamed_file(from, parent_folder(to)).map_err(RecoverError::Read)?)
     } else {
         None
     };
@@ -124,7 +124,7 @@ fn copy(
 }
 
 /// Copies the rest of a pipe into an unnamed file.
-fn buffered_pipe(mut from: &File, folder: &Path) -> io::Result<File> {
+fn pipe_to_unnamed_file(mut from: &File, folder: &Path) -> io::Result<File> {
     let mut file = create_unnamed_file(folder, 0o600)?;
     io::copy(&mut from, &mut file)?;
     file.rewind()?;
@@ -184,7 +184,7 @@ mod tests {
     fn what_cannot_be_repaired_where_it_is_is_repaired_elsewhere() {
         let folder = tempfile::tempdir().unwrap();
         let (part, _file) = PartFile::create(folder.path().join("run.mcap")).unwrap();
-        let line = |kind: io::ErrorKind| unrepaired(&part, &RecoverError::Write(kind.into()));
+        let line = |kind: io::ErrorKind| unrepaired_message(&part, &RecoverError::Write(kind.into()));
         let full = line(io::ErrorKind::StorageFull);
         assert!(full.ends_with("run.mcap.part -o FILE`, a file on another disk"), "{full}");
         let taken = line(io::ErrorKind::AlreadyExists);

@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Chain, Skin};
-use robots::{DhRow, LinkPose, RobotError, RobotProblem, Urdf, frames, pose_of, write_urdf};
+use robots::{DhRow, LinkPose, RobotError, RobotProblem, Urdf, chain_base_pose, frames, write_urdf};
 
 use crate::ros2::robot::Transform;
 
@@ -51,7 +51,7 @@ impl RecordedRobot {
     pub fn from_urdf(skin: &Skin, urdf: Urdf, text: String) -> Result<Self, RobotError> {
         let link = |joint: &usize| {
             let name = skin.robot.joints.get(*joint).map_or("", |joint| &joint.name);
-            urdf.link_of(name).map(str::to_owned)
+            urdf.link_moved_by(name).map(str::to_owned)
         };
         let links = skin.robot.chains.iter().map(|chain| chain.joints.iter().map(link).collect());
         let links = links.collect::<Result<Vec<_>, _>>()?;
@@ -68,42 +68,43 @@ impl RecordedRobot {
         let poses = urdf.link_poses(&names)?;
         let base = urdf.root().to_owned();
         let described = LinkedUrdf { urdf, poses, links };
-        let cells = skin.cells.iter().map(|cell| described.cell(skin, cell)).collect::<Result<_, _>>()?;
+        let cells =
+            skin.cells.iter().map(|cell| described.cell_frame(skin, cell)).collect::<Result<_, _>>()?;
         let LinkedUrdf { poses, links, .. } = described;
         Ok(Self { description, base, poses, links, cells })
     }
 
     /// Returns the name of the robot's root link.
     #[must_use]
-    pub fn base(&self) -> &str {
+    pub fn root_link_name(&self) -> &str {
         &self.base
     }
 
     /// Returns the name of the link that a joint moves. `chain` counts from 0 and `joint` from 1.
     #[must_use]
-    pub fn link(&self, (chain, joint): (usize, usize)) -> Option<&str> {
+    pub fn link_moved_by(&self, (chain, joint): (usize, usize)) -> Option<&str> {
         self.links.get(chain)?.get(joint.checked_sub(1)?).map(String::as_str)
     }
 
     /// Returns the poses of all links that joints move, for the joint positions `q` in rad or m.
     #[must_use]
     pub fn moving_transforms(&self, q: &[f64]) -> Vec<Transform<'_>> {
-        let moving = self.poses.iter().filter(|pose| pose.moves());
-        moving.map(|pose| transform(&pose.parent, &pose.child, &pose.pose(q))).collect()
+        let moving = self.poses.iter().filter(|pose| pose.is_moved_by_joint());
+        moving.map(|pose| transform(&pose.parent, &pose.child, &pose.pose_in_parent(q))).collect()
     }
 
     /// Returns the poses that never change: those of fixed links, and those of cells on their links.
     #[must_use]
     pub fn fixed_transforms(&self) -> Vec<Transform<'_>> {
-        let links = self.poses.iter().filter(|pose| !pose.moves());
-        let links = links.map(|pose| transform(&pose.parent, &pose.child, &pose.pose(&[])));
+        let links = self.poses.iter().filter(|pose| !pose.is_moved_by_joint());
+        let links = links.map(|pose| transform(&pose.parent, &pose.child, &pose.pose_in_parent(&[])));
         links.chain(self.cells.iter().map(|(link, cell, pose)| transform(link, cell, pose))).collect()
     }
 }
 
 impl LinkedUrdf {
     /// Returns the link that a cell is on, the name of the cell's own frame, and the pose of that frame on the link.
-    fn cell(&self, skin: &Skin, cell: &Cell) -> Result<(String, String, Isometry3<f64>), RobotError> {
+    fn cell_frame(&self, skin: &Skin, cell: &Cell) -> Result<(String, String, Isometry3<f64>), RobotError> {
         let bus = skin.buses.get(cell.bus);
         let index = bus.map_or(0, |bus| bus.chain);
         let chain = skin.chain(cell.bus);
@@ -138,11 +139,11 @@ impl LinkedUrdf {
         let of_chain: Vec<_> =
             chain.joints.iter().map(|joint| q.get(*joint).copied().unwrap_or_default()).collect();
         let rows: Vec<_> = chain.rows.iter().map(DhRow::from).collect();
-        let frames = frames(&pose_of(&chain.base), &rows, &of_chain);
+        let frames = frames(&chain_base_pose(&chain.base), &rows, &of_chain);
         let frame = frames.get(row).copied().unwrap_or_else(Isometry3::identity);
         let (mut pose, mut at) = (Isometry3::identity(), link);
         while let Some(above) = self.poses.iter().find(|pose| pose.child == at) {
-            pose = above.pose(q) * pose;
+            pose = above.pose_in_parent(q) * pose;
             at = &above.parent;
         }
         pose.inverse() * frame

@@ -196,12 +196,12 @@ impl<T> SplitRecording<T> {
     }
 
     /// Begins the first file with `head`. `topics` creates the channels of a file.
-    pub fn begin(&mut self, head: FileHead, topics: impl FnOnce(&mut Writer) -> io::Result<T>) {
+    pub fn begin_first_file(&mut self, head: FileHead, topics: impl FnOnce(&mut Writer) -> io::Result<T>) {
         (self.now, self.head) = (head.nanos, head);
         let Some((part, file)) = self.claimed.take() else { return };
-        match self.start(part, file, topics) {
+        match self.start_file(part, file, topics) {
             Ok(open) => self.open = Some(open),
-            Err(error) => self.fail(&error),
+            Err(error) => self.handle_error(&error),
         }
     }
 
@@ -214,7 +214,7 @@ impl<T> SplitRecording<T> {
         }
     }
 
-    fn start(
+    fn start_file(
         &mut self,
         part: PartFile,
         file: File,
@@ -287,7 +287,7 @@ impl<T> SplitRecording<T> {
     /// Writes the messages that have waited long enough. Ends a file whose disk is full, or one that is large or old
     /// enough, the latter only if `holds` is false. Returns true if the caller should begin another file with
     /// [`SplitRecording::begin_next`].
-    pub fn flush(&mut self, holds: bool) -> bool {
+    pub fn flush_due_messages(&mut self, holds: bool) -> bool {
         self.collect_published();
         let Some(open) = &mut self.open else {
             let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY_INTERVAL);
@@ -311,7 +311,7 @@ impl<T> SplitRecording<T> {
         open.gauge.extend_reserve(open.writer.chunks());
         if open.gauge.is_full() {
             self.end_file();
-            self.fail(&rustix::io::Errno::NOSPC.into());
+            self.handle_error(&rustix::io::Errno::NOSPC.into());
             return false;
         }
         let enough =
@@ -330,7 +330,7 @@ impl<T> SplitRecording<T> {
         let goal = names::numbered_path(&self.path, number);
         let failed_before = self.failed;
         let before = std::mem::replace(&mut self.number, number);
-        match PartFile::create(goal).and_then(|(part, file)| self.start(part, file, topics)) {
+        match PartFile::create(goal).and_then(|(part, file)| self.start_file(part, file, topics)) {
             Ok(open) => {
                 if failed_before.is_some() {
                     let goal = open.part.goal.display();
@@ -340,7 +340,7 @@ impl<T> SplitRecording<T> {
                 true
             }
             Err(error) => {
-                self.fail(&error);
+                self.handle_error(&error);
                 self.number = before;
                 false
             }
@@ -355,7 +355,7 @@ impl<T> SplitRecording<T> {
 
     /// Returns the number of messages that could not be written.
     #[must_use]
-    pub const fn lost(&self) -> MessageCount {
+    pub const fn lost_messages(&self) -> MessageCount {
         self.lost
     }
 
@@ -407,15 +407,15 @@ impl<T> SplitRecording<T> {
     fn close_broken_file(&mut self, error: &io::Error) {
         let Some(open) = self.open.take() else { return };
         self.lost.add(open.written);
-        self.lost.add(self.window.count());
+        self.lost.add(self.window.waiting_count());
         // The buffer holds an incomplete record, which is dropped. The file stays locked until it is repaired.
         let (sink, _) = open.writer.into_inner().into_parts();
         self.broken.push(BrokenFile { part: open.part, file: sink.into_file(), kept: open.kept });
-        self.fail(error);
+        self.handle_error(error);
     }
 
     /// Handles an error. Requests another file at once, unless that was done a moment ago: the error then persists.
-    fn fail(&mut self, error: &io::Error) {
+    fn handle_error(&mut self, error: &io::Error) {
         let (last, prompt) = &mut self.immediate_retry;
         if last.is_none_or(|at| at.elapsed() >= RETRY_INTERVAL) {
             (*last, *prompt) = (Some(Instant::now()), true);
@@ -454,7 +454,7 @@ impl<T> SplitRecording<T> {
                 }
                 Ok(RepairResult { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
-                    self.said.push(RecordingEvent::Other(repair::unrepaired(&part, &error)));
+                    self.said.push(RecordingEvent::Other(repair::unrepaired_message(&part, &error)));
                     let bytes = file.metadata().map_or(0, |about| about.len());
                     self.written.push(kept.into_written_file(&part.path, bytes));
                 }

@@ -16,7 +16,7 @@ use super::file::{Channel, FileWriter};
 use crate::ros2::Message;
 
 /// The time for which a message waits for older ones, in ns.
-pub const WINDOW_NS: u64 = 40_000_000;
+pub const REORDER_WINDOW_NS: u64 = 40_000_000;
 /// The maximum number of waiting messages: those of three full buses in more than a second.
 const MAX_MESSAGES: usize = 65_536;
 /// The maximum size of waiting messages, in bytes.
@@ -99,18 +99,18 @@ impl ReorderWindow {
 
     /// Adds a message of a channel with its own time, in ns since 1970.
     pub fn write<M: Message>(&mut self, channel: &mut Channel, nanos: u64, message: &M) {
-        self.write_at(channel, nanos, nanos, message);
+        self.write_sorted_at(channel, nanos, nanos, message);
     }
 
     /// Adds a message that is sorted in the file by the time `at` instead of its own time `nanos`, both in ns since
     /// 1970.
-    pub fn write_at<M: Message>(&mut self, channel: &mut Channel, at: u64, nanos: u64, message: &M) {
+    pub fn write_sorted_at<M: Message>(&mut self, channel: &mut Channel, at: u64, nanos: u64, message: &M) {
         let id = usize::from(channel.id());
         if self.latest.len() <= id {
             self.latest.resize(id + 1, 0);
         }
         // Without this limit, a message with a time in the future would delay all later messages of its channel.
-        let mut at = at.min(self.now.saturating_add(WINDOW_NS));
+        let mut at = at.min(self.now.saturating_add(REORDER_WINDOW_NS));
         if let Some(latest) = self.latest.get_mut(id) {
             at = at.max(*latest);
             *latest = at;
@@ -131,8 +131,8 @@ impl ReorderWindow {
 
     /// Returns the number of waiting messages.
     #[must_use]
-    pub fn count(&self) -> MessageCount {
-        count(&self.waiting)
+    pub fn waiting_count(&self) -> MessageCount {
+        count_messages(&self.waiting)
     }
 
     /// Returns the number of messages that arrived after messages of later times had been written.
@@ -166,10 +166,10 @@ impl ReorderWindow {
     /// Returns an error if the file cannot be written.
     pub fn write_due<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         self.sort();
-        let until = self.now.saturating_sub(WINDOW_NS);
+        let until = self.now.saturating_sub(REORDER_WINDOW_NS);
         let due = self.waiting.partition_point(|it| it.log_nanos <= until);
         let due = if self.is_full() { due.max(self.waiting.len() / 2) } else { due };
-        self.write_out(due, file)
+        self.write_sorted(due, file)
     }
 
     /// Returns true if the number or the size of the waiting messages has reached its limit.
@@ -184,7 +184,7 @@ impl ReorderWindow {
     /// Returns an error if the file cannot be written.
     pub fn write_all<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         self.sort();
-        self.write_out(self.waiting.len(), file)
+        self.write_sorted(self.waiting.len(), file)
     }
 
     /// Sorts the waiting messages by their time. Messages with the same time keep the order in which they arrived.
@@ -193,7 +193,7 @@ impl ReorderWindow {
     }
 
     /// Writes the first `due` of the sorted messages.
-    fn write_out<W: Write>(&mut self, due: usize, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
+    fn write_sorted<W: Write>(&mut self, due: usize, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         let Self { waiting, bytes, released, late, buffers: (_, kept), .. } = self;
         let written = waiting.get(..due).unwrap_or_default();
         for it in written {
@@ -202,7 +202,7 @@ impl ReorderWindow {
             let data = bytes.get(it.begin..it.end).unwrap_or_default();
             file.write_encoded((it.channel, it.sequence), (*released, it.nanos), data)?;
         }
-        let written = count(written);
+        let written = count_messages(written);
         waiting.drain(..due);
         kept.clear();
         for it in waiting.iter_mut() {
@@ -221,7 +221,7 @@ impl ReorderWindow {
     }
 }
 
-fn count(messages: &[WaitingMessage]) -> MessageCount {
+fn count_messages(messages: &[WaitingMessage]) -> MessageCount {
     let frames = messages.iter().filter(|it| it.is_frame).count() as u64;
     MessageCount { frames, others: messages.len() as u64 - frames }
 }

@@ -12,7 +12,7 @@ use thiserror::Error;
 /// The encapsulation header: "plain CDR, little endian", and two option bytes.
 const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
 /// The maximum number of elements in a decoded sequence.
-const MAX_ELEMENTS: u32 = 64;
+const MAX_SEQUENCE_ELEMENTS: u32 = 64;
 
 /// A value that can be encoded as a field of a message.
 pub trait Encode {
@@ -39,7 +39,7 @@ macro_rules! numbers {
 
         impl Decode<'_> for $number {
             fn decode(from: &mut CdrReader<'_>) -> Result<Self, CdrError> {
-                from.number($what).map(Self::from_le_bytes)
+                from.read_number($what).map(Self::from_le_bytes)
             }
         }
     )+};
@@ -76,7 +76,7 @@ impl Encode for str {
 
 impl<'a> Decode<'a> for &'a str {
     fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
-        let bytes = from.bytes()?;
+        let bytes = from.get_bytes()?;
         let wrong = CdrError::Text { at: from.at - bytes.len() };
         let text = match bytes {
             _ if from.form == CdrEncoding::Ros1 => bytes,
@@ -93,7 +93,7 @@ impl<'a> Decode<'a> for &'a str {
 impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
     fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
         let count = from.get::<u32>()?;
-        if count > MAX_ELEMENTS {
+        if count > MAX_SEQUENCE_ELEMENTS {
             return Err(CdrError::Value { what: "a count", got: count.into(), allowed: "0 to 64" });
         }
         (0..count).map(|_| from.get()).collect()
@@ -158,7 +158,7 @@ impl<'a> CdrWriter<'a> {
     }
 
     /// Appends a sequence of elements.
-    pub fn sequence(&mut self, elements: impl ExactSizeIterator<Item = impl Encode>) {
+    pub fn put_sequence(&mut self, elements: impl ExactSizeIterator<Item = impl Encode>) {
         self.put_count(elements.len());
         elements.for_each(|element| self.put(element));
     }
@@ -254,7 +254,7 @@ impl<'a> CdrReader<'a> {
 
     /// Begins at the first field of a ROS 1 message.
     #[must_use]
-    pub const fn ros1(bytes: &'a [u8]) -> Self {
+    pub const fn from_ros1(bytes: &'a [u8]) -> Self {
         Self { bytes, at: 0, form: CdrEncoding::Ros1 }
     }
 
@@ -270,12 +270,12 @@ impl<'a> CdrReader<'a> {
     ///
     /// # Errors
     /// Returns [`CdrError::Short`] if the message ends too early.
-    pub fn bytes(&mut self) -> Result<&'a [u8], CdrError> {
+    pub fn get_bytes(&mut self) -> Result<&'a [u8], CdrError> {
         let count = self.get::<u32>()?;
         self.read_bytes(usize::try_from(count).unwrap_or(usize::MAX), "a sequence of bytes")
     }
 
-    fn number<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], CdrError> {
+    fn read_number<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], CdrError> {
         let over = match self.form {
             CdrEncoding::Cdr => (self.at - CDR_HEADER.len()) % N,
             CdrEncoding::Ros1 => 0,
@@ -345,9 +345,9 @@ mod tests {
         out.put(value.signed);
         out.put_bytes(&value.bytes);
         out.put(value.long);
-        out.sequence(value.singles.iter());
-        out.sequence(value.doubles.iter());
-        out.sequence(value.texts.iter().map(String::as_str));
+        out.put_sequence(value.singles.iter());
+        out.put_sequence(value.doubles.iter());
+        out.put_sequence(value.texts.iter().map(String::as_str));
         out.put(value.last);
         buffer
     }
@@ -361,7 +361,7 @@ mod tests {
             short: from.get()?,
             text: from.get::<&str>()?.to_owned(),
             signed: from.get()?,
-            bytes: from.bytes()?.to_vec(),
+            bytes: from.get_bytes()?.to_vec(),
             long: from.get()?,
             singles: from.get()?,
             doubles: from.get()?,
@@ -393,7 +393,7 @@ mod tests {
         assert_eq!(CdrReader::new(&[]).unwrap_err(), CdrError::Encoding { got: [0; 2] });
         let mut short = CdrReader::new(&[0, 1, 0, 0, 9, 0, 0, 0, 1]).unwrap();
         assert_eq!(
-            short.bytes().unwrap_err().to_string(),
+            short.get_bytes().unwrap_err().to_string(),
             "a message ends at byte 9 in the middle of a sequence of bytes"
         );
         let mut text = CdrReader::new(&[0, 1, 0, 0, 1, 0, 0, 0, b'a']).unwrap();

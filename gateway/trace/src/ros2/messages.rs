@@ -42,7 +42,7 @@ impl Encode for Record<'_> {
 ///
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not a message of this type.
-pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
+pub fn decode_stamp_nanos(message: &[u8]) -> Result<u64, CdrError> {
     Ok(CdrReader::new(message)?.get::<Header<'_>>()?.nanos)
 }
 
@@ -50,7 +50,7 @@ pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
 ///
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not a message of this type.
-pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
+pub fn decode_frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
     let mut from = CdrReader::new(message)?;
     let (Header { frame_id: interface, .. }, number) = (from.get()?, from.get::<u32>()?);
     let mut kind = 0;
@@ -78,7 +78,7 @@ pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
     if !(raw_dlc == 0 || is_raw && matches!(raw_dlc, 9..=15)) {
         return Err(value_error("raw_dlc", raw_dlc, "0; 9 to 15 in a classic frame of 8 bytes"));
     }
-    let data = from.bytes()?;
+    let data = from.get_bytes()?;
     let wrong = value_error(
         "length",
         length,
@@ -130,11 +130,11 @@ impl Encode for CaptureNote<'_> {
 ///
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not a message of this type.
-pub fn note(message: &[u8], nanos: u64) -> Result<CaptureNote<'_>, CdrError> {
+pub fn decode_note(message: &[u8], nanos: u64) -> Result<CaptureNote<'_>, CdrError> {
     let mut from = CdrReader::new(message)?;
     let (Header { frame_id: interface, .. }, kind) = (from.get()?, from.get::<u8>()?);
     let [frames, line]: [u64; 2] = from.get()?;
-    let (words, bytes) = (from.get::<&str>()?, from.bytes()?);
+    let (words, bytes) = (from.get::<&str>()?, from.get_bytes()?);
     let text = if bytes.is_empty() { words.as_bytes() } else { bytes };
     let (kind, text) = match kind {
         0 => (NoteKind::Text, text),
@@ -156,7 +156,7 @@ mod tests {
     fn back_and_forth(record: Record<'_>) -> Result<Record<'_>, CdrError> {
         let mut buffer = Vec::new();
         record.encode_into(&mut buffer);
-        let back = frame(&buffer, record.time)?;
+        let back = decode_frame(&buffer, record.time)?;
         assert_eq!(back.interface, record.interface);
         Ok(Record { interface: record.interface, ..back })
     }
@@ -189,7 +189,7 @@ mod tests {
         let with = |at: usize, value: u8| {
             let mut bytes = buffer.clone();
             bytes[at] = value;
-            frame(&bytes, time).map(|_| ()).unwrap_err().to_string()
+            decode_frame(&bytes, time).map(|_| ()).unwrap_err().to_string()
         };
         // An empty name takes 5 bytes, and 3 bytes of padding follow it.
         let id = "id of a message: FF000000 does not fit an identifier of 11 bits: at most 7FF";
@@ -206,7 +206,7 @@ mod tests {
     fn back_from_1969(message: &[u8]) -> String {
         let mut bytes = message.to_vec();
         bytes[4..8].copy_from_slice(&(-1_i32).to_le_bytes());
-        frame(&bytes, Timestamp::with_nine_digits(0)).map(|_| ()).unwrap_err().to_string()
+        decode_frame(&bytes, Timestamp::with_nine_digits(0)).map(|_| ()).unwrap_err().to_string()
     }
 
     fn note(kind: NoteKind, text: &[u8]) -> CaptureNote<'_> {
@@ -226,7 +226,7 @@ mod tests {
                 let note = note(kind.clone(), text);
                 let mut buffer = Vec::new();
                 note.encode_into(&mut buffer);
-                assert_eq!(super::note(&buffer, 42).unwrap(), note);
+                assert_eq!(decode_note(&buffer, 42).unwrap(), note);
             }
         }
     }
@@ -254,8 +254,8 @@ mod tests {
 
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(0_u8..4, 0..80)) {
-            let _ = frame(&bytes, Timestamp::with_nine_digits(0));
-            let _ = super::note(&bytes, 0);
+            let _ = decode_frame(&bytes, Timestamp::with_nine_digits(0));
+            let _ = decode_note(&bytes, 0);
         }
     }
 }

@@ -82,7 +82,7 @@ impl Encode for Header<'_> {
 impl<'a> Decode<'a> for Header<'a> {
     fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
         let (sec, nanosec) = (from.get::<i32>()?, from.get::<u32>()?);
-        Ok(Self { nanos: nanos(sec.into(), nanosec)?, frame_id: from.get()? })
+        Ok(Self { nanos: stamp_to_nanos(sec.into(), nanosec)?, frame_id: from.get()? })
     }
 }
 
@@ -90,7 +90,7 @@ impl<'a> Decode<'a> for Header<'a> {
 ///
 /// # Errors
 /// Returns [`CdrError::Time`] if the time is before 1970, or if `nanosec` is a second or more.
-pub fn nanos(sec: i64, nanosec: u32) -> Result<u64, CdrError> {
+pub fn stamp_to_nanos(sec: i64, nanosec: u32) -> Result<u64, CdrError> {
     let whole = u64::try_from(sec).ok().filter(|_| u64::from(nanosec) < NANOS_PER_SECOND);
     let nanos = whole.and_then(|sec| sec.checked_mul(NANOS_PER_SECOND)?.checked_add(nanosec.into()));
     nanos.ok_or(CdrError::Time { sec, nanosec })

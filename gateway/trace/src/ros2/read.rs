@@ -28,7 +28,7 @@ pub struct Torques {
 ///
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not a message of this type.
-pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
+pub fn decode_joints(message: &[u8]) -> Result<Joints, CdrError> {
     let mut from = CdrReader::new(message)?;
     from.get::<Header<'_>>()?;
     from.get::<Vec<&str>>()?;
@@ -39,7 +39,7 @@ pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
 ///
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not a message of this type.
-pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
+pub fn decode_torques(message: &[u8]) -> Result<Torques, CdrError> {
     let mut from = CdrReader::new(message)?;
     from.get::<Header<'_>>()?;
     let [distributed, central, _difference] = [from.get()?, from.get()?, from.get()?];
@@ -50,7 +50,7 @@ pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
 ///
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not a message of this type.
-pub fn timing(message: &[u8]) -> Result<LoopTiming, CdrError> {
+pub fn decode_loop_timing(message: &[u8]) -> Result<LoopTiming, CdrError> {
     CdrReader::new(message)?.get()
 }
 
@@ -73,13 +73,16 @@ mod tests {
             effort: &[],
         }
         .encode_into(&mut bytes);
-        assert_eq!(joints(&bytes).unwrap(), Joints { position: position.into(), velocity: velocity.into() });
+        assert_eq!(
+            decode_joints(&bytes).unwrap(),
+            Joints { position: position.into(), velocity: velocity.into() }
+        );
 
         let (distributed, central) = ([1.0, 2.0], [1.5, 2.5]);
         skin::Torques { nanos: 5, distributed: &distributed, central: &central, active: 7 }
             .encode_into(&mut bytes);
         let expected = Torques { distributed: distributed.into(), central: central.into(), active: 7 };
-        assert_eq!(torques(&bytes).unwrap(), expected);
+        assert_eq!(decode_torques(&bytes).unwrap(), expected);
 
         let written = LoopTiming {
             nanos: 5,
@@ -98,8 +101,8 @@ mod tests {
             refused: true,
         };
         written.encode_into(&mut bytes);
-        assert_eq!(format!("{:?}", timing(&bytes).unwrap()), format!("{written:?}"));
-        assert!(timing(bytes.get(..60).unwrap()).is_err());
-        assert!(torques(&bytes).is_err(), "another type");
+        assert_eq!(format!("{:?}", decode_loop_timing(&bytes).unwrap()), format!("{written:?}"));
+        assert!(decode_loop_timing(bytes.get(..60).unwrap()).is_err());
+        assert!(decode_torques(&bytes).is_err(), "another type");
     }
 }

@@ -40,7 +40,7 @@ impl Message for Transforms<'_> {
 
 impl Encode for Transforms<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
-        out.sequence(self.transforms.iter().map(|transform| StampedTransform(self.nanos, transform)));
+        out.put_sequence(self.transforms.iter().map(|transform| StampedTransform(self.nanos, transform)));
     }
 }
 

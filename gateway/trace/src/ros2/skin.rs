@@ -88,10 +88,10 @@ impl Message for Torques<'_> {
 impl Encode for Torques<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
-        out.sequence(self.distributed.iter());
-        out.sequence(self.central.iter());
+        out.put_sequence(self.distributed.iter());
+        out.put_sequence(self.central.iter());
         let both = self.distributed.iter().zip(self.central);
-        out.sequence(both.map(|(distributed, central)| distributed - central));
+        out.put_sequence(both.map(|(distributed, central)| distributed - central));
         out.put(self.active);
     }
 }
@@ -132,9 +132,9 @@ impl Encode for PatchState<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: self.frame_id });
         out.put(self.epoch);
-        out.sequence(self.cells.iter().map(|cell| cell.node));
-        out.sequence(self.cells.iter().map(|cell| cell.force));
-        out.sequence(self.cells.iter().map(|cell| cell.proximity));
-        out.sequence(self.cells.iter().map(|cell| cell.status));
+        out.put_sequence(self.cells.iter().map(|cell| cell.node));
+        out.put_sequence(self.cells.iter().map(|cell| cell.force));
+        out.put_sequence(self.cells.iter().map(|cell| cell.proximity));
+        out.put_sequence(self.cells.iter().map(|cell| cell.status));
     }
 }

@@ -27,9 +27,9 @@ impl Message for JointState<'_> {
 impl Encode for JointState<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
-        out.sequence(self.names.iter().map(String::as_str));
+        out.put_sequence(self.names.iter().map(String::as_str));
         for values in [self.position, self.velocity, self.effort] {
-            out.sequence(values.iter());
+            out.put_sequence(values.iter());
         }
     }
 }
@@ -58,7 +58,7 @@ impl PointCloud<'_> {
     /// The size of an encoded point, in bytes.
     const POINT_STEP_BYTES: u32 = 16;
     /// The `PointField` constant for single precision.
-    const FLOAT32: u8 = 7;
+    const FLOAT32_FIELD_TYPE: u8 = 7;
 }
 
 impl Message for PointCloud<'_> {
@@ -77,7 +77,7 @@ impl Encode for PointCloud<'_> {
         let width = u32::try_from(self.points.len()).unwrap_or(u32::MAX);
         out.put((1_u32, width));
         let fields = [("x", 0_u32), ("y", 4), ("z", 8), ("force", 12)].into_iter();
-        out.sequence(fields.map(|field| (field, (Self::FLOAT32, 1_u32))));
+        out.put_sequence(fields.map(|field| (field, (Self::FLOAT32_FIELD_TYPE, 1_u32))));
         out.put(false);
         out.put((Self::POINT_STEP_BYTES, Self::POINT_STEP_BYTES * width));
         out.put_count(self.points.len() * Self::POINT_STEP_BYTES as usize);
@@ -138,7 +138,7 @@ impl Message for Diagnostics<'_> {
 impl Encode for Diagnostics<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
-        out.sequence(self.parts.iter());
+        out.put_sequence(self.parts.iter());
     }
 }
 
@@ -146,6 +146,6 @@ impl Encode for Diagnosis {
     fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put((self.level as u8, self.name.as_str()));
         out.put((self.message.as_str(), ""));
-        out.sequence(self.values.iter().map(|(name, value)| (*name, value.as_str())));
+        out.put_sequence(self.values.iter().map(|(name, value)| (*name, value.as_str())));
     }
 }

@@ -29,7 +29,7 @@ pub(super) struct BroadcastJoints {
 
 /// The share of time for which frames occupy the real bus.
 #[derive(Clone, Copy, Debug, Default)]
-struct Load {
+struct BusLoad {
     since: Option<Micros>,
     busy_s: f64,
     /// The load in the last complete window; 1 is the bus's capacity.
@@ -54,7 +54,7 @@ pub(super) struct LiveBus {
     /// For each cell, the time since which it is dead; `None` for a live cell.
     pub(super) dead_since: Vec<Option<Micros>>,
     rates: Option<BitRates>,
-    load: Load,
+    load: BusLoad,
     pub(super) halted: bool,
     pub(super) is_up: bool,
     pub(super) dropped: u64,
@@ -63,7 +63,7 @@ pub(super) struct LiveBus {
 impl LiveBus {
     pub(super) fn new(skin: &Skin, bus: usize) -> Self {
         let mut table = BusTable::new(skin, bus);
-        table.set_comparing(true);
+        table.set_torque_comparison(true);
         let described = skin.buses.get(bus);
         let cells = table.cells().len();
         Self {
@@ -78,7 +78,7 @@ impl LiveBus {
             last: vec![None; cells],
             dead_since: vec![None; cells],
             rates: described.and_then(|bus| Some(RequestedRates::default().for_bus(bus).ok()?.rates)),
-            load: Load::default(),
+            load: BusLoad::default(),
             halted: false,
             is_up: false,
             dropped: 0,
@@ -88,7 +88,7 @@ impl LiveBus {
 
     /// Applies a frame. Returns true if it carries joints, which begin an epoch.
     pub(super) fn apply_frame(&mut self, at: Micros, frame: &Frame) -> bool {
-        let received = self.table.read(at, frame);
+        let received = self.table.read_frame(at, frame);
         let message = received.message().copied();
         if wire_message(frame).is_none() && !matches!(message, Some(Message::Stimulus { .. })) {
             // On a bench, wire states and stimuli are frames of the same bus, but a real bus would not carry them.
@@ -115,7 +115,7 @@ impl LiveBus {
             Some(_) | None => {}
         }
         // Joints begin an epoch, whichever node sent them.
-        self.table.receive(at, joints, &received, &mut |_| None);
+        self.table.handle_read_frame(at, joints, &received, &mut |_| None);
         joints
     }
 
@@ -125,8 +125,8 @@ impl LiveBus {
     }
 
     /// Returns the number of all losses so far, of any kind.
-    pub(super) fn losses(&self) -> u64 {
-        let (replies, uplink) = (self.table.replies(), self.table.uplink());
+    pub(super) fn loss_count(&self) -> u64 {
+        let (replies, uplink) = (self.table.reply_counts(), self.table.uplink());
         replies.late + replies.missing + uplink.lost + uplink.rejected + self.dropped
     }
 
@@ -134,7 +134,7 @@ impl LiveBus {
     /// centrally.
     fn close_epoch(&mut self) {
         let Some(heard) = self.current else { return };
-        let frames = self.central.frames(&heard.positions);
+        let frames = self.central.link_frames(&heard.positions);
         let cells = self.table.cells().iter();
         let sensors: Vec<_> = cells.map(|cell| cell.presumed_sensors().unwrap_or_default()).collect();
         let central = self.central.total_torque(&frames, &sensors).torque;
@@ -146,7 +146,7 @@ impl LiveBus {
 
     pub(super) fn handle_time(&mut self, now: Micros) {
         self.table.handle_time(now);
-        self.table.notices().for_each(drop);
+        self.table.drain_notices().for_each(drop);
         for ((_, status), since) in self.table.statuses(now).zip(&mut self.dead_since) {
             match status {
                 CellStatus::Dead => _ = since.get_or_insert(now),
@@ -160,7 +160,7 @@ impl LiveBus {
         if passed >= LOAD_WINDOW_US {
             #[expect(clippy::cast_precision_loss, reason = "a few seconds")]
             let share = self.load.busy_s / (passed as f64 * 1e-6);
-            self.load = Load { since: Some(now), busy_s: 0.0, share: Some(share) };
+            self.load = BusLoad { since: Some(now), busy_s: 0.0, share: Some(share) };
         }
     }
 
@@ -168,7 +168,7 @@ impl LiveBus {
         (self.is_up, self.dropped) = (is_up, dropped);
     }
 
-    pub(super) const fn load(&self) -> Option<f64> {
+    pub(super) const fn bus_load(&self) -> Option<f64> {
         self.load.share
     }
 
@@ -181,17 +181,17 @@ impl LiveBus {
     }
 
     /// Returns the distributed and the central torque of each joint of the chain.
-    pub(super) fn torques(&self) -> impl Iterator<Item = (f64, f64)> {
+    pub(super) fn joint_torques(&self) -> impl Iterator<Item = (f64, f64)> {
         self.torques.into_iter().take(self.joints)
     }
 
     /// Returns the position of a joint of the chain in rad or m; `None` before the first joints.
-    pub(super) fn position(&self, joint: usize) -> Option<f64> {
-        self.central.positions(&self.current?.positions).get(joint).copied()
+    pub(super) fn joint_position(&self, joint: usize) -> Option<f64> {
+        self.central.joint_positions(&self.current?.positions).get(joint).copied()
     }
 
     /// Returns the joint positions that were broadcast in one of the last two epochs; `None` for another epoch.
-    pub(super) fn positions_of(&self, epoch: Epoch) -> Option<[Q1_14; MAX_JOINTS]> {
+    pub(super) fn joint_positions_in(&self, epoch: Epoch) -> Option<[Q1_14; MAX_JOINTS]> {
         let both = [self.current, self.previous];
         both.into_iter().flatten().find(|heard| heard.epoch == epoch).map(|heard| heard.positions)
     }
@@ -202,15 +202,16 @@ impl LiveBus {
         let bytes = cells.map(|(place, (cell, (sensors, status)))| {
             let view = CellView::new(cell, status);
             let flags = [
-                (view.unconfigured, flag::UNCONFIGURED),
-                (view.seen && view.other_configuration, flag::OTHER_CONFIGURATION),
-                (view.measures, flag::MEASURING),
-                (view.halted, flag::HALTED),
-                (cell.is_stuck(), flag::STUCK),
+                (view.unconfigured, flag::UNCONFIGURED_BIT),
+                (view.seen && view.other_configuration, flag::OTHER_CONFIGURATION_BIT),
+                (view.measures, flag::MEASURING_BIT),
+                (view.halted, flag::HALTED_BIT),
+                (cell.is_stuck(), flag::STUCK_BIT),
             ];
             let flags = flags.iter().filter(|(is, _)| *is).fold(0, |all, (_, bit)| all | bit);
             let sensors = sensors.unwrap_or_default();
-            let force = clamped_integer(self.central.force(place, &sensors) * 1e3, 0.0, f64::from(u16::MAX));
+            let force =
+                clamped_integer(self.central.cell_force(place, &sensors) * 1e3, 0.0, f64::from(u16::MAX));
             let proximity = clamped_integer(sensors.proximity.to_f64() * 32_768.0, 0.0, f64::from(u16::MAX));
             let [warmth, _] =
                 sensors.temperature.map(|word| clamped_integer(word.to_f64() * 100.0, -32_768.0, 32_767.0));

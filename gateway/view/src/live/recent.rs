@@ -2,15 +2,15 @@
 
 use std::collections::VecDeque;
 
-use analysis::explain::{CellExplained, JointsWatcher, RequestedJoints, explain};
+use analysis::explain::{CellExplanation, JointsWatcher, RequestedJoints, explain};
 use model::decode::settle::OrderedDecoder;
 use model::decode::{Decoded, Decoder};
 use model::latched::{LatchedFrame, LatchedPackets};
 use protocol::can::Frame;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::Message;
-use protocol::packet::data_id;
-use protocol::schema::Units;
+use protocol::packet::data_frame_id;
+use protocol::schema::BusUnits;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
@@ -64,7 +64,7 @@ pub struct TorqueExplanation {
     /// The epoch to which the torque belongs.
     pub epoch: u8,
     /// The steps of the cell's computation; `None` if inputs are unknown.
-    pub cell: Option<CellExplained>,
+    pub cell: Option<CellExplanation>,
     /// The inputs of the computation that are unknown, one line each.
     pub missing: Vec<String>,
 }
@@ -81,19 +81,19 @@ impl RecentFrames {
         while self.frames.len() > MAX_FRAMES
             || self.frames.front().is_some_and(|first| at.elapsed_since(first.at).0 > RETENTION_US)
         {
-            self.drop_first();
+            self.drop_oldest_frame();
         }
     }
 
     /// Drops all stored frames. The latched state stays.
     pub(super) fn clear(&mut self) {
         while !self.frames.is_empty() {
-            self.drop_first();
+            self.drop_oldest_frame();
         }
         self.frames.shrink_to_fit();
     }
 
-    fn drop_first(&mut self) {
+    fn drop_oldest_frame(&mut self) {
         let Some(RecentFrame { at, bus, frame }) = self.frames.pop_front() else { return };
         if let Some(latched) = self.latched.get_mut(bus) {
             latched.receive(LatchedFrame { at_nanos: at.0 * 1_000, from_gateway: false, frame });
@@ -110,8 +110,10 @@ impl RecentFrames {
     ) -> Vec<DecodedFrame> {
         let format = skin.buses.get(bus).map(|bus| bus.format);
         let mut settler = OrderedDecoder::new(format);
-        for (number, kept) in (self.first_number()..).zip(&self.frames).filter(|(_, kept)| kept.bus == bus) {
-            let Ok(id) = data_id(&kept.frame) else { continue };
+        for (number, kept) in
+            (self.first_frame_number()..).zip(&self.frames).filter(|(_, kept)| kept.bus == bus)
+        {
+            let Ok(id) = data_frame_id(&kept.frame) else { continue };
             // The frame of a command is needed too, because the length of a torque depends on earlier commands.
             let is_command = id.kind == Kind::Command;
             if is_command || Node::from_byte(id.node) == Node::Cell(node) {
@@ -119,7 +121,7 @@ impl RecentFrames {
             }
         }
         settler.finish();
-        let units = Units::for_bus(skin, bus);
+        let units = BusUnits::for_bus(skin, bus);
         let mut all = VecDeque::new();
         while let Some(((number, kept, is_command), decoded)) = settler.pop() {
             if is_command {
@@ -141,7 +143,7 @@ impl RecentFrames {
 
     /// Explains the torque in the frame with this number. Returns `None` if the frame is no longer stored.
     pub(super) fn explain_torque(&self, skin: &Skin, number: u64) -> Option<TorqueExplanation> {
-        let place = usize::try_from(number.checked_sub(self.first_number())?).ok()?;
+        let place = usize::try_from(number.checked_sub(self.first_frame_number())?).ok()?;
         let asked = self.frames.get(place)?;
         let mut decoder = Decoder::new(None);
         let mut found = None;
@@ -168,7 +170,7 @@ impl RecentFrames {
                 break;
             }
         }
-        let said = match watch.moments() {
+        let said = match watch.into_joints() {
             Ok(moments) => explain(skin, &moments),
             Err(error) => {
                 return Some(TorqueExplanation {
@@ -187,7 +189,7 @@ impl RecentFrames {
         Some(TorqueExplanation { number, epoch: epoch.0, cell, missing })
     }
 
-    fn first_number(&self) -> u64 {
+    fn first_frame_number(&self) -> u64 {
         self.count - self.frames.len() as u64
     }
 }

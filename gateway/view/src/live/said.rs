@@ -1,7 +1,7 @@
 //! The status message to the page: values that change slowly, as JSON.
 
 use bench::remote::BenchState;
-use model::table::{CellStatus, Event};
+use model::table::{CellStatus, FrameEvent};
 use protocol::fixed::is_saturated;
 use protocol::id::{CellId, Id, Kind};
 use protocol::message::{SensorPage, SensorReadings};
@@ -86,12 +86,12 @@ pub struct BusStatus {
     pub error_nm: Option<f64>,
     /// For a bus whose cells send sums: the wires of each cell in the tree, in the skin's order. It is null for a cell
     /// that has not reported them or is dead.
-    pub tree: Option<Vec<Option<TreePlace>>>,
+    pub tree: Option<Vec<Option<CellParentAndWires>>>,
 }
 
 /// A cell's parent and wires in the tree, as the cell reports them.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
-pub struct TreePlace(
+pub struct CellParentAndWires(
     /// The node id of the parent, or 0 if that is the gateway's side. It is null if the cell is unreachable.
     pub Option<u8>,
     /// A bit for each port: bit p is set if the wire at port p works in both directions.
@@ -112,7 +112,7 @@ pub struct CellDetail {
     /// The hash of the cell's configuration, and the hash that the skin requires.
     pub configuration: [Option<String>; 2],
     /// The gains and thresholds of the cell, from the skin.
-    pub gains: Gains,
+    pub gains: GainsAndThresholds,
     /// The fields of its sensors pages.
     pub readings: Vec<SensorReading>,
     /// Its force by Algorithm 1, in N.
@@ -146,17 +146,17 @@ pub struct SensorReading {
 
 impl SensorReading {
     /// Returns the fields of a page. The total of a skin's page is left out: the force is shown by Algorithm 1.
-    fn from_page(page: SensorPage) -> impl Iterator<Item = Self> {
+    fn fields_of_page(page: SensorPage) -> impl Iterator<Item = Self> {
         let bytes = page.words().map(i16::to_le_bytes);
         let layout = PacketSchema::for_id(Id { kind: Kind::Sensors, node: 1 })
             .and_then(|schema| schema.layouts.iter().find(|layout| layout.number == page.number()));
         layout.into_iter().flat_map(move |layout| {
             let fields = layout.fields.iter().filter(|field| !matches!(field.format, FieldFormat::Total(_)));
             fields.map(move |field| Self {
-                name: field.bare_name(),
+                name: field.name_without_unit(),
                 unit: &field.unit,
                 decimals: layout.decimals(field),
-                values: (0..field.elements())
+                values: (0..field.element_count())
                     .map(|element| field.raw_to_real(field.raw_value(bytes.as_flattened(), element)))
                     .collect(),
             })
@@ -166,14 +166,14 @@ impl SensorReading {
 
 /// The gains and thresholds of Algorithm 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Gains {
+pub struct GainsAndThresholds {
     /// The gains α_c (a number) and α_p (in N).
     pub alpha: [f64; 2],
     /// The thresholds F_c,th in N, F_p,th (0 to 1) and F_z,th in N.
     pub thresholds: [f64; 3],
 }
 
-impl Gains {
+impl GainsAndThresholds {
     fn from_contact(contact: Contact) -> Self {
         let Contact { alpha_c, alpha_p, contact_threshold, proximity_threshold, force_threshold } = contact;
         Self {
@@ -211,7 +211,7 @@ impl LiveState {
                 contacts += usize::from(matches!(status, CellStatus::Active | CellStatus::Stale));
                 dead += usize::from(status == CellStatus::Dead);
                 if let Some(since) = since.filter(|_| dead_cells.len() < MAX_LISTED_DEAD_CELLS) {
-                    let for_s = (self.seconds(now) - self.seconds(since)).max(0.0);
+                    let for_s = (self.seconds_since_start(now) - self.seconds_since_start(since)).max(0.0);
                     dead_cells.push(DeadCell { bus: bus.name.clone(), node: cell.node.get(), for_s });
                 }
             }
@@ -222,7 +222,7 @@ impl LiveState {
             dead,
             dead_cells,
             halted: self.buses.iter().any(|bus| bus.halted),
-            buses: self.buses.iter().map(|bus| bus.status(now)).collect(),
+            buses: self.buses.iter().map(|bus| bus.bus_status(now)).collect(),
             detail: None,
             playback: None,
             bench: None,
@@ -231,7 +231,7 @@ impl LiveState {
 
     /// Returns the details of the cell that a page has selected; `None` if the skin does not have this cell.
     #[must_use]
-    pub fn detail(&self, chosen: SelectedCell, now: Micros) -> Option<CellDetail> {
+    pub fn cell_detail(&self, chosen: SelectedCell, now: Micros) -> Option<CellDetail> {
         let SelectedCell { bus: index, node, frame } = chosen;
         let bus = self.buses.get(index)?;
         let id = CellId::new(node.into()).ok()?;
@@ -239,13 +239,13 @@ impl LiveState {
         let cell = bus.table.cells().get(place)?;
         let (sensors, status) = bus.table.presumed_sensors(now).nth(place)?;
         let sensors = sensors.unwrap_or_default();
-        let force_n = bus.central.force(place, &sensors);
+        let force_n = bus.central.cell_force(place, &sensors);
         let torque = bus.last.get(place).copied().flatten().map(|(epoch, words)| {
             let words = words.as_slice();
-            let frames = bus.positions_of(epoch).map(|positions| bus.central.frames(&positions));
+            let frames = bus.joint_positions_in(epoch).map(|positions| bus.central.link_frames(&positions));
             let joints = self.skin.joints_on_bus(index).len();
             let at = |force_n: f64| {
-                let torque = bus.central.torque(place, frames.as_ref()?, force_n);
+                let torque = bus.central.cell_torque(place, frames.as_ref()?, force_n);
                 Some(torque.into_iter().take(joints).collect())
             };
             TorqueReply {
@@ -269,34 +269,34 @@ impl LiveState {
                 cell.heartbeat().map(|it| hash(it.configuration)),
                 Some(hash(cell.configuration)),
             ],
-            gains: Gains::from_contact(skin_cell.contact),
+            gains: GainsAndThresholds::from_contact(skin_cell.contact),
             readings: SensorReadings { skin: sensors, ..cell.readings() }
-                .pages()
+                .simulated_pages()
                 .into_iter()
-                .flat_map(SensorReading::from_page)
+                .flat_map(SensorReading::fields_of_page)
                 .collect(),
             force_n,
             torque,
             replies: [cell.replies.due, cell.replies.in_time],
             lost: uplink.lost,
             restarts: uplink.restarts,
-            frames: self.recent.cell_frames(&self.skin, (index, id), |at| self.seconds(at)),
+            frames: self.recent.cell_frames(&self.skin, (index, id), |at| self.seconds_since_start(at)),
             why: frame.and_then(|frame| self.recent.explain_torque(&self.skin, frame)),
         })
     }
 }
 
 impl LiveBus {
-    fn status(&self, now: Micros) -> BusStatus {
+    fn bus_status(&self, now: Micros) -> BusStatus {
         let counters = self.table.counters();
         let uplink = self.table.uplink();
-        let account = self.table.replies();
+        let account = self.table.reply_counts();
         let accuracy = self.table.accuracy();
         let errors = if self.sums { accuracy.sums } else { accuracy.single };
         BusStatus {
             name: self.name.clone(),
             up: self.is_up,
-            load: self.load(),
+            load: self.bus_load(),
             epochs_due: counters.epochs_due,
             epochs_complete: counters.epochs_complete,
             due: account.due,
@@ -305,14 +305,14 @@ impl LiveBus {
             missing: account.missing,
             lost: uplink.lost,
             rejected: uplink.rejected,
-            saturated: counters.events(Event::Saturated),
+            saturated: counters.event_count(FrameEvent::Saturated),
             dropped: self.dropped,
             error_nm: errors.mean(),
             tree: self.sums.then(|| {
                 let cells = self.table.statuses(now).map(|(cell, status)| {
                     let sends = !matches!(status, CellStatus::Dead | CellStatus::Unknown);
                     let tree = cell.pages().tree.filter(|_| sends);
-                    tree.map(|tree| TreePlace(tree.parent, tree.working_ports))
+                    tree.map(|tree| CellParentAndWires(tree.parent, tree.working_ports))
                 });
                 cells.collect()
             }),

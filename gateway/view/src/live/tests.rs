@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::command::SelectedCell;
-use model::generate::{Reply, SkinRequest, generate};
+use model::generate::{ReplyMode, SkinRequest, generate};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
 use protocol::message::{
@@ -96,13 +96,17 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!((cell(5)[0], cell(5)[1]), (2, 0), "active");
     let force = u16::from_le_bytes([cell(5)[2], cell(5)[3]]);
     assert!((2990..=3010).contains(&force), "{force} mN");
-    assert_eq!((cell(6)[0], cell(6)[1]), (1, flag::OTHER_CONFIGURATION), "quiet, with another configuration");
+    assert_eq!(
+        (cell(6)[0], cell(6)[1]),
+        (1, flag::OTHER_CONFIGURATION_BIT),
+        "quiet, with another configuration"
+    );
     assert_eq!(cell(7)[0], 0, "never heard");
 
     let said = bench.live.status_message(bench.now);
     // The start of the cell was not observed, so no reply of it was due.
     assert_eq!((said.contacts, said.dead, said.halted, said.buses[0].due), (1, 0, false, 0));
-    let detail = bench.live.detail(SelectedCell { bus: 0, node: 5, frame: None }, bench.now).unwrap();
+    let detail = bench.live.cell_detail(SelectedCell { bus: 0, node: 5, frame: None }, bench.now).unwrap();
     let answer = detail.torque.unwrap();
     assert_eq!((answer.epoch, answer.words[..2].to_vec(), detail.serial), (2, vec![100, -200], 100_005));
     let exact = answer.central.unwrap();
@@ -114,8 +118,8 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!(detail.gains.alpha[0], contact.alpha_c.to_f64());
     assert_eq!(detail.gains.thresholds[2], contact.force_threshold.to_f64());
     assert!((exact[0] - f64::from(central)).abs() < 1e-6, "the only cell in contact: {exact:?} {central}");
-    assert_eq!(bench.live.detail(SelectedCell { bus: 0, node: 254, frame: None }, bench.now), None);
-    assert_eq!(bench.live.detail(SelectedCell { bus: 7, node: 1, frame: None }, bench.now), None);
+    assert_eq!(bench.live.cell_detail(SelectedCell { bus: 0, node: 254, frame: None }, bench.now), None);
+    assert_eq!(bench.live.cell_detail(SelectedCell { bus: 7, node: 1, frame: None }, bench.now), None);
 }
 
 #[test]
@@ -192,7 +196,7 @@ fn ten_thousand_cells_on_forty_buses_are_shown() {
 
 #[test]
 fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
-    let target = SkinRequest { cells: 4, reply: Reply::Sum, ..SkinRequest::default() };
+    let target = SkinRequest { cells: 4, reply: ReplyMode::Sum, ..SkinRequest::default() };
     let skin = Skin::parse("sums", &generate(&target).unwrap()).unwrap();
     let mut bench = Bench { live: LiveState::new(skin), now: Micros(1_000_000), bus: 0 };
     let places = |bench: &Bench| bench.live.status_message(bench.now).buses[0].tree.clone().unwrap();
@@ -214,9 +218,9 @@ fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
     assert_eq!(
         places(&bench),
         [
-            Some(TreePlace(Some(0), 0b0101)),
-            Some(TreePlace(Some(1), 0b0101)),
-            Some(TreePlace(None, 0b0101)),
+            Some(CellParentAndWires(Some(0), 0b0101)),
+            Some(CellParentAndWires(Some(1), 0b0101)),
+            Some(CellParentAndWires(None, 0b0101)),
             None
         ]
     );

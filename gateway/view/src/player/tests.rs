@@ -89,7 +89,7 @@ fn log(skin: &Skin) -> Vec<u8> {
 
 /// Returns the snapshot without its number, and the status.
 fn shown(tape: &mut LiveState, now: Micros) -> (Vec<u8>, String) {
-    let detail = tape.detail(SelectedCell { bus: 0, node: 5, frame: None }, now);
+    let detail = tape.cell_detail(SelectedCell { bus: 0, node: 5, frame: None }, now);
     let said = StatusMessage { detail, ..tape.status_message(now) };
     (tape.snapshot(now, &TouchRegistry::default()).split_off(4), serde_json::to_string(&said).unwrap())
 }
@@ -99,7 +99,7 @@ fn straight(bytes: &[u8], skin: &Skin, until: u64) -> (Vec<u8>, String) {
     let mut reader = Reader::from_read("log", std::io::Cursor::new(bytes.to_vec())).unwrap();
     let mut tape = PlaybackState::new(skin.clone(), BEGAN + 10_000);
     loop {
-        match tape.step(until) {
+        match tape.step_until(until) {
             PlaybackStep::NeedsEntries => tape.read_entry(&mut reader).unwrap(),
             PlaybackStep::Reached | PlaybackStep::Over => break,
             PlaybackStep::Updated | PlaybackStep::Applied { .. } => {}
@@ -148,7 +148,7 @@ fn events_are_found_and_gone_to() {
     let mut player = bench.player();
     bench.build(&player);
     let mut at = |kind, forward| {
-        assert!(player.jump(kind, forward).unwrap(), "{kind:?}");
+        assert!(player.jump_to_event(kind, forward).unwrap(), "{kind:?}");
         player.status().at_s
     };
     let near = |found: f64, expected: f64| (expected..expected + 0.06).contains(&found);
@@ -158,7 +158,7 @@ fn events_are_found_and_gone_to() {
     assert!(near(at(EventKind::Halt, true), 25.0));
     let silent = at(EventKind::Silence, false);
     assert!((20.3..20.8).contains(&silent), "{silent}");
-    assert!(!player.jump(EventKind::Silence, true).unwrap(), "only one cell falls silent");
+    assert!(!player.jump_to_event(EventKind::Silence, true).unwrap(), "only one cell falls silent");
     assert_eq!(player.parts_with_events(EventKind::Touch, 100), [15, 75]);
     let said = player.status();
     assert!((39.9..40.1).contains(&said.of_s) && said.read == 1.0 && said.others == 0);
@@ -171,18 +171,18 @@ fn an_epoch_forth_and_back_is_where_it_began() {
     bench.build(&player);
     player.seek(7.0).unwrap();
     player.play(1.0);
-    player.step(true).unwrap();
+    player.step_epoch(true).unwrap();
     let first = player.status();
     assert!(!first.playing && (first.at_s - 7.008).abs() < 1e-4, "{}", first.at_s);
-    player.step(true).unwrap();
+    player.step_epoch(true).unwrap();
     assert!((player.status().at_s - 7.024).abs() < 1e-4);
-    player.step(false).unwrap();
+    player.step_epoch(false).unwrap();
     assert_eq!(player.status().at_s, first.at_s);
     player.seek(0.0).unwrap();
-    player.step(false).unwrap();
+    player.step_epoch(false).unwrap();
     assert!(player.status().at_s < 0.001);
     player.seek(1e300).unwrap();
-    player.step(true).unwrap();
+    player.step_epoch(true).unwrap();
     assert!(player.status().at_s >= 39.9);
 }
 
@@ -201,7 +201,7 @@ fn time_passes_at_its_speed_and_ends_with_the_recording() {
     player.advance_time(Duration::from_secs(1)).unwrap();
     assert!(!player.status().playing, "it is over");
     assert!(!player.advance_time(Duration::from_secs(1)).unwrap());
-    let history = player.history();
+    let history = player.encode_torque_history();
     let moments = u32::from_le_bytes(history[8..12].try_into().unwrap()) as usize;
     assert!((300..=625).contains(&moments), "{moments}");
     assert_eq!(history.len(), 16 + moments * (8 + 8 * 6));
@@ -254,13 +254,13 @@ proptest! {
         bench.build(&player);
         for at_s in seeks {
             player.seek(at_s).unwrap();
-            player.step(true).unwrap();
-            player.step(false).unwrap();
-            player.jump(EventKind::Halt, true).unwrap();
+            player.step_epoch(true).unwrap();
+            player.step_epoch(false).unwrap();
+            player.jump_to_event(EventKind::Halt, true).unwrap();
             player.play(1e9);
             player.advance_time(Duration::from_secs(3)).unwrap();
             let now = player.now();
-            prop_assert!(player.status().at_s >= 0.0 && !player.history().is_empty());
+            prop_assert!(player.status().at_s >= 0.0 && !player.encode_torque_history().is_empty());
             shown(player.live(), now);
         }
     }

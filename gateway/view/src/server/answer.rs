@@ -20,7 +20,7 @@ pub(super) struct HttpResponse {
 
 /// The reason why a request is refused.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Refusal {
+pub(super) enum RefusalReason {
     /// The request is not a GET request of HTTP/1.1.
     Malformed,
     /// The request is addressed to another host, or comes from a page of another site.
@@ -41,7 +41,7 @@ pub(super) enum Refusal {
     Full,
 }
 
-impl Refusal {
+impl RefusalReason {
     /// Returns the HTTP status line, and a text that tells the user what to do.
     const fn status_and_advice(self) -> (&'static str, &'static str) {
         match self {
@@ -73,7 +73,7 @@ impl Refusal {
 
 impl HttpResponse {
     /// Returns the answer for a request that is refused.
-    pub(super) fn refusal(why: Refusal) -> Self {
+    pub(super) fn from_refusal(why: RefusalReason) -> Self {
         let (status, words) = why.status_and_advice();
         let number = status.split(' ').next().unwrap_or_default();
         Self::new(status, "text/plain; charset=utf-8", format!("{number}: {words}\n").as_bytes(), false)
@@ -97,33 +97,33 @@ impl HttpResponse {
 ///
 /// Scripts and styles need no token, because the page requests them by links without one. They are the same for every
 /// client and reveal nothing about the bench.
-pub(super) fn answer(head: &[u8], shared: &ServerState) -> Option<HttpResponse> {
+pub(super) fn answer_request(head: &[u8], shared: &ServerState) -> Option<HttpResponse> {
     let turned = |why| {
         shared.refused.fetch_add(1, Ordering::Relaxed);
-        Some(HttpResponse::refusal(why))
+        Some(HttpResponse::from_refusal(why))
     };
     let Some(request) = str::from_utf8(head).ok().and_then(Request::parse) else {
-        return turned(Refusal::Malformed);
+        return turned(RefusalReason::Malformed);
     };
     if !request.is_addressed_to(shared.address) {
-        return turned(Refusal::Elsewhere);
+        return turned(RefusalReason::Elsewhere);
     }
     let is_known = request.has_token(shared.access.token.as_ref());
     let is_code = web::is_script_or_style(&request.path);
     if !is_known && !is_code {
-        return turned(Refusal::Unknown);
+        return turned(RefusalReason::Unknown);
     }
     match request.path.as_str() {
         "/live" if request.is_upgrade => None,
-        "/live" if shared.pages.load(Ordering::Relaxed) >= super::MAX_PAGES => turned(Refusal::Full),
-        "/live" => turned(Refusal::NoPage),
+        "/live" if shared.pages.load(Ordering::Relaxed) >= super::MAX_PAGES => turned(RefusalReason::Full),
+        "/live" => turned(RefusalReason::NoPage),
         "/surface" => {
             Some(HttpResponse::new("200 OK", "application/octet-stream", &shared.surface, is_known))
         }
         path => match web::media_type_and_contents(path) {
             // A request for a script does not show that the client knows the token.
             Some((kind, bytes)) => Some(HttpResponse::new("200 OK", kind, bytes, is_known && !is_code)),
-            None => turned(Refusal::NoFile),
+            None => turned(RefusalReason::NoFile),
         },
     }
 }

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, getrlimit, setpriority_process};
 
-use super::answer::{HttpResponse, Refusal, answer};
+use super::answer::{HttpResponse, RefusalReason, answer_request};
 use super::page::{self, PrefixedStream};
 use super::request::MAX_HEAD_BYTES;
 use super::{MAX_PAGES, ServerState};
@@ -38,7 +38,7 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// The niceness of the thread, so that many connections do not take processor time from the bench.
 const THREAD_NICENESS: i32 = 10;
 /// The maximum number of bytes that are read at once.
-const READ_SIZE: usize = 4 * 1024;
+const READ_CHUNK_BYTES: usize = 4 * 1024;
 
 /// A client that has not received its answer yet.
 #[derive(Debug)]
@@ -51,7 +51,7 @@ struct PendingClient {
 }
 
 /// The next step for a visitor after its data was read and written.
-enum NextStep {
+enum ClientNextStep {
     /// The visitor stays, because its request or answer is not complete.
     Stays(PendingClient),
     /// The visitor becomes a page with a WebSocket.
@@ -61,7 +61,7 @@ enum NextStep {
 }
 
 /// Serves clients until the server stops. Passes clients that become pages to `pages`.
-pub(super) fn serve(listener: &TcpListener, shared: &ServerState, pages: &Sender<PrefixedStream>) {
+pub(super) fn serve_clients(listener: &TcpListener, shared: &ServerState, pages: &Sender<PrefixedStream>) {
     // On Linux, niceness applies to the thread alone. If it cannot be set, the door works without it.
     let _ = setpriority_process(None, THREAD_NICENESS);
     let room = pending_client_limit();
@@ -79,10 +79,10 @@ pub(super) fn serve(listener: &TcpListener, shared: &ServerState, pages: &Sender
                 // Browsers open connections before they need them, and would take this text for the answer to a later
                 // request.
                 if !visitor.head.is_empty() {
-                    visitor.refuse(Refusal::Late);
+                    visitor.refuse(RefusalReason::Late);
                 }
             } else if *is_ready {
-                apply_next_step(visitor.advance(shared), &mut visitors, pages);
+                apply_next_step(visitor.read_and_answer(shared), &mut visitors, pages);
             } else {
                 visitors.push(visitor);
             }
@@ -97,7 +97,7 @@ pub(super) fn serve(listener: &TcpListener, shared: &ServerState, pages: &Sender
                         continue;
                     }
                     let visitor = PendingClient::new(stream);
-                    apply_next_step(visitor.advance(shared), &mut visitors, pages);
+                    apply_next_step(visitor.read_and_answer(shared), &mut visitors, pages);
                     if visitors.len() > room {
                         refuse_oldest_client(&mut visitors, shared);
                     }
@@ -142,12 +142,12 @@ fn wait_until_ready(listener: &TcpListener, accepts: bool, visitors: &[PendingCl
 }
 
 /// Keeps a visitor, passes it on as a page, or drops it.
-fn apply_next_step(next: NextStep, visitors: &mut Vec<PendingClient>, pages: &Sender<PrefixedStream>) {
+fn apply_next_step(next: ClientNextStep, visitors: &mut Vec<PendingClient>, pages: &Sender<PrefixedStream>) {
     match next {
-        NextStep::Stays(visitor) => visitors.push(visitor),
-        NextStep::Done => {}
+        ClientNextStep::Stays(visitor) => visitors.push(visitor),
+        ClientNextStep::Done => {}
         // If the receiver no longer exists, the server stops, so the error is ignored.
-        NextStep::Page(begun) => _ = pages.send(begun),
+        ClientNextStep::Page(begun) => _ = pages.send(begun),
     }
 }
 
@@ -157,12 +157,12 @@ pub(super) fn start_page_threads(pages: Receiver<PrefixedStream>, shared: &Arc<S
         if shared.pages.fetch_add(1, Ordering::Relaxed) >= MAX_PAGES {
             shared.pages.fetch_sub(1, Ordering::Relaxed);
             shared.refused.fetch_add(1, Ordering::Relaxed);
-            PendingClient::new(begun.into_stream()).refuse(Refusal::Full);
+            PendingClient::new(begun.into_stream()).refuse(RefusalReason::Full);
             continue;
         }
         let of_thread = Arc::clone(shared);
         let started = thread::Builder::new().name(format!("view page {page}")).spawn(move || {
-            page::serve(begun, page, &of_thread);
+            page::serve_page(begun, page, &of_thread);
             of_thread.pages.fetch_sub(1, Ordering::Relaxed);
         });
         if started.is_err() {
@@ -183,7 +183,7 @@ fn refuse_oldest_client(visitors: &mut Vec<PendingClient>, shared: &ServerState)
     let oldest = visitors.remove(at);
     shared.refused.fetch_add(1, Ordering::Relaxed);
     if oldest.answer.is_none() {
-        oldest.refuse(Refusal::Crowded);
+        oldest.refuse(RefusalReason::Crowded);
     }
 }
 
@@ -193,42 +193,42 @@ impl PendingClient {
     }
 
     /// Reads the data that has arrived from a visitor, and sends as much of the answer as the socket accepts.
-    fn advance(mut self, shared: &ServerState) -> NextStep {
+    fn read_and_answer(mut self, shared: &ServerState) -> ClientNextStep {
         while self.answer.is_none() {
-            let mut piece = [0; READ_SIZE];
+            let mut piece = [0; READ_CHUNK_BYTES];
             // The empty line that ends the head may begin in the last three bytes that were read before.
             let seen = self.head.len().saturating_sub(3);
             match self.stream.read(&mut piece) {
-                Ok(0) => return NextStep::Done,
+                Ok(0) => return ClientNextStep::Done,
                 Ok(read) => self.head.extend(piece.iter().take(read)),
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
-                Err(error) if error.kind() == ErrorKind::WouldBlock => return NextStep::Stays(self),
-                Err(_) => return NextStep::Done,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return ClientNextStep::Stays(self),
+                Err(_) => return ClientNextStep::Done,
             }
             let new = self.head.get(seen..).unwrap_or_default();
             let end = new.windows(4).position(|end| end == b"\r\n\r\n").map(|at| seen + at + 4);
             if self.head.len() > MAX_HEAD_BYTES {
                 shared.refused.fetch_add(1, Ordering::Relaxed);
-                self.answer = Some((HttpResponse::refusal(Refusal::Long), 0));
+                self.answer = Some((HttpResponse::from_refusal(RefusalReason::Long), 0));
             } else if let Some(head) = end.and_then(|end| self.head.get(..end)) {
-                match answer(head, shared) {
+                match answer_request(head, shared) {
                     Some(answer) => self.answer = Some((answer, 0)),
-                    None => return NextStep::Page(PrefixedStream::new(self.head, self.stream)),
+                    None => return ClientNextStep::Page(PrefixedStream::new(self.head, self.stream)),
                 }
             }
         }
         self.send_answer()
     }
 
-    fn send_answer(mut self) -> NextStep {
+    fn send_answer(mut self) -> ClientNextStep {
         while let Some((answer, sent)) = &mut self.answer {
             let rest = answer.bytes.get(*sent..).unwrap_or_default();
             if rest.is_empty() {
                 self.close();
-                return NextStep::Done;
+                return ClientNextStep::Done;
             }
             match self.stream.write(rest) {
-                Ok(0) => return NextStep::Done,
+                Ok(0) => return ClientNextStep::Done,
                 Ok(written) => {
                     *sent += written;
                     if answer.is_known {
@@ -236,17 +236,17 @@ impl PendingClient {
                     }
                 }
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                Err(error) if error.kind() == ErrorKind::WouldBlock => return NextStep::Stays(self),
-                Err(_) => return NextStep::Done,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return ClientNextStep::Stays(self),
+                Err(_) => return ClientNextStep::Done,
             }
         }
-        NextStep::Stays(self)
+        ClientNextStep::Stays(self)
     }
 
     /// Refuses the visitor. Sends the reason only as far as the socket accepts it at once.
-    fn refuse(mut self, why: Refusal) {
+    fn refuse(mut self, why: RefusalReason) {
         if self.answer.is_none() {
-            let _ = self.stream.write(&HttpResponse::refusal(why).bytes);
+            let _ = self.stream.write(&HttpResponse::from_refusal(why).bytes);
         }
         self.close();
     }
@@ -255,7 +255,7 @@ impl PendingClient {
     /// might be lost.
     fn close(mut self) {
         let _ = self.stream.shutdown(Shutdown::Write);
-        let mut piece = [0; READ_SIZE];
+        let mut piece = [0; READ_CHUNK_BYTES];
         for _ in 0..8 {
             if !matches!(self.stream.read(&mut piece), Ok(1..)) {
                 break;

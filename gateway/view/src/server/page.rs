@@ -10,7 +10,7 @@ use tungstenite::{Error, Message, WebSocket, accept_with_config};
 
 use super::ServerState;
 use crate::command::{self, Command};
-use crate::locked;
+use crate::lock_ignoring_poison;
 
 /// The time within which a page must receive each piece of a message.
 const MESSAGE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -56,7 +56,7 @@ impl Write for PrefixedStream {
 }
 
 /// Serves a page until it disconnects, or receives messages too slowly.
-pub(super) fn serve(begun: PrefixedStream, page: u64, shared: &ServerState) {
+pub(super) fn serve_page(begun: PrefixedStream, page: u64, shared: &ServerState) {
     let _ = serve_websocket(begun, page, shared);
 }
 
@@ -77,8 +77,8 @@ fn serve_websocket(begun: PrefixedStream, page: u64, shared: &ServerState) -> io
     };
     shared.clients.fetch_add(1, Ordering::Relaxed);
     let ended = exchange_messages(&mut socket, page, shared);
-    locked(&shared.chosen).remove(&page);
-    locked(&shared.gone).push(page);
+    lock_ignoring_poison(&shared.chosen).remove(&page);
+    lock_ignoring_poison(&shared.gone).push(page);
     if ended.is_ok() {
         let _ = socket.close(None);
         let _ = socket.flush();
@@ -97,7 +97,7 @@ fn exchange_messages(
     let (mut sent, mut said_number, mut jumps) = (0, 0, 0);
     while !shared.stop.load(Ordering::Relaxed) {
         let (history, snapshot, said) = {
-            let newest = locked(&shared.newest);
+            let newest = lock_ignoring_poison(&shared.newest);
             let history = (newest.jumps != jumps).then(|| newest.history.clone());
             let snapshot = (newest.number != sent).then(|| newest.snapshot.clone());
             let own = newest.own.get(&page).unwrap_or(&newest.said);
@@ -140,8 +140,8 @@ fn handle_message(text: &str, page: u64, shared: &ServerState) {
         None => ignore(),
         Some(command) if command.affects_cells() && !shared.access.may_act => ignore(),
         Some(command) if command.controls_playback() && !shared.access.may_play => ignore(),
-        Some(Command::Choose(chosen)) => _ = locked(&shared.chosen).insert(page, chosen),
-        Some(Command::Unchoose) => _ = locked(&shared.chosen).remove(&page),
+        Some(Command::Choose(chosen)) => _ = lock_ignoring_poison(&shared.chosen).insert(page, chosen),
+        Some(Command::Unchoose) => _ = lock_ignoring_poison(&shared.chosen).remove(&page),
         Some(command) => {
             if shared.commands.try_send((page, command)).is_err() {
                 ignore();

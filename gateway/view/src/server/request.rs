@@ -48,10 +48,10 @@ impl Request {
     /// Returns true if the request is addressed to this server by one of its own addresses and does not come from a
     /// page of another site.
     pub(super) fn is_addressed_to(&self, address: SocketAddr) -> bool {
-        let Some(host) = self.host.as_deref().and_then(Authority::parse) else { return false };
+        let Some(host) = self.host.as_deref().and_then(HostAndPort::parse) else { return false };
         // Browsers send an origin with every WebSocket; other programs may omit it.
         let is_origin = self.origin.as_ref().is_none_or(|origin| {
-            origin.strip_prefix("http://").and_then(Authority::parse).is_some_and(|origin| origin == host)
+            origin.strip_prefix("http://").and_then(HostAndPort::parse).is_some_and(|origin| origin == host)
         });
         host.matches_address(address) && is_origin
     }
@@ -66,12 +66,12 @@ impl Request {
 
 /// The host and the port of a URL or a Host header.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-struct Authority<'a> {
+struct HostAndPort<'a> {
     host: &'a str,
     port: u16,
 }
 
-impl<'a> Authority<'a> {
+impl<'a> HostAndPort<'a> {
     /// Parses `HOST` or `HOST:PORT`; an IPv6 address is in brackets.
     fn parse(text: &'a str) -> Option<Self> {
         let end = text.rfind(']').map_or(0, |bracket| bracket + 1);

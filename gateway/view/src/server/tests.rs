@@ -181,7 +181,7 @@ fn an_address_is_one_that_a_browser_opens() {
         ("0.0.0.0:8100", "http://127.0.0.1:8100/?token=abcdef0123456789"),
         ("[::]:80", "http://[::1]:80/?token=abcdef0123456789"),
     ] {
-        assert_eq!(url(listen.parse().unwrap(), Some(&token)), expected);
+        assert_eq!(page_url(listen.parse().unwrap(), Some(&token)), expected);
     }
-    assert_eq!(url("127.0.0.1:80".parse().unwrap(), None), "http://127.0.0.1:80/");
+    assert_eq!(page_url("127.0.0.1:80".parse().unwrap(), None), "http://127.0.0.1:80/");
 }

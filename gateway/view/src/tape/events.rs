@@ -54,7 +54,7 @@ impl EventDetector {
     /// Returns the events that have happened since the last call.
     pub fn detect(&mut self, at: u64, live: &LiveState) -> Vec<Event> {
         let mut events = Vec::new();
-        for (bus, (losses, halted)) in live.losses().enumerate() {
+        for (bus, (losses, halted)) in live.losses_and_halted_by_bus().enumerate() {
             if self.buses.len() <= bus {
                 self.buses.push((0, false, None));
             }
@@ -70,7 +70,7 @@ impl EventDetector {
             }
             (*before, *was_halted) = (losses, halted);
         }
-        for (bus, node, now) in live.touched_and_dead(Micros(at / 1_000)) {
+        for (bus, node, now) in live.touched_and_dead_cells(Micros(at / 1_000)) {
             let before = self.cells.insert((bus, node), now).unwrap_or_default();
             for (kind, (now, before)) in
                 [EventKind::Touch, EventKind::Silence].into_iter().zip(now.into_iter().zip(before))

@@ -10,8 +10,8 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, sockopt};
 use socketcan::{CanFdSocket, SocketOptions};
 
-use super::{ClientHello, FilterPart, HelloReply, OWN_FRAME_BYTE, VERSION, decode_dropped};
-use super::{address, default_directory, open_directory};
+use super::{ClientHello, FilterPart, HELLO_VERSION, HelloReply, OWN_FRAME_BYTE_INDEX, decode_drop_notice};
+use super::{default_directory, open_directory, socket_address};
 use crate::bus::batch::{self, Datagram};
 use crate::bus::carrier::BusBackend;
 use crate::bus::{Bus, BusError, BusOptions, Filter};
@@ -19,7 +19,7 @@ use crate::bus::{Bus, BusError, BusOptions, Filter};
 /// Maximum time to wait for a server, which answers at once unless it is stopped.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum time until a server that is ending resets a new connection.
-const RESET_TIMEOUT: Duration = Duration::from_millis(50);
+const CONNECTION_RESET_TIMEOUT: Duration = Duration::from_millis(50);
 /// Size of the send buffer in bytes: room for some 700 FD frames, the answers of a whole skin to one message.
 const SEND_BUFFER_BYTES: usize = 1 << 18;
 
@@ -65,16 +65,16 @@ impl BusBackend for EmbeddedBackend {
                 Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX)))
             }
             Some(HelloReply::Refused { version }) => {
-                Err(BusError::Refused { name: name.to_owned(), ours: VERSION, theirs: version })
+                Err(BusError::Refused { name: name.to_owned(), ours: HELLO_VERSION, theirs: version })
             }
             None => Err(closed_error(name, options.directory.as_deref())),
         }
     }
 
     fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError> {
-        let parts: Vec<_> = FilterPart::split(filters).map(|part| part.encode()).collect();
+        let parts: Vec<_> = FilterPart::split_filters(filters).map(|part| part.encode()).collect();
         let send = |sent| parts.get::<usize>(sent).map_or(Ok(0), |part| batch::send_one(&bus.socket, part));
-        Ok(bus.send_all(parts.len(), send)?)
+        Ok(bus.send_items(parts.len(), send)?)
     }
 
     fn is_virtual(&self, _name: &str) -> io::Result<bool> {
@@ -82,11 +82,11 @@ impl BusBackend for EmbeddedBackend {
     }
 
     fn is_own(&self, frame: Datagram<'_>) -> bool {
-        frame.bytes().and_then(|bytes| bytes.get(OWN_FRAME_BYTE)) == Some(&1)
+        frame.bytes().and_then(|bytes| bytes.get(OWN_FRAME_BYTE_INDEX)) == Some(&1)
     }
 
     fn decode_drop_notice(&self, notice: &[u8]) -> Option<u32> {
-        decode_dropped(notice)
+        decode_drop_notice(notice)
     }
 
     fn bus_error(&self, errno: Errno) -> Option<fn(String) -> BusError> {
@@ -111,7 +111,7 @@ fn is_served(name: &str, directory: Option<&Path>) -> bool {
 
 /// Returns true if a server keeps a new connection open. A server that is ending resets new connections.
 fn is_kept_open(socket: &OwnedFd) -> bool {
-    let wait = Timespec::try_from(RESET_TIMEOUT).unwrap_or_default();
+    let wait = Timespec::try_from(CONNECTION_RESET_TIMEOUT).unwrap_or_default();
     let mut polled = [PollFd::new(socket, PollFlags::IN)];
     let is_quiet = rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))) == Ok(0);
     is_quiet || rustix::net::recv(socket, &mut [0; 64], RecvFlags::DONTWAIT).is_ok()
@@ -124,8 +124,8 @@ fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
     let not_served = || BusError::NotServed { name: name.to_owned(), directory: directory.clone() };
     open_directory(&directory)
         .map_err(|error| if error.is_absent() { not_served() } else { error.into() })?;
-    let address = address(&directory, name)?;
-    let socket = seqpacket(SocketFlags::empty()).map_err(failed)?;
+    let address = socket_address(&directory, name)?;
+    let socket = seqpacket_socket(SocketFlags::empty()).map_err(failed)?;
     // `connect` blocks while the server's queue of new clients is full; the timeout limits that.
     sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(ANSWER_TIMEOUT)).map_err(failed)?;
     sockopt::set_socket_send_buffer_size(&socket, SEND_BUFFER_BYTES).map_err(failed)?;
@@ -141,6 +141,6 @@ fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
 ///
 /// # Errors
 /// Returns an error if the system cannot create the socket.
-pub fn seqpacket(flags: SocketFlags) -> rustix::io::Result<OwnedFd> {
+pub fn seqpacket_socket(flags: SocketFlags) -> rustix::io::Result<OwnedFd> {
     rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags | SocketFlags::CLOEXEC, None)
 }

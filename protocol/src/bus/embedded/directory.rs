@@ -34,7 +34,7 @@ pub fn socket_name(bus: &str) -> String {
 ///
 /// # Errors
 /// Returns an error if the path is too long for a socket.
-pub fn address(directory: &Path, bus: &str) -> Result<SocketAddrUnix, DirectoryError> {
+pub fn socket_address(directory: &Path, bus: &str) -> Result<SocketAddrUnix, DirectoryError> {
     let path = directory.join(socket_name(bus));
     SocketAddrUnix::new(&path).map_err(|_| DirectoryError::TooLong(path))
 }

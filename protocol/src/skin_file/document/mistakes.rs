@@ -11,7 +11,7 @@ use crate::skin::CellName;
 const MAX_QUOTED_CHARS: usize = 40;
 
 /// Rewrites the parser's error message about the value at the bytes `at` in terms of the key and its value.
-pub(super) fn explain(text: &str, at: Range<usize>, message: &str) -> String {
+pub(super) fn explain_parse_error(text: &str, at: Range<usize>, message: &str) -> String {
     let found = DeTable::parse(text).ok().and_then(|root| find_in_table(root.get_ref(), at.start));
     if let Some(field) = message.strip_prefix("missing field ") {
         // A key that is missing at the top level has no table.
@@ -21,7 +21,7 @@ pub(super) fn explain(text: &str, at: Range<usize>, message: &str) -> String {
     let Some(FoundValue { path, value }) = found else { return explain_syntax_error(message) };
     let value = text.get(value).unwrap_or_default().lines().next().unwrap_or_default();
     let quoted = value.chars().take(MAX_QUOTED_CHARS).collect::<String>();
-    let Some(allowed) = describe_allowed(&path, message) else { return message.to_owned() };
+    let Some(allowed) = describe_allowed_values(&path, message) else { return message.to_owned() };
     match quoted.starts_with('[') && allowed.contains("[[") {
         true => format!("{path}: {allowed}"),
         false => format!("{path} = {quoted}: {allowed}"),
@@ -29,7 +29,7 @@ pub(super) fn explain(text: &str, at: Range<usize>, message: &str) -> String {
 }
 
 /// Describes the values that the parser expected at a path; `None` if its message does not contain them.
-fn describe_allowed(path: &str, message: &str) -> Option<String> {
+fn describe_allowed_values(path: &str, message: &str) -> Option<String> {
     if let Some((got, target)) = message
         .strip_prefix("invalid length ")
         .and_then(|rest| rest.split_once(", expected an array of length "))

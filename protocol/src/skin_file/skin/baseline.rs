@@ -6,7 +6,7 @@ use crate::fixed::{Q1_14, Q5_10};
 use crate::parameters::{Baseline, BaselineSettings};
 
 /// Baseline settings for omitted keys.
-const DEFAULT: BaselineSettings = BaselineSettings {
+const DEFAULT_BASELINE_SETTINGS: BaselineSettings = BaselineSettings {
     threshold: Q5_10::from_bits(103),
     hysteresis: Q1_14::from_bits(8_192),
     rate_un_per_s: 2_000,
@@ -19,21 +19,21 @@ pub(super) fn skin_baseline(raw: Option<raw::RawBaseline>) -> Result<Baseline, D
     let Some(raw) = raw else { return Ok(Baseline::Off) };
     let at = KeyPath::top_level_key("baseline");
     let modes = [("off", None), ("hold", Some(false)), ("follow", Some(true))];
-    let follows = at.key("mode").parse_choice(raw.mode.as_deref().unwrap_or("follow"), &modes)?;
-    let mut to = DEFAULT;
-    at.key("threshold_n").set_fixed_if_given(raw.threshold_n, &mut to.threshold, Q5_10::try_round_up)?;
+    let follows = at.with_key("mode").parse_choice(raw.mode.as_deref().unwrap_or("follow"), &modes)?;
+    let mut to = DEFAULT_BASELINE_SETTINGS;
+    at.with_key("threshold_n").set_fixed_if_given(raw.threshold_n, &mut to.threshold, Q5_10::try_round_up)?;
     if let Some(got) = raw.threshold_n.filter(|_| to.threshold <= Q5_10::ZERO) {
-        return Err(at.key("threshold_n").fault(got, "must be above 0"));
+        return Err(at.with_key("threshold_n").fault(got, "must be above 0"));
     }
-    at.key("hysteresis").set_fixed_if_given(raw.hysteresis, &mut to.hysteresis, Q1_14::try_nearest)?;
+    at.with_key("hysteresis").set_fixed_if_given(raw.hysteresis, &mut to.hysteresis, Q1_14::try_nearest)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
-        return Err(at.key("hysteresis").fault(got, "a part of the threshold: 0 to 1 is possible"));
+        return Err(at.with_key("hysteresis").fault(got, "a part of the threshold: 0 to 1 is possible"));
     }
-    at.key("limit_n").set_fixed_if_given(raw.limit_n, &mut to.limit, Q5_10::try_nearest)?;
-    set_temperature_slope(&at.key("n_per_c"), raw.n_per_c, &mut to)?;
+    at.with_key("limit_n").set_fixed_if_given(raw.limit_n, &mut to.limit, Q5_10::try_nearest)?;
+    set_temperature_slope(&at.with_key("n_per_c"), raw.n_per_c, &mut to)?;
     if let Some(got) = raw.rate_n_per_s {
         to.rate_un_per_s = to_micronewtons_per_s(got)
-            .ok_or_else(|| at.key("rate_n_per_s").fault(got, "1e-6 to 0.065535 N/s are possible"))?;
+            .ok_or_else(|| at.with_key("rate_n_per_s").fault(got, "1e-6 to 0.065535 N/s are possible"))?;
     }
     Ok(match follows {
         None => Baseline::Off,
@@ -52,11 +52,15 @@ pub(super) fn cell_baseline(
         let given = [("baseline_limit_n", raw.baseline_limit_n), ("baseline_n_per_c", raw.baseline_n_per_c)];
         let given = given.into_iter().find_map(|(key, value)| Some((key, value?)));
         return given.map_or(Ok(base), |(key, value)| {
-            Err(at.key(key).fault(value, "the skin has no [baseline], or its mode is \"off\""))
+            Err(at.with_key(key).fault(value, "the skin has no [baseline], or its mode is \"off\""))
         });
     };
-    at.key("baseline_limit_n").set_fixed_if_given(raw.baseline_limit_n, &mut to.limit, Q5_10::try_nearest)?;
-    set_temperature_slope(&at.key("baseline_n_per_c"), raw.baseline_n_per_c, &mut to)?;
+    at.with_key("baseline_limit_n").set_fixed_if_given(
+        raw.baseline_limit_n,
+        &mut to.limit,
+        Q5_10::try_nearest,
+    )?;
+    set_temperature_slope(&at.with_key("baseline_n_per_c"), raw.baseline_n_per_c, &mut to)?;
     Ok(Baseline::On(to))
 }
 
@@ -98,16 +102,24 @@ mod tests {
     fn cells_have_no_baseline_unless_the_skin_has() {
         assert_eq!(read("", ""), Ok(Baseline::Off));
         assert_eq!(read("[baseline]\nmode = \"off\"\nlimit_n = 1.0", ""), Ok(Baseline::Off));
-        assert_eq!(read("[baseline]", ""), Ok(Baseline::On(DEFAULT)));
-        let hold = BaselineSettings { rate_un_per_s: 0, ..DEFAULT };
+        assert_eq!(read("[baseline]", ""), Ok(Baseline::On(DEFAULT_BASELINE_SETTINGS)));
+        let hold = BaselineSettings { rate_un_per_s: 0, ..DEFAULT_BASELINE_SETTINGS };
         assert_eq!(read("[baseline]\nmode = \"hold\"", ""), Ok(Baseline::On(hold)));
         let said = "threshold_n = 0.1\nhysteresis = 0.5\nrate_n_per_s = 0.002\nlimit_n = 0.5\nn_per_c = 0.0";
-        assert_eq!(read(&format!("[baseline]\n{said}"), ""), Ok(Baseline::On(DEFAULT)), "the defaults");
+        assert_eq!(
+            read(&format!("[baseline]\n{said}"), ""),
+            Ok(Baseline::On(DEFAULT_BASELINE_SETTINGS)),
+            "the defaults"
+        );
     }
 
     #[test]
     fn a_cell_overrides_limit_and_slope() {
-        let own = BaselineSettings { limit: Q5_10::nearest(1.5), n_per_c: Q1_14::nearest(-0.02), ..DEFAULT };
+        let own = BaselineSettings {
+            limit: Q5_10::nearest(1.5),
+            n_per_c: Q1_14::nearest(-0.02),
+            ..DEFAULT_BASELINE_SETTINGS
+        };
         let cell = "baseline_limit_n = 1.5\nbaseline_n_per_c = -0.02";
         assert_eq!(read("[baseline]", cell), Ok(Baseline::On(own)));
         let why = read("", cell).unwrap_err();

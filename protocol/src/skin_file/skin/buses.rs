@@ -11,7 +11,7 @@ use crate::wire_time::BitRates;
 /// Maximum number of buses in a skin.
 const MAX_BUSES: usize = 64;
 
-pub(super) fn buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>> {
+pub(super) fn check_buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>> {
     if raw.is_empty() {
         return Err(KeyPath::top_level_key("bus").fault("[]", "at least one bus is needed"));
     }
@@ -21,20 +21,20 @@ pub(super) fn buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>>
     }
     let mut seen = HashSet::new();
     let bus = |(index, bus): (usize, &raw::RawBus)| {
-        let at = KeyPath::top_level_key("bus").element(index);
+        let at = KeyPath::top_level_key("bus").with_index(index);
         let name = bus.name.clone();
         if !crate::bus::is_plain_name(&name) || name.starts_with('.') {
             let why = "an interface's name has 1 to 15 letters, digits, `-`, `_` or `.`";
-            return Err(at.key("name").fault(format_args!("{name:?}"), why));
+            return Err(at.with_key("name").fault(format_args!("{name:?}"), why));
         }
         if !seen.insert(name.clone()) {
-            return Err(at.key("name").fault(format_args!("{name:?}"), "this bus is named twice"));
+            return Err(at.with_key("name").fault(format_args!("{name:?}"), "this bus is named twice"));
         }
-        let reply = reply(&at, bus)?;
+        let reply = check_reply(&at, bus)?;
         let format = at
-            .key("format")
+            .with_key("format")
             .parse_choice(&bus.format, &[("fd", Format::Fd), ("classic", Format::Classic)])?;
-        let (bitrate, data_bitrate) = bit_rates(&at, bus, format)?;
+        let (bitrate, data_bitrate) = check_bit_rates(&at, bus, format)?;
         let chain = chain_index(&at, bus, robot)?;
         let torque_format = torque_format(&at, bus, robot, chain)?;
         let sensing = sensing::bus_sensing(&at, bus)?;
@@ -47,7 +47,7 @@ pub(super) fn buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>>
 fn chain_index(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize> {
     let names =
         || robot.chains.iter().map(|chain| format!("{:?}", chain.name)).collect::<Vec<_>>().join(", ");
-    let at = at.key("chain");
+    let at = at.with_key("chain");
     match &bus.chain {
         Some(name) => robot.chains.iter().position(|chain| chain.name == *name).ok_or_else(|| {
             at.fault(format_args!("{name:?}"), format_args!("no such chain; there is {}", names()))
@@ -62,7 +62,7 @@ fn chain_index(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize>
 fn torque_format(at: &KeyPath, bus: &raw::RawBus, robot: &Robot, chain: usize) -> Checked<TorqueFormat> {
     if let Some(name) = &bus.torque_format {
         let formats = TorqueFormat::ALL.map(|format| (format.name(), format));
-        return at.key("torque_format").parse_choice(name, &formats);
+        return at.with_key("torque_format").parse_choice(name, &formats);
     }
     let joints = robot.chains.get(chain).map_or(&[][..], |chain| &chain.joints);
     let slides = |&joint: &usize| robot.joints.get(joint).is_some_and(|it| it.kind == JointKind::Prismatic);
@@ -70,33 +70,33 @@ fn torque_format(at: &KeyPath, bus: &raw::RawBus, robot: &Robot, chain: usize) -
 }
 
 /// Checks the reply of the cells of a bus to joints.
-fn reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
-    let sums = at.key("reply").parse_choice(&bus.reply, &[("torque", false), ("sum", true)])?;
+fn check_reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
+    let sums = at.with_key("reply").parse_choice(&bus.reply, &[("torque", false), ("sum", true)])?;
     let only_sum = "only with reply = \"sum\"";
     match (sums, bus.slot_us, bus.carry) {
         (false, None, None) => Ok(SkinReply::Torque),
-        (false, Some(got), _) => Err(at.key("slot_us").fault(got, only_sum)),
-        (false, None, Some(got)) => Err(at.key("carry").fault(got, only_sum)),
+        (false, Some(got), _) => Err(at.with_key("slot_us").fault(got, only_sum)),
+        (false, None, Some(got)) => Err(at.with_key("carry").fault(got, only_sum)),
         (true, Some(got), carry) => match u32::try_from(got) {
             Ok(slot_us @ 1..) => Ok(SkinReply::Sum { slot_us, carry: carry.unwrap_or(true) }),
-            Ok(0) | Err(_) => Err(at.key("slot_us").fault(got, "must be above 0")),
+            Ok(0) | Err(_) => Err(at.with_key("slot_us").fault(got, "must be above 0")),
         },
-        (true, None, _) => Err(at.key("reply").fault("\"sum\"", "slot_us is needed with it")),
+        (true, None, _) => Err(at.with_key("reply").fault("\"sum\"", "slot_us is needed with it")),
     }
 }
 
 /// Checks the nominal and data bit rates of a bus, which are optional and only needed for real hardware.
-fn bit_rates(at: &KeyPath, bus: &raw::RawBus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
-    let within = |key, got, min, max| at.key(key).check_range(got, min..=max, " bit/s");
+fn check_bit_rates(at: &KeyPath, bus: &raw::RawBus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
+    let within = |key, got, min, max| at.with_key(key).check_range(got, min..=max, " bit/s");
     let (min, max) = (BitRates::MIN_NOMINAL_BIT_RATE, BitRates::MAX_NOMINAL_BIT_RATE);
     let bitrate = bus.bitrate.map(|got| within("bitrate", got, min, max)).transpose()?;
     let data_bitrate = match (bus.data_bitrate, format, bitrate) {
         (None, _, _) => None,
         (Some(got), Format::Classic, _) => {
-            return Err(at.key("data_bitrate").fault(got, "only with format = \"fd\""));
+            return Err(at.with_key("data_bitrate").fault(got, "only with format = \"fd\""));
         }
         (Some(got), Format::Fd, None) => {
-            return Err(at.key("data_bitrate").fault(got, "only together with bitrate"));
+            return Err(at.with_key("data_bitrate").fault(got, "only together with bitrate"));
         }
         (Some(got), Format::Fd, Some(min)) => {
             Some(within("data_bitrate", got, min, BitRates::MAX_DATA_BIT_RATE)?)

@@ -44,7 +44,7 @@ pub fn split_bus(text: &str) -> Result<(Option<&str>, &str), String> {
 impl CellName {
     /// Returns true if the name denotes the cell with this bus and node id.
     #[must_use]
-    pub fn fits(&self, bus: &str, node: CellId) -> bool {
+    pub fn matches_cell(&self, bus: &str, node: CellId) -> bool {
         self.node == node && self.bus.as_deref().is_none_or(|own| own == bus)
     }
 }

@@ -17,7 +17,7 @@ pub(super) struct CellDefaults {
     pub(super) baseline: Baseline,
 }
 
-pub(super) fn cells(
+pub(super) fn check_cells(
     raw: &[raw::RawCell],
     robot: &Robot,
     buses: &[SkinBus],
@@ -27,16 +27,16 @@ pub(super) fn cells(
     let mut serials = HashMap::new();
     let mut cells = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let at = KeyPath::top_level_key("cell").element(index);
-        let cell = cell(&at, raw, robot, buses, base)?;
+        let at = KeyPath::top_level_key("cell").with_index(index);
+        let cell = check_cell(&at, raw, robot, buses, base)?;
         if let Some(first) = taken.insert((cell.bus, cell.node), index) {
             let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
             let why = format!("cell[{first}] already has this node id on {bus:?}");
-            return Err(at.key("node").fault(raw.node, why));
+            return Err(at.with_key("node").fault(raw.node, why));
         }
         if let Some(first) = serials.insert(cell.serial, index) {
             let why = format!("cell[{first}] already has this serial number");
-            return Err(at.key("serial").fault(cell.serial, why));
+            return Err(at.with_key("serial").fault(cell.serial, why));
         }
         cells.push(cell);
     }
@@ -44,9 +44,9 @@ pub(super) fn cells(
         if neighbor == cell.node || !taken.contains_key(&(cell.bus, neighbor)) {
             let why = "must be the node of another cell on the same bus, or 0";
             return Err(KeyPath::top_level_key("cell")
-                .element(index)
-                .key("neighbors")
-                .element(port)
+                .with_index(index)
+                .with_key("neighbors")
+                .with_index(port)
                 .fault(neighbor, why));
         }
     }
@@ -80,16 +80,16 @@ fn check_wire_ends(cells: &[Cell]) -> Checked<()> {
                  or put 0 here"
             );
             return Err(KeyPath::top_level_key("cell")
-                .element(index)
-                .key("neighbors")
-                .element(port)
+                .with_index(index)
+                .with_key("neighbors")
+                .with_index(port)
                 .fault(neighbor, why));
         }
     }
     Ok(())
 }
 
-fn cell(
+fn check_cell(
     at: &KeyPath,
     raw: &raw::RawCell,
     robot: &Robot,
@@ -99,10 +99,10 @@ fn cell(
     let bus = bus_index(at, raw, buses)?;
     let node = CellId::new(raw.node);
     let why = "a cell's node is 1 to 254; further cells need another bus";
-    let node = node.map_err(|_| at.key("node").fault(raw.node, why))?;
+    let node = node.map_err(|_| at.with_key("node").fault(raw.node, why))?;
     let (joint, row) = joint_and_row(at, raw, robot, buses.get(bus).map_or(0, |bus| bus.chain))?;
     for (axis, &value) in raw.position.iter().enumerate() {
-        at.key("position").element(axis).check_finite(value)?;
+        at.with_key("position").with_index(axis).check_finite(value)?;
     }
     let chain = buses.get(bus).and_then(|bus| robot.chains.get(bus.chain));
     let rows = chain.and_then(|chain| chain.rows.get(..usize::from(row))).unwrap_or_default();
@@ -113,53 +113,54 @@ fn cell(
             "node {node} can be {reach:.3} m away from a frame of its rows, {:.3} m more than the {MAX_REACH} m that Q1.14 can hold",
             reach - MAX_REACH
         );
-        return Err(at.key("position").fault(format_args!("[{x}, {y}, {z}]"), why));
+        return Err(at.with_key("position").fault(format_args!("[{x}, {y}, {z}]"), why));
     }
     let mut neighbors = [None; 4];
     for (port, (neighbor, &got)) in neighbors.iter_mut().zip(&raw.neighbors).enumerate() {
         if got != 0 {
-            let wrong = |_| at.key("neighbors").element(port).fault(got, "a node is 1 to 254, or 0 for none");
+            let wrong =
+                |_| at.with_key("neighbors").with_index(port).fault(got, "a node is 1 to 254, or 0 for none");
             *neighbor = Some(CellId::new(got).map_err(wrong)?);
         }
     }
-    let serial = raw.serial.unwrap_or_else(|| default_serial(bus, node));
+    let serial = raw.serial.unwrap_or_else(|| default_serial_number(bus, node));
     Ok(Cell {
         bus,
         node,
-        serial: at.key("serial").check_range(serial, 0..=u32::MAX, "")?,
+        serial: at.with_key("serial").check_range(serial, 0..=u32::MAX, "")?,
         joint,
         row,
         position: raw.position,
         normal: cell_normal(at, raw)?,
         orientation: raw
             .orientation
-            .map(|it| normalized(&at.key("orientation"), "quaternion", it))
+            .map(|it| normalized(&at.with_key("orientation"), "quaternion", it))
             .transpose()?,
         neighbors,
         root: raw.root,
-        contact: contact(at, raw.contact(), base.contact)?,
+        contact: contact_with_overrides(at, raw.contact(), base.contact)?,
         baseline: baseline::cell_baseline(at, raw, base.baseline)?,
     })
 }
 
 /// Returns `base` with the gains and thresholds that are given.
-pub(super) fn contact(at: &KeyPath, raw: raw::RawContact, base: Contact) -> Checked<Contact> {
+pub(super) fn contact_with_overrides(at: &KeyPath, raw: raw::RawContact, base: Contact) -> Checked<Contact> {
     let raw::RawContact { alpha_c, alpha_p, contact_threshold_n, proximity_threshold, force_threshold_n } =
         raw;
     let mut to = base;
-    at.key("alpha_c").set_fixed_if_given(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
-    at.key("alpha_p").set_fixed_if_given(alpha_p, &mut to.alpha_p, Q::try_nearest)?;
-    at.key("contact_threshold_n").set_fixed_if_given(
+    at.with_key("alpha_c").set_fixed_if_given(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
+    at.with_key("alpha_p").set_fixed_if_given(alpha_p, &mut to.alpha_p, Q::try_nearest)?;
+    at.with_key("contact_threshold_n").set_fixed_if_given(
         contact_threshold_n,
         &mut to.contact_threshold,
         Q::try_round_up,
     )?;
-    at.key("proximity_threshold").set_fixed_if_given(
+    at.with_key("proximity_threshold").set_fixed_if_given(
         proximity_threshold,
         &mut to.proximity_threshold,
         Q::try_round_up,
     )?;
-    at.key("force_threshold_n").set_fixed_if_given(
+    at.with_key("force_threshold_n").set_fixed_if_given(
         force_threshold_n,
         &mut to.force_threshold,
         Q::try_round_up,
@@ -168,7 +169,7 @@ pub(super) fn contact(at: &KeyPath, raw: raw::RawContact, base: Contact) -> Chec
 }
 
 /// Returns the serial number of a cell whose file gives none. Default serial numbers are unique within a skin.
-fn default_serial(bus: usize, node: CellId) -> i64 {
+fn default_serial_number(bus: usize, node: CellId) -> i64 {
     i64::try_from(bus).unwrap_or(0) * 1_000 + i64::from(node.get())
 }
 
@@ -178,21 +179,21 @@ fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) 
     let (joints, rows) = (chain.joints.len(), chain.rows.len());
     let within = |key, got: i64, max: usize, what: &str| {
         let number = u8::try_from(got).ok().filter(|&it| it > 0 && usize::from(it) <= max);
-        number.ok_or_else(|| at.key(key).fault(got, format_args!("{what} 1 to {max}")))
+        number.ok_or_else(|| at.with_key(key).fault(got, format_args!("{what} 1 to {max}")))
     };
     let joint = raw.joint.map(|got| within("joint", got, joints, "the robot has joints")).transpose()?;
     let row = raw.row.map(|got| within("row", got, rows, "its chain has rows")).transpose()?;
     match (joint, row) {
         (None, None) => Err(at
-            .key("joint")
+            .with_key("joint")
             .fault("", format_args!("which joint moves the cell? the joints are 1 to {joints}"))),
         (Some(joint), None) => Ok((joint, chain.row_of(joint).unwrap_or_default())),
         (given, Some(row)) => match chain.joint_of_row(row) {
-            0 => Err(at.key("row").fault(row, "no joint moves what this row carries")),
+            0 => Err(at.with_key("row").fault(row, "no joint moves what this row carries")),
             joint if given.is_none_or(|given| given == joint) => Ok((joint, row)),
             joint => {
                 let why = format!("this row is moved by joint {joint}: correct the joint, or leave it out");
-                Err(at.key("row").fault(row, why))
+                Err(at.with_key("row").fault(row, why))
             }
         },
     }
@@ -201,7 +202,7 @@ fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) 
 /// Returns the index of a cell's bus. The file may omit the name if there is only one bus.
 fn bus_index(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usize> {
     let names = || buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
-    let at = at.key("bus");
+    let at = at.with_key("bus");
     match &raw.bus {
         Some(name) => buses.iter().position(|bus| bus.name == *name).ok_or_else(|| {
             at.fault(format_args!("{name:?}"), format_args!("no such bus; there is {}", names()))
@@ -215,14 +216,16 @@ fn bus_index(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usi
 fn cell_normal(at: &KeyPath, raw: &raw::RawCell) -> Checked<[f64; 3]> {
     match (raw.orientation, raw.normal) {
         (Some(orientation), None) => {
-            let [x, y, z, w] = normalized(&at.key("orientation"), "quaternion", orientation)?;
+            let [x, y, z, w] = normalized(&at.with_key("orientation"), "quaternion", orientation)?;
             Ok([2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)])
         }
-        (None, Some(normal)) => normalized(&at.key("normal"), "vector", normal),
-        (Some(_), Some(_)) => Err(at.key("normal").fault("", "either a normal or an orientation, not both")),
+        (None, Some(normal)) => normalized(&at.with_key("normal"), "vector", normal),
+        (Some(_), Some(_)) => {
+            Err(at.with_key("normal").fault("", "either a normal or an orientation, not both"))
+        }
         (None, None) => {
             let why = "where does the cell face? give the x, y, z of its outward normal, or its orientation";
-            Err(at.key("normal").fault("", why))
+            Err(at.with_key("normal").fault("", why))
         }
     }
 }

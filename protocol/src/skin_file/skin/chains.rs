@@ -18,10 +18,10 @@ const MAX_BASE_COORDINATE_M: f64 = 100.0;
 const UNIT_LENGTH_TOLERANCE: f64 = 1e-3;
 
 /// Checks the joints and chains of the robot.
-pub(super) fn robot(raw: raw::RawRobot) -> Checked<Robot> {
+pub(super) fn check_robot(raw: raw::RawRobot) -> Checked<Robot> {
     let at = KeyPath::top_level_key("robot");
     if raw.urdf.as_ref().is_some_and(String::is_empty) {
-        return Err(at.key("urdf").fault("\"\"", "the path of a file, from the skin's file"));
+        return Err(at.with_key("urdf").fault("\"\"", "the path of a file, from the skin's file"));
     }
     match (raw.joints, raw.joint.is_empty() && raw.chain.is_empty()) {
         (Some(rows), true) => {
@@ -29,19 +29,21 @@ pub(super) fn robot(raw: raw::RawRobot) -> Checked<Robot> {
         }
         (None, false) => {
             if raw.limits_rad.is_some() {
-                return Err(at.key("limits_rad").fault("", "with [[robot.joint]] each joint has its limits"));
+                return Err(at
+                    .with_key("limits_rad")
+                    .fault("", "with [[robot.joint]] each joint has its limits"));
             }
-            let joints = joints(&at, &raw.joint)?;
-            let chains = chains(&at, &raw.chain, &joints)?;
+            let joints = check_joints(&at, &raw.joint)?;
+            let chains = check_chains(&at, &raw.chain, &joints)?;
             Ok(Robot { name: raw.name, urdf: raw.urdf, joints, chains })
         }
         (Some(_), false) => {
             let why = "either joints, or [[robot.joint]] and [[robot.chain]], not both";
-            Err(at.key("joints").fault("", why))
+            Err(at.with_key("joints").fault("", why))
         }
         (None, true) => {
             let why = "give the rows of its joints, or [[robot.joint]] and [[robot.chain]]";
-            Err(at.key("joints").fault("", why))
+            Err(at.with_key("joints").fault("", why))
         }
     }
 }
@@ -56,15 +58,15 @@ fn serial_robot(
     let count = rows.len();
     if count == 0 || count > MAX_JOINTS {
         let why = format!("1 to {MAX_JOINTS} revolute joints are allowed in this key");
-        return Err(at.key("joints").fault(format_args!("{count} joints"), why));
+        return Err(at.with_key("joints").fault(format_args!("{count} joints"), why));
     }
     for (index, row) in rows.iter().enumerate() {
-        check_row(&at.key("joints").element(index), row)?;
+        check_row(&at.with_key("joints").with_index(index), row)?;
     }
     let all = limits.unwrap_or_else(|| vec![[-TAU, TAU]; count]);
-    check_joint_count(&at.key("limits_rad"), all.len(), count)?;
+    check_joint_count(&at.with_key("limits_rad"), all.len(), count)?;
     for (index, &limits) in all.iter().enumerate() {
-        check_limits(&at.key("limits_rad").element(index), limits, JointKind::Revolute)?;
+        check_limits(&at.with_key("limits_rad").with_index(index), limits, JointKind::Revolute)?;
     }
     let joint = |(index, &limits): (usize, &[f64; 2])| Joint {
         name: format!("joint{}", index + 1),
@@ -84,10 +86,10 @@ fn serial_robot(
 
 /// Checks that the lengths of a row, in m, fit Q1.14 words, and that the angles are finite.
 fn check_row(at: &KeyPath, row: &DenavitHartenberg) -> Checked<()> {
-    at.key("a").to_fixed(row.a, Q1_14::try_nearest)?;
-    at.key("d").to_fixed(row.d, Q1_14::try_nearest)?;
-    at.key("alpha").check_finite(row.alpha)?;
-    at.key("theta_offset").check_finite(row.theta_offset)?;
+    at.with_key("a").to_fixed(row.a, Q1_14::try_nearest)?;
+    at.with_key("d").to_fixed(row.d, Q1_14::try_nearest)?;
+    at.with_key("alpha").check_finite(row.alpha)?;
+    at.with_key("theta_offset").check_finite(row.theta_offset)?;
     Ok(())
 }
 
@@ -106,50 +108,50 @@ fn check_limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<
     Ok([min, max])
 }
 
-fn joints(at: &KeyPath, raw: &[raw::RawJoint]) -> Checked<Vec<Joint>> {
+fn check_joints(at: &KeyPath, raw: &[raw::RawJoint]) -> Checked<Vec<Joint>> {
     let count = raw.len();
     if count == 0 || count > MAX_ROBOT_JOINTS {
         let why = format!("a robot has 1 to {MAX_ROBOT_JOINTS} joints");
-        return Err(at.key("joint").fault(format_args!("{count} joints"), why));
+        return Err(at.with_key("joint").fault(format_args!("{count} joints"), why));
     }
     let mut joints: Vec<Joint> = Vec::with_capacity(count);
     for (index, raw) in raw.iter().enumerate() {
-        let at = at.key("joint").element(index);
+        let at = at.with_key("joint").with_index(index);
         if raw.name.is_empty() || joints.iter().any(|joint| joint.name == raw.name) {
             let why = "each joint has a name of its own";
-            return Err(at.key("name").fault(format_args!("{:?}", raw.name), why));
+            return Err(at.with_key("name").fault(format_args!("{:?}", raw.name), why));
         }
         let kinds = [JointKind::Revolute, JointKind::Prismatic].map(|kind| (kind.name(), kind));
-        let kind = at.key("kind").parse_choice(&raw.kind, &kinds)?;
+        let kind = at.with_key("kind").parse_choice(&raw.kind, &kinds)?;
         let given = match (raw.limits, kind) {
             (Some(limits), _) => limits,
             (None, JointKind::Revolute) => [-TAU, TAU],
             (None, JointKind::Prismatic) => {
-                return Err(at.key("limits").fault("", "a prismatic joint needs them, in m"));
+                return Err(at.with_key("limits").fault("", "a prismatic joint needs them, in m"));
             }
         };
-        let limits = check_limits(&at.key("limits"), given, kind)?;
+        let limits = check_limits(&at.with_key("limits"), given, kind)?;
         joints.push(Joint { name: raw.name.clone(), kind, limits });
     }
     Ok(joints)
 }
 
-fn chains(at: &KeyPath, raw: &[raw::RawChain], joints: &[Joint]) -> Checked<Vec<Chain>> {
+fn check_chains(at: &KeyPath, raw: &[raw::RawChain], joints: &[Joint]) -> Checked<Vec<Chain>> {
     if raw.is_empty() {
-        return Err(at.key("chain").fault("[]", "at least one chain is needed"));
+        return Err(at.with_key("chain").fault("[]", "at least one chain is needed"));
     }
     let mut chains: Vec<Chain> = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let at = at.key("chain").element(index);
+        let at = at.with_key("chain").with_index(index);
         if raw.name.is_empty() || chains.iter().any(|chain| chain.name == raw.name) {
             let why = "each chain has a name of its own";
-            return Err(at.key("name").fault(format_args!("{:?}", raw.name), why));
+            return Err(at.with_key("name").fault(format_args!("{:?}", raw.name), why));
         }
-        chains.push(chain(&at, raw, joints)?);
+        chains.push(check_chain(&at, raw, joints)?);
     }
     let unused = |(index, _): &(usize, &Joint)| chains.iter().all(|chain| !chain.joints.contains(index));
     if let Some((index, joint)) = joints.iter().enumerate().find(unused) {
-        let at = at.key("joint").element(index).key("name");
+        let at = at.with_key("joint").with_index(index).with_key("name");
         return Err(at.fault(format_args!("{:?}", joint.name), "no chain has this joint"));
     }
     Ok(chains)
@@ -159,35 +161,35 @@ fn check_base(at: &KeyPath, raw: &raw::RawBase) -> Checked<ChainBase> {
     if let Some((index, value)) =
         raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > MAX_BASE_COORDINATE_M)
     {
-        return Err(at.key("position").element(index).fault(
+        return Err(at.with_key("position").with_index(index).fault(
             value,
             format_args!("it must be within -{MAX_BASE_COORDINATE_M} to {MAX_BASE_COORDINATE_M} m"),
         ));
     }
-    let orientation = raw.orientation.map(|it| normalized(&at.key("orientation"), "quaternion", it));
+    let orientation = raw.orientation.map(|it| normalized(&at.with_key("orientation"), "quaternion", it));
     Ok(ChainBase {
         position: raw.position,
         orientation: orientation.unwrap_or_else(|| Ok(ChainBase::default().orientation))?,
     })
 }
 
-fn chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> {
+fn check_chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> {
     let count = raw.rows.len();
     if count > MAX_ROWS {
         let why = format!("a chain has at most {MAX_ROWS} rows");
-        return Err(at.key("rows").fault(format_args!("{count} rows"), why));
+        return Err(at.with_key("rows").fault(format_args!("{count} rows"), why));
     }
     let mut chain = Chain {
         name: raw.name.clone(),
         base: raw
             .base
             .as_ref()
-            .map_or_else(|| Ok(ChainBase::default()), |raw| check_base(&at.key("base"), raw))?,
+            .map_or_else(|| Ok(ChainBase::default()), |raw| check_base(&at.with_key("base"), raw))?,
         joints: Vec::new(),
         rows: Vec::with_capacity(raw.rows.len()),
     };
     for (index, raw) in raw.rows.iter().enumerate() {
-        let at = at.key("rows").element(index);
+        let at = at.with_key("rows").with_index(index);
         let table =
             DenavitHartenberg { a: raw.a, alpha: raw.alpha, d: raw.d, theta_offset: raw.theta_offset };
         check_row(&at, &table)?;
@@ -195,7 +197,7 @@ fn chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> 
             chain.rows.push(ChainRow { kind: RowKind::Fixed, table, limits: [0.0; 2] });
             continue;
         };
-        let at = at.key("joint");
+        let at = at.with_key("joint");
         let known = joints.iter().position(|joint| joint.name == *name);
         let known = known.and_then(|number| Some((number, joints.get(number)?)));
         let (number, joint) = known
@@ -213,12 +215,12 @@ fn chain(at: &KeyPath, raw: &raw::RawChain, joints: &[Joint]) -> Checked<Chain> 
             return Err(at.fault(format_args!("{name:?} from {min} to {max} with d = {}", table.d), why));
         }
         chain.joints.push(number);
-        chain.rows.push(ChainRow { kind: joint.kind.row(), table, limits: joint.limits });
+        chain.rows.push(ChainRow { kind: joint.kind.row_kind(), table, limits: joint.limits });
     }
     let moving = chain.joints.len();
     if moving == 0 || moving > MAX_JOINTS {
         let why = format!("a chain has 1 to {MAX_JOINTS} joints, which are rows with the name of a joint");
-        return Err(at.key("rows").fault(format_args!("{moving} joints"), why));
+        return Err(at.with_key("rows").fault(format_args!("{moving} joints"), why));
     }
     Ok(chain)
 }

@@ -31,7 +31,7 @@ use crate::time::Span;
 pub use cell_name::{CellName, split_bus};
 pub use reach::{MAX_REACH, max_frame_distance};
 pub use robot::{Chain, ChainBase, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
-pub use wires::Wires;
+pub use wires::BusWires;
 
 /// Keys at the top level that only skin files have. They distinguish a skin from a scenario.
 pub const SKIN_KEYS: &[&str] = &["robot", "cell"];
@@ -253,7 +253,7 @@ impl Skin {
     /// Returns the first error in the text.
     pub fn parse(path: &str, text: &str) -> Result<Self, DocumentError> {
         let what = "this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both";
-        document::parse(path, text, check::skin)
+        document::parse(path, text, check::check_whole_skin)
             .map_err(|error: DocumentError| error.detect_wrong_kind(text, SCENARIO_KEYS, SKIN_KEYS, what))
     }
 
@@ -264,7 +264,7 @@ impl Skin {
     /// # Errors
     /// Returns the first error in the text.
     pub fn parse_recorded(path: &str, text: &str) -> Result<Self, DocumentError> {
-        document::parse(path, text, check::recorded_skin)
+        document::parse(path, text, check::check_recorded_skin)
     }
 
     /// Returns the parameters that are written into a cell.
@@ -287,7 +287,7 @@ impl Skin {
                 normal: cell.normal.map(Q1_14::nearest),
             },
             contact: cell.contact,
-            period_us: self.period_us()?,
+            period_us: self.broadcast_period_us()?,
             ..Parameters::default()
         };
         for (word, &ChainRow { kind, table, .. }) in parameters.rows.iter_mut().zip(&chain.rows) {
@@ -333,7 +333,7 @@ impl Skin {
         clippy::cast_sign_loss,
         reason = "positive; u16 decides what fits"
     )]
-    pub fn period_us(&self) -> Option<u16> {
+    pub fn broadcast_period_us(&self) -> Option<u16> {
         u16::try_from((1e6 / self.timing.broadcast_hz()).round() as u64).ok()
     }
 
@@ -350,7 +350,7 @@ impl Skin {
 
     /// Returns the index of the bus with this name in [`Skin::buses`].
     #[must_use]
-    pub fn bus_named(&self, name: &str) -> Option<usize> {
+    pub fn bus_index(&self, name: &str) -> Option<usize> {
         self.buses.iter().position(|bus| bus.name == name)
     }
 }

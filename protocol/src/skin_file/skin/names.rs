@@ -12,17 +12,19 @@ const MAX_CHARACTERS: usize = 200;
 /// a terminal, change the direction of text, or are not allowed in XML.
 pub(super) fn check_names(skin: &raw::RawSkin) -> Checked<()> {
     let robot = KeyPath::top_level_key("robot");
-    for (at, given) in [(KeyPath::top_level_key("name"), &skin.name), (robot.key("name"), &skin.robot.name)] {
+    for (at, given) in
+        [(KeyPath::top_level_key("name"), &skin.name), (robot.with_key("name"), &skin.robot.name)]
+    {
         if given.is_empty() {
             return Err(at.fault("\"\"", "a name has at least one character"));
         }
         check_name(&at, given)?;
     }
     for (index, joint) in skin.robot.joint.iter().enumerate() {
-        check_name(&robot.key("joint").element(index).key("name"), &joint.name)?;
+        check_name(&robot.with_key("joint").with_index(index).with_key("name"), &joint.name)?;
     }
     for (index, chain) in skin.robot.chain.iter().enumerate() {
-        check_name(&robot.key("chain").element(index).key("name"), &chain.name)?;
+        check_name(&robot.with_key("chain").with_index(index).with_key("name"), &chain.name)?;
     }
     Ok(())
 }

@@ -28,7 +28,7 @@ impl Skin {
             return Ok(skin);
         }
         let skin = Self::parse(path, text)?;
-        let index = skin.bus_named(bus);
+        let index = skin.bus_index(bus);
         Ok(index.map(|index| skin.with_cells_of_bus(index)).unwrap_or(skin))
     }
 }

@@ -56,7 +56,7 @@ impl Circle {
 
     /// Returns the maximum distance of a point of the circle from the z axis, and the range of the points along that
     /// axis.
-    fn extent_around_z(&self) -> (f64, [f64; 2]) {
+    fn z_axis_distance_and_range(&self) -> (f64, [f64; 2]) {
         let [x, y, z] = self.center;
         let [ax, ay, _] = self.axis;
         let height = self.radius * ax.hypot(ay);
@@ -91,7 +91,7 @@ pub fn max_frame_distance(rows: &[ChainRow], position: [f64; 3]) -> f64 {
         sphere += table.a.hypot(if index == first { 0.0 } else { along });
         circles = carried;
         if row.kind == RowKind::Revolute {
-            let spans = circles.iter().map(Circle::extent_around_z);
+            let spans = circles.iter().map(Circle::z_axis_distance_and_range);
             let start = (0.0, [f64::INFINITY, f64::NEG_INFINITY]);
             let (radius, [low, high]) = spans.fold(start, |(most, [low, high]), (radius, [from, to])| {
                 (f64::max(most, radius), [f64::min(low, from), f64::max(high, to)])
@@ -106,7 +106,7 @@ pub fn max_frame_distance(rows: &[ChainRow], position: [f64; 3]) -> f64 {
                 .to_vec();
         }
         let from_here = if index == first {
-            circles.iter().map(|circle| circle.extent_around_z().0).fold(0.0, f64::max)
+            circles.iter().map(|circle| circle.z_axis_distance_and_range().0).fold(0.0, f64::max)
         } else {
             farthest(&circles)
         };

@@ -46,12 +46,12 @@ impl JointKind {
     /// Returns the name of the kind.
     #[must_use]
     pub const fn name(self) -> &'static str {
-        self.row().name()
+        self.row_kind().name()
     }
 
     /// Returns the kind of a table row with such a joint.
     #[must_use]
-    pub const fn row(self) -> RowKind {
+    pub const fn row_kind(self) -> RowKind {
         match self {
             Self::Revolute => RowKind::Revolute,
             Self::Prismatic => RowKind::Prismatic,
@@ -128,7 +128,7 @@ impl ChainBase {
     /// Returns the homogeneous transform from frame 0 to the robot's base, a 4 by 4 matrix in columns with lengths in
     /// m.
     #[must_use]
-    pub fn matrix(&self) -> [[f64; 4]; 4] {
+    pub fn transform_matrix(&self) -> [[f64; 4]; 4] {
         let norm = self.orientation.iter().map(|it| it * it).sum::<f64>().sqrt();
         let [x, y, z, w] = self.orientation.map(|it| it / norm);
         let [px, py, pz] = self.position;

@@ -39,16 +39,16 @@ pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, Do
         ("continuous", SensingModeName::Continuous),
         ("event", SensingModeName::Event),
     ];
-    let mode = at.key("sensing").parse_choice(bus.sensing.as_deref().unwrap_or("off"), &words)?;
+    let mode = at.with_key("sensing").parse_choice(bus.sensing.as_deref().unwrap_or("off"), &words)?;
     match (mode, bus.sensing_hz) {
         (SensingModeName::Continuous, Some(hz)) => {
-            continuous_sensing(hz).map_err(|why| at.key("sensing_hz").fault(hz, why))
+            continuous_sensing(hz).map_err(|why| at.with_key("sensing_hz").fault(hz, why))
         }
         (SensingModeName::Continuous, None) => {
-            Err(at.key("sensing").fault("\"continuous\"", "sensing_hz is needed with it"))
+            Err(at.with_key("sensing").fault("\"continuous\"", "sensing_hz is needed with it"))
         }
         (SensingModeName::Off | SensingModeName::Event, Some(hz)) => {
-            Err(at.key("sensing_hz").fault(hz, "only with sensing = \"continuous\""))
+            Err(at.with_key("sensing_hz").fault(hz, "only with sensing = \"continuous\""))
         }
         (SensingModeName::Off, None) => Ok(Sensing::Off),
         (SensingModeName::Event, None) => Ok(Sensing::Event),
@@ -56,25 +56,25 @@ pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, Do
 }
 
 /// Checks the thresholds of event mode. An omitted value is the default of a cell.
-pub(super) fn events(raw: raw::RawEvents) -> Result<Events, DocumentFault> {
+pub(super) fn check_events(raw: raw::RawEvents) -> Result<Events, DocumentFault> {
     /// Rounds a threshold to a word. An error gives 0 as the lower limit, because a threshold is not negative.
     fn round_threshold<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
         Q::try_nearest(value).map_err(|error| OutOfRange { min: 0.0, ..error })
     }
     let at = KeyPath::top_level_key("events");
     let mut events = Events::default();
-    at.key("hysteresis").set_fixed_if_given(raw.hysteresis, &mut events.hysteresis, round_threshold)?;
+    at.with_key("hysteresis").set_fixed_if_given(raw.hysteresis, &mut events.hysteresis, round_threshold)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
-        return Err(at.key("hysteresis").fault(got, "a part of a threshold: 0 to 1 is possible"));
+        return Err(at.with_key("hysteresis").fault(got, "a part of a threshold: 0 to 1 is possible"));
     }
-    at.key("contact_n").set_fixed_if_given(raw.contact_n, &mut events.contact, round_threshold)?;
-    at.key("proximity").set_fixed_if_given(raw.proximity, &mut events.proximity, round_threshold)?;
-    at.key("temperature_c").set_fixed_if_given(
+    at.with_key("contact_n").set_fixed_if_given(raw.contact_n, &mut events.contact, round_threshold)?;
+    at.with_key("proximity").set_fixed_if_given(raw.proximity, &mut events.proximity, round_threshold)?;
+    at.with_key("temperature_c").set_fixed_if_given(
         raw.temperature_c,
         &mut events.temperature,
         round_threshold,
     )?;
-    at.key("acceleration_g").set_fixed_if_given(
+    at.with_key("acceleration_g").set_fixed_if_given(
         raw.acceleration_g,
         &mut events.acceleration,
         round_threshold,
@@ -110,7 +110,7 @@ mod tests {
             acceleration_g: Some(0.1),
             hysteresis: Some(0.5),
         };
-        assert_eq!(events(explicit).unwrap(), Events::default());
-        assert_eq!(events(raw::RawEvents::default()).unwrap(), Events::default());
+        assert_eq!(check_events(explicit).unwrap(), Events::default());
+        assert_eq!(check_events(raw::RawEvents::default()).unwrap(), Events::default());
     }
 }

@@ -287,7 +287,7 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
          but sums need them: name neighbors at both ends, or set root = true"
     );
     assert_eq!(
-        parse("reply = \"torque\"", &cells).unwrap().wires(0).depths()[..4],
+        parse("reply = \"torque\"", &cells).unwrap().wires(0).cell_depths()[..4],
         [Some(0), Some(1), None, None]
     );
     assert!(

@@ -19,30 +19,30 @@ use crate::id::CellId;
 use crate::port::{LinkId, MAX_WIRES, PORTS, UPLINK};
 
 /// One end of a wire: a cell and its port; the port is [`UPLINK`] for a root's wire to the gateway's side.
-type PortEnd = (CellId, usize);
+type WireEnd = (CellId, usize);
 
 // A bus never has more wires than link ids.
 const _: () = assert!(CellId::COUNT * (PORTS + 1) <= MAX_WIRES);
 
 /// The wires of one bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Wires {
+pub struct BusWires {
     /// Link id that each port sends with, by cell ([`CellId::index`]) and port; `None` for a free port.
     link_ids: Vec<[Option<LinkId>; PORTS + 1]>,
     /// The two ends of each wire: the end named first, and the other, which is `None` at the gateway's side.
-    ends: Vec<(PortEnd, Option<PortEnd>)>,
+    ends: Vec<(WireEnd, Option<WireEnd>)>,
 }
 
 impl Skin {
     /// Returns the wires of a bus, given as an index into [`Skin::buses`].
     #[must_use]
-    pub fn wires(&self, bus: usize) -> Wires {
+    pub fn wires(&self, bus: usize) -> BusWires {
         let cells: Vec<_> = self.cells_on_bus(bus).collect();
-        Wires::new(&cells)
+        BusWires::new(&cells)
     }
 }
 
-impl Wires {
+impl BusWires {
     /// Returns the wires between these cells, all of one bus. A port is free if its neighbour does not name the cell in
     /// turn, which does not happen in a checked skin.
     pub(super) fn new(cells: &[&Cell]) -> Self {
@@ -72,7 +72,7 @@ impl Wires {
         wires
     }
 
-    fn add_wire(&mut self, first: PortEnd, second: Option<PortEnd>) {
+    fn add_wire(&mut self, first: WireEnd, second: Option<WireEnd>) {
         let Ok(wire) = u16::try_from(self.ends.len()) else { return };
         self.ends.push((first, second));
         for (end, back) in [(Some(first), false), (second, true)] {
@@ -97,7 +97,7 @@ impl Wires {
     }
 
     /// Returns the roots in the order of the file, each with the link id that the gateway's side sends with.
-    pub fn roots(&self) -> impl Iterator<Item = (CellId, LinkId)> {
+    pub fn roots_with_link_ids(&self) -> impl Iterator<Item = (CellId, LinkId)> {
         let uplinks = self.ends.iter().filter(|(_, second)| second.is_none());
         uplinks.filter_map(|&((cell, port), _)| Some((cell, self.link_id(cell, port)?.reversed())))
     }
@@ -112,16 +112,16 @@ impl Wires {
 
     /// Returns the number of wires, including those of the roots.
     #[must_use]
-    pub const fn count(&self) -> usize {
+    pub const fn wire_count(&self) -> usize {
         self.ends.len()
     }
 
     /// Returns the depth of each cell ([`CellId::index`]): the number of wires to the nearest root, whose
     /// depth is 0; `None` without a path to a root.
     #[must_use]
-    pub fn depths(&self) -> [Option<u8>; CellId::COUNT] {
+    pub fn cell_depths(&self) -> [Option<u8>; CellId::COUNT] {
         let mut depths = [None; CellId::COUNT];
-        let mut next: VecDeque<_> = self.roots().map(|(root, _)| (root, 0_u8)).collect();
+        let mut next: VecDeque<_> = self.roots_with_link_ids().map(|(root, _)| (root, 0_u8)).collect();
         while let Some((cell, depth)) = next.pop_front() {
             let Some(slot @ None) = depths.get_mut(cell.index()) else { continue };
             *slot = Some(depth);
@@ -153,7 +153,7 @@ mod tests {
     fn wires_are_numbered_as_they_are_mentioned_and_roots_come_last() {
         let skin = wired(&[([2, 2, 0, 0], true), ([3, 1, 1, 0], false), ([0, 0, 0, 2], true)]);
         let wires = skin.wires(0);
-        assert_eq!(wires.count(), 5);
+        assert_eq!(wires.wire_count(), 5);
         let none = None;
         assert_eq!(
             wires.link_ids_of(id(1)),
@@ -164,7 +164,7 @@ mod tests {
             [link_id(2, false), link_id(0, true), link_id(1, true), none, none]
         );
         assert_eq!(wires.link_ids_of(id(3)), [none, none, none, link_id(2, true), link_id(4, false)]);
-        let roots: Vec<_> = wires.roots().collect();
+        let roots: Vec<_> = wires.roots_with_link_ids().collect();
         assert_eq!(roots, [(id(1), LinkId { wire: 3, back: true }), (id(3), LinkId { wire: 4, back: true })]);
         assert_eq!(wires.other_end(id(1), 1), Some((id(2), 2)));
         assert_eq!(wires.other_end(id(1), 2), None, "a free port");
@@ -182,7 +182,7 @@ mod tests {
             ([3, 1, 0, 0], false),
             ([3, 0, 0, 0], false),
         ]);
-        let depths = skin.wires(0).depths();
+        let depths = skin.wires(0).cell_depths();
         assert_eq!(depths[..6], [Some(0), Some(1), Some(2), Some(1), Some(3), None]);
     }
 
@@ -223,17 +223,17 @@ mod tests {
                 let wired = neighbors.iter().filter(|&&neighbor| neighbor != 0).count();
                 prop_assert_eq!(link_ids[..PORTS].iter().flatten().count(), wired, "no end is left out");
             }
-            for (root, link_id) in wires.roots() {
+            for (root, link_id) in wires.roots_with_link_ids() {
                 prop_assert_eq!(senders.insert(link_id, root), None, "the gateway's side has its own link ids");
             }
-            prop_assert_eq!(senders.len(), 2 * wires.count());
-            prop_assert!(senders.keys().all(|link_id| usize::from(link_id.wire) < wires.count()), "dense");
+            prop_assert_eq!(senders.len(), 2 * wires.wire_count());
+            prop_assert!(senders.keys().all(|link_id| usize::from(link_id.wire) < wires.wire_count()), "dense");
         }
 
         #[test]
         fn depths_differ_by_one_wire_at_most(cells in wiring()) {
             let wires = wired(&cells).wires(0);
-            let depths = wires.depths();
+            let depths = wires.cell_depths();
             for (at, (_, root)) in cells.iter().enumerate() {
                 let others = (0..PORTS).filter_map(|port| wires.other_end(id(at + 1), port));
                 let nearest = others.map(|(other, _)| depths[other.index()]).min_by_key(|depth| depth.unwrap_or(u8::MAX));

@@ -2,7 +2,7 @@
 
 /// The detected kind of a file, and a hint for the user.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct ForeignFile {
+pub struct UnexpectedFileKind {
     /// Line of the file that shows the kind, from 1, if there is one.
     pub line: Option<usize>,
     /// The kind of the file, worded to follow "it is".
@@ -16,8 +16,8 @@ const CONFLICT_MARKER: &[u8] = b"<<<<<<< ";
 /// Detects a file that is in the place of the expected one: a Git LFS pointer, a saved web page, an archive, or a file
 /// with an unresolved merge conflict.
 #[must_use]
-pub fn detect_foreign(bytes: &[u8]) -> Option<ForeignFile> {
-    let whole = |what, hint| Some(ForeignFile { line: None, what, hint });
+pub fn detect_unexpected_file(bytes: &[u8]) -> Option<UnexpectedFileKind> {
+    let whole = |what, hint| Some(UnexpectedFileKind { line: None, what, hint });
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).trim_ascii_start();
     if text.starts_with(b"version https://git-lfs") {
         return whole("a Git LFS pointer to a file, not the file", "fetch it with `git lfs pull`");
@@ -37,7 +37,7 @@ pub fn detect_foreign(bytes: &[u8]) -> Option<ForeignFile> {
     }
     let conflict = bytes.split(|byte| *byte == b'\n').position(|line| line.starts_with(CONFLICT_MARKER))?;
     let hint = "keep one side, and delete the lines <<<<<<<, =======, >>>>>>> and the other side";
-    Some(ForeignFile { line: Some(conflict + 1), what: "a merge conflict of git", hint })
+    Some(UnexpectedFileKind { line: Some(conflict + 1), what: "a merge conflict of git", hint })
 }
 
 /// Returns the file format whose root element has this name.
@@ -63,15 +63,16 @@ mod tests {
 
     #[test]
     fn files_that_stand_for_others_are_named() {
-        let what =
-            |bytes: &[u8]| detect_foreign(bytes).map(|it| (it.line, it.what.split(' ').nth(1).unwrap()));
+        let what = |bytes: &[u8]| {
+            detect_unexpected_file(bytes).map(|it| (it.line, it.what.split(' ').nth(1).unwrap()))
+        };
         assert_eq!(what(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"), Some((None, "Git")));
         assert_eq!(what(b"\n<!DOCTYPE html>\n<html>"), Some((None, "web")));
         assert_eq!(what(b"<HTML lang='en'>"), Some((None, "web")));
         assert_eq!(what(b"PK\x03\x04"), Some((None, "zip")));
         assert_eq!(what(b"<r>\n<<<<<<< HEAD\n=======\n>>>>>>> x\n</r>"), Some((Some(2), "merge")));
         for good in [&b""[..], b"<robot/>", b"solid a", b"<r>\n <<<<<<< HEAD</r>"] {
-            assert_eq!(detect_foreign(good), None);
+            assert_eq!(detect_unexpected_file(good), None);
         }
     }
 }

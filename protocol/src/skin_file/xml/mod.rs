@@ -2,7 +2,7 @@
 //!
 //! [`decode`] decodes a file by its byte order mark or its declaration. [`prepare`] repairs common errors without
 //! changing any value: it binds undeclared prefixes, blanks comments that contain `--` and document types without
-//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`detect_foreign`] detects files that are not XML
+//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`detect_unexpected_file`] detects files that are not XML
 //! or not of the expected kind. [`escaped`] escapes a text for XML or HTML.
 
 mod encoding;
@@ -17,8 +17,8 @@ use std::ops::Range;
 
 pub use encoding::{decode, utf16_encoding_name};
 pub use escape::escaped;
-pub use foreign::{ForeignFile, detect_foreign, format_of_root_element};
-use tags::{Tag, XmlPart, parts};
+pub use foreign::{UnexpectedFileKind, detect_unexpected_file, format_of_root_element};
+use tags::{Tag, XmlPart, xml_parts};
 
 /// Maximum number of attributes of an element. The limit exists because a parser compares each attribute with all
 /// others.
@@ -27,7 +27,7 @@ pub const MAX_ATTRIBUTES: usize = 256;
 /// Maximum number of prefixes in a file, and of their bindings. The limit exists because a parser compares each binding
 /// with all others in scope.
 const MAX_PREFIXES: usize = 64;
-const MAX_BINDINGS: usize = 10_000;
+const MAX_PREFIX_BINDINGS: usize = 10_000;
 
 /// An error in an XML file, with advice for the user.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -79,13 +79,13 @@ pub fn prepare(file: &str) -> Result<PreparedXml<'_>, XmlFault> {
     let text = whole.trim_start_matches('\u{feff}').trim_start();
     let before = whole.len() - text.len();
     let mut survey = XmlSurvey::default();
-    for part in parts(text) {
+    for part in xml_parts(text) {
         survey
-            .visit(text, part)
+            .visit_part(text, part)
             .map_err(|(offset, what)| XmlFault::at_offset(whole, before + offset, what))?;
     }
-    survey.check()?;
-    Ok(PreparedXml { text: survey.repaired(text), lines_before: line_of(whole.as_bytes(), before) - 1 })
+    survey.check_limits()?;
+    Ok(PreparedXml { text: survey.repair_text(text), lines_before: line_of(whole.as_bytes(), before) - 1 })
 }
 
 /// Prefixes and ranges found in one pass over a text, for the limits and the repairs.
@@ -109,7 +109,7 @@ struct XmlSurvey<'a> {
 
 impl<'a> XmlSurvey<'a> {
     /// Processes the next part of the text. An error consists of a byte offset and the reason.
-    fn visit(&mut self, text: &str, part: XmlPart<'a>) -> Result<(), (usize, String)> {
+    fn visit_part(&mut self, text: &str, part: XmlPart<'a>) -> Result<(), (usize, String)> {
         let of = |range: &Range<usize>| text.get(range.clone()).unwrap_or_default();
         let content = match &part {
             XmlPart::Text(range) => Some(range).filter(|range| !of(range).trim().is_empty()),
@@ -180,10 +180,10 @@ impl<'a> XmlSurvey<'a> {
     }
 
     /// Checks the numbers of prefixes and bindings, on which a parser's running time depends.
-    fn check(&self) -> Result<(), XmlFault> {
+    fn check_limits(&self) -> Result<(), XmlFault> {
         for (count, what, most) in [
             (self.prefixes.len(), "prefixes of names", MAX_PREFIXES),
-            (self.bindings, "xmlns attributes", MAX_BINDINGS),
+            (self.bindings, "xmlns attributes", MAX_PREFIX_BINDINGS),
         ] {
             if count > most {
                 let what =
@@ -196,7 +196,7 @@ impl<'a> XmlSurvey<'a> {
 
     /// Returns the text with undeclared prefixes bound at the root element, and with spaces in place of the blanked
     /// ranges.
-    fn repaired(self, text: &str) -> Cow<'_, str> {
+    fn repair_text(self, text: &str) -> Cow<'_, str> {
         let unbound = self.used.difference(&self.bound).filter(|prefix| is_bindable_prefix(prefix));
         let names = unbound.map(|prefix| format!(" xmlns:{prefix}=\"unbound:{prefix}\"")).collect::<String>();
         let insert = self.root.filter(|_| !names.is_empty()).map(|at| at..at);
@@ -265,7 +265,7 @@ mod tests {
         assert!(refused(&format!("<r>{many}</r>")).contains("it has 65 prefixes of names, and at most 64"));
         let nested: String = (0..5_000).map(|number| format!("<x xmlns:a{number}='1'>")).collect();
         assert!(refused(&nested).contains("it has 5000 prefixes"));
-        let again = "<x xmlns='1'/>".repeat(MAX_BINDINGS + 1);
+        let again = "<x xmlns='1'/>".repeat(MAX_PREFIX_BINDINGS + 1);
         assert!(refused(&format!("<r>{again}</r>")).contains("it has 10001 xmlns attributes"));
     }
 

@@ -28,7 +28,7 @@ pub(super) struct Tag<'a> {
 }
 
 /// Returns the parts in the order of the text.
-pub(super) fn parts(text: &str) -> impl Iterator<Item = XmlPart<'_>> {
+pub(super) fn xml_parts(text: &str) -> impl Iterator<Item = XmlPart<'_>> {
     let mut at = 0;
     core::iter::from_fn(move || {
         let rest = text.get(at..).filter(|rest| !rest.is_empty())?;
@@ -160,14 +160,14 @@ mod tests {
                 whole = &whole[length..];
                 count += 1;
             }
-            assert_eq!(parts(text).count(), count, "{text}");
+            assert_eq!(xml_parts(text).count(), count, "{text}");
         }
     }
 
     #[test]
     fn quotes_hide_what_ends_a_tag() {
         let text = "<a b='/>' c = \"'<\" xs:d='1'>t</a>";
-        let found: Vec<_> = parts(text).collect();
+        let found: Vec<_> = xml_parts(text).collect();
         let XmlPart::Open(tag) = &found[0] else { panic!("{found:?}") };
         assert_eq!(
             (tag.name, tag.attributes.as_slice(), tag.is_empty),

@@ -11,8 +11,8 @@ use crate::message::{
 };
 use crate::packet::{Epoch, Length, MAX_WORDS, PacketError, WORDS, Words};
 use crate::parameters::{
-    Baseline, BaselineSettings, Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind,
-    Sensing, SumSchedule,
+    Baseline, BaselineSettings, Contact, Events, LinksDown, Parameter, Parameters, Pose, ReplyKind, Row,
+    RowKind, Sensing, SumSchedule,
 };
 use crate::port::{Hello, LinkId, NodeIdWalk, PortMessage, TreeRank};
 
@@ -195,10 +195,10 @@ impl<'a> Meaning<'a> {
         (link_id, message)
     }
 
-    fn reply(&mut self) -> Reply {
+    fn reply(&mut self) -> ReplyKind {
         match self.take("reply") {
-            "torque" => Reply::Torque,
-            "sum" => Reply::Sum(SumSchedule {
+            "torque" => ReplyKind::Torque,
+            "sum" => ReplyKind::Sum(SumSchedule {
                 slot_us: self.number("slot_us"),
                 deepest: self.number("deepest"),
                 carry: self.number::<u8>("carry") == 1,

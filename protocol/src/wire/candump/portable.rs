@@ -7,7 +7,7 @@
 //!   0          11     18 20   3 or 8 digits, # or ## and flags, whole bytes, the end of the line
 //! ```
 
-use super::read::{four_bytes, hex_value, is_blank, parse_leading_digits};
+use super::read::{decode_eight_hex_digits, hex_digit_value, is_blank, parse_leading_digits};
 use super::{Record, Timestamp};
 use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 
@@ -24,7 +24,7 @@ pub(super) fn parse_record(line: &[u8]) -> Option<Record<'_>> {
     let interface = core::str::from_utf8(name).ok().filter(|name| !name.is_empty())?;
     let frame = match frame {
         [_, a, b, c, b'#', rest @ ..] => {
-            let [a, b, c] = [hex_value(*a), hex_value(*b), hex_value(*c)];
+            let [a, b, c] = [hex_digit_value(*a), hex_digit_value(*b), hex_digit_value(*c)];
             let id = u32::from(a) << 8 | u32::from(b) << 4 | u32::from(c);
             // `value` returns 0xFF for other bytes, so more than the low four bits would be set.
             if a | b | c > 0xF || id > STANDARD_MASK {
@@ -33,7 +33,7 @@ pub(super) fn parse_record(line: &[u8]) -> Option<Record<'_>> {
             parse_data(id, rest)?
         }
         [_, a, b, c, d, e, f, g, h, b'#', rest @ ..] => {
-            let id = u32::from_be_bytes(four_bytes([*a, *b, *c, *d, *e, *f, *g, *h])?);
+            let id = u32::from_be_bytes(decode_eight_hex_digits([*a, *b, *c, *d, *e, *f, *g, *h])?);
             if id > EXTENDED_MASK {
                 return None;
             }
@@ -65,7 +65,7 @@ fn parse_nanos(time: &[u8; TIME_LEN]) -> Option<u64> {
 #[inline(always)]
 fn parse_data(id: u32, text: &[u8]) -> Option<Frame> {
     let (format, flags, digits) = match text {
-        [b'#', flags, digits @ ..] => (Format::Fd, hex_value(*flags), digits),
+        [b'#', flags, digits @ ..] => (Format::Fd, hex_digit_value(*flags), digits),
         digits => (Format::Classic, 0, digits),
     };
     let len = digits.len() / 2;
@@ -77,19 +77,19 @@ fn parse_data(id: u32, text: &[u8]) -> Option<Frame> {
     // An iterator with `next` is faster here than `zip`.
     let mut places = data.as_chunks_mut().0.iter_mut();
     for four in fours {
-        *places.next()? = four_bytes(*four)?;
+        *places.next()? = decode_eight_hex_digits(*four)?;
     }
     if let [_, _, ..] = rest {
         let mut last = *b"00000000";
         last.get_mut(..rest.len())?.copy_from_slice(rest);
-        *places.next()? = four_bytes(last)?;
+        *places.next()? = decode_eight_hex_digits(last)?;
     }
     Frame::with_buffer(id, format, flags, data, len).ok()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::{CandumpLine, parse_general};
+    use super::super::{CandumpLine, parse_any_variant};
     use super::*;
     use proptest::prelude::*;
 
@@ -103,7 +103,7 @@ mod tests {
             "(1700000000.123456) vcan0 1F334455##F",
         ] {
             let record = parse_record(line.as_bytes()).expect(line);
-            assert_eq!(parse_general(line.as_bytes()), Ok(CandumpLine::Frame(record)), "{line}");
+            assert_eq!(parse_any_variant(line.as_bytes()), Ok(CandumpLine::Frame(record)), "{line}");
         }
     }
 
@@ -130,7 +130,7 @@ mod tests {
     fn agrees(line: &[u8]) {
         if let Some(record) = parse_record(line) {
             assert_eq!(
-                parse_general(line),
+                parse_any_variant(line),
                 Ok(CandumpLine::Frame(record)),
                 "{:?}",
                 String::from_utf8_lossy(line)

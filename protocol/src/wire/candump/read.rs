@@ -6,7 +6,7 @@ use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, check_id
 
 /// The value of each byte as a hexadecimal digit; [`NONE`] for bytes that are not digits.
 #[expect(clippy::indexing_slicing, reason = "when this is compiled")]
-const NIBBLES: [u8; 256] = {
+const HEX_DIGIT_VALUES: [u8; 256] = {
     let mut nibbles = [NOT_A_DIGIT; 256];
     let mut value = 0;
     while value < 16 {
@@ -21,30 +21,31 @@ const NOT_A_DIGIT: u8 = 0xFF;
 /// Returns the value of a hexadecimal digit; [`NONE`] for any other byte.
 #[expect(clippy::indexing_slicing, reason = "a byte is less than 256")]
 #[inline]
-pub(super) const fn hex_value(digit: u8) -> u8 {
-    NIBBLES[digit as usize]
+pub(super) const fn hex_digit_value(digit: u8) -> u8 {
+    HEX_DIGIT_VALUES[digit as usize]
 }
 
-fn nibble(digit: u8) -> Option<u8> {
-    Some(hex_value(digit)).filter(|&value| value < 16)
+fn parse_hex_digit(digit: u8) -> Option<u8> {
+    Some(hex_digit_value(digit)).filter(|&value| value < 16)
 }
 
 /// Decodes eight hexadecimal digits to four bytes. Returns `None` if one of them is not a digit.
 #[inline]
-pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
+pub(super) const fn decode_eight_hex_digits(digits: [u8; 8]) -> Option<[u8; 4]> {
     /// Returns `byte` repeated eight times.
-    const fn repeated(byte: u8) -> u64 {
+    const fn repeat_byte(byte: u8) -> u64 {
         u64::from_le_bytes([byte; 8])
     }
     let text = u64::from_le_bytes(digits);
-    let letters = text & repeated(0x40);
+    let letters = text & repeat_byte(0x40);
     // '1' is 31, 'A' is 41 and 'a' is 61: a letter's value is 9 more than its lower half.
-    let values = (text & repeated(0x0F)).wrapping_add((letters >> 6).wrapping_mul(9));
+    let values = (text & repeat_byte(0x0F)).wrapping_add((letters >> 6).wrapping_mul(9));
     // The upper half of a digit is 3, that of a letter 4 or 6; this maps 6 to 4.
-    let segments = (text & repeated(0xF0) & !(letters >> 1)) ^ (letters >> 2).wrapping_add(repeated(0x30));
+    let segments =
+        (text & repeat_byte(0xF0) & !(letters >> 1)) ^ (letters >> 2).wrapping_add(repeat_byte(0x30));
     // A value has 4 bits; that of a letter is 10 or more.
-    let tens = (values.wrapping_add(repeated(6)) ^ (letters >> 2)) & repeated(0x10);
-    if segments | values & repeated(0xF0) | tens != 0 {
+    let tens = (values.wrapping_add(repeat_byte(6)) ^ (letters >> 2)) & repeat_byte(0x10);
+    if segments | values & repeat_byte(0xF0) | tens != 0 {
         return None;
     }
     // Combine neighbours into one, two, then four bytes.
@@ -57,9 +58,9 @@ pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
 /// Returns the value of the decimal digits at the start of eight bytes, and their number.
 #[inline]
 pub(super) fn parse_leading_digits(text: [u8; 8]) -> (u64, usize) {
-    const ZEROS: u64 = 0x3030_3030_3030_3030;
+    const ASCII_ZEROS: u64 = 0x3030_3030_3030_3030;
     let text = u64::from_le_bytes(text);
-    let digits = text ^ ZEROS;
+    let digits = text ^ ASCII_ZEROS;
     // For a digit 0 to 9, neither the value nor the value plus 6 has a bit in the upper half.
     let others = (digits | digits.wrapping_add(0x0606_0606_0606_0606)) & 0xF0F0_F0F0_F0F0_F0F0;
     let bits = others.trailing_zeros() & !7;
@@ -179,7 +180,7 @@ impl<'a> Cursor<'a> {
         let expected = "an identifier of 3 or 8 hexadecimal digits";
         let start = self.at;
         let mut id = 0_u32;
-        while let Some(digit) = self.peek().and_then(nibble) {
+        while let Some(digit) = self.peek().and_then(parse_hex_digit) {
             id = id.wrapping_shl(4) | u32::from(digit);
             self.at += 1;
         }
@@ -192,11 +193,12 @@ impl<'a> Cursor<'a> {
         let wrong = |expected| LineError { column: start + 1, expected };
         let id = match digits {
             3 => check_identifier(id, 0).map_err(|_| wrong("an 11-bit identifier, at most 7FF"))?,
-            8 => eight_digit_identifier(id),
+            8 => raw_id_from_eight_digits(id),
             _ => return Err(wrong(expected)),
         };
         if self.accept(b'#') {
-            let flags = self.peek().and_then(nibble).ok_or_else(|| self.error("one digit of FD flags"))?;
+            let flags =
+                self.peek().and_then(parse_hex_digit).ok_or_else(|| self.error("one digit of FD flags"))?;
             self.at += 1;
             // CAN FD has no remote frames.
             return self.parse_data_frame(id & !REMOTE, Format::Fd, flags).map(Some);
@@ -222,7 +224,7 @@ impl<'a> Cursor<'a> {
     }
 
     fn parse_remote_frame(&mut self, id: u32) -> Result<Frame, LineError> {
-        let length = self.peek().and_then(nibble);
+        let length = self.peek().and_then(parse_hex_digit);
         self.at += usize::from(length.is_some());
         let frame = Frame::remote(id, length.unwrap_or(0)).map_err(|_| self.error("a length of 0 to 8"))?;
         self.parse_raw_dlc(frame)
@@ -233,11 +235,14 @@ impl<'a> Cursor<'a> {
         let mut len = 0;
         loop {
             self.accept(b'.');
-            let Some(high) = self.peek().and_then(nibble) else {
+            let Some(high) = self.peek().and_then(parse_hex_digit) else {
                 break;
             };
             self.at += 1;
-            let low = self.peek().and_then(nibble).ok_or_else(|| self.error("the second digit of a byte"))?;
+            let low = self
+                .peek()
+                .and_then(parse_hex_digit)
+                .ok_or_else(|| self.error("the second digit of a byte"))?;
             self.at += 1;
             *data.get_mut(len).ok_or_else(|| self.error("at most 64 bytes"))? = high << 4 | low;
             len += 1;
@@ -251,7 +256,7 @@ impl<'a> Cursor<'a> {
         if !self.accept(b'_') {
             return Ok(frame);
         }
-        match self.peek().and_then(nibble) {
+        match self.peek().and_then(parse_hex_digit) {
             Some(dlc @ 9..) if frame.len() == 8 && frame.format() == Format::Classic => {
                 self.at += 1;
                 Ok(frame.with_raw_dlc(dlc))
@@ -271,7 +276,7 @@ impl<'a> Cursor<'a> {
         match rest.get(..len) {
             Some(b"T") => Ok(Some(Direction::Sent)),
             Some(b"R") => Ok(Some(Direction::Received)),
-            Some([high, low]) if hex_value(*high) < 16 && hex_value(*low) < 16 => {
+            Some([high, low]) if hex_digit_value(*high) < 16 && hex_digit_value(*low) < 16 => {
                 Err(self.error("the end of the data: a byte follows a space"))
             }
             Some(_) | None => Ok(None),
@@ -299,7 +304,7 @@ pub fn fraction_to_nanos(digits: &[u8]) -> Option<(u64, usize)> {
 /// they are all 0, the identifier is extended, as in can-utils and python-can; an error frame is not marked as
 /// extended.
 #[must_use]
-pub const fn eight_digit_identifier(word: u32) -> u32 {
+pub const fn raw_id_from_eight_digits(word: u32) -> u32 {
     let number = word & EXTENDED_MASK;
     if word & ERROR != 0 { number | ERROR } else { number | EXTENDED | word & REMOTE }
 }
@@ -313,7 +318,7 @@ mod tests {
     fn every_byte_is_a_digit_or_none() {
         for byte in 0..=u8::MAX {
             let expected = char::from(byte).to_digit(16).and_then(|value| u8::try_from(value).ok());
-            assert_eq!(nibble(byte), expected);
+            assert_eq!(parse_hex_digit(byte), expected);
         }
     }
 
@@ -325,7 +330,7 @@ mod tests {
                 text[at] = byte;
                 let value = str::from_utf8(&text).ok().filter(|_| byte.is_ascii_hexdigit());
                 let value = value.map(|text| u32::from_str_radix(text, 16).unwrap().to_be_bytes());
-                assert_eq!(four_bytes(text), value, "{text:?}");
+                assert_eq!(decode_eight_hex_digits(text), value, "{text:?}");
             }
         }
     }
@@ -347,13 +352,13 @@ mod tests {
         #[test]
         fn eight_digits_are_four_bytes(value: u32, upper: bool) {
             let text = if upper { format!("{value:08X}") } else { format!("{value:08x}") };
-            prop_assert_eq!(four_bytes(*text.as_bytes().first_chunk().unwrap()), Some(value.to_be_bytes()));
+            prop_assert_eq!(decode_eight_hex_digits(*text.as_bytes().first_chunk().unwrap()), Some(value.to_be_bytes()));
         }
 
         #[test]
         fn eight_bytes_are_digits_or_none(text: [u8; 8]) {
             let digits = text.iter().all(u8::is_ascii_hexdigit);
-            prop_assert_eq!(four_bytes(text).is_some(), digits);
+            prop_assert_eq!(decode_eight_hex_digits(text).is_some(), digits);
         }
 
         #[test]

@@ -8,7 +8,7 @@ use crate::can::{ERROR, EXTENDED_MASK, Format, Frame};
 
 /// The two hexadecimal digits of each byte.
 #[expect(clippy::indexing_slicing, reason = "when this is compiled")]
-const HEX: [[u8; 2]; 256] = {
+const HEX_DIGIT_PAIRS: [[u8; 2]; 256] = {
     let digits = *b"0123456789ABCDEF";
     let mut pairs = [[0; 2]; 256];
     let mut at = 0;
@@ -151,5 +151,5 @@ impl<const N: usize> TextBuffer<N> {
 }
 
 fn hex_digits(value: u8) -> [u8; 2] {
-    HEX.get(usize::from(value)).copied().unwrap_or_default()
+    HEX_DIGIT_PAIRS.get(usize::from(value)).copied().unwrap_or_default()
 }

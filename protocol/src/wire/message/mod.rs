@@ -92,24 +92,24 @@ pub enum Answer {
         /// The parameter's number.
         number: u8,
         /// The reason: [`crate::parameters::ParameterError::code`], or a constant of [`Answer`] such as
-        /// [`Answer::WRONG_HASH`].
+        /// [`Answer::REFUSED_WRONG_HASH`].
         reason: i16,
     },
 }
 
 impl Answer {
     /// Reason of a refusal: the hash of a commit differs from that of the written parameters.
-    pub const WRONG_HASH: i16 = 16;
+    pub const REFUSED_WRONG_HASH: i16 = 16;
     /// Reason of a refusal: writing to flash failed.
-    pub const FLASH_FAILED: i16 = 17;
+    pub const REFUSED_FLASH_FAILED: i16 = 17;
     /// Reason of a refusal: the parameter does not exist.
-    pub const UNKNOWN_PARAMETER: i16 = 18;
+    pub const REFUSED_UNKNOWN_PARAMETER: i16 = 18;
     /// Reason of a refusal: the words are invalid for this parameter, or `links_down` was written outside test mode.
-    pub const INVALID_WORDS: i16 = 19;
+    pub const REFUSED_INVALID_WORDS: i16 = 19;
     /// Reason of a refusal: a tare was requested while the cell is touched, or before it has received joints.
-    pub const CELL_TOUCHED: i16 = 20;
+    pub const REFUSED_CELL_TOUCHED: i16 = 20;
     /// Reason of a refusal: the sensor value exceeds the limit of the baseline.
-    pub const ABOVE_BASELINE_LIMIT: i16 = 21;
+    pub const REFUSED_ABOVE_BASELINE_LIMIT: i16 = 21;
 }
 
 /// A decoded packet.
@@ -411,7 +411,7 @@ impl Message {
 
     /// Returns the tag of a request or reply; `None` for other messages.
     #[must_use]
-    pub const fn tag(&self) -> Option<u8> {
+    pub const fn configuration_tag(&self) -> Option<u8> {
         if let Self::Configure { tag, .. } | Self::Configured { tag, .. } = *self { Some(tag) } else { None }
     }
 

@@ -162,7 +162,7 @@ pub struct NetworkPages {
 
 impl NetworkPages {
     /// Records a page.
-    pub const fn record(&mut self, page: &NetworkPage) {
+    pub const fn record_page(&mut self, page: &NetworkPage) {
         match *page {
             NetworkPage::Heartbeat(_) => {}
             NetworkPage::Received(counts) => self.received = Some(counts),
@@ -177,7 +177,7 @@ impl NetworkPage {
     /// Returns true for a page that a cell sends only in answer to a report command. A heartbeat and the tree
     /// are also sent at other times.
     #[must_use]
-    pub const fn is_only_reported(&self) -> bool {
+    pub const fn is_sent_only_on_request(&self) -> bool {
         !matches!(self, Self::Heartbeat(_) | Self::Tree(_))
     }
 

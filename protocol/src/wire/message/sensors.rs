@@ -57,7 +57,7 @@ pub struct SensorReadings {
 
 impl SensorReadings {
     /// Sets the values of a page. Other pages than simulated ones have no effect.
-    pub const fn set(&mut self, page: &SensorPage) {
+    pub const fn set_page(&mut self, page: &SensorPage) {
         match *page {
             SensorPage::Skin(skin) => self.skin = skin,
             SensorPage::Acceleration(acceleration) => self.acceleration = acceleration,
@@ -65,18 +65,18 @@ impl SensorReadings {
         }
     }
 
-    /// Returns the simulated pages, in the order of [`SensorPage::SIMULATED`].
+    /// Returns the simulated pages, in the order of [`SensorPage::SIMULATED_PAGE_NAMES`].
     #[must_use]
-    pub const fn pages(&self) -> [SensorPage; SensorPage::SIMULATED.len()] {
+    pub const fn simulated_pages(&self) -> [SensorPage; SensorPage::SIMULATED_PAGE_NAMES.len()] {
         [SensorPage::Skin(self.skin), SensorPage::Acceleration(self.acceleration)]
     }
 }
 
 impl SensorPage {
     /// The names of the simulated pages: those that a cell measures and a stimulus sets.
-    pub const SIMULATED: [&str; 2] = ["skin", "acceleration"];
+    pub const SIMULATED_PAGE_NAMES: [&str; 2] = ["skin", "acceleration"];
 
-    /// Returns the index in [`Self::SIMULATED`]; `None` for a page that is only measured.
+    /// Returns the index in [`Self::SIMULATED_PAGE_NAMES`]; `None` for a page that is only measured.
     #[must_use]
     pub const fn simulated_index(&self) -> Option<usize> {
         match self {

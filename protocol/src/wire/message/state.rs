@@ -23,7 +23,7 @@ impl State {
     /// A torque has saturated since the last heartbeat.
     pub const SATURATED: Self = Self(1 << 6);
     /// The cell has just started and checks whether another cell uses its node id.
-    pub const CLAIMING: Self = Self(1 << 7);
+    pub const CLAIMING_NODE_ID: Self = Self(1 << 7);
 
     /// Each flag and its name in all output.
     pub const NAMES: [(Self, &'static str); 8] = [
@@ -34,7 +34,7 @@ impl State {
         (Self::DUPLICATE, "duplicate"),
         (Self::TEST_MODE, "test-mode"),
         (Self::SATURATED, "saturated"),
-        (Self::CLAIMING, "claiming"),
+        (Self::CLAIMING_NODE_ID, "claiming"),
     ];
 
     /// Returns the names of the flags that are set.
@@ -50,7 +50,7 @@ impl State {
 
     /// Returns a copy with these bits set or cleared.
     #[must_use]
-    pub const fn with(self, bits: Self, set: bool) -> Self {
+    pub const fn with_flags(self, bits: Self, set: bool) -> Self {
         if set { Self(self.0 | bits.0) } else { Self(self.0 & !bits.0) }
     }
 
@@ -79,9 +79,9 @@ mod tests {
 
     #[test]
     fn the_state_word_keeps_its_parts_apart() {
-        let state = State::CONFIGURED.with(State::ACTIVE, true).with_joint(5);
+        let state = State::CONFIGURED.with_flags(State::ACTIVE, true).with_joint(5);
         assert!(state.has(State::CONFIGURED) && state.has(State::ACTIVE) && !state.has(State::HALTED));
         assert_eq!((state.joint(), state.version()), (5, 1));
-        assert_eq!(state.with(State::ACTIVE, false).0, 0x1501);
+        assert_eq!(state.with_flags(State::ACTIVE, false).0, 0x1501);
     }
 }

@@ -37,11 +37,11 @@ fn what_cannot_be_is_refused_with_the_value() {
 fn senders_and_tags_are_those_of_the_packet() {
     let from = CellId::new(7).unwrap();
     let torque = Message::Torque { from, epoch: Epoch(0), torque: [0; WORDS].into() };
-    assert_eq!((torque.sender(), torque.tag()), (Some(from), None));
+    assert_eq!((torque.sender(), torque.configuration_tag()), (Some(from), None));
     let request = Request::Read { number: 3 };
     let configure = Message::Configure { to: Node::Cell(from), tag: 5, request };
-    assert_eq!((configure.sender(), configure.tag()), (None, Some(5)));
+    assert_eq!((configure.sender(), configure.configuration_tag()), (None, Some(5)));
     let answer = Answer::Refused { number: 3, reason: 1 };
     let configured = Message::Configured { from, tag: 6, answer };
-    assert_eq!((configured.sender(), configured.tag()), (Some(from), Some(6)));
+    assert_eq!((configured.sender(), configured.configuration_tag()), (Some(from), Some(6)));
 }

@@ -1,6 +1,6 @@
 //! A packet that is read in the bytes in which it was received, without a copy.
 
-use super::{Epoch, Length, Lengths, Packet, PacketError, Words, checksum, data_id};
+use super::{Epoch, Length, Lengths, Packet, PacketError, Words, checksum, data_frame_id};
 use crate::can::{Format, Frame};
 use crate::id::Id;
 
@@ -26,7 +26,7 @@ impl<'b> PacketRef<'b> {
             .filter(|&length| lengths.contains(length))
             .and_then(|length| Self::split(id, length, bytes));
         let Some((packet, got)) = split else {
-            return Err(PacketError::Length { expected: lengths.first().bytes(), got: bytes.len() });
+            return Err(PacketError::Length { expected: lengths.shortest().bytes(), got: bytes.len() });
         };
         let expected = checksum(id, bytes.get(..bytes.len() - 2).unwrap_or_default());
         if expected == got { Ok(packet) } else { Err(PacketError::Crc { expected, got }) }
@@ -37,7 +37,7 @@ impl<'b> PacketRef<'b> {
     /// # Errors
     /// Returns an error if the frame is not an FD data frame with an 11-bit identifier, or does not contain a packet.
     pub fn from_fd(frame: &'b Frame) -> Result<Self, PacketError> {
-        let id = data_id(frame)?;
+        let id = data_frame_id(frame)?;
         if frame.format() != Format::Fd {
             return Err(PacketError::Length { expected: super::PACKET_BYTES, got: frame.data().len() });
         }

@@ -52,7 +52,7 @@ impl Length {
 
     /// Returns the size in bytes of the last classic frame of a packet; the frames before it have 8 bytes.
     #[must_use]
-    pub const fn last_segment(self) -> usize {
+    pub const fn last_segment_bytes(self) -> usize {
         self.bytes() - (self.segments() - 1) * SEGMENT_BYTES
     }
 
@@ -91,7 +91,7 @@ impl Lengths {
 
     /// Returns the set for a chain: its one length, or all lengths if the chain is unknown.
     #[must_use]
-    pub fn for_chain(length: Option<Length>) -> Self {
+    pub fn from_chain_length(length: Option<Length>) -> Self {
         length.map_or(Self::ALL, Self::only)
     }
 
@@ -123,7 +123,7 @@ impl Lengths {
     }
 
     /// Returns the shortest length.
-    pub(super) fn first(self) -> Length {
+    pub(super) fn shortest(self) -> Length {
         self.iter().next().unwrap_or_default()
     }
 

@@ -50,10 +50,10 @@ impl Reassembler {
     /// The maximum time between the segments of joints, torques and sums. It is less than the usual 16 ms between two
     /// broadcasts, so that segments of different packets are rarely combined: one in 65 536 such combinations has a
     /// correct CRC.
-    const MAX_PERIODIC_GAP: Span = Span::from_millis(15);
+    const MAX_PERIODIC_SEGMENT_GAP: Span = Span::from_millis(15);
     /// The maximum time between the segments of all other packets. Most of them are sent only once, so no later packet
     /// can be mixed in.
-    const MAX_GAP: Span = Span::from_millis(100);
+    const MAX_SEGMENT_GAP: Span = Span::from_millis(100);
 
     /// An empty buffer.
     pub const NONE: Self = Self {
@@ -68,7 +68,7 @@ impl Reassembler {
     #[must_use]
     pub fn max_gap(id: Id) -> Span {
         let is_periodic = matches!(id.kind, Kind::Sum | Kind::Torque) || id == Id::command(Command::Joints);
-        if is_periodic { Self::MAX_PERIODIC_GAP } else { Self::MAX_GAP }
+        if is_periodic { Self::MAX_PERIODIC_SEGMENT_GAP } else { Self::MAX_SEGMENT_GAP }
     }
 
     /// Returns true if the buffer holds a segment of an incomplete packet.
@@ -79,7 +79,7 @@ impl Reassembler {
 
     /// Returns the number of segments in the buffer.
     #[must_use]
-    pub fn waiting(&self) -> usize {
+    pub fn waiting_segment_count(&self) -> usize {
         self.waiting.into()
     }
 
@@ -116,10 +116,12 @@ impl Reassembler {
         data: &[u8],
     ) -> Result<Reassembly<PacketRef<'_>>, PacketError> {
         let lengths = lengths.restricted_to(id);
-        if data.len() != SEGMENT_BYTES && !lengths.iter().any(|length| data.len() == length.last_segment()) {
+        if data.len() != SEGMENT_BYTES
+            && !lengths.iter().any(|length| data.len() == length.last_segment_bytes())
+        {
             return Err(PacketError::Length { expected: SEGMENT_BYTES, got: data.len() });
         }
-        if self.waiting() == Length::MAX_SEGMENTS {
+        if self.waiting_segment_count() == Length::MAX_SEGMENTS {
             self.drop_segments(1);
         }
         self.append(at, data);
@@ -142,7 +144,7 @@ impl Reassembler {
         let Some((place, length)) = found else {
             return Ok(self.drop_oldest(at, within, lengths.longest().segments(), belong_together));
         };
-        let older = self.waiting().saturating_sub(length.segments());
+        let older = self.waiting_segment_count().saturating_sub(length.segments());
         let lost = older > usize::from(self.reported) || self.unreported_loss;
         self.clear();
         self.unreported_loss = lost;
@@ -158,7 +160,7 @@ impl Reassembler {
 
     /// Returns the pending segments.
     fn pending(&self) -> &[PendingSegment] {
-        self.segments.get(..self.waiting()).unwrap_or_default()
+        self.segments.get(..self.waiting_segment_count()).unwrap_or_default()
     }
 
     /// Returns the number of bytes of the first `count` segments.
@@ -168,7 +170,7 @@ impl Reassembler {
 
     /// Appends a segment, for which there must be room.
     fn append(&mut self, at: Micros, data: &[u8]) {
-        let first = self.byte_count(self.waiting());
+        let first = self.byte_count(self.waiting_segment_count());
         if let (Some(segment), Some(place), Ok(byte_count)) = (
             self.segments.get_mut(usize::from(self.waiting)),
             self.bytes.get_mut(first..first + data.len()),
@@ -197,8 +199,8 @@ impl Reassembler {
     /// Returns the place of the bytes of the newest segments that together have this length, and the arrival time of
     /// the first of them. Returns `None` if segments are missing or have other sizes.
     fn segments_of_last(&self, length: Length) -> Option<(Range<usize>, Micros)> {
-        let skipped = self.waiting().checked_sub(length.segments())?;
-        let (first, end) = (self.byte_count(skipped), self.byte_count(self.waiting()));
+        let skipped = self.waiting_segment_count().checked_sub(length.segments())?;
+        let (first, end) = (self.byte_count(skipped), self.byte_count(self.waiting_segment_count()));
         let since = self.pending().get(skipped)?.arrived;
         (end - first == length.bytes()).then_some((first..end, since))
     }
@@ -214,7 +216,8 @@ impl Reassembler {
     ) -> Reassembly<PacketRef<'static>> {
         let is_late = |segment: &&PendingSegment| now.elapsed_since(segment.arrived) > within;
         let late = self.pending().iter().filter(is_late).count();
-        let dropped = if late > 0 { late } else { (self.waiting() + 1).saturating_sub(segments) };
+        let dropped =
+            if late > 0 { late } else { (self.waiting_segment_count() + 1).saturating_sub(segments) };
         let reported = usize::from(self.reported);
         let is_new = dropped > reported;
         let reported = match (is_new, late > 0 && !belong_together) {

@@ -99,7 +99,7 @@ impl Abilities {
         if number == 0 { 6 } else { number.into() }
     }
 
-    const fn has(self, bit: u16) -> bool {
+    const fn has_bit(self, bit: u16) -> bool {
         self.0 & bit != 0
     }
 
@@ -115,16 +115,16 @@ impl Abilities {
         }
         let can = |kind| match kind {
             RowKind::Revolute => true,
-            RowKind::Prismatic => self.has(Self::PRISMATIC_ROW_FLAG),
-            RowKind::Fixed => self.has(Self::FIXED_ROW_FLAG),
+            RowKind::Prismatic => self.has_bit(Self::PRISMATIC_ROW_FLAG),
+            RowKind::Fixed => self.has_bit(Self::FIXED_ROW_FLAG),
         };
         if let Some(row) = table.iter().find(|row| !can(row.kind)) {
             return Some(MissingAbility::Kind(row.kind));
         }
         let has_format = match parameters.torque_format {
             TorqueFormat::Q3_12 => true,
-            TorqueFormat::Q5_10 => self.has(Self::Q5_10_FLAG),
-            TorqueFormat::Q7_8 => self.has(Self::Q7_8_FLAG),
+            TorqueFormat::Q5_10 => self.has_bit(Self::Q5_10_FLAG),
+            TorqueFormat::Q7_8 => self.has_bit(Self::Q7_8_FLAG),
         };
         (!has_format).then_some(MissingAbility::Format(parameters.torque_format))
     }

@@ -33,7 +33,7 @@ pub use abilities::{Abilities, MissingAbility};
 pub use baseline::{Baseline, BaselineSettings, TareCommand};
 pub use error::ParameterError;
 pub use rows::{Row, RowKind};
-pub use switches::{Events, LinksDown, Reply, Sensing, SumSchedule};
+pub use switches::{Events, LinksDown, ReplyKind, Sensing, SumSchedule};
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
 use crate::packet::{MAX_WORDS, WORDS, crc16_of_parts, padded_words};
@@ -158,7 +158,7 @@ impl Parameter {
     #[must_use]
     pub fn accepts(self, words: [i16; WORDS]) -> bool {
         match self {
-            Self::Reply => Reply::from_words(words).is_some(),
+            Self::Reply => ReplyKind::from_words(words).is_some(),
             Self::Sensing => Sensing::from_words(words).is_some(),
             Self::Events => Events::from_words(words).is_some(),
             Self::Baseline => Baseline::from_words(words).is_some(),
@@ -254,7 +254,7 @@ pub const IMAGE_BYTES: usize = (STORED_BEFORE_ROWS.len() + MIN_IMAGE_ROWS) * WOR
 pub const MAX_IMAGE_BYTES: usize = (STORED_BEFORE_ROWS.len() + MAX_ROWS) * WORDS * 2;
 
 /// The stored parameters as bytes: [`IMAGE_BYTES`], and 12 more for each row after the sixth.
-pub type Image = heapless::Vec<u8, MAX_IMAGE_BYTES>;
+pub type ParameterImage = heapless::Vec<u8, MAX_IMAGE_BYTES>;
 
 impl Parameters {
     /// Returns the words of a stored parameter; zeros for other parameters.
@@ -405,7 +405,7 @@ impl Parameters {
 
     /// Returns the rows from the base to the row that carries the cell.
     #[must_use]
-    pub fn chain(&self) -> &[Row] {
+    pub fn rows_to_cell(&self) -> &[Row] {
         let row = if self.row == 0 { self.joint } else { self.row };
         self.rows.get(..usize::from(row)).unwrap_or_default()
     }
@@ -424,18 +424,18 @@ impl Parameters {
 
     /// Encodes all stored parameters, in the order of [`Parameter::stored_for_rows`], words little endian.
     #[must_use]
-    pub fn image(&self) -> Image {
-        self.image_parts().flatten().collect()
+    pub fn encode_image(&self) -> ParameterImage {
+        self.encode_image_parts().flatten().collect()
     }
 
-    /// Returns [`Parameters::image`] in pieces of one parameter each, for callers with a small stack.
-    pub fn image_parts(&self) -> impl Iterator<Item = [u8; WORDS * 2]> {
-        Parameter::stored_for_rows(self.all_rows().len()).map(|parameter| self.image_part(parameter))
+    /// Returns [`Parameters::encode_image`] in pieces of one parameter each, for callers with a small stack.
+    pub fn encode_image_parts(&self) -> impl Iterator<Item = [u8; WORDS * 2]> {
+        Parameter::stored_for_rows(self.all_rows().len()).map(|parameter| self.encode_parameter(parameter))
     }
 
     /// Encodes one parameter.
     #[inline(never)]
-    fn image_part(&self, parameter: Parameter) -> [u8; WORDS * 2] {
+    fn encode_parameter(&self, parameter: Parameter) -> [u8; WORDS * 2] {
         let mut bytes = [0; WORDS * 2];
         for (bytes, word) in bytes.as_chunks_mut().0.iter_mut().zip(self.words(parameter)) {
             *bytes = word.to_le_bytes();
@@ -457,17 +457,17 @@ impl Parameters {
         }
         parameters.check()?;
         let (parts, rest) = image.as_chunks();
-        if !rest.is_empty() || !parameters.image_parts().eq(parts.iter().copied()) {
+        if !rest.is_empty() || !parameters.encode_image_parts().eq(parts.iter().copied()) {
             let (rows, joints) = (parameters.table_rows.into(), parameters.joints.into());
             return Err(ParameterError::Rows { got: rows, joints });
         }
         Ok(parameters)
     }
 
-    /// Returns the configuration hash, as sent in heartbeats: the CRC-16 of packets over [`Parameters::image`].
+    /// Returns the configuration hash, as sent in heartbeats: the CRC-16 of packets over [`Parameters::encode_image`].
     #[must_use]
     pub fn hash(&self) -> u16 {
-        crc16_of_parts(self.image_parts())
+        crc16_of_parts(self.encode_image_parts())
     }
 }
 

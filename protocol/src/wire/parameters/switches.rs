@@ -3,9 +3,9 @@
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use crate::packet::{self, WORDS};
 
-/// The message with which a cell replies to joints, parameter 6. It is volatile: a cell starts with [`Reply::Torque`].
+/// The message with which a cell replies to joints, parameter 6. It is volatile: a cell starts with [`ReplyKind::Torque`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum Reply {
+pub enum ReplyKind {
     /// The cell's own torque, in the torque format of its parameters.
     #[default]
     Torque,
@@ -25,7 +25,7 @@ pub struct SumSchedule {
     pub carry: bool,
 }
 
-impl Reply {
+impl ReplyKind {
     /// Encodes the reply as the words of parameter 6.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {

@@ -68,7 +68,7 @@ fn rows_are_checked_against_the_joints() {
     // Joint 1 of 2 moves the cell.
     assert_eq!(rows(1, 2, &[slides, turns]).check(), Ok(()));
     assert_eq!(rows(3, 4, &[fixed, turns, fixed, turns]).check(), Ok(()));
-    assert_eq!(rows(3, 4, &[fixed, turns, fixed, turns]).chain().len(), 3);
+    assert_eq!(rows(3, 4, &[fixed, turns, fixed, turns]).rows_to_cell().len(), 3);
     let code = |parameters: Parameters| parameters.check().unwrap_err().code();
     assert_eq!(code(rows(0, 0, &[slides])), 7, "the short form has revolute rows only");
     assert_eq!(code(rows(1, 33, &[turns, turns])), 7);
@@ -98,9 +98,12 @@ fn a_longer_table_has_a_longer_image() {
             ..Row::default()
         };
     }
-    assert_eq!(long.image().len(), IMAGE_BYTES + 3 * 12);
-    assert_eq!(Parameters::from_image(&long.image()).map(|it| it.image()), Ok(long.image()));
-    assert_eq!(Parameters::from_image(&long.image()[..IMAGE_BYTES + 24]).unwrap_err().code(), 7);
+    assert_eq!(long.encode_image().len(), IMAGE_BYTES + 3 * 12);
+    assert_eq!(
+        Parameters::from_image(&long.encode_image()).map(|it| it.encode_image()),
+        Ok(long.encode_image())
+    );
+    assert_eq!(Parameters::from_image(&long.encode_image()[..IMAGE_BYTES + 24]).unwrap_err().code(), 7);
     let mut other = long;
     other.rows[8].d = Q1_14::from_bits(4);
     assert_ne!(other.hash(), long.hash());
@@ -114,7 +117,7 @@ proptest! {
         for (row, [a, d, alpha, offset]) in target.rows.iter_mut().zip(words) {
             *row = Row { kind: RowKind::Revolute, a: Q1_14::from_bits(a), d: Q1_14::from_bits(d), alpha: Q1_14::from_bits(alpha), theta_offset: Q1_14::from_bits(offset) };
         }
-        prop_assert_eq!(Parameters::from_image(&target.image()), Ok(target));
+        prop_assert_eq!(Parameters::from_image(&target.encode_image()), Ok(target));
     }
 
     #[test]

@@ -75,7 +75,7 @@ pub enum FieldRange {
 /// The representation in JSON of a field whose condition `when` is false.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq)]
 #[serde(rename_all = "snake_case")]
-pub enum WhenAbsent {
+pub enum AbsentFieldJson {
     /// The field is omitted.
     #[default]
     Omitted,
@@ -110,7 +110,7 @@ pub struct Field {
     /// Without bounds the field is always present.
     when: Option<[u16; 2]>,
     /// Representation of the field while the condition is false.
-    pub absent: WhenAbsent,
+    pub absent: AbsentFieldJson,
     /// True if the field may be omitted on the command line. The value is then 0.
     pub optional: bool,
     /// Description of further restrictions on the values.
@@ -150,13 +150,13 @@ impl Field {
 
     /// Returns the number of bits of one element.
     #[must_use]
-    pub fn width(&self) -> u8 {
+    pub fn bit_width(&self) -> u8 {
         self.bit_layout().0
     }
 
     /// Returns the number of fraction bits; 0 for integers.
     #[must_use]
-    pub fn fraction(&self) -> u32 {
+    pub fn fraction_bits(&self) -> u32 {
         self.bit_layout().1
     }
 
@@ -168,7 +168,7 @@ impl Field {
 
     /// Returns the number of elements: 1, or the number of labels.
     #[must_use]
-    pub fn elements(&self) -> usize {
+    pub fn element_count(&self) -> usize {
         if self.labels.is_empty() { 1 } else { self.labels.len() }
     }
 
@@ -184,7 +184,7 @@ impl Field {
     pub fn raw_value(&self, bytes: &[u8], element: usize) -> i64 {
         // Epoch and count follow the sixth word.
         let element = element + usize::from(element >= WORDS);
-        let (at, width) = (self.first_bit() + element * 16, u32::from(self.width()));
+        let (at, width) = (self.first_bit() + element * 16, u32::from(self.bit_width()));
         let there = bytes.get(at / 8..).unwrap_or_default();
         let all = there.iter().take(5).rev().fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
         let bits = (all >> (at % 8) & ((1 << width) - 1)).cast_signed();
@@ -200,24 +200,26 @@ impl Field {
     /// Returns the number of elements in use: for positions the joints in use, for other fields whose length varies the
     /// words of the packet, else all elements.
     #[must_use]
-    pub fn elements_in(&self, bytes: &[u8]) -> usize {
+    pub fn element_count_in(&self, bytes: &[u8]) -> usize {
         let there = bytes.len().saturating_sub(SIX_WORDS_BYTES + 2) / 2 + WORDS;
         match bytes.get(COUNT_BYTE_INDEX) {
-            Some(&in_use) if self.format == FieldFormat::Position => self.elements().min(usize::from(in_use)),
+            Some(&in_use) if self.format == FieldFormat::Position => {
+                self.element_count().min(usize::from(in_use))
+            }
             Some(_) | None if self.varies_with_chain() => there,
-            Some(_) | None => self.elements(),
+            Some(_) | None => self.element_count(),
         }
     }
 
     /// Returns the name of a value; `None` if it has no name.
     #[must_use]
-    pub fn name_of(&self, raw: i64) -> Option<&str> {
+    pub fn value_name(&self, raw: i64) -> Option<&str> {
         self.names.iter().find(|(value, _)| i64::from(*value) == raw).map(|(_, name)| name.as_str())
     }
 
     /// Returns the value that a name stands for; `None` for an unknown name.
     #[must_use]
-    pub fn value_of(&self, name: &str) -> Option<i16> {
+    pub fn value_from_name(&self, name: &str) -> Option<i16> {
         self.names.iter().find(|(_, known)| known == name).map(|(value, _)| *value)
     }
 
@@ -247,7 +249,7 @@ impl Field {
     #[must_use]
     pub fn signal_name(&self, prefix: &str, label: &str) -> String {
         let name = if self.signal.is_empty() {
-            format!("{prefix}{}", self.bare_name())
+            format!("{prefix}{}", self.name_without_unit())
         } else {
             self.signal.clone()
         };
@@ -260,7 +262,7 @@ impl Field {
 
     /// Returns the name of the field without its unit.
     #[must_use]
-    pub fn bare_name(&self) -> &str {
+    pub fn name_without_unit(&self) -> &str {
         match self.name.rsplit_once('_') {
             Some((bare, _)) if !self.unit.is_empty() => bare,
             Some(_) | None => &self.name,
@@ -268,7 +270,7 @@ impl Field {
     }
 
     /// Returns the name of each element on the command line.
-    pub fn written_names(&self) -> Vec<String> {
+    pub fn command_line_names(&self) -> Vec<String> {
         let label = |label: &String| match self.name.rsplit_once('_') {
             Some((_, unit)) if !self.unit.is_empty() => format!("{label}_{unit}"),
             Some(_) | None => format!("{}_{label}", self.name),

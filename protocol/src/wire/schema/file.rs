@@ -6,7 +6,7 @@ use std::sync::LazyLock;
 use serde::Deserialize;
 use serde::de::{Deserializer, Error};
 
-use super::ANY_NUMBER;
+use super::ANY_NUMBER_RANGE;
 use super::field::Field;
 use crate::id::{Command, Kind};
 
@@ -17,7 +17,7 @@ static SCHEMA: LazyLock<Schema> = LazyLock::new(|| {
 
 /// Returns the schema of every kind of packet and every command, in the order of their identifiers.
 #[must_use]
-pub fn packets() -> &'static [PacketSchema] {
+pub fn packet_schemas() -> &'static [PacketSchema] {
     &SCHEMA.packets
 }
 
@@ -61,7 +61,7 @@ struct Schema {
 
 /// One alternative of a human-readable text, used for some values of a number.
 #[derive(Clone, Debug, PartialEq)]
-pub struct TextPart {
+pub struct TextAlternative {
     /// Bounds of the number, inclusive, within which this alternative is used.
     pub when: [u16; 2],
     /// Name of the field with the number; `None` for the number that the layout or packet defines.
@@ -103,7 +103,7 @@ impl TextPiece {
         Self::Field { name: name.to_owned(), decimals: decimals.parse().unwrap_or_default() }
     }
 
-    fn parse_all(mut text: &str) -> Vec<Self> {
+    fn parse_pieces(mut text: &str) -> Vec<Self> {
         let mut pieces = Vec::new();
         while let Some((before, (inside, after))) =
             text.split_once('{').and_then(|(before, after)| Some((before, after.split_once('}')?)))
@@ -116,21 +116,21 @@ impl TextPiece {
     }
 }
 
-impl<'de> Deserialize<'de> for TextPart {
+impl<'de> Deserialize<'de> for TextAlternative {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         #[derive(Deserialize)]
         #[serde(untagged)]
-        enum RawPart {
+        enum RawTextPart {
             Always(String),
             Within(u16, u16, String),
             Of(String, u16, u16, String),
         }
-        let (when, of, text) = match RawPart::deserialize(deserializer)? {
-            RawPart::Always(text) => (ANY_NUMBER, None, text),
-            RawPart::Within(min, max, text) => ([min, max], None, text),
-            RawPart::Of(field, min, max, text) => ([min, max], Some(field), text),
+        let (when, of, text) = match RawTextPart::deserialize(deserializer)? {
+            RawTextPart::Always(text) => (ANY_NUMBER_RANGE, None, text),
+            RawTextPart::Within(min, max, text) => ([min, max], None, text),
+            RawTextPart::Of(field, min, max, text) => ([min, max], Some(field), text),
         };
-        Ok(Self { when, of, pieces: TextPiece::parse_all(&text) })
+        Ok(Self { when, of, pieces: TextPiece::parse_pieces(&text) })
     }
 }
 
@@ -147,7 +147,7 @@ pub struct Layout {
     /// Prefix of the signal names in a DBC file.
     pub prefix: String,
     /// Human-readable text. The first field selects an alternative, unless the alternative names another field.
-    pub text: Vec<TextPart>,
+    pub text: Vec<TextAlternative>,
     /// Fields of the words, in order.
     pub fields: Vec<Field>,
 }
@@ -165,7 +165,7 @@ impl Layout {
     }
 
     /// Returns one layout for each of its numbers.
-    fn expand(&self) -> impl Iterator<Item = Self> {
+    fn expand_layouts(&self) -> impl Iterator<Item = Self> {
         (0..self.times.unwrap_or(1)).map(|index| {
             let named = |text: &str| text.replace("{}", &(index + 1).to_string());
             let (name, prefix) = (named(&self.name), named(&self.prefix));
@@ -184,7 +184,7 @@ pub struct PacketSchema {
     /// Meaning of the packet, in one or a few sentences.
     pub meaning: String,
     /// Human-readable text. Byte 13 selects an alternative, unless the alternative names a field.
-    pub text: Vec<TextPart>,
+    pub text: Vec<TextAlternative>,
     /// Fields of bytes 12 and 13 (epoch and count), in the order of JSON output.
     pub end: Vec<Field>,
     /// Layouts of the words, by page or parameter.
@@ -206,7 +206,7 @@ struct RawPacket {
     of: (Kind, Option<Command>),
     meaning: String,
     #[serde(default)]
-    text: Vec<TextPart>,
+    text: Vec<TextAlternative>,
     #[serde(default)]
     end: Vec<Field>,
     #[serde(default)]
@@ -225,7 +225,7 @@ fn kind_or_command<'de, D: Deserializer<'de>>(deserializer: D) -> Result<(Kind, 
 impl From<SchemaFile> for Schema {
     fn from(SchemaFile { packets, layouts, reasons }: SchemaFile) -> Self {
         let set = |name: &str| -> Vec<_> {
-            layouts.get(name).into_iter().flatten().flat_map(Layout::expand).collect()
+            layouts.get(name).into_iter().flatten().flat_map(Layout::expand_layouts).collect()
         };
         let packet = |RawPacket { of: (kind, command), meaning, text, end, layouts }| {
             let layouts = layouts.iter().flat_map(|name: &String| set(name)).collect();

@@ -13,11 +13,12 @@ mod field;
 mod file;
 mod units;
 
-pub use field::{Field, FieldFormat, FieldRange, WhenAbsent};
+pub use field::{AbsentFieldJson, Field, FieldFormat, FieldRange};
 pub use file::{
-    Layout, PacketSchema, TextPart, TextPiece, packets, parameter_layouts, refusal_reasons, wire_layouts,
+    Layout, PacketSchema, TextAlternative, TextPiece, packet_schemas, parameter_layouts, refusal_reasons,
+    wire_layouts,
 };
-pub use units::Units;
+pub use units::BusUnits;
 
 use crate::id::{Id, Kind};
 use crate::message::{FROM_NEXT_JOINTS_FLAG, Message, REFUSAL_NUMBER, Request, WRITE_FLAG};
@@ -25,7 +26,7 @@ use crate::packet::{Packet, WORDS};
 use crate::parameters::Parameter;
 
 /// Bounds that contain every 16-bit number.
-const ANY_NUMBER: [u16; 2] = [0, u16::MAX];
+const ANY_NUMBER_RANGE: [u16; 2] = [0, u16::MAX];
 
 impl PacketSchema {
     /// Returns the schema of packets with an identifier; `None` for an undefined command.
@@ -34,7 +35,7 @@ impl PacketSchema {
         let is_it = |schema: &&Self| {
             schema.kind == id.kind && schema.command.is_none_or(|command| Id::command(command) == id)
         };
-        packets().iter().find(is_it)
+        packet_schemas().iter().find(is_it)
     }
 
     /// Returns the fields of bytes 12 and 13 (epoch and count) that are defined for this layout.

@@ -5,7 +5,7 @@ use crate::packet::{Epoch, MAX_WORDS};
 
 /// Returns every layout, together with the fields of bytes 12 and 13 that are defined for it.
 fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {
-    let packets = packets()
+    let packets = packet_schemas()
         .iter()
         .flat_map(|schema| schema.layouts.iter().map(move |layout| (&schema.end[..], layout)));
     packets.chain(wire_layouts().iter().map(|layout| (&[][..], layout)))
@@ -17,10 +17,10 @@ fn fields_stand_side_by_side_within_the_packet() {
         let mut taken = [false; MAX_WORDS * 16 + 16];
         let real = |field: &&Field| !matches!(field.format, FieldFormat::Total(_));
         for field in end.iter().chain(&layout.fields).filter(real) {
-            for element in 0..field.elements() {
+            for element in 0..field.element_count() {
                 // Epoch and count follow the sixth word.
                 let at = field.first_bit() + (element + usize::from(element >= 6)) * 16;
-                for bit in &mut taken[at..at + usize::from(field.width())] {
+                for bit in &mut taken[at..at + usize::from(field.bit_width())] {
                     assert!(!*bit, "{} {}", layout.name, field.name);
                     *bit = true;
                 }
@@ -31,7 +31,7 @@ fn fields_stand_side_by_side_within_the_packet() {
 
 #[test]
 fn texts_name_fields_that_are_there() {
-    let names = |text: &'static [TextPart]| {
+    let names = |text: &'static [TextAlternative]| {
         let name = |piece: &'static TextPiece| match piece {
             TextPiece::Literal(_) => None,
             TextPiece::Field { name, .. } | TextPiece::Either { name, .. } => Some(name.as_str()),
@@ -43,7 +43,7 @@ fn texts_name_fields_that_are_there() {
             assert!(layout.fields.iter().any(|field| field.name == name), "{}: {name}", layout.name);
         }
     }
-    for schema in packets() {
+    for schema in packet_schemas() {
         let fields = || schema.end.iter().chain(schema.layouts.iter().flat_map(|layout| &layout.fields));
         for name in names(&schema.text) {
             assert!(
@@ -83,9 +83,9 @@ fn a_field_gives_its_bits_with_their_sign() {
 #[test]
 fn names_are_of_fields_of_labels_and_of_units() {
     let field = |parameter: &str, place: usize| &find_parameter(parameter).unwrap().fields[place];
-    assert_eq!(field("pose", 0).written_names(), ["x_m", "y_m", "z_m"]);
-    assert_eq!(field("pose", 1).written_names(), ["normal_x", "normal_y", "normal_z"]);
-    assert_eq!(field("timing", 0).written_names(), ["period_us"]);
+    assert_eq!(field("pose", 0).command_line_names(), ["x_m", "y_m", "z_m"]);
+    assert_eq!(field("pose", 1).command_line_names(), ["normal_x", "normal_y", "normal_z"]);
+    assert_eq!(field("timing", 0).command_line_names(), ["period_us"]);
     assert_eq!(field("pose", 0).signal_name("", "x"), "pose_x", "it has another name as a signal");
     assert_eq!(field("timing", 0).signal_name("timing_", ""), "timing_period", "the unit stands elsewhere");
     assert_eq!(field("mount", 0).signal_name("mount_", ""), "mount_joint");
@@ -95,7 +95,7 @@ fn names_are_of_fields_of_labels_and_of_units() {
 
 #[test]
 fn a_refusal_has_no_tag_and_no_parameter_beside_its_layout() {
-    let schema = |kind| packets().iter().find(|schema| schema.kind == kind).unwrap();
+    let schema = |kind| packet_schemas().iter().find(|schema| schema.kind == kind).unwrap();
     let configured = schema(Kind::Configured);
     let refusal = configured.layouts.iter().find(|layout| layout.number == REFUSAL_NUMBER).unwrap();
     assert_eq!(configured.trailing_fields(refusal), []);

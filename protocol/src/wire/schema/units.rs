@@ -9,13 +9,13 @@ use crate::skin::{JointKind, Skin};
 /// The properties of a bus on which units depend: the torque format, and which joints of the chain are prismatic. The
 /// default is Q3.12 and revolute joints only.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Units {
+pub struct BusUnits {
     torque: TorqueFormat,
     /// Bit j is set if joint j + 1 is prismatic.
     prismatic: u16,
 }
 
-impl Units {
+impl BusUnits {
     /// Returns the units of a bus, given as an index into [`Skin::buses`].
     #[must_use]
     pub fn for_bus(skin: &Skin, bus: usize) -> Self {
@@ -54,8 +54,8 @@ impl Units {
 impl Field {
     /// Returns the value of one step of an element, in the unit [`Self::element_unit`].
     #[must_use]
-    pub fn element_step_size(&self, element: usize, units: Units) -> f64 {
-        let step = 1.0 / f64::from(1_u32 << self.fraction());
+    pub fn element_step_size(&self, element: usize, units: BusUnits) -> f64 {
+        let step = 1.0 / f64::from(1_u32 << self.fraction_bits());
         if self.format == FieldFormat::Torque {
             units.torque.step_size()
         } else if self.format == FieldFormat::Angle
@@ -69,19 +69,19 @@ impl Field {
 
     /// Converts the raw value of an element to the unit [`Self::element_unit`].
     #[must_use]
-    pub fn element_value(&self, raw: i64, element: usize, units: Units) -> f64 {
+    pub fn element_value(&self, raw: i64, element: usize, units: BusUnits) -> f64 {
         f64::from(i16::try_from(raw).unwrap_or_default()) * self.element_step_size(element, units)
     }
 
     /// Converts a raw value to the unit of the field, for fields whose unit is the same on every bus.
     #[must_use]
     pub fn raw_to_real(&self, raw: i64) -> f64 {
-        self.element_value(raw, 0, Units::default())
+        self.element_value(raw, 0, BusUnits::default())
     }
 
     /// Returns the unit of an element: that of the field, but m or N if the element belongs to a prismatic joint.
     #[must_use]
-    pub fn element_unit(&self, element: usize, units: Units) -> &str {
+    pub fn element_unit(&self, element: usize, units: BusUnits) -> &str {
         let (turns, slides) = (JointKind::Revolute, JointKind::Prismatic);
         match self.unit.as_str() {
             unit if !units.is_prismatic(self, element) => unit,
@@ -95,16 +95,17 @@ impl Field {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::schema::packets;
+    use crate::schema::packet_schemas;
 
     #[test]
     fn what_grows_with_the_chain_has_the_unit_of_its_joint() {
-        let units = Units { prismatic: 0b10, ..Units::default() };
-        let fields = || packets().iter().flat_map(|packet| packet.layouts.iter().flat_map(|it| &it.fields));
+        let units = BusUnits { prismatic: 0b10, ..BusUnits::default() };
+        let fields =
+            || packet_schemas().iter().flat_map(|packet| packet.layouts.iter().flat_map(|it| &it.fields));
         let positions = fields().find(|field| field.format == FieldFormat::Position).unwrap();
         assert_eq!([0, 1, 2].map(|joint| positions.element_unit(joint, units)), ["rad", "m", "rad"]);
         let torques = fields().find(|field| field.format == FieldFormat::Torque).unwrap();
         assert_eq!([0, 1].map(|joint| torques.element_unit(joint, units)), ["Nm", "N"]);
-        assert_eq!([0, 1].map(|joint| torques.element_unit(joint, Units::default())), ["Nm", "Nm"]);
+        assert_eq!([0, 1].map(|joint| torques.element_unit(joint, BusUnits::default())), ["Nm", "Nm"]);
     }
 }

@@ -27,7 +27,7 @@ pub enum SlcanLine {
     Reported(AdapterReport),
     /// Any other line of printable characters, such as the version of an adapter. The caller ignores it.
     Other,
-    /// An invalid line, which [`Decoder::refused`] counts.
+    /// An invalid line, which [`Decoder::rejected_lines`] counts.
     Refused(LineRefusal),
 }
 
@@ -69,7 +69,7 @@ impl RejectedLines {
         [garbage, long, short, dlc, identifier].into_iter().map(u64::from).sum()
     }
 
-    const fn count(&mut self, refusal: LineRefusal) {
+    const fn count_refusal(&mut self, refusal: LineRefusal) {
         let counter = match refusal {
             LineRefusal::Garbage => &mut self.garbage,
             LineRefusal::Long => &mut self.long,
@@ -99,13 +99,13 @@ pub struct Decoder {
     /// The reason for which the current line will be refused, if an error was found in it.
     fault: Option<LineRefusal>,
     refused: RejectedLines,
-    endings: EndDigitDetector,
+    endings: ErrorStateDigitDetector,
 }
 
 /// Detects from earlier frames whether the adapter appends a digit for the sender's error state to each frame. Adapters
 /// do so for all frames or for none. A line that lost a byte is thus not mistaken for a line of the other form.
 #[derive(Clone, Debug, Default)]
-struct EndDigitDetector {
+struct ErrorStateDigitDetector {
     has_state: bool,
     /// Number of consecutive frames of the same form.
     run_length: u8,
@@ -113,7 +113,7 @@ struct EndDigitDetector {
     deviated: bool,
 }
 
-impl EndDigitDetector {
+impl ErrorStateDigitDetector {
     /// Number of frames of one form after which a single frame of the other form is refused. Two in a row are accepted.
     const CONFIRMED_AFTER_FRAMES: u8 = 16;
 
@@ -122,7 +122,7 @@ impl EndDigitDetector {
     }
 
     /// Records the form of a frame. Returns true if the form is plausible after the earlier frames.
-    const fn record_form(&mut self, has_state: bool) -> bool {
+    const fn record_frame_form(&mut self, has_state: bool) -> bool {
         if self.has_state == has_state {
             self.run_length = self.run_length.saturating_add(1);
             self.deviated = false;
@@ -146,7 +146,7 @@ impl Decoder {
             line: heapless::Vec::new(),
             fault: None,
             refused: RejectedLines { garbage: 0, long: 0, short: 0, dlc: 0, identifier: 0 },
-            endings: EndDigitDetector::new(),
+            endings: ErrorStateDigitDetector::new(),
         }
     }
 
@@ -160,7 +160,7 @@ impl Decoder {
             b'\n' => (!self.is_empty()).then(|| self.finish_line()),
             BEL => {
                 if !self.is_empty() {
-                    self.refused.count(LineRefusal::Garbage);
+                    self.refused.count_refusal(LineRefusal::Garbage);
                 }
                 self.clear();
                 Some(SlcanLine::Failed)
@@ -180,7 +180,7 @@ impl Decoder {
 
     /// Returns the numbers of refused lines so far.
     #[must_use]
-    pub const fn refused(&self) -> RejectedLines {
+    pub const fn rejected_lines(&self) -> RejectedLines {
         self.refused
     }
 
@@ -189,7 +189,7 @@ impl Decoder {
     pub fn discard_unfinished(&mut self) -> bool {
         let begun = !self.is_empty();
         if begun {
-            self.refused.count(LineRefusal::Short);
+            self.refused.count_refusal(LineRefusal::Short);
         }
         self.clear();
         begun
@@ -208,7 +208,7 @@ impl Decoder {
         let endings = &mut self.endings;
         let line = self.fault.map_or_else(|| decode_line(&self.line, endings), SlcanLine::Refused);
         if let SlcanLine::Refused(refusal) = line {
-            self.refused.count(refusal);
+            self.refused.count_refusal(refusal);
         }
         self.clear();
         line
@@ -216,7 +216,7 @@ impl Decoder {
 }
 
 /// Decodes a line of printable characters, given without its line ending.
-fn decode_line(line: &[u8], endings: &mut EndDigitDetector) -> SlcanLine {
+fn decode_line(line: &[u8], endings: &mut ErrorStateDigitDetector) -> SlcanLine {
     let [kind, rest @ ..] = line else { return SlcanLine::Done };
     let flags = match kind.to_ascii_lowercase() {
         b't' | b'r' => None,
@@ -225,7 +225,7 @@ fn decode_line(line: &[u8], endings: &mut EndDigitDetector) -> SlcanLine {
         b'z' if rest.is_empty() => return SlcanLine::Sent,
         _ => {
             #[cfg(feature = "host")]
-            if let Some(report) = AdapterReport::read(line) {
+            if let Some(report) = AdapterReport::parse_report(line) {
                 return SlcanLine::Reported(report);
             }
             return SlcanCommand::decode(line).map_or(SlcanLine::Other, SlcanLine::Command);
@@ -244,7 +244,7 @@ fn decode_frame(
     is_extended: bool,
     flags: Option<u8>,
     is_remote: bool,
-    endings: &mut EndDigitDetector,
+    endings: &mut ErrorStateDigitDetector,
 ) -> Result<Frame, LineRefusal> {
     let (digits, flag, max) = if is_extended { (8, EXTENDED, EXTENDED_MASK) } else { (3, 0, STANDARD_MASK) };
     let (id, rest) = text.split_at_checked(digits).ok_or(LineRefusal::Short)?;
@@ -282,7 +282,7 @@ fn decode_frame(
     }
     // `S` cannot be mistaken for a digit, so it is always plausible.
     let has_state = matches!(state, Some(b'0' | b'1'));
-    if state != Some(b'S') && !endings.record_form(has_state) {
+    if state != Some(b'S') && !endings.record_frame_form(has_state) {
         return Err(if has_state { LineRefusal::Long } else { LineRefusal::Short });
     }
     let passive = if matches!(state, Some(b'1' | b'S')) { ERROR_STATE } else { 0 };

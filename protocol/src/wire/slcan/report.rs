@@ -12,29 +12,29 @@ use super::{digit, number};
 use crate::can::{ERROR, Format, Frame};
 
 // Classes and bits of linux/can/error.h.
-const CLASS_TRANSMIT_TIMEOUT: u32 = 0x001;
-const CLASS_LOST_ARBITRATION: u32 = 0x002;
-const CLASS_CONTROLLER: u32 = 0x004;
-const CLASS_PROTOCOL: u32 = 0x008;
-const CLASS_ACK: u32 = 0x020;
-const CLASS_BUS_OFF: u32 = 0x040;
-const CLASS_BUS_ERROR: u32 = 0x080;
-const CLASS_COUNTERS: u32 = 0x200;
+const ERROR_CLASS_TRANSMIT_TIMEOUT: u32 = 0x001;
+const ERROR_CLASS_LOST_ARBITRATION: u32 = 0x002;
+const ERROR_CLASS_CONTROLLER: u32 = 0x004;
+const ERROR_CLASS_PROTOCOL: u32 = 0x008;
+const ERROR_CLASS_ACK: u32 = 0x020;
+const ERROR_CLASS_BUS_OFF: u32 = 0x040;
+const ERROR_CLASS_BUS_ERROR: u32 = 0x080;
+const ERROR_CLASS_COUNTERS: u32 = 0x200;
 const RECEIVE_OVERFLOW: u8 = 0x01;
 const TRANSMIT_OVERFLOW: u8 = 0x02;
 const RECEIVE_WARNING: u8 = 0x04;
 const TRANSMIT_WARNING: u8 = 0x08;
 const RECEIVE_PASSIVE: u8 = 0x10;
 const TRANSMIT_PASSIVE: u8 = 0x20;
-const ERROR_ACTIVE: u8 = 0x40;
+const ERROR_ACTIVE_FLAG: u8 = 0x40;
 const SINGLE_BIT_ERROR: u8 = 0x01;
 const FORM_ERROR: u8 = 0x02;
 const STUFF_ERROR: u8 = 0x04;
 const BIT_0_ERROR: u8 = 0x08;
 const BIT_1_ERROR: u8 = 0x10;
 const ERROR_ON_TRANSMISSION: u8 = 0x80;
-const CRC_LOCATION: u8 = 0x08;
-const ACK_LOCATION: u8 = 0x19;
+const CRC_ERROR_LOCATION: u8 = 0x08;
+const ACK_ERROR_LOCATION: u8 = 0x19;
 
 /// The state of a CAN controller, which follows from its error counters.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
@@ -68,7 +68,7 @@ impl BusState {
     /// Returns the controller bits of an error frame that reports this state for the transmitter, the receiver or both.
     const fn controller_bits(self, transmits: bool, receives: bool) -> u8 {
         let (transmit, receive) = match self {
-            Self::Active => (ERROR_ACTIVE, ERROR_ACTIVE),
+            Self::Active => (ERROR_ACTIVE_FLAG, ERROR_ACTIVE_FLAG),
             Self::Warning => (TRANSMIT_WARNING, RECEIVE_WARNING),
             Self::Passive => (TRANSMIT_PASSIVE, RECEIVE_PASSIVE),
             Self::Off => (0, 0),
@@ -149,20 +149,20 @@ impl AdapterFault {
 
     /// Returns the class, and the controller, protocol and location bytes, of the error frame for this fault.
     const fn error_frame_parts(self) -> (u32, u8, u8, u8) {
-        const BUS_CLASSES: u32 = CLASS_PROTOCOL | CLASS_BUS_ERROR;
+        const BUS_ERROR_CLASSES: u32 = ERROR_CLASS_PROTOCOL | ERROR_CLASS_BUS_ERROR;
         match self {
-            Self::Ack => (BUS_CLASSES | CLASS_ACK, 0, 0, ACK_LOCATION),
-            Self::Bit0 => (BUS_CLASSES, 0, BIT_0_ERROR, 0),
-            Self::Bit1 => (BUS_CLASSES, 0, BIT_1_ERROR, 0),
-            Self::Crc => (BUS_CLASSES, 0, SINGLE_BIT_ERROR, CRC_LOCATION),
-            Self::Form => (BUS_CLASSES, 0, FORM_ERROR, 0),
-            Self::Stuff => (BUS_CLASSES, 0, STUFF_ERROR, 0),
-            Self::Bus | Self::ReceiveFailed => (BUS_CLASSES, 0, 0, 0),
-            Self::TransmitFailed => (BUS_CLASSES, 0, ERROR_ON_TRANSMISSION, 0),
-            Self::Arbitration => (CLASS_LOST_ARBITRATION, 0, 0, 0),
-            Self::ReceiveOverrun => (CLASS_CONTROLLER, RECEIVE_OVERFLOW, 0, 0),
-            Self::TransmitOverrun => (CLASS_CONTROLLER, TRANSMIT_OVERFLOW, 0, 0),
-            Self::TransmitTimeout => (CLASS_TRANSMIT_TIMEOUT, 0, 0, 0),
+            Self::Ack => (BUS_ERROR_CLASSES | ERROR_CLASS_ACK, 0, 0, ACK_ERROR_LOCATION),
+            Self::Bit0 => (BUS_ERROR_CLASSES, 0, BIT_0_ERROR, 0),
+            Self::Bit1 => (BUS_ERROR_CLASSES, 0, BIT_1_ERROR, 0),
+            Self::Crc => (BUS_ERROR_CLASSES, 0, SINGLE_BIT_ERROR, CRC_ERROR_LOCATION),
+            Self::Form => (BUS_ERROR_CLASSES, 0, FORM_ERROR, 0),
+            Self::Stuff => (BUS_ERROR_CLASSES, 0, STUFF_ERROR, 0),
+            Self::Bus | Self::ReceiveFailed => (BUS_ERROR_CLASSES, 0, 0, 0),
+            Self::TransmitFailed => (BUS_ERROR_CLASSES, 0, ERROR_ON_TRANSMISSION, 0),
+            Self::Arbitration => (ERROR_CLASS_LOST_ARBITRATION, 0, 0, 0),
+            Self::ReceiveOverrun => (ERROR_CLASS_CONTROLLER, RECEIVE_OVERFLOW, 0, 0),
+            Self::TransmitOverrun => (ERROR_CLASS_CONTROLLER, TRANSMIT_OVERFLOW, 0, 0),
+            Self::TransmitTimeout => (ERROR_CLASS_TRANSMIT_TIMEOUT, 0, 0, 0),
         }
     }
 }
@@ -189,7 +189,7 @@ pub struct AdapterReport {
 impl AdapterReport {
     /// Returns the reported faults.
     pub fn faults(self) -> impl Iterator<Item = AdapterFault> {
-        AdapterFault::ALL.into_iter().filter(move |&fault| self.has(fault))
+        AdapterFault::ALL.into_iter().filter(move |&fault| self.has_fault(fault))
     }
 
     /// Returns the controller state, if the report contains it.
@@ -208,7 +208,7 @@ impl AdapterReport {
     /// before the report. Returns `None` if there is no fault and the state has not changed.
     #[must_use]
     pub fn error_frame(self, before: BusState) -> Option<Frame> {
-        let bus_error = if self.is_bus_error { CLASS_PROTOCOL | CLASS_BUS_ERROR } else { 0 };
+        let bus_error = if self.is_bus_error { ERROR_CLASS_PROTOCOL | ERROR_CLASS_BUS_ERROR } else { 0 };
         let (mut class, mut controller, mut protocol, mut location) = (bus_error, 0, 0, 0);
         for error in self.faults().map(AdapterFault::error_frame_parts) {
             class |= error.0;
@@ -220,9 +220,9 @@ impl AdapterReport {
         let counters = self.counters;
         match changed {
             None => {}
-            Some(BusState::Off) => class |= CLASS_BUS_OFF,
+            Some(BusState::Off) => class |= ERROR_CLASS_BUS_OFF,
             Some(state) => {
-                class |= CLASS_CONTROLLER;
+                class |= ERROR_CLASS_CONTROLLER;
                 // The side with more errors caused the state.
                 controller |= counters.map_or_else(
                     || state.controller_bits(true, true),
@@ -236,29 +236,29 @@ impl AdapterReport {
         let byte = |count: u16| u8::try_from(count).unwrap_or(u8::MAX);
         let (mut transmit, mut receive) = (0, 0);
         if let Some(counters) = counters.filter(|_| changed != Some(BusState::Off)) {
-            class |= CLASS_COUNTERS;
+            class |= ERROR_CLASS_COUNTERS;
             (transmit, receive) = (byte(counters.transmit), byte(counters.receive));
         }
         let data = [0, controller, protocol, location, 0, 0, transmit, receive];
         Frame::with_data(ERROR | class, Format::Classic, 0, &data).ok()
     }
 
-    const fn has(self, fault: AdapterFault) -> bool {
+    const fn has_fault(self, fault: AdapterFault) -> bool {
         self.faults & fault as u16 != 0
     }
 
-    const fn with(mut self, fault: AdapterFault) -> Self {
+    const fn with_fault(mut self, fault: AdapterFault) -> Self {
         self.faults |= fault as u16;
         self
     }
 
     fn with_flags(self, flags: u8, meanings: &[(u8, AdapterFault)]) -> Self {
         let set = meanings.iter().filter(|(bit, _)| flags & bit != 0);
-        set.fold(self, |report, &(_, fault)| report.with(fault))
+        set.fold(self, |report, &(_, fault)| report.with_fault(fault))
     }
 
     /// Decodes a report from a line without its line ending; `None` for any other line.
-    pub(super) fn read(line: &[u8]) -> Option<Self> {
+    pub(super) fn parse_report(line: &[u8]) -> Option<Self> {
         match line {
             [b'e', count @ b'1'..=b'8', letters @ ..] => {
                 Self::decode_bus_errors(letters.get(..usize::from(count - b'0'))?)
@@ -268,16 +268,18 @@ impl AdapterReport {
                 let [flags, transmit, receive] = hex_bytes(digits)?;
                 let counters = Some(ErrorCounters { transmit: transmit.into(), receive: receive.into() });
                 let state = BusState::ALL.get(usize::from(state - b'0')).copied();
-                Some(Self { state, counters, ..Self::default() }.with_last_error(last - b'0').with_flags(
-                    flags,
-                    &[
-                        (0x01, AdapterFault::ReceiveFailed),
-                        (0x02, AdapterFault::TransmitFailed),
-                        (0x04, AdapterFault::TransmitOverrun),
-                        (0x08, AdapterFault::ReceiveOverrun),
-                        (0x10, AdapterFault::TransmitTimeout),
-                    ],
-                ))
+                Some(
+                    Self { state, counters, ..Self::default() }.with_last_error_code(last - b'0').with_flags(
+                        flags,
+                        &[
+                            (0x01, AdapterFault::ReceiveFailed),
+                            (0x02, AdapterFault::TransmitFailed),
+                            (0x04, AdapterFault::TransmitOverrun),
+                            (0x08, AdapterFault::ReceiveOverrun),
+                            (0x10, AdapterFault::TransmitTimeout),
+                        ],
+                    ),
+                )
             }
             &[b'F', high, low] => {
                 let flags = (digit(high)? << 4) | digit(low)?;
@@ -301,7 +303,7 @@ impl AdapterReport {
     /// Decodes a line of bus errors, one letter each. Returns `None` if a letter is unknown.
     fn decode_bus_errors(letters: &[u8]) -> Option<Self> {
         letters.iter().try_fold(Self { is_bus_error: true, ..Self::default() }, |report, letter| {
-            Some(report.with(match letter {
+            Some(report.with_fault(match letter {
                 b'a' => AdapterFault::Ack,
                 b'b' => AdapterFault::Bit0,
                 b'B' => AdapterFault::Bit1,
@@ -334,14 +336,14 @@ impl AdapterReport {
     }
 
     /// Adds the fault that stands for the controller's last error code.
-    const fn with_last_error(self, last: u8) -> Self {
+    const fn with_last_error_code(self, last: u8) -> Self {
         match last {
-            1 => self.with(AdapterFault::Stuff),
-            2 => self.with(AdapterFault::Form),
-            3 => self.with(AdapterFault::Ack),
-            4 => self.with(AdapterFault::Bit1),
-            5 => self.with(AdapterFault::Bit0),
-            6 => self.with(AdapterFault::Crc),
+            1 => self.with_fault(AdapterFault::Stuff),
+            2 => self.with_fault(AdapterFault::Form),
+            3 => self.with_fault(AdapterFault::Ack),
+            4 => self.with_fault(AdapterFault::Bit1),
+            5 => self.with_fault(AdapterFault::Bit0),
+            6 => self.with_fault(AdapterFault::Crc),
             _ => self,
         }
     }

@@ -348,7 +348,7 @@ fn a_bell_in_a_line_ends_it() {
     let mut decoder = Decoder::new();
     let lines: Vec<_> = b"t12\x07t1230\r".iter().filter_map(|&byte| decoder.push(byte)).collect();
     assert_eq!(lines, [SlcanLine::Failed, SlcanLine::Frame(Frame::classic(0x123, &[]).unwrap())]);
-    assert_eq!(decoder.refused(), RejectedLines { garbage: 1, ..RejectedLines::default() });
+    assert_eq!(decoder.rejected_lines(), RejectedLines { garbage: 1, ..RejectedLines::default() });
 }
 
 #[test]
@@ -361,7 +361,7 @@ fn what_was_refused_is_counted_by_reason() {
     assert!(decoder.discard_unfinished());
     assert!(!decoder.discard_unfinished());
     let expected = RejectedLines { garbage: 2, long: 2, short: 3, dlc: 1, identifier: 1 };
-    assert_eq!(decoder.refused(), expected);
+    assert_eq!(decoder.rejected_lines(), expected);
     assert_eq!(expected.total(), 9);
 }
 
@@ -416,8 +416,8 @@ proptest! {
         let ended: Vec<_> = bytes.iter().filter_map(|&byte| decoder.push(byte)).collect();
         let refused = ended.iter().filter(|line| matches!(line, SlcanLine::Refused(_))).count() as u64;
         let bells = bytes.iter().filter(|&&byte| byte == BEL).count() as u64;
-        prop_assert!((refused..=refused + bells).contains(&decoder.refused().total()));
-        prop_assert!(decoder.refused().total() <= bytes.len() as u64);
+        prop_assert!((refused..=refused + bells).contains(&decoder.rejected_lines().total()));
+        prop_assert!(decoder.rejected_lines().total() <= bytes.len() as u64);
     }
 
     #[test]

@@ -6,8 +6,8 @@
 //! `every_frame` computes the table from all possible frames. The maxima in the table are one to four bits below the
 //! usual formula, which treats the CRC as free.
 
-use super::{CLASSIC_TAIL_BITS, FrameBits, fd_bits, stuffing};
-use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_dlc, fd_len};
+use super::{CLASSIC_TAIL_BITS, FrameBits, fd_bits_from_counts, stuffing};
+use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_dlc, rounded_fd_len};
 
 /// The kind of a frame, as far as the number of bits depends on it.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
@@ -83,25 +83,25 @@ impl FrameShape {
     }
 
     fn fd_frame_bits(self, switched: bool, pick: fn(BitRange) -> u32) -> FrameBits {
-        let len = fd_len(usize::from(self.len));
+        let len = rounded_fd_len(usize::from(self.len));
         // RRS 0, IDE 0, or RRS 0 alone; then FDF 1, res 0, BRS.
         let fdf_res_brs = 0b100 | u64::from(switched);
-        let sof_id = StuffBits::IDLE.push_fixed(0, 1).push_any(11);
+        let sof_id = StuffBits::IDLE_BUS.push_known_bits(0, 1).push_unknown_bits(11);
         let (ways, head) = if self.extended {
-            (sof_id.push_fixed(0b11, 2).push_any(18).push_fixed(fdf_res_brs, 4), 36)
+            (sof_id.push_known_bits(0b11, 2).push_unknown_bits(18).push_known_bits(fdf_res_brs, 4), 36)
         } else {
-            (sof_id.push_fixed(fdf_res_brs, 5), 17)
+            (sof_id.push_known_bits(fdf_res_brs, 5), 17)
         };
         // After BRS only one state is possible for every identifier, so the rest is independent of it.
         let head = head + pick(ways.total_range());
         let dlc = u64::from(fd_dlc(len));
-        let ways = ways.with_reset_counts().push_any(1);
+        let ways = ways.with_reset_counts().push_unknown_bits(1);
         // A stuff bit after the last bit is the first fixed stuff bit, and is not counted here.
         let ways = match u32::try_from(len) {
-            Ok(0) | Err(_) => ways.push_fixed(dlc >> 1, 3),
-            Ok(len) => ways.push_fixed(dlc, 4).push_any(8 * len - 1),
+            Ok(0) | Err(_) => ways.push_known_bits(dlc >> 1, 3),
+            Ok(len) => ways.push_known_bits(dlc, 4).push_unknown_bits(8 * len - 1),
         };
-        fd_bits(switched, head, len, pick(ways.total_range()))
+        fd_bits_from_counts(switched, head, len, pick(ways.total_range()))
     }
 }
 
@@ -122,14 +122,14 @@ const REMOTE_EXTENDED_STUFF_BITS: [BitRange; 9] =
 
 /// For each state of stuffing, the minimum and maximum number of stuff bits in any sequence of bits that ends in it.
 #[derive(Clone, Copy)]
-struct StuffBits([Option<BitRange>; stuffing::STATES]);
+struct StuffBits([Option<BitRange>; stuffing::STATE_COUNT]);
 
 impl StuffBits {
     /// The idle bus before SOF: only state 4 is possible, as in [`stuffing::Run::IDLE`].
-    const IDLE: Self = Self([None, None, None, None, Some((0, 0)), None, None, None]);
+    const IDLE_BUS: Self = Self([None, None, None, None, Some((0, 0)), None, None, None]);
 
     /// Appends the lowest `count` bits of a word with their values.
-    fn push_fixed(self, word: u64, count: u32) -> Self {
+    fn push_known_bits(self, word: u64, count: u32) -> Self {
         (0..count).rev().fold(self, |ways, place| {
             let bit = (word >> place) & 1 == 1;
             ways.push_possible_bit(!bit, bit)
@@ -137,7 +137,7 @@ impl StuffBits {
     }
 
     /// Appends `count` bits that can have any value.
-    fn push_any(self, count: u32) -> Self {
+    fn push_unknown_bits(self, count: u32) -> Self {
         (0..count).fold(self, |ways, _| ways.push_possible_bit(true, true))
     }
 
@@ -148,17 +148,18 @@ impl StuffBits {
 
     /// Returns the minimum and maximum number of stuff bits over all states.
     fn total_range(self) -> BitRange {
-        self.0.into_iter().flatten().reduce(hull).unwrap_or((0, 0))
+        self.0.into_iter().flatten().reduce(enclosing_range).unwrap_or((0, 0))
     }
 
     fn push_possible_bit(self, zero: bool, one: bool) -> Self {
-        let mut then = [None; stuffing::STATES];
+        let mut then = [None; stuffing::STATE_COUNT];
         for (state, range) in (0..).zip(self.0) {
             for (bit, _) in [(0, zero), (1, one)].into_iter().filter(|&(_, may)| may) {
                 let (next, more) = stuffing::next_state(state, bit);
                 let range = range.map(|(min, most)| (min + u32::from(more), most + u32::from(more)));
                 if let Some(slot) = then.get_mut(usize::from(next)) {
-                    *slot = slot.map_or(range, |old| Some(range.map_or(old, |new| hull(old, new))));
+                    *slot =
+                        slot.map_or(range, |old| Some(range.map_or(old, |new| enclosing_range(old, new))));
                 }
             }
         }
@@ -166,6 +167,6 @@ impl StuffBits {
     }
 }
 
-fn hull(a: BitRange, b: BitRange) -> BitRange {
+fn enclosing_range(a: BitRange, b: BitRange) -> BitRange {
     (a.0.min(b.0), a.1.max(b.1))
 }

@@ -6,11 +6,11 @@
 
 /// Number of states. A state consists of three bits: the value of the repeated bit, and the number of repetitions minus
 /// one.
-pub(super) const STATES: usize = 8;
+pub(super) const STATE_COUNT: usize = 8;
 /// Number of sequences of up to eight bits. A sequence is encoded with a leading one.
-const SEQUENCES: usize = 512;
+const SEQUENCE_COUNT: usize = 512;
 /// For each state and sequence, the next state in the lowest three bits and the number of stuff bits above them.
-static TRANSITIONS: [u8; STATES * SEQUENCES] = compute_transitions();
+static STATE_TRANSITIONS: [u8; STATE_COUNT * SEQUENCE_COUNT] = compute_transitions();
 
 /// The current run of equal bits, and the number of stuff bits so far.
 #[derive(Clone, Copy, Debug)]
@@ -22,7 +22,7 @@ pub(super) struct BitRun {
 
 impl BitRun {
     /// The state of the idle bus: recessive bits, before the dominant first bit of a frame.
-    pub(super) const IDLE: Self = Self { state: 0b100, stuffed: 0 };
+    pub(super) const IDLE_BUS: Self = Self { state: 0b100, stuffed: 0 };
 
     /// Appends eight bits, most significant first.
     #[inline]
@@ -51,8 +51,8 @@ impl BitRun {
 
     #[inline]
     fn push_sequence(self, word: usize) -> Self {
-        let at = (usize::from(self.state) * SEQUENCES + word) % TRANSITIONS.len();
-        let step = TRANSITIONS.get(at).copied().unwrap_or(0);
+        let at = (usize::from(self.state) * SEQUENCE_COUNT + word) % STATE_TRANSITIONS.len();
+        let step = STATE_TRANSITIONS.get(at).copied().unwrap_or(0);
         Self { state: step & 7, stuffed: self.stuffed + u32::from(step >> 3) }
     }
 }
@@ -72,12 +72,12 @@ pub(super) const fn next_state(state: u8, bit: u8) -> (u8, u8) {
     clippy::cast_possible_truncation,
     reason = "worked out by the compiler, which would stop; a state has three bits"
 )]
-const fn compute_transitions() -> [u8; STATES * SEQUENCES] {
-    let mut steps = [0; STATES * SEQUENCES];
+const fn compute_transitions() -> [u8; STATE_COUNT * SEQUENCE_COUNT] {
+    let mut steps = [0; STATE_COUNT * SEQUENCE_COUNT];
     let mut state = 0;
-    while state < STATES {
+    while state < STATE_COUNT {
         let mut word = 1;
-        while word < SEQUENCES {
+        while word < SEQUENCE_COUNT {
             let (mut now, mut stuffed) = (state as u8, 0);
             let mut left = word.ilog2();
             while left > 0 {
@@ -86,7 +86,7 @@ const fn compute_transitions() -> [u8; STATES * SEQUENCES] {
                 now = then;
                 stuffed += more;
             }
-            steps[state * SEQUENCES + word] = (stuffed << 3) | now;
+            steps[state * SEQUENCE_COUNT + word] = (stuffed << 3) | now;
             word += 1;
         }
         state += 1;

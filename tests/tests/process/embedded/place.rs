@@ -58,7 +58,7 @@ fn a_directory_of_the_user_stays_and_one_of_ours_goes_with_its_last_bus() {
 fn leave_stale_socket(directory: &Path) {
     drop(protocol::bus::embedded::make_directory(directory).unwrap());
     let socket = rustix::net::socket(AddressFamily::UNIX, SocketType::SEQPACKET, None).unwrap();
-    rustix::net::bind(&socket, &address(directory, BUS).unwrap()).unwrap();
+    rustix::net::bind(&socket, &socket_address(directory, BUS).unwrap()).unwrap();
 }
 
 #[test]

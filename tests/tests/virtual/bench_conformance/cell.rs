@@ -225,7 +225,7 @@ impl VirtualBus {
         self.busy = self.busy.max(at);
         let mut out = Vec::new();
         while let Some(packet) = node.poll_transmit() {
-            out.extend(self.mutant.change_output(at, packet));
+            out.extend(self.mutant.change_output(at, *packet));
         }
         out.extend(self.mutant.additional_packets(at));
         for (delay, packet) in out {
@@ -342,12 +342,12 @@ impl TestBus for VirtualBus {
         }
     }
 
-    fn lateness(&mut self) -> Span {
+    fn bench_lateness(&mut self) -> Span {
         let seen = self.starved.as_mut().filter(|starved| starved.is_seen);
         seen.map_or(Span(0), |starved| core::mem::take(&mut starved.late))
     }
 
-    fn finish(&mut self) {}
+    fn ignore_signals(&mut self) {}
 
     fn can_restart(&self) -> bool {
         self.restarts

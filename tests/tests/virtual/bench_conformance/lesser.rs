@@ -33,7 +33,7 @@ pub(crate) const ALL: &[ReducedCase] = &[
                 _ => 0,
             };
             let Message::Configured { from, tag, .. } = message else { return vec![(0, message)] };
-            let unknown = Answer::Refused { number: asked, reason: Answer::UNKNOWN_PARAMETER };
+            let unknown = Answer::Refused { number: asked, reason: Answer::REFUSED_UNKNOWN_PARAMETER };
             let unknown = Message::Configured { from, tag, answer: unknown };
             vec![(0, if [11, 12].contains(&asked) { unknown } else { message })]
         }

@@ -94,7 +94,7 @@ impl Memory {
             Message::Halt => self.halted = true,
             Message::Resume => self.halted = false,
             Message::Stimulus { to, from, page }
-                if to.addresses(cell) && self.test_mode && self.pending.len() < 8 =>
+                if to.addresses_cell(cell) && self.test_mode && self.pending.len() < 8 =>
             {
                 let from = match (from, self.last) {
                     (StimulusStart::Epoch(first), Some((last, _))) if last.epochs_since(first) >= 0 => {
@@ -105,7 +105,7 @@ impl Memory {
                 self.pending.push((from, page));
             }
             Message::Configure { to, request: Request::Write { number, words }, .. }
-                if to.addresses(cell) && self.settled =>
+                if to.addresses_cell(cell) && self.settled =>
             {
                 if number == Parameter::Mode.number() {
                     self.test_mode = words[0] == 1;
@@ -156,7 +156,7 @@ impl FaultyCell {
     }
 
     fn message(&mut self, frame: &Frame) -> Option<Message> {
-        let id = protocol::packet::data_id(frame).ok()?;
+        let id = protocol::packet::data_frame_id(frame).ok()?;
         let packet = match self.format {
             Format::Fd => Packet::from_fd(frame).ok()?,
             Format::Classic => {
@@ -192,7 +192,7 @@ impl Mutant for FaultyCell {
         self.memory.now = now;
         let Ok(message) = Message::decode(&packet) else { return vec![(Span(0), packet)] };
         if let Message::Network { page: NetworkPage::Heartbeat(beat), .. } = message
-            && !beat.state.has(State::CLAIMING)
+            && !beat.state.has(State::CLAIMING_NODE_ID)
         {
             self.memory.settled = true;
         }
@@ -267,7 +267,7 @@ pub(crate) fn beat(message: &mut Message) -> Option<&mut Heartbeat> {
 /// Sets or clears a bit of the state.
 pub(crate) fn with(mut message: Message, bit: State, set: bool) -> Message {
     if let Some(beat) = beat(&mut message) {
-        beat.state = beat.state.with(bit, set);
+        beat.state = beat.state.with_flags(bit, set);
     }
     message
 }

@@ -5,7 +5,7 @@ use std::os::fd::OwnedFd;
 use std::time::Duration;
 
 use protocol::bus::batch::{is_memory_shortage, send_one};
-use protocol::bus::embedded::{ClientHello, HelloReply, MAX_HELLO_BYTES, VERSION};
+use protocol::bus::embedded::{ClientHello, HELLO_VERSION, HelloReply, MAX_HELLO_BYTES};
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
 use rustix::net::{RecvFlags, Shutdown, SocketFlags, shutdown, sockopt};
@@ -22,10 +22,10 @@ const MAX_ADMISSIONS: usize = 64;
 
 impl Server {
     /// Accepts waiting clients, at most [`ADMISSIONS`].
-    pub(super) fn accept(&mut self) {
+    pub(super) fn accept_clients(&mut self) {
         for _ in 0..MAX_ADMISSIONS {
             match self.accept_socket() {
-                Ok(socket) => self.admit(socket),
+                Ok(socket) => self.admit_client(socket),
                 Err(Errno::INTR | Errno::CONNABORTED) => {}
                 Err(Errno::AGAIN) => return,
                 // The system reports the lack of a file descriptor even if no client waits.
@@ -53,25 +53,25 @@ impl Server {
             let has_sent = close_connection(&socket);
             self.parting = (!has_sent).then_some(socket);
         } else {
-            self.close_parting();
+            self.close_parting_client();
             accepted?;
         }
         if self.parting.is_some() {
             return Err(Errno::MFILE);
         }
-        self.close_parting();
+        self.close_parting_client();
         Ok(())
     }
 
     /// Disconnects the client that uses the reserved file descriptor, and reserves the descriptor again.
-    pub(super) fn close_parting(&mut self) {
+    pub(super) fn close_parting_client(&mut self) {
         if let Some(socket) = self.parting.take() {
             close_connection(&socket);
         }
         self.spare = self.post.epoll.try_clone().ok();
     }
 
-    fn admit(&mut self, socket: OwnedFd) {
+    fn admit_client(&mut self, socket: OwnedFd) {
         let index = self.clients.iter().position(Option::is_none).unwrap_or(self.clients.len());
         let data = EventData::new_u64(index as u64);
         if epoll::add(&self.post.epoll, &socket, data, EventFlags::IN).is_err() {
@@ -104,7 +104,7 @@ impl Server {
         };
         let Some(hello) = hello else {
             // The client may have closed its socket already, so an error is ignored.
-            let _ = send_one(&client.socket, &HelloReply::Refused { version: VERSION }.encode());
+            let _ = send_one(&client.socket, &HelloReply::Refused { version: HELLO_VERSION }.encode());
             self.post.totals.refused += 1;
             return self.remove_client(id);
         };

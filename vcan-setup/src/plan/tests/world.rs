@@ -20,7 +20,7 @@ impl SimulatedKernel {
     }
 
     fn named(&self, name: &str) -> &Interface {
-        find(&self.here, name).unwrap_or_else(|| panic!("{name} is there: {self:?}"))
+        find_interface(&self.here, name).unwrap_or_else(|| panic!("{name} is there: {self:?}"))
     }
 
     fn by_number(&mut self, index: u32, name: &str) -> &mut Interface {
@@ -40,7 +40,7 @@ impl SimulatedKernel {
         let Step { name, action } = step;
         match action {
             StepAction::MakeVcan => {
-                assert!(find(&self.here, name).is_none(), "{name} is there already");
+                assert!(find_interface(&self.here, name).is_none(), "{name} is there already");
                 self.here.push(ours(name, next(&self.here)));
             }
             StepAction::MakePair { peer, namespace } => {
@@ -53,10 +53,10 @@ impl SimulatedKernel {
                     let peer = Peer { name: Some(peer.to_owned()), namespace_id, ..number(peer_index) };
                     Interface { ours: true, ..interface(name, index, InterfaceKind::Vxcan(Some(peer))) }
                 };
-                assert!(find(&self.here, name).is_none(), "{name} is there already");
+                assert!(find_interface(&self.here, name).is_none(), "{name} is there already");
                 self.here.push(end(name, first, second, peer, id));
                 let others = if namespace.is_some() { &mut self.there } else { &mut self.here };
-                assert!(find(others, peer).is_none(), "{peer} is there already");
+                assert!(find_interface(others, peer).is_none(), "{peer} is there already");
                 others.push(end(peer, second, first, name, back));
             }
             StepAction::BringUp { index } => self.ours(*index, name).up = true,
@@ -71,7 +71,7 @@ impl SimulatedKernel {
                 let InterfaceKind::Hardware(hardware) = &mut found.kind else {
                     panic!("no hardware: {found:?}")
                 };
-                assert_eq!(hardware.rates(), *before);
+                assert_eq!(hardware.bit_rates(), *before);
                 (hardware.bitrate, hardware.data_bitrate) = (rates.bitrate, rates.data_bitrate);
                 hardware.fd = rates.data_bitrate.is_some();
                 found.mtu = if hardware.fd { FD_MTU } else { CLASSIC_MTU };
@@ -155,7 +155,7 @@ proptest! {
         world in any_world(), target in any_target(), set: bool,
     ) {
         let Ok(plan) = plan_up(&target, &world.here, set) else {
-            let harmless = |target: &InterfaceTarget| find(&world.here, &target.name)
+            let harmless = |target: &InterfaceTarget| find_interface(&world.here, &target.name)
                 .map_or_else(|| target.hardware().is_none(), |it| it.is_virtual() && it.ours);
             prop_assert!(!target.iter().all(harmless), "refused, and all could have been had");
             return Ok(());
@@ -163,7 +163,7 @@ proptest! {
         let after = world.carry_out_all(&plan);
         for target in &target {
             let it = after.named(&target.name);
-            prop_assert!(it.is_can() && it.up && target.carried_by(it.mtu), "{it:?}");
+            prop_assert!(it.is_can() && it.up && target.fits_mtu(it.mtu), "{it:?}");
         }
         for before in &world.here {
             let hardware = matches!(before.kind, InterfaceKind::Hardware(_));
@@ -186,20 +186,20 @@ proptest! {
             let taken_along = before.peer().is_some_and(|peer| peer.namespace_id.is_none());
             prop_assert!(taken_along || end.named(&before.name) == before);
         }
-        prop_assert!(made.iter().all(|target| find(&end.here, &target.name).is_none()));
+        prop_assert!(made.iter().all(|target| find_interface(&end.here, &target.name).is_none()));
     }
 
     #[test]
     fn down_removes_what_is_ours_and_only_that(world in any_world(), target in any_target()) {
         let Ok(plan) = plan_down(&target, &world.here) else {
-            let foreign = |target: &InterfaceTarget| find(&world.here, &target.name)
+            let foreign = |target: &InterfaceTarget| find_interface(&world.here, &target.name)
                 .is_some_and(|it| !it.ours || !it.is_virtual());
             prop_assert!(target.iter().any(|target| target.skin.is_none() && foreign(target)));
             return Ok(());
         };
         let after = world.carry_out_all(&plan);
         for target in &target {
-            let unchanged = find(&after.here, &target.name);
+            let unchanged = find_interface(&after.here, &target.name);
             prop_assert!(unchanged.is_none_or(|it| !it.ours || !it.is_virtual()), "{unchanged:?}");
         }
         prop_assert_eq!(plan_down(&target, &after.here).unwrap().steps, []);

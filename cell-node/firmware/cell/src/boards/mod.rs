@@ -12,12 +12,12 @@ pub use stm32g4::SelectedBoard;
 
 use core::ptr::read_volatile;
 
-use protocol::factory::{ERASED, FactoryRecord, RECORD_BYTES};
+use protocol::factory::{ERASED_RECORD, FactoryRecord, RECORD_BYTES};
 
 /// The factory record, in a flash page of its own. The page is erased until the manufacturer writes it.
 #[used]
 #[unsafe(link_section = ".factory")]
-static FACTORY: [u8; RECORD_BYTES] = ERASED;
+static FACTORY: [u8; RECORD_BYTES] = ERASED_RECORD;
 
 unsafe extern "C" {
     /// The start of the pages for parameters; only its address is meaningful.

@@ -54,35 +54,35 @@ impl AxisFrame {
     pub(super) const BASE: Self = Self { known: [Axis::Level, Axis::Level, Axis::Up], base: true };
 
     /// Returns the known components of the z axis.
-    pub(super) fn z(self) -> Axis {
+    pub(super) fn z_axis(self) -> Axis {
         let [.., z] = self.known;
         z
     }
 
     /// Returns the products needed to rotate x and y by a turn about z.
-    pub(super) fn turn_products(self) -> RotationProducts {
+    pub(super) fn z_rotation_products(self) -> RotationProducts {
         let [x, y, _] = self.known;
         if self.base { RotationProducts::Base } else { RotationProducts::new(x, y) }
     }
 
     /// Returns the frame after a turn about z and a twist about the new x axis, and the products needed for the twist.
     pub(super) fn after_twist<N>(self, twist: Twist<N>) -> (Self, RotationProducts) {
-        let (x, v) = self.turn_products().axes();
-        let z = self.z();
+        let (x, v) = self.z_rotation_products().rotated_axes();
+        let z = self.z_axis();
         let mix = RotationProducts::new(v, z);
         let (y, z) = match twist {
             Twist::None => (v, z),
             Twist::Ahead => (z, v.opposite()),
             Twist::Half => (v.opposite(), z.opposite()),
             Twist::Back => (z.opposite(), v),
-            Twist::Other { .. } => mix.axes(),
+            Twist::Other { .. } => mix.rotated_axes(),
         };
         (Self { known: [x, y, z], base: false }, mix)
     }
 }
 
 impl Axis {
-    pub(super) fn is_upright(self) -> bool {
+    pub(super) fn is_vertical(self) -> bool {
         matches!(self, Self::Up | Self::Down)
     }
 
@@ -110,7 +110,7 @@ impl RotationProducts {
     }
 
     /// Returns the known components of both rotated axes.
-    fn axes(self) -> (Axis, Axis) {
+    fn rotated_axes(self) -> (Axis, Axis) {
         match self {
             Self::Base | Self::Level => (Axis::Level, Axis::Level),
             Self::Up | Self::Down | Self::First | Self::Second | Self::Both => (Axis::Any, Axis::Any),
@@ -154,9 +154,9 @@ impl BaseTransform {
     /// needed.
     pub(super) fn new(AxisFrame { known, .. }: AxisFrame, upright: bool) -> Self {
         let [_, y, z] = known;
-        let level = if y.is_upright() {
+        let level = if y.is_vertical() {
             HorizontalTerms::Xz
-        } else if z.is_upright() {
+        } else if z.is_vertical() {
             HorizontalTerms::Xy
         } else {
             HorizontalTerms::All
@@ -186,7 +186,7 @@ pub(super) struct Rotation<N>(pub(super) [N; 2]);
 impl<N: Number> Rotation<N> {
     /// Returns `c a + s b`, with cosine c and sine s.
     #[inline(always)]
-    pub(super) fn rotate_first(
+    pub(super) fn rotated_first_axis(
         self,
         mix: RotationProducts,
         &[a0, a1, a2]: &Vector<N>,
@@ -195,29 +195,49 @@ impl<N: Number> Rotation<N> {
         let Self([sine, cosine]) = self;
         match mix {
             RotationProducts::Base => [cosine, sine, N::zero()],
-            RotationProducts::Up => [product(cosine, a0), product(cosine, a1), sine],
-            RotationProducts::Down => [product(cosine, a0), product(cosine, a1), sine.bounded_negative()],
-            RotationProducts::Level => [self.sum(a0, b0), self.sum(a1, b1), N::zero()],
-            RotationProducts::Second => [self.sum(a0, b0), self.sum(a1, b1), product(sine, b2)],
-            RotationProducts::First => [self.sum(a0, b0), self.sum(a1, b1), product(cosine, a2)],
-            RotationProducts::Both => [self.sum(a0, b0), self.sum(a1, b1), self.sum(a2, b2)],
+            RotationProducts::Up => [rounded_product(cosine, a0), rounded_product(cosine, a1), sine],
+            RotationProducts::Down => {
+                [rounded_product(cosine, a0), rounded_product(cosine, a1), sine.bounded_negative()]
+            }
+            RotationProducts::Level => {
+                [self.cosine_a_plus_sine_b(a0, b0), self.cosine_a_plus_sine_b(a1, b1), N::zero()]
+            }
+            RotationProducts::Second => [
+                self.cosine_a_plus_sine_b(a0, b0),
+                self.cosine_a_plus_sine_b(a1, b1),
+                rounded_product(sine, b2),
+            ],
+            RotationProducts::First => [
+                self.cosine_a_plus_sine_b(a0, b0),
+                self.cosine_a_plus_sine_b(a1, b1),
+                rounded_product(cosine, a2),
+            ],
+            RotationProducts::Both => [
+                self.cosine_a_plus_sine_b(a0, b0),
+                self.cosine_a_plus_sine_b(a1, b1),
+                self.cosine_a_plus_sine_b(a2, b2),
+            ],
         }
     }
 
     /// Replaces a by `c a + s b`, and b by `c b - s a`, with cosine c and sine s.
     #[inline(always)]
-    pub(super) fn rotate_both(
+    pub(super) fn rotate_both_axes(
         self,
         mix: RotationProducts,
         [a0, a1, a2]: &mut Vector<N>,
         [b0, b1, b2]: &mut Vector<N>,
     ) {
         let Self([sine, cosine]) = self;
-        let turn = |a: &mut N, b: &mut N| (*a, *b) = (self.sum(*a, *b), self.difference(*b, *a));
+        let turn = |a: &mut N, b: &mut N| {
+            (*a, *b) = (self.cosine_a_plus_sine_b(*a, *b), self.cosine_b_minus_sine_a(*b, *a))
+        };
         // The cases in which the component of b or of a is zero.
-        let first =
-            |a: &mut N, b: &mut N| (*a, *b) = (product(cosine, *a), product(sine.bounded_negative(), *a));
-        let second = |a: &mut N, b: &mut N| (*a, *b) = (product(sine, *b), product(cosine, *b));
+        let first = |a: &mut N, b: &mut N| {
+            (*a, *b) = (rounded_product(cosine, *a), rounded_product(sine.bounded_negative(), *a))
+        };
+        let second =
+            |a: &mut N, b: &mut N| (*a, *b) = (rounded_product(sine, *b), rounded_product(cosine, *b));
         match mix {
             RotationProducts::Base => {
                 (*a0, *a1) = (cosine, sine);
@@ -251,23 +271,23 @@ impl<N: Number> Rotation<N> {
         }
     }
 
-    fn sum(self, a: N, b: N) -> N {
+    fn cosine_a_plus_sine_b(self, a: N, b: N) -> N {
         let Self([sine, cosine]) = self;
         N::round_bounded(N::bounded_plus(cosine.times(a), sine.times(b)))
     }
 
-    fn difference(self, b: N, a: N) -> N {
+    fn cosine_b_minus_sine_a(self, b: N, a: N) -> N {
         let Self([sine, cosine]) = self;
         N::round_bounded(N::bounded_minus(cosine.times(b), sine.times(a)))
     }
 }
 
-fn product<N: Number>(factor: N, number: N) -> N {
+fn rounded_product<N: Number>(factor: N, number: N) -> N {
     N::round_bounded(factor.times(number))
 }
 
 /// Negates an axis.
 #[inline(always)]
-pub(super) fn negate<N: Number>([x, y, z]: &mut Vector<N>) {
+pub(super) fn negate_axis<N: Number>([x, y, z]: &mut Vector<N>) {
     (*x, *y, *z) = (x.bounded_negative(), y.bounded_negative(), z.bounded_negative());
 }

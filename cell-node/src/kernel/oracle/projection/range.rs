@@ -12,17 +12,24 @@ use crate::kernel::Number;
 /// components adds less than two. Multiplying a vector by the axes, or by an axis, increases its length by at
 /// most that norm times itself; and no component of an axis exceeds 1 plus that norm. For 32 rows this is
 /// still below 1.1.
-pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links: &[ChainLink<N>]) -> bool {
+pub(super) fn stays_in_word_range<N: Number>(
+    force: Vector<N>,
+    position: Vector<N>,
+    links: &[ChainLink<N>],
+) -> bool {
     let off = links.iter().fold(0, |off, _| error_after_rotation(error_after_rotation(off)));
     let axes = (1 << 14) + off;
     // Rounding adds less than one step to a vector, and so does this division.
     let along = |norm: u32| ((axes * norm) >> 14) + 2;
     let within = |number: &u32| *number < (1 << 15) - 1;
-    let (Some(force), Some(mut reach)) = (N::norm(force).map(along), N::norm(position).map(along)) else {
+    let (Some(force), Some(mut reach)) =
+        (N::norm_upper_bound(force).map(along), N::norm_upper_bound(position).map(along))
+    else {
         return false;
     };
     for link in links {
-        let Some(length) = N::norm([N::from_word(link.a), N::from_word(link.d), N::zero()]) else {
+        let Some(length) = N::norm_upper_bound([N::from_word(link.a), N::from_word(link.d), N::zero()])
+        else {
             return false;
         };
         reach += along(length);
@@ -83,8 +90,8 @@ mod tests {
             let kernel = Projection::<CountingWord>::new(&arm(rows, &words));
             let held = Projection { bounded: false, ..kernel };
             prop_assert_eq!(
-                Operations::count(|| kernel.jacobian(&joints)),
-                Operations::count(|| held.jacobian(&joints))
+                Operations::count_operations(|| kernel.jacobian(&joints)),
+                Operations::count_operations(|| held.jacobian(&joints))
             );
         }
     }

@@ -1,7 +1,7 @@
 //! Rounding of sums with more than two products.
 
 use crate::kernel::Number;
-use crate::kernel::rounding::{Bounded, Rounding, Saturating};
+use crate::kernel::rounding::{NonSaturatingRounding, Rounding, SaturatingRounding};
 
 /// Roundings of sums that only the projection kernel needs, with saturation or without.
 pub(super) trait VectorSums: Rounding {
@@ -13,7 +13,7 @@ pub(super) trait VectorSums: Rounding {
     fn round<N: Number>(sum: N::WideSum) -> N;
 }
 
-impl VectorSums for Saturating {
+impl VectorSums for SaturatingRounding {
     #[inline(always)]
     fn add_products<N: Number>(number: N, first: N::WideSum, second: N::WideSum) -> N {
         N::round(N::plus(N::plus(number.widen(), first), second))
@@ -30,7 +30,7 @@ impl VectorSums for Saturating {
     }
 }
 
-impl VectorSums for Bounded {
+impl VectorSums for NonSaturatingRounding {
     #[inline(always)]
     fn add_products<N: Number>(number: N, first: N::WideSum, second: N::WideSum) -> N {
         number.bounded_add_product(N::bounded_plus(first, second))

@@ -105,11 +105,11 @@ proptest! {
         let settled = there.len().saturating_sub(4);
         let lost = |numbers: &[u64]| numbers.iter().filter(|number| !harm.has_torque(**number)).count() as u64;
         let changed = there.iter().filter(|it| harm.has_torque(**it) && harm.word(**it) != 40).count() as u64;
-        prop_assert_eq!(report.torques.missing(), lost(&there[..settled]));
+        prop_assert_eq!(report.torques.missing_count(), lost(&there[..settled]));
         prop_assert_eq!(report.torques.open, lost(&there[settled..]));
         prop_assert_eq!(report.torques.different, changed);
         prop_assert_eq!(report.torques.equal, there.len() as u64 - changed - lost(&there));
-        let is_equal = missing + report.torques.missing() + changed == 0;
+        let is_equal = missing + report.torques.missing_count() + changed == 0;
         prop_assert_eq!(report.equal, is_equal);
     }
 }

@@ -9,7 +9,7 @@ use protocol::wire_time::{FrameBits, FrameCoding, FrameShape};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::{AnswerPlan, BusCase, COMPUTATION_NS};
+use super::{AnswerPlan, BusCase, PAPER_COMPUTATION_NS};
 use bus_model::{BusModel, Priority, Request};
 
 /// The times that the cells need to compute their answers in an epoch.
@@ -153,7 +153,7 @@ fn simulate(case: &BusCase, epochs: u64, seed: u64, how: (Computation, Heartbeat
         let phase = match heartbeats {
             Heartbeats::Spread => (start + 250_000_000 * u64::from(node) / 255) % 250_000_000,
             Heartbeats::Any => bench.dice.random_range(0..250_000_000),
-            Heartbeats::Together => period + bench.dice.random_range(0..2 * case.frame_ns()),
+            Heartbeats::Together => period + bench.dice.random_range(0..2 * case.longest_frame_ns()),
         };
         for due in (0..).map(|it| phase + it * 250_000_000).take_while(|&due| due < end) {
             // Send a heartbeat as early as the rules allow: up to a period.
@@ -225,7 +225,7 @@ fn case(rates: &str, cells: u32) -> BusCase {
         format,
         rates: rates.parse().unwrap(),
         period_ns: 16_000_000,
-        computation_ns: COMPUTATION_NS,
+        computation_ns: PAPER_COMPUTATION_NS,
         sensing: Sensing::Off,
         answers: AnswerPlan::Torques { cells },
     }

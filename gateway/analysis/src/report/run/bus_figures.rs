@@ -4,7 +4,7 @@ use protocol::can::Frame;
 use protocol::candump::{Direction, Record};
 use protocol::id::{Command, Kind};
 use protocol::message::{Message, SensorPage};
-use protocol::packet::data_id;
+use protocol::packet::data_frame_id;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
@@ -73,7 +73,7 @@ pub(super) enum FrameEffect {
 /// Returns true for a frame that cells receive and that the gateway's table records. The capture does not contain the
 /// sender of a frame, but the identifier shows the receiver.
 fn is_for_cells(frame: &Frame) -> bool {
-    let Ok(id) = data_id(frame) else { return false };
+    let Ok(id) = data_frame_id(frame) else { return false };
     // A table counts a resume only in frames of others: the gateway knows its own.
     let is_resume = id.kind == Kind::Command && Command::from_byte(id.node) == Some(Command::Resume);
     id.sender().is_none() && !is_resume
@@ -135,7 +135,7 @@ impl BusFigures {
         is_of_frames_only: bool,
     ) -> Self {
         let mut table = BusTable::new(skin, bus);
-        table.set_comparing(true);
+        table.set_torque_comparison(true);
         let described = skin.buses.get(bus);
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
@@ -187,7 +187,7 @@ impl BusFigures {
         if now.0 >= self.received.last_timeout_check.0 + TIMEOUT_INTERVAL_US {
             self.received.last_timeout_check = now;
             self.table.handle_time(now);
-            for notice in self.table.notices() {
+            for notice in self.table.drain_notices() {
                 self.moments.record_notice(at, notice);
             }
         }
@@ -195,7 +195,7 @@ impl BusFigures {
             true => is_for_cells(&record.frame),
             false => record.direction == Some(Direction::Sent),
         };
-        let read = self.table.read(now, &record.frame);
+        let read = self.table.read_frame(now, &record.frame);
         let message = read.message();
         if let Some(message) = message {
             self.record_reply_time(now, message);
@@ -204,7 +204,7 @@ impl BusFigures {
         let seconds = FrameBits::from_frame(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
         self.load_of_all.add(at, seconds);
         let before = self.table.snapshot().sums;
-        self.table.receive(now, own, &read, &mut |_| None);
+        self.table.handle_read_frame(now, own, &read, &mut |_| None);
         let newest = self.table.newest_joints().map(|(number, _, _)| number);
         let is_next = newest.is_some() && newest != self.open.map(|open| open.number);
         if is_next {
@@ -213,7 +213,7 @@ impl BusFigures {
         }
         match message {
             Some(Message::Joints { joints, .. }) if is_next => {
-                Some(FrameEffect::Joints(self.central.positions(&joints.positions)))
+                Some(FrameEffect::Joints(self.central.joint_positions(&joints.positions)))
             }
             Some(Message::Halt) => Some(FrameEffect::Halted(true)),
             Some(Message::Resume) => Some(FrameEffect::Halted(false)),
@@ -251,7 +251,7 @@ impl BusFigures {
         let Message::Sensors { from, page: SensorPage::Skin(skin), .. } = message else { return };
         let Some(place) = self.table.cells().iter().position(|cell| cell.node == *from) else { return };
         if let Some(measured) = self.measured.get_mut(place) {
-            *measured = Some(self.central.force(place, skin));
+            *measured = Some(self.central.cell_force(place, skin));
         }
     }
 
@@ -265,7 +265,7 @@ impl BusFigures {
             .enumerate();
         let mut in_contact = Some(0);
         let forces = sensors.map(|(place, (((sensors, _), cell), measured))| {
-            let stimulated = sensors.map(|sensors| central.force(place, &sensors));
+            let stimulated = sensors.map(|sensors| central.cell_force(place, &sensors));
             let force = stimulated.or_else(|| measured.filter(|_| cell.is_measuring() == Some(true)));
             let is_known = !cell.is_ready() || force.is_some() && !cell.has_unseen_stimuli();
             let is_pressed = force.is_some_and(|force| force > 0.0);
@@ -278,7 +278,7 @@ impl BusFigures {
 
     /// Returns the counts of due and received replies over all epochs.
     pub(super) fn reply_counts(&self) -> Replies {
-        self.table.replies()
+        self.table.reply_counts()
     }
 
     /// Returns the number and the sum in Nm of the torque errors so far.

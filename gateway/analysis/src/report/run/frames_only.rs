@@ -8,7 +8,7 @@ use super::motion::TickSeries;
 
 /// A capture with frames only, as far as it has been read.
 #[derive(Debug)]
-pub(super) struct FramesOnly {
+pub(super) struct FramesOnlyCapture {
     /// Kind of the capture for use in a sentence, without article: `candump log`.
     pub(super) format: &'static str,
     /// Kind of the capture with its article, as the subject of a sentence: `a log`.
@@ -24,7 +24,7 @@ pub(super) struct FramesOnly {
     pub(super) began: Option<u64>,
 }
 
-impl FramesOnly {
+impl FramesOnlyCapture {
     pub(super) fn new(is_log: bool, skin_file: &str) -> Self {
         let (format, noun) =
             if is_log { ("candump log", "a log") } else { ("MCAP file of another program", "frames alone") };
@@ -33,7 +33,7 @@ impl FramesOnly {
     }
 
     /// Handles a frame on one of the skin's buses; `effect` is its effect on the series.
-    pub(super) fn receive(
+    pub(super) fn receive_frame(
         &mut self,
         (at, bus, effect): (f64, usize, Option<FrameEffect>),
         (skin, bus_figures): (&Skin, &[BusFigures]),
@@ -73,7 +73,7 @@ impl FramesOnly {
     }
 
     /// Returns the parts of the report that this capture cannot have, as list items.
-    pub(super) fn missing(&self, bus_figures: &[BusFigures], motion: &TickSeries) -> Vec<&'static str> {
+    pub(super) fn missing_parts(&self, bus_figures: &[BusFigures], motion: &TickSeries) -> Vec<&'static str> {
         let has_joints = bus_figures.iter().any(|it| it.joints.is_some());
         let compared = bus_figures.iter().any(|it| {
             let accuracy = it.table.accuracy();
@@ -116,16 +116,20 @@ mod tests {
 
     #[test]
     fn halts_are_turns_and_a_repeated_one_is_none() {
-        let skin = model::testing::skin();
+        let skin = model::testing::one_cell_skin();
         let mut motion = TickSeries::new(6);
-        let mut frames_only = FramesOnly::new(true, "skin.toml");
+        let mut frames_only = FramesOnlyCapture::new(true, "skin.toml");
         for (at, is_halted) in [(1.0, true), (1.1, true), (2.0, false), (3.0, false)] {
-            frames_only.receive((at, 0, Some(FrameEffect::Halted(is_halted))), (&skin, &[]), &mut motion);
+            frames_only.receive_frame(
+                (at, 0, Some(FrameEffect::Halted(is_halted))),
+                (&skin, &[]),
+                &mut motion,
+            );
         }
         frames_only.finish(&mut motion);
         assert_eq!(motion.changes, [(1.0, "halted"), (2.0, "goes on")]);
-        assert!((motion.seconds() - 3.0).abs() < 1e-9);
-        let missing = frames_only.missing(&[], &motion);
+        assert!((motion.duration_s() - 3.0).abs() < 1e-9);
+        let missing = frames_only.missing_parts(&[], &motion);
         assert_eq!(missing.first(), Some(&"joints, and with them torques and replies"));
     }
 }

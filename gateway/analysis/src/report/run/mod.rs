@@ -28,7 +28,7 @@ use super::figure::Page;
 use crate::fit::rates::{ChosenRates, RequestedRates};
 use crate::shadow::{self, Shadow};
 use bus_figures::BusFigures;
-use frames_only::FramesOnly;
+use frames_only::FramesOnlyCapture;
 use motion::TickSeries;
 use trace::capture::{
     CaptureEntry, CaptureError, CaptureFormat, CaptureNote, NoteKind, OtherMessage, Reader, RecordingExtras,
@@ -157,9 +157,9 @@ impl ReportOptions {
 /// Returns [`ReportError`] if the files are not a recording of a run, if they contain no run, or if CAN does not allow
 /// the bit rates.
 pub fn report(paths: &[PathBuf], options: &ReportOptions) -> Result<RunReport, ReportError> {
-    let (run, broken, is_damaged) = read(paths, options)?;
+    let (run, broken, is_damaged) = read_recording(paths, options)?;
     let missing = broken.map(|why| run.early_end_sentence(&why));
-    let page = page::page(&run, &options.command, missing.as_deref());
+    let page = page::report_page(&run, &options.command, missing.as_deref());
     let lacking = run.frames_only.as_ref().map(|it| format!("not in {}: {}", it.noun, run.missing_parts()));
     let remarks = lacking.into_iter().chain(run.remarks).collect();
     Ok(RunReport { page, missing, is_damaged, name: run.name, remarks })
@@ -169,12 +169,12 @@ pub fn report(paths: &[PathBuf], options: &ReportOptions) -> Result<RunReport, R
 ///
 /// # Errors
 /// Returns [`ReportError`] if a file is not a recording, or cannot be opened.
-pub fn check(paths: &[PathBuf], options: &ReportOptions) -> Result<(), ReportError> {
-    open(paths, options).map(drop)
+pub fn check_recordings(paths: &[PathBuf], options: &ReportOptions) -> Result<(), ReportError> {
+    open_recording(paths, options).map(drop)
 }
 
 /// Opens a recording. Also returns the size of its files in bytes, if known.
-fn open(paths: &[PathBuf], options: &ReportOptions) -> Result<(Reader, Option<u64>), ReportError> {
+fn open_recording(paths: &[PathBuf], options: &ReportOptions) -> Result<(Reader, Option<u64>), ReportError> {
     let mut items = Reader::open_with_all_topics(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
     let bytes =
@@ -200,8 +200,11 @@ fn open(paths: &[PathBuf], options: &ReportOptions) -> Result<(Reader, Option<u6
 }
 
 /// Reads the whole recording. Also returns the reason why it ends early, if it does, and true if that is damage.
-fn read(paths: &[PathBuf], options: &ReportOptions) -> Result<(RunData, Option<String>, bool), ReportError> {
-    let (mut items, bytes) = open(paths, options)?;
+fn read_recording(
+    paths: &[PathBuf],
+    options: &ReportOptions,
+) -> Result<(RunData, Option<String>, bool), ReportError> {
+    let (mut items, bytes) = open_recording(paths, options)?;
     let name = items.name().to_owned();
     // The header is known once the file is open, unless the file is damaged; then the damage is the reason.
     let begun = RunData::from_extras(&name, bytes.unwrap_or(0), (items.format(), items.extras()), options);
@@ -238,7 +241,7 @@ fn read(paths: &[PathBuf], options: &ReportOptions) -> Result<(RunData, Option<S
 }
 
 /// Creates the timing model of the real buses for which the load is computed.
-fn shadow(skin: &Skin, bus_figures: &[BusFigures]) -> Shadow {
+fn create_shadow(skin: &Skin, bus_figures: &[BusFigures]) -> Shadow {
     let rates = RequestedRates::default().rates().expect("the default rates are valid");
     let of_bus =
         bus_figures.iter().map(|bus_figures| (bus_figures.name.clone(), bus_figures.rates.rates)).collect();
@@ -282,7 +285,7 @@ struct RunData {
     /// Number of messages that do not match the type of their topic.
     unreadable: u64,
     /// The additional state for a capture with frames only.
-    frames_only: Option<FramesOnly>,
+    frames_only: Option<FramesOnlyCapture>,
     /// Warnings about a capture with frames only.
     remarks: Vec<String>,
 }
@@ -299,7 +302,7 @@ impl RunData {
         let recorded = extras.skin();
         let skin_file = options.skin.as_ref().map_or("", |(file, _)| file);
         let is_log = format == CaptureFormat::Candump;
-        let frames_only = recorded.is_none().then(|| FramesOnly::new(is_log, skin_file));
+        let frames_only = recorded.is_none().then(|| FramesOnlyCapture::new(is_log, skin_file));
         let Some(skin) = recorded.or_else(|| options.skin.clone().map(|(_, skin)| Ok(skin))) else {
             let what = format!("{SKIN_ATTACHMENT} is not attached to it");
             return Err(match &extras.unfinished {
@@ -320,10 +323,10 @@ impl RunData {
             Ok(BusFigures::new(&skin, at, rates, frames_only.is_some()))
         });
         let mut bus_figures = bus_figures.collect::<Result<Vec<_>, ReportError>>()?;
-        let mut shadow = shadow(&skin, &bus_figures);
+        let mut shadow = create_shadow(&skin, &bus_figures);
         for before in &extras.latched {
             shadow.receive_latched(&before.bus, before.nanos, &before.frame);
-            if let Some(bus_figures) = skin.bus_named(&before.bus).and_then(|bus| bus_figures.get_mut(bus)) {
+            if let Some(bus_figures) = skin.bus_index(&before.bus).and_then(|bus| bus_figures.get_mut(bus)) {
                 bus_figures.receive_latched(before);
             }
         }
@@ -353,17 +356,17 @@ impl RunData {
     fn receive_item(&mut self, item: &RecordingItem<'_>) {
         match item {
             RecordingItem::Entry(CaptureEntry::Frame(record)) => {
-                let at = self.seconds(record.time.nanos);
-                let zero = self.run_began.map_or(at, |nanos| self.seconds(nanos));
+                let at = self.seconds_since_start(record.time.nanos);
+                let zero = self.run_began.map_or(at, |nanos| self.seconds_since_start(nanos));
                 self.zero.get_or_insert(zero);
-                let bus = self.skin.bus_named(record.interface);
+                let bus = self.skin.bus_index(record.interface);
                 match bus.and_then(|bus| Some((bus, self.bus_figures.get_mut(bus)?))) {
                     Some((bus, bus_figures)) => {
                         let effect = bus_figures.receive_frame(at, record);
                         if let Some(frames_only) = &mut self.frames_only {
                             frames_only.began.get_or_insert(record.time.nanos);
                             let so_far = (&self.skin, self.bus_figures.as_slice());
-                            frames_only.receive((at, bus, effect), so_far, &mut self.motion);
+                            frames_only.receive_frame((at, bus, effect), so_far, &mut self.motion);
                         }
                         self.shadow.receive(record.interface, record.time.nanos, &record.frame);
                         self.add_real_load();
@@ -384,7 +387,7 @@ impl RunData {
     fn receive_note(&mut self, note: &CaptureNote<'_>) {
         match note.kind {
             NoteKind::Dropped(frames) => {
-                match self.skin.bus_named(note.interface).and_then(|bus| self.bus_figures.get_mut(bus)) {
+                match self.skin.bus_index(note.interface).and_then(|bus| self.bus_figures.get_mut(bus)) {
                     Some(bus_figures) => bus_figures.dropped = bus_figures.dropped.saturating_add(frames),
                     None => self.backlog = self.backlog.saturating_add(frames),
                 }
@@ -395,14 +398,14 @@ impl RunData {
     }
 
     fn receive_message(&mut self, other: &OtherMessage<'_>) {
-        let at = self.seconds(other.nanos);
+        let at = self.seconds_since_start(other.nanos);
         let [states, torques] = &self.topics;
         let taken = if other.topic == states {
-            read::joints(other.message).map(|joints| self.motion.record_joints(at, &joints))
+            read::decode_joints(other.message).map(|joints| self.motion.record_joints(at, &joints))
         } else if other.topic == torques {
-            read::torques(other.message).map(|torques| self.motion.record_torques(at, &torques))
+            read::decode_torques(other.message).map(|torques| self.motion.record_torques(at, &torques))
         } else if other.topic == "/gateway/timing" {
-            read::timing(other.message).map(|timing| self.motion.record_timing(at, &timing))
+            read::decode_loop_timing(other.message).map(|timing| self.motion.record_timing(at, &timing))
         } else {
             Ok(())
         };
@@ -410,15 +413,15 @@ impl RunData {
     }
 
     /// Converts a time in ns since 1970 to s after the first message.
-    fn seconds(&mut self, nanos: u64) -> f64 {
+    fn seconds_since_start(&mut self, nanos: u64) -> f64 {
         seconds_since(*self.began.get_or_insert(nanos), nanos)
     }
 
     /// Adds the frames whose load on the real bus the timing model has computed.
     fn add_real_load(&mut self) {
         while let Some(frame) = self.shadow.poll() {
-            let at = self.seconds(frame.nanos);
-            let bus = frame.bus.and_then(|bus| self.skin.bus_named(self.shadow.bus(bus)));
+            let at = self.seconds_since_start(frame.nanos);
+            let bus = frame.bus.and_then(|bus| self.skin.bus_index(self.shadow.bus(bus)));
             let bus_figures = bus.and_then(|bus| self.bus_figures.get_mut(bus));
             bus_figures.into_iter().for_each(|bus_figures| bus_figures.add_real_load(at, frame.bits));
         }
@@ -440,7 +443,7 @@ impl RunData {
 
     /// Returns the parts that a report on this capture with frames only lacks, as a list in words.
     fn missing_parts(&self) -> String {
-        let missing = self.frames_only.as_ref().map(|it| it.missing(&self.bus_figures, &self.motion));
+        let missing = self.frames_only.as_ref().map(|it| it.missing_parts(&self.bus_figures, &self.motion));
         missing.unwrap_or_default().join("; ")
     }
 
@@ -473,15 +476,16 @@ impl RunData {
     }
 
     /// Returns a value from the recording's metadata, by record and key.
-    fn fact(&self, record: &str, key: &str) -> Option<&str> {
+    fn metadata_value(&self, record: &str, key: &str) -> Option<&str> {
         let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
         facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }
 
     /// Returns a sentence about a recording that ends early; `why` is the reason.
     fn early_end_sentence(&self, why: &str) -> String {
-        let here = self.motion.seconds();
-        let planned = self.fact("configuration", "duration_s").and_then(|text| text.parse::<f64>().ok());
+        let here = self.motion.duration_s();
+        let planned =
+            self.metadata_value("configuration", "duration_s").and_then(|text| text.parse::<f64>().ok());
         let lacks = planned.filter(|planned| *planned > here).map_or_else(String::new, |planned| {
             format!(" of the planned {planned} s: {:.2} s are missing", planned - here)
         });

@@ -12,7 +12,7 @@ const MAX_KEPT_ENTRIES: usize = 500;
 
 /// Late, missing or lost items within a short time, listed as one loss.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Loss {
+pub(super) struct ListedLoss {
     /// Times of the first and the last epoch with a loss, in s after the recording's first message.
     pub(super) seconds: (f64, f64),
     pub(super) late: u64,
@@ -21,7 +21,7 @@ pub(super) struct Loss {
     pub(super) packets: u64,
 }
 
-impl Loss {
+impl ListedLoss {
     pub(super) const fn total(&self) -> u64 {
         self.late + self.missing + self.packets
     }
@@ -32,7 +32,7 @@ impl Loss {
 pub(super) struct BusProblems {
     /// Start times of the most recent epochs, newest first.
     opened: VecDeque<f64>,
-    pub(super) losses: Vec<Loss>,
+    pub(super) losses: Vec<ListedLoss>,
     pub(super) notices: Vec<(f64, Notice)>,
     /// Number of losses and notices that were not kept.
     pub(super) further: u64,
@@ -61,7 +61,7 @@ impl BusProblems {
                 last.packets += packets;
             }
             _ if is_full => self.further += 1,
-            _ => self.losses.push(Loss { seconds: (from, at), late, missing, packets }),
+            _ => self.losses.push(ListedLoss { seconds: (from, at), late, missing, packets }),
         }
     }
 
@@ -75,7 +75,7 @@ impl BusProblems {
     }
 
     /// Returns the loss for which `of` returns the highest count.
-    pub(super) fn largest_loss(&self, of: impl Fn(&Loss) -> u64) -> Option<&Loss> {
+    pub(super) fn largest_loss(&self, of: impl Fn(&ListedLoss) -> u64) -> Option<&ListedLoss> {
         self.losses.iter().filter(|loss| of(loss) > 0).max_by_key(|loss| of(loss))
     }
 }
@@ -101,6 +101,6 @@ mod tests {
         assert!((first.seconds.1 - 61.0 * 0.016).abs() < 1e-9, "{first:?}");
         assert!((second.seconds.0 - 149.0 * 0.016).abs() < 1e-9 && second.late == 1, "{second:?}");
         assert_eq!(moments.largest_loss(|loss| loss.late), Some(second));
-        assert_eq!(moments.largest_loss(Loss::total), Some(first));
+        assert_eq!(moments.largest_loss(ListedLoss::total), Some(first));
     }
 }

@@ -6,7 +6,7 @@ use trace::ros2::read::{Joints, Torques};
 use trace::ros2::skin::LoopTiming;
 
 /// Maximum number of changes of the control loop's state that are listed.
-const MAX_CHANGES: usize = 12;
+const MAX_LISTED_CHANGES: usize = 12;
 
 /// The series and counts of all ticks.
 #[derive(Debug, Default)]
@@ -59,7 +59,7 @@ pub(super) struct TickDurations {
 impl TickDurations {
     fn push(&mut self, at: f64, micros: f64) {
         self.line.push(at, micros);
-        self.times.record(nanos(micros));
+        self.times.record(micros_to_nanos(micros));
     }
 }
 
@@ -70,14 +70,18 @@ impl TickSeries {
     }
 
     pub(super) fn record_joints(&mut self, at: f64, joints: &Joints) {
-        push(&mut self.position, at, joints.position.iter().copied());
-        push(&mut self.velocity, at, joints.velocity.iter().copied());
+        push_points(&mut self.position, at, joints.position.iter().copied());
+        push_points(&mut self.velocity, at, joints.velocity.iter().copied());
     }
 
     pub(super) fn record_torques(&mut self, at: f64, torques: &Torques) {
-        push(&mut self.distributed, at, torques.distributed.iter().copied());
+        push_points(&mut self.distributed, at, torques.distributed.iter().copied());
         // Without a central computation, the line has a gap.
-        push(&mut self.central, at, torques.central.iter().copied().chain(std::iter::repeat(f64::NAN)));
+        push_points(
+            &mut self.central,
+            at,
+            torques.central.iter().copied().chain(std::iter::repeat(f64::NAN)),
+        );
         let compared = !torques.central.is_empty();
         self.active.push(at, if compared { torques.active.into() } else { f64::NAN });
         if compared {
@@ -95,7 +99,7 @@ impl TickSeries {
     pub(super) fn record_timing(&mut self, at: f64, timing: &LoopTiming) {
         self.first.get_or_insert(at);
         self.last = self.last.max(at);
-        self.counts.record(timing, self.number.replace(timing.tick));
+        self.counts.record_tick(timing, self.number.replace(timing.tick));
         if timing.skipped > self.skip.map_or(0, |(_, skipped)| skipped) {
             self.skip = Some((at, timing.skipped));
         }
@@ -106,7 +110,7 @@ impl TickSeries {
             self.central_took.push(at, timing.central_us);
         } else {
             self.central_took.line.push(at, f64::NAN);
-            self.plain.record(nanos(timing.took_us));
+            self.plain.record(micros_to_nanos(timing.took_us));
         }
         if timing.halted != self.halt {
             self.halt = timing.halted;
@@ -115,20 +119,20 @@ impl TickSeries {
     }
 
     pub(super) fn record_change(&mut self, at: f64, what: &'static str) {
-        if self.changes.len() < MAX_CHANGES {
+        if self.changes.len() < MAX_LISTED_CHANGES {
             self.changes.push((at, what));
         }
     }
 
     /// Returns the time from the first tick to the last, in s.
-    pub(super) fn seconds(&self) -> f64 {
+    pub(super) fn duration_s(&self) -> f64 {
         self.first.map_or(0.0, |first| self.last - first)
     }
 }
 
 impl TickCounts {
     /// Counts a tick, and the skipped or unrecorded ones since the tick with the number `before`.
-    fn record(&mut self, timing: &LoopTiming, before: Option<u64>) {
+    fn record_tick(&mut self, timing: &LoopTiming, before: Option<u64>) {
         self.ticks += 1;
         self.skipped = self.skipped.saturating_add(timing.skipped);
         if let Some(before) = before {
@@ -141,7 +145,7 @@ impl TickCounts {
     }
 }
 
-fn push(lines: &mut [ThinnedLine], at: f64, values: impl Iterator<Item = f64>) {
+fn push_points(lines: &mut [ThinnedLine], at: f64, values: impl Iterator<Item = f64>) {
     lines.iter_mut().zip(values).for_each(|(line, value)| line.push(at, value));
 }
 
@@ -150,7 +154,7 @@ fn push(lines: &mut [ThinnedLine], at: f64, values: impl Iterator<Item = f64>) {
     clippy::cast_sign_loss,
     reason = "not negative, and below 2^53 ns"
 )]
-fn nanos(micros: f64) -> u64 {
+fn micros_to_nanos(micros: f64) -> u64 {
     (micros.max(0.0) * 1e3).round() as u64
 }
 

@@ -9,21 +9,21 @@ mod skin;
 
 use super::RunData;
 use super::bus_figures::BusFigures;
-use super::frames_only::FramesOnly;
-use super::moments::Loss;
+use super::frames_only::FramesOnlyCapture;
+use super::moments::ListedLoss;
 use crate::paper;
 use crate::report::figure::{
-    Axis, Figure, Finding, MarkLine, Page, Section, Series, Shape, number, quantity,
+    Axis, Figure, Finding, MarkLine, Page, Section, Series, SeriesShape, format_number, format_quantity,
 };
 use crate::report::thin::ThinnedLine;
-use model::table::{Accuracy, CellState, Uplink};
+use model::table::{CellState, TorqueAccuracy, UplinkCounts};
 
 /// The paper's number of cells, control loop rate and broadcast rate.
 const PAPER_CELLS: f64 = 253.0;
 const PAPER_CONTROL_HZ: f64 = 500.0;
 const PAPER_BROADCAST_HZ: f64 = 62.5;
 /// The paper's law of the central computation (Eq. 29 and 30), in µs: per active cell, per cell, and fixed.
-const PAPER_CENTRAL_US: [f64; 3] = [0.798, 0.827, 10.7];
+const PAPER_CENTRAL_TIME_US: [f64; 3] = [0.798, 0.827, 10.7];
 
 /// Maximum number of stuck cells that are listed.
 const MAX_LISTED_CELLS: usize = 10;
@@ -35,7 +35,7 @@ struct PageDraft<'a> {
     zero: f64,
 }
 
-pub(super) fn page(run: &RunData, command: &str, missing: Option<&str>) -> Page {
+pub(super) fn report_page(run: &RunData, command: &str, missing: Option<&str>) -> Page {
     let draft = PageDraft { run, zero: run.motion.first.unwrap_or(0.0) };
     let mut intro = match &run.frames_only {
         Some(frames_only) => intro_of_frames(run, frames_only),
@@ -44,13 +44,18 @@ pub(super) fn page(run: &RunData, command: &str, missing: Option<&str>) -> Page 
     if let Some(missing) = missing {
         intro = format!("The run is incomplete: {missing}. {intro}");
     }
-    let mut sections = vec![draft.summary(), draft.skin()];
+    let mut sections = vec![draft.summary_section(), draft.touch_section()];
     if run.motion.counts.ticks > 0 || run.has_joints() {
-        sections.extend([draft.torque(), draft.motion(), draft.cells(), draft.cycle()]);
+        sections.extend([
+            draft.torque_section(),
+            draft.motion_section(),
+            draft.cells_section(),
+            draft.cycle_section(),
+        ]);
     }
-    sections.extend([draft.replies(), draft.load(), draft.losses()]);
+    sections.extend([draft.replies_section(), draft.load_section(), draft.losses_section()]);
     let of = if run.frames_only.is_some() { "a capture" } else { "a run" };
-    let facts = facts::facts(run, command);
+    let facts = facts::capture_facts(run, command);
     Page { title: format!("{}: report on {of}", run.skin.name), intro, facts, sections }
 }
 
@@ -59,19 +64,19 @@ fn intro_of_run(run: &RunData) -> String {
         "A run of {} on {} and {} of its {} control loop, from the recording {}. Times count from the first tick.",
         skin_size_text(run),
         count_text(run.skin.buses.len(), "bus", "buses"),
-        format_seconds(run.motion.seconds()),
-        quantity(run.skin.timing.control_hz, "Hz"),
+        format_seconds(run.motion.duration_s()),
+        format_quantity(run.skin.timing.control_hz, "Hz"),
         run.name,
     )
 }
 
-fn intro_of_frames(run: &RunData, frames_only: &FramesOnly) -> String {
+fn intro_of_frames(run: &RunData, frames_only: &FramesOnlyCapture) -> String {
     let remarks: String = run.remarks.iter().map(|remark| format!(" {remark}.")).collect();
     format!(
         "Frames of {} on {} during {}, from the {} {}. Times count from the first joints message. Not in {}: {}.{remarks}",
         skin_size_text(run),
         count_text(run.skin.buses.len(), "bus", "buses"),
-        format_seconds(run.motion.seconds()),
+        format_seconds(run.motion.duration_s()),
         frames_only.format,
         run.name,
         frames_only.noun,
@@ -84,7 +89,7 @@ fn skin_size_text(run: &RunData) -> String {
 }
 
 fn format_seconds(seconds: f64) -> String {
-    quantity((seconds * 100.0).round() / 100.0, "s")
+    format_quantity((seconds * 100.0).round() / 100.0, "s")
 }
 
 impl PageDraft<'_> {
@@ -92,18 +97,18 @@ impl PageDraft<'_> {
         thinned.points().into_iter().map(|(x, y)| (x - self.zero, y)).collect()
     }
 
-    fn line(&self, caption: impl Into<String>, thinned: &ThinnedLine) -> Series {
-        Series::new(caption, Shape::Line, self.points(thinned))
+    fn thinned_series(&self, caption: impl Into<String>, thinned: &ThinnedLine) -> Series {
+        Series::new(caption, SeriesShape::Line, self.points(thinned))
     }
 
     /// Creates a figure of full width over the time of the run.
-    fn figure(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
-        Figure::new(name, title, self.time(), y)
+    fn time_figure(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
+        Figure::new(name, title, self.time_axis(), y)
     }
 
-    fn time(&self) -> Axis {
+    fn time_axis(&self) -> Axis {
         let axis = Axis::new("time", "s");
-        let seconds = self.run.motion.seconds();
+        let seconds = self.run.motion.duration_s();
         if seconds > 0.0 { axis.with_ends(0.0, seconds) } else { axis }
     }
 
@@ -116,7 +121,7 @@ impl PageDraft<'_> {
     }
 
     /// Creates the section with all numbers that the paper has, too, and with the requirements.
-    fn summary(&self) -> Section {
+    fn summary_section(&self) -> Section {
         let (skin, motion) = (&self.run.skin, &self.run.motion);
         let mut findings = Vec::new();
         let accuracy = self
@@ -124,7 +129,7 @@ impl PageDraft<'_> {
             .bus_figures
             .iter()
             .map(|bus_figures| bus_figures.table.accuracy())
-            .reduce(Accuracy::merged);
+            .reduce(TorqueAccuracy::merged);
         let accuracy = accuracy.unwrap_or_default();
         let farthest = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.largest_error);
         let farthest =
@@ -146,21 +151,21 @@ impl PageDraft<'_> {
             let median = central.value_at_quantile(0.5) as f64 * 1e-3;
             let (active, ticks) = motion.active_sum;
             let active = active as f64 / ticks.max(1) as f64;
-            let [of_active, of_each, of_none] = PAPER_CENTRAL_US;
+            let [of_active, of_each, of_none] = PAPER_CENTRAL_TIME_US;
             let law = of_active * active + of_each * skin.cells.len() as f64 + of_none;
             let what = format!(
                 "central computation per tick, median (paper: value of its formula for {} cells, {} of them active on average)",
                 skin.cells.len(),
-                number((active * 10.0).round() / 10.0)
+                format_number((active * 10.0).round() / 10.0)
             );
             findings.push(Finding::less_is_better(what, law, (median, "µs")));
         }
         findings.push(Finding::new_unrated("cells", skin.cells.len() as f64).with_paper_value(PAPER_CELLS));
-        if motion.seconds() > 0.0 {
+        if motion.duration_s() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
             if motion.counts.ticks > 0 {
                 let ticks = motion.counts.ticks.saturating_add(motion.counts.unrecorded);
-                let loop_hz = hertz(ticks, motion.seconds());
+                let loop_hz = hertz(ticks, motion.duration_s());
                 findings
                     .push(Finding::new_unrated("control loop", loop_hz).with_paper_value(PAPER_CONTROL_HZ));
             }
@@ -171,7 +176,7 @@ impl PageDraft<'_> {
                 findings.push(finding.with_paper_value(PAPER_BROADCAST_HZ));
             }
             if motion.counts.ticks > 0 {
-                let skipped = zero_required("ticks skipped".to_owned(), motion.counts.skipped);
+                let skipped = zero_required_finding("ticks skipped".to_owned(), motion.counts.skipped);
                 findings.push(skipped.with_command(motion.skip.map(|(at, _)| self.view_command(at))));
             }
         }
@@ -180,19 +185,20 @@ impl PageDraft<'_> {
         if due > 0 {
             let what = format!("replies not received before the next joints message, of {due} due");
             let period = 1.0 / skin.timing.broadcast_hz();
-            let bar = format!("none after {}", quantity(period, "s"));
+            let bar = format!("none after {}", format_quantity(period, "s"));
             let late = due - in_time;
             let finding = Finding::new_unrated(what, late as f64).with_requirement(bar, late == 0);
-            let worst = self.worst_loss(|loss| loss.late + loss.missing);
+            let worst = self.worst_loss_command(|loss| loss.late + loss.missing);
             findings.push(finding.with_origin("skin: joint_broadcast_hz").with_command(worst));
         }
-        findings.extend(self.beyond_range());
+        findings.extend(self.range_findings());
         findings.extend(self.fit_findings());
-        let uplink: Uplink = self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
-        let lost = zero_required("packets of cells lost, by their own count".to_owned(), uplink.lost);
-        findings.push(lost.with_command(self.worst_loss(|loss| loss.packets)));
+        let uplink: UplinkCounts =
+            self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
+        let lost = zero_required_finding("packets of cells lost, by their own count".to_owned(), uplink.lost);
+        findings.push(lost.with_command(self.worst_loss_command(|loss| loss.packets)));
         findings.extend(self.stuck_cells_finding());
-        Section::new("summary", "In numbers").findings(findings).text(
+        Section::new("summary", "In numbers").with_findings(findings).with_paragraph(
             "Compared with the paper (Efficient Distributed Torque Computation for Large Scale Robot Skin). Numbers within \
              5 % of the paper's count as the same. The commands show the recording where a number is worst.",
         )
@@ -203,7 +209,7 @@ impl PageDraft<'_> {
         let cells = self.run.bus_figures.iter().flat_map(|bus_figures| {
             let name = |cell: &CellState| {
                 let kinds: Vec<_> =
-                    cell.stuck().map(|(kind, count)| format!("{count} times one {kind}")).collect();
+                    cell.stuck_word_runs().map(|(kind, count)| format!("{count} times one {kind}")).collect();
                 (!kinds.is_empty())
                     .then(|| format!("{} {}: {}", bus_figures.name, cell.node, kinds.join(", ")))
             };
@@ -216,7 +222,7 @@ impl PageDraft<'_> {
             "stuck cells, which sent constant words while the expected words changed ({}{more})",
             named.join("; ")
         );
-        (!cells.is_empty()).then(|| zero_required(what, cells.len() as u64))
+        (!cells.is_empty()).then(|| zero_required_finding(what, cells.len() as u64))
     }
 
     /// Returns a sentence about a part that only a recording of a run has; `None` for such a recording.
@@ -226,7 +232,7 @@ impl PageDraft<'_> {
     }
 
     /// Returns the command that shows the loss with the highest count.
-    fn worst_loss(&self, of: impl Fn(&Loss) -> u64) -> Option<String> {
+    fn worst_loss_command(&self, of: impl Fn(&ListedLoss) -> u64) -> Option<String> {
         let all = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.moments.largest_loss(&of));
         all.max_by_key(|loss| of(loss)).map(|loss| self.view_command(loss.seconds.0))
     }
@@ -239,7 +245,7 @@ fn without_empty_series(mut figure: Figure) -> Option<Figure> {
 }
 
 /// Creates a finding whose count must be zero.
-fn zero_required(what: String, count: u64) -> Finding {
+fn zero_required_finding(what: String, count: u64) -> Finding {
     Finding::new_unrated(what, count as f64).with_requirement("none", count == 0).with_origin("default")
 }
 

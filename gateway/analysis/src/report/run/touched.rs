@@ -7,7 +7,7 @@ use protocol::skin::Skin;
 
 /// Maximum number of bins, and their initial width in s.
 const MAX_BINS: usize = 600;
-const INITIAL_BIN_S: f64 = 0.016;
+const INITIAL_BIN_WIDTH_S: f64 = 0.016;
 /// Maximum number of touches that are kept with their details.
 const MAX_TOUCHES: usize = 2_000;
 
@@ -48,7 +48,7 @@ impl TouchHistory {
     pub(super) fn new(skin: &Skin, bus: usize) -> Self {
         let rows: Vec<_> = skin.cells_on_bus(bus).map(|cell| cell.row).collect();
         Self {
-            width: INITIAL_BIN_S,
+            width: INITIAL_BIN_WIDTH_S,
             bins: BTreeMap::new(),
             max: vec![None; rows.len()],
             now: vec![0.0; rows.len()],
@@ -62,7 +62,7 @@ impl TouchHistory {
 
     /// Records new joints on the bus at `at` in s, with the force on each cell since these joints in N, where known.
     pub(super) fn record_joints(&mut self, at: f64, forces: impl Iterator<Item = Option<f64>>) {
-        self.extend_to(at);
+        self.extend_bins_to(at);
         self.at = Some(at);
         for (place, force) in forces.enumerate().take(self.rows.len()) {
             if let (Some(max), Some(force)) = (self.max.get_mut(place), force) {
@@ -73,7 +73,7 @@ impl TouchHistory {
                 *now = force;
             }
             if force > 0.0 {
-                self.touch(at, place, force);
+                self.extend_touch(at, place, force);
             }
         }
         let rows: Vec<_> = self.open.keys().copied().collect();
@@ -85,7 +85,7 @@ impl TouchHistory {
         }
     }
 
-    fn touch(&mut self, at: f64, place: usize, force: f64) {
+    fn extend_touch(&mut self, at: f64, place: usize, force: f64) {
         let Some(row) = self.rows.get(place).copied() else { return };
         let touch = self.open.entry(row).or_insert_with(|| Touch {
             row,
@@ -117,7 +117,7 @@ impl TouchHistory {
         clippy::cast_sign_loss,
         reason = "not negative; wide bins are few"
     )]
-    fn extend_to(&mut self, at: f64) {
+    fn extend_bins_to(&mut self, at: f64) {
         let Some(from) = self.at.map(|from| from.max(0.0)).filter(|from| at > *from) else { return };
         while at / self.width >= MAX_BINS as f64 {
             self.width *= 2.0;
@@ -145,7 +145,7 @@ impl TouchHistory {
     }
 
     /// Returns for each touched cell its index, and the bins: start and end in s, and the largest force in N.
-    pub(super) fn cells(&self) -> impl Iterator<Item = (usize, Vec<(f64, f64, f64)>)> + '_ {
+    pub(super) fn touch_bins_by_cell(&self) -> impl Iterator<Item = (usize, Vec<(f64, f64, f64)>)> + '_ {
         self.bins.iter().map(|(place, bins)| {
             let place_of = |at: usize| at as f64 * self.width;
             let touched = bins.iter().enumerate().filter(|(_, force)| **force > 0.0);
@@ -179,7 +179,7 @@ mod tests {
         for (at, force) in [(0.0, 0.0), (0.16, 2.0), (0.32, 5.0), (0.48, 0.0), (0.64, 0.0)] {
             joints(&mut touched, at, &[(3, force)]);
         }
-        let cells: Vec<_> = touched.cells().collect();
+        let cells: Vec<_> = touched.touch_bins_by_cell().collect();
         let [(3, values)] = cells.as_slice() else { panic!("{cells:?}") };
         let of = |force: f64| values.iter().filter(|value| (value.2 - force).abs() < 1e-9).count();
         assert_eq!((of(2.0), of(5.0), values.len()), (10, 10, 20));
@@ -209,7 +209,7 @@ mod tests {
             let force = if epoch == 100_000 { 7.0 } else { 0.0 };
             joints(&mut touched, f64::from(epoch) * 0.016, &[(5, force)]);
         }
-        let cells: Vec<_> = touched.cells().collect();
+        let cells: Vec<_> = touched.touch_bins_by_cell().collect();
         let [(5, values)] = cells.as_slice() else { panic!("{cells:?}") };
         let [(from, to, force)] = values[..] else { panic!("{values:?}") };
         assert!(from <= 1_600.0 && to >= 1_600.016 && to - from < 10.0, "{from} {to}");

@@ -4,21 +4,23 @@ use std::fmt::Write as _;
 
 use protocol::xml::escaped;
 
-use super::super::figure::{Axis, CellMap, CellStrip, Drawing, FigureWidth, Legend, Panel, quantity};
+use super::super::figure::{
+    Axis, CellMap, CellStrip, ColourLegend, Drawing, FigureWidth, LinkPanel, format_quantity,
+};
 use super::super::scale::AxisSpan;
-use super::colour::{BACKGROUND_COLOURS, LEVEL_COUNT, colours, level};
-use super::{FAINT, INK, LETTER_SIZE, dark_rules, natural_size};
+use super::colour::{BACKGROUND_COLOURS, COLOUR_LEVEL_COUNT, colour_level, level_colours};
+use super::{FAINT_TEXT_COLOUR, LETTER_SIZE_PX, TEXT_COLOUR, dark_css_rules, natural_size};
 
 /// Mean width of a letter, in pixels.
-const LETTER_WIDTH: f64 = 0.56 * LETTER_SIZE;
+const LETTER_WIDTH_PX: f64 = 0.56 * LETTER_SIZE_PX;
 /// Margin of a drawing, in pixels.
 const MARGIN_PX: f64 = 12.0;
 /// Height of the legend with the space below it, in pixels.
-const LEGEND_HEIGHT: f64 = 52.0;
+const LEGEND_HEIGHT_PX: f64 = 52.0;
 /// Height of the heading of a panel or group, in pixels.
-const HEADING_HEIGHT: f64 = 24.0;
+const HEADING_HEIGHT_PX: f64 = 24.0;
 /// Maximum distance between the centres of adjacent cells, in pixels.
-const MAX_PITCH: f64 = 18.0;
+const MAX_CELL_PITCH_PX: f64 = 18.0;
 /// Overlap of adjacent areas in pixels, so that no seams are visible.
 const SEAM_OVERLAP_PX: f64 = 0.3;
 /// Distance between cells in m that is assumed for a link with a single cell.
@@ -26,32 +28,32 @@ const SINGLE_CELL_PITCH_M: f64 = 0.028;
 
 /// Draws a standalone SVG file.
 #[must_use]
-pub fn draw(drawing: &Drawing) -> String {
-    let style = format!("<style>{}</style>\n", dark_rules());
+pub fn draw_cells(drawing: &Drawing) -> String {
+    let style = format!("<style>{}</style>\n", dark_css_rules());
     let (width, _) = natural_size(FigureWidth::Wide);
-    let (height, body) = body(drawing, width.into());
+    let (height, body) = draw_body(drawing, width.into());
     let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
-    document(drawing, (width.into(), height), &attributes, &format!("{style}{body}"))
+    svg_document(drawing, (width.into(), height), &attributes, &format!("{style}{body}"))
 }
 
-/// Draws cells as an element of a page that contains the CSS rules of [`dark_rules`](super::dark_rules); `width` is the width in pixels before
+/// Draws cells as an element of a page that contains the CSS rules of [`dark_rules`](super::dark_css_rules); `width` is the width in pixels before
 /// scaling.
 #[must_use]
 pub fn draw_inline(drawing: &Drawing, width: u32, class: &str) -> String {
-    let (height, body) = body(drawing, width.into());
-    document(drawing, (width.into(), height), &format!("class=\"{class}\""), &body)
+    let (height, body) = draw_body(drawing, width.into());
+    svg_document(drawing, (width.into(), height), &format!("class=\"{class}\""), &body)
 }
 
-fn document(drawing: &Drawing, (width, height): (f64, f64), attributes: &str, body: &str) -> String {
+fn svg_document(drawing: &Drawing, (width, height): (f64, f64), attributes: &str, body: &str) -> String {
     let title = escaped(drawing.title());
     format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" role=\"img\" {attributes} \
-         font-size=\"{LETTER_SIZE}\">\n<title>{title}</title>\n{body}</svg>\n"
+         font-size=\"{LETTER_SIZE_PX}\">\n<title>{title}</title>\n{body}</svg>\n"
     )
 }
 
 /// Returns the height of a drawing in pixels and the text of its SVG elements.
-fn body(drawing: &Drawing, width: f64) -> (f64, String) {
+fn draw_body(drawing: &Drawing, width: f64) -> (f64, String) {
     let mut out = String::new();
     let height = match drawing {
         Drawing::Strip(strip) => write_strip(&mut out, strip, width),
@@ -62,18 +64,18 @@ fn body(drawing: &Drawing, width: f64) -> (f64, String) {
 
 /// The alignment of a text.
 #[derive(Clone, Copy)]
-enum Anchor {
+enum TextAnchor {
     Start,
     Middle,
     End,
 }
 
-fn write_text(out: &mut String, (x, y): (f64, f64), anchor: Anchor, is_faint: bool, text: &str) {
-    let (colour, class) = if is_faint { (FAINT, "faint-f") } else { (INK, "ink-f") };
+fn write_text(out: &mut String, (x, y): (f64, f64), anchor: TextAnchor, is_faint: bool, text: &str) {
+    let (colour, class) = if is_faint { (FAINT_TEXT_COLOUR, "faint-f") } else { (TEXT_COLOUR, "ink-f") };
     let anchor = match anchor {
-        Anchor::Start => "",
-        Anchor::Middle => " text-anchor=\"middle\"",
-        Anchor::End => " text-anchor=\"end\"",
+        TextAnchor::Start => "",
+        TextAnchor::Middle => " text-anchor=\"middle\"",
+        TextAnchor::End => " text-anchor=\"end\"",
     };
     let (r, g, b) = (colour.0, colour.1, colour.2);
     let _ = writeln!(
@@ -84,7 +86,7 @@ fn write_text(out: &mut String, (x, y): (f64, f64), anchor: Anchor, is_faint: bo
 }
 
 fn write_line(out: &mut String, path: &str) {
-    let (r, g, b) = (FAINT.0, FAINT.1, FAINT.2);
+    let (r, g, b) = (FAINT_TEXT_COLOUR.0, FAINT_TEXT_COLOUR.1, FAINT_TEXT_COLOUR.2);
     let _ = writeln!(
         out,
         "<path class=\"faint-s\" fill=\"none\" stroke=\"#{r:02X}{g:02X}{b:02X}\" stroke-width=\"1\" d=\"{path}\"/>"
@@ -98,16 +100,16 @@ fn write_background(out: &mut String, path: &str) {
 
 /// Areas to fill, by level of colour; the areas of a level become one SVG element.
 #[derive(Default)]
-struct LevelPaths([String; LEVEL_COUNT]);
+struct LevelPaths([String; COLOUR_LEVEL_COUNT]);
 
 impl LevelPaths {
     fn path_of_value(&mut self, value: f64, max: f64) -> Option<&mut String> {
-        self.0.get_mut(level(value, max))
+        self.0.get_mut(colour_level(value, max))
     }
 
-    fn write(self, out: &mut String) {
+    fn write_paths(self, out: &mut String) {
         for (level, path) in self.0.iter().enumerate().filter(|(_, path)| !path.is_empty()) {
-            let [paper, _] = colours(level);
+            let [paper, _] = level_colours(level);
             let _ = writeln!(out, "<path class=\"v{level}\" fill=\"{paper}\" d=\"{path}\"/>");
         }
     }
@@ -118,21 +120,27 @@ fn add_rectangle(path: &mut String, (x, y): (f64, f64), (width, height): (f64, f
 }
 
 /// Draws the legend of the colours at the top.
-fn write_legend(out: &mut String, legend: &Legend, width: f64) {
+fn write_legend(out: &mut String, legend: &ColourLegend, width: f64) {
     let bar = (width * 0.4).min(260.0);
-    let left = MARGIN_PX + LETTER_WIDTH * legend.caption.chars().count() as f64 + 14.0;
-    write_text(out, (MARGIN_PX, 23.0), Anchor::Start, false, &legend.caption);
+    let left = MARGIN_PX + LETTER_WIDTH_PX * legend.caption.chars().count() as f64 + 14.0;
+    write_text(out, (MARGIN_PX, 23.0), TextAnchor::Start, false, &legend.caption);
     let mut levels = LevelPaths::default();
-    for at in 0..LEVEL_COUNT {
-        let part = bar / LEVEL_COUNT as f64;
-        let path = levels.path_of_value((at as f64 + 0.5) / LEVEL_COUNT as f64, 1.0);
+    for at in 0..COLOUR_LEVEL_COUNT {
+        let part = bar / COLOUR_LEVEL_COUNT as f64;
+        let path = levels.path_of_value((at as f64 + 0.5) / COLOUR_LEVEL_COUNT as f64, 1.0);
         path.into_iter().for_each(|path| {
             add_rectangle(path, (left + part * at as f64, 12.0), (part + SEAM_OVERLAP_PX, 14.0))
         });
     }
-    levels.write(out);
-    for (part, anchor) in [(0.0, Anchor::Middle), (0.5, Anchor::Middle), (1.0, Anchor::Middle)] {
-        write_text(out, (left + part * bar, 42.0), anchor, true, &quantity(part * legend.max, &legend.unit));
+    levels.write_paths(out);
+    for (part, anchor) in [(0.0, TextAnchor::Middle), (0.5, TextAnchor::Middle), (1.0, TextAnchor::Middle)] {
+        write_text(
+            out,
+            (left + part * bar, 42.0),
+            anchor,
+            true,
+            &format_quantity(part * legend.max, &legend.unit),
+        );
     }
 }
 
@@ -141,17 +149,17 @@ fn write_strip(out: &mut String, strip: &CellStrip, width: f64) -> f64 {
     let rows: usize = strip.groups.iter().map(|group| group.rows.len()).sum();
     let row = if rows > 20 { 14.0 } else { 18.0 };
     let captions = strip.groups.iter().flat_map(|group| &group.rows).map(|row| row.caption.chars().count());
-    let left = MARGIN_PX + LETTER_WIDTH * captions.max().unwrap_or(0) as f64 + 10.0;
+    let left = MARGIN_PX + LETTER_WIDTH_PX * captions.max().unwrap_or(0) as f64 + 10.0;
     let right = width - 24.0;
     let time = Axis::new("time", "s").with_ends(strip.seconds.0, strip.seconds.1);
     let span = AxisSpan::new(&time, [].into_iter(), 0.0);
     let place = |seconds: f64| left + span.position(seconds).clamp(0.0, 1.0) * (right - left);
-    let (mut tracks, mut levels, mut y) = (String::new(), LevelPaths::default(), LEGEND_HEIGHT);
+    let (mut tracks, mut levels, mut y) = (String::new(), LevelPaths::default(), LEGEND_HEIGHT_PX);
     for group in &strip.groups {
-        write_text(out, (MARGIN_PX, y + 16.0), Anchor::Start, false, &group.title);
-        y += HEADING_HEIGHT;
+        write_text(out, (MARGIN_PX, y + 16.0), TextAnchor::Start, false, &group.title);
+        y += HEADING_HEIGHT_PX;
         for of_cell in &group.rows {
-            write_text(out, (left - 8.0, y + row * 0.5 + 4.5), Anchor::End, true, &of_cell.caption);
+            write_text(out, (left - 8.0, y + row * 0.5 + 4.5), TextAnchor::End, true, &of_cell.caption);
             add_rectangle(&mut tracks, (left, y), (right - left, row - 2.0));
             for (from, to, value) in &of_cell.values {
                 let (from, to) = (place(*from), place(*to));
@@ -165,22 +173,22 @@ fn write_strip(out: &mut String, strip: &CellStrip, width: f64) -> f64 {
         y += 4.0;
     }
     write_background(out, &tracks);
-    levels.write(out);
+    levels.write_paths(out);
     let mut axis = format!("M{left:.1} {y:.1}H{right:.1}");
     let most = if width > 600.0 { 12 } else { 5 };
     for tick in span.ticks(most) {
         let x = place(tick);
         let _ = write!(axis, "M{x:.1} {y:.1}v5");
-        write_text(out, (x, y + 19.0), Anchor::Middle, false, &span.caption(tick, most));
+        write_text(out, (x, y + 19.0), TextAnchor::Middle, false, &span.tick_caption(tick, most));
     }
     write_line(out, &axis);
-    write_text(out, ((left + right) / 2.0, y + 38.0), Anchor::Middle, false, &span.title(&time));
+    write_text(out, ((left + right) / 2.0, y + 38.0), TextAnchor::Middle, false, &span.title(&time));
     y + 46.0
 }
 
 /// The cells of one panel, and the area that they cover in m.
 struct PanelLayout<'a> {
-    panel: &'a Panel,
+    panel: &'a LinkPanel,
     /// The smallest coordinates of the area in m; in the next field, its width and height.
     from: [f64; 2],
     size: [f64; 2],
@@ -191,7 +199,7 @@ struct PanelLayout<'a> {
 }
 
 impl<'a> PanelLayout<'a> {
-    fn new(panel: &'a Panel) -> Self {
+    fn new(panel: &'a LinkPanel) -> Self {
         let nearest = panel.cells.iter().filter_map(|cell| {
             let [x, y] = cell.at;
             let others = panel.cells.iter().map(|other| (other.at[0] - x, other.at[1] - y));
@@ -226,10 +234,11 @@ fn write_map(out: &mut String, map: &CellMap, width: f64) -> f64 {
     let max = |of: &dyn Fn(&PanelLayout<'_>) -> f64| sheets.iter().map(of).fold(f64::MIN_POSITIVE, f64::max);
     let pitch = sheets.iter().map(|sheet| sheet.pitch).fold(f64::INFINITY, f64::min);
     // Scale in pixels per metre, the same for all links.
-    let scale = (MAX_PITCH / pitch).min((width - 2.0 * MARGIN_PX - 50.0) / max(&|sheet| sheet.size[0]));
-    let (mut x, mut y, mut height) = (MARGIN_PX, LEGEND_HEIGHT, 0.0_f64);
+    let scale =
+        (MAX_CELL_PITCH_PX / pitch).min((width - 2.0 * MARGIN_PX - 50.0) / max(&|sheet| sheet.size[0]));
+    let (mut x, mut y, mut height) = (MARGIN_PX, LEGEND_HEIGHT_PX, 0.0_f64);
     for sheet in &sheets {
-        let title = LETTER_WIDTH * sheet.panel.title.chars().count() as f64;
+        let title = LETTER_WIDTH_PX * sheet.panel.title.chars().count() as f64;
         let wide = (sheet.size[0] * scale + 50.0).max(title);
         if x > MARGIN_PX && x + wide > width - MARGIN_PX {
             (x, y, height) = (MARGIN_PX, y + height, 0.0);
@@ -244,12 +253,12 @@ fn write_map(out: &mut String, map: &CellMap, width: f64) -> f64 {
 fn write_panel(
     out: &mut String,
     sheet: &PanelLayout<'_>,
-    legend: &Legend,
+    legend: &ColourLegend,
     (x, y): (f64, f64),
     scale: f64,
 ) -> f64 {
-    write_text(out, (x, y + 14.0), Anchor::Start, false, &sheet.panel.title);
-    let (left, top) = (x + 44.0, y + HEADING_HEIGHT);
+    write_text(out, (x, y + 14.0), TextAnchor::Start, false, &sheet.panel.title);
+    let (left, top) = (x + 44.0, y + HEADING_HEIGHT_PX);
     let [wide, high] = sheet.size.map(|size| size * scale);
     let mut ground = String::new();
     add_rectangle(&mut ground, (left, top), (wide, high));
@@ -280,7 +289,7 @@ fn write_panel(
         let y = top + (first + along - sheet.from[1]) * scale;
         let _ = write!(axis, "M{left:.1} {y:.1}h-5");
         let text = if at == 0 { "0 cm".to_owned() } else { format!("{:.0}", along * 100.0) };
-        write_text(out, (left - 7.0, y + 4.5), Anchor::End, true, &text);
+        write_text(out, (left - 7.0, y + 4.5), TextAnchor::End, true, &text);
     }
     let bottom = top + high;
     if sheet.panel.radius.is_some() {
@@ -290,27 +299,27 @@ fn write_panel(
             let x = left + inner + part * (wide - 2.0 * inner);
             let _ = write!(axis, "M{x:.1} {bottom:.1}v5");
             if wide > 200.0 || at % 2 == 0 {
-                write_text(out, (x, bottom + 18.0), Anchor::Middle, true, degrees);
+                write_text(out, (x, bottom + 18.0), TextAnchor::Middle, true, degrees);
             }
         }
     } else {
-        write_text(out, (left, bottom + 18.0), Anchor::Start, true, "flat");
+        write_text(out, (left, bottom + 18.0), TextAnchor::Start, true, "flat");
     }
     write_line(out, &axis);
-    HEADING_HEIGHT + high + 24.0
+    HEADING_HEIGHT_PX + high + 24.0
 }
 
-fn write_hexagon(out: &mut String, value: Option<f64>, legend: &Legend, caption: &str, path: &str) {
+fn write_hexagon(out: &mut String, value: Option<f64>, legend: &ColourLegend, caption: &str, path: &str) {
     let (fill, text) = match value {
         Some(value) if value > 0.0 => {
-            let level = level(value, legend.max);
-            let [paper, _] = colours(level);
-            (format!("class=\"v{level}\" fill=\"{paper}\""), quantity(value, &legend.unit))
+            let level = colour_level(value, legend.max);
+            let [paper, _] = level_colours(level);
+            (format!("class=\"v{level}\" fill=\"{paper}\""), format_quantity(value, &legend.unit))
         }
-        Some(_) => ("class=\"none\" fill=\"none\"".to_owned(), quantity(0.0, &legend.unit)),
+        Some(_) => ("class=\"none\" fill=\"none\"".to_owned(), format_quantity(0.0, &legend.unit)),
         None => ("class=\"none\" fill=\"none\" stroke-dasharray=\"2 2\"".to_owned(), "not known".to_owned()),
     };
-    let (r, g, b) = (FAINT.0, FAINT.1, FAINT.2);
+    let (r, g, b) = (FAINT_TEXT_COLOUR.0, FAINT_TEXT_COLOUR.1, FAINT_TEXT_COLOUR.2);
     let _ = writeln!(
         out,
         "<path {fill} stroke=\"#{r:02X}{g:02X}{b:02X}\" stroke-width=\"0.5\" d=\"{path}\"><title>{}: {}</title></path>",

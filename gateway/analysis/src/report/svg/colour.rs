@@ -5,10 +5,10 @@
 use std::fmt::Write as _;
 
 /// Number of colours for values above 0.
-pub(super) const LEVEL_COUNT: usize = 16;
+pub(super) const COLOUR_LEVEL_COUNT: usize = 16;
 
 /// The colours of cividis at equal distances, as red, green and blue.
-const CIVIDIS: [[f64; 3]; 10] = [
+const CIVIDIS_RGB: [[f64; 3]; 10] = [
     [0.0, 34.0, 78.0],
     [18.0, 53.0, 112.0],
     [59.0, 73.0, 108.0],
@@ -26,11 +26,11 @@ pub(super) const BACKGROUND_COLOURS: [&str; 2] = ["#EBEDEF", "#26292E"];
 
 /// Returns the cividis colour at a position from 0 to 1, as a CSS colour.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 9, and 0 to 255")]
-fn cividis(place: f64) -> String {
-    let at = place.clamp(0.0, 1.0) * (CIVIDIS.len() - 1) as f64;
+fn cividis_css_colour(place: f64) -> String {
+    let at = place.clamp(0.0, 1.0) * (CIVIDIS_RGB.len() - 1) as f64;
     let (from, part) = (at.floor() as usize, at.fract());
     let [one, next] =
-        [from, from + 1].map(|at| CIVIDIS.get(at).or(CIVIDIS.last()).copied().unwrap_or_default());
+        [from, from + 1].map(|at| CIVIDIS_RGB.get(at).or(CIVIDIS_RGB.last()).copied().unwrap_or_default());
     let mut text = "#".to_owned();
     for (one, next) in one.into_iter().zip(next) {
         let _ = write!(text, "{:02X}", (one + part * (next - one)).round() as u8);
@@ -39,24 +39,24 @@ fn cividis(place: f64) -> String {
 }
 
 /// Returns the colours of a level on paper and on a dark screen; levels count from 0.
-pub(super) fn colours(level: usize) -> [String; 2] {
-    let part = level as f64 / (LEVEL_COUNT - 1) as f64;
-    [cividis(1.0 - part), cividis(0.2 + 0.8 * part)]
+pub(super) fn level_colours(level: usize) -> [String; 2] {
+    let part = level as f64 / (COLOUR_LEVEL_COUNT - 1) as f64;
+    [cividis_css_colour(1.0 - part), cividis_css_colour(0.2 + 0.8 * part)]
 }
 
 /// Returns the level of colour, from 0, for a value above 0 and up to `max`.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 15")]
-pub(super) fn level(value: f64, max: f64) -> usize {
-    let part = (value / max).clamp(0.0, 1.0) * LEVEL_COUNT as f64;
-    (part.ceil() as usize).clamp(1, LEVEL_COUNT) - 1
+pub(super) fn colour_level(value: f64, max: f64) -> usize {
+    let part = (value / max).clamp(0.0, 1.0) * COLOUR_LEVEL_COUNT as f64;
+    (part.ceil() as usize).clamp(1, COLOUR_LEVEL_COUNT) - 1
 }
 
 /// Adds the CSS rules with which a dark screen replaces the colours.
 pub(super) fn add_dark_rules(rules: &mut String) {
     let [_, track] = BACKGROUND_COLOURS;
     let _ = write!(rules, ".track{{fill:{track}}}");
-    for level in 0..LEVEL_COUNT {
-        let [_, colour] = colours(level);
+    for level in 0..COLOUR_LEVEL_COUNT {
+        let [_, colour] = level_colours(level);
         let _ = write!(rules, ".v{level}{{fill:{colour}}}");
     }
 }
@@ -74,15 +74,15 @@ mod tests {
 
     #[test]
     fn levels_grow_darker_on_paper_and_lighter_on_a_dark_screen() {
-        let all: Vec<_> = (0..LEVEL_COUNT).map(colours).collect();
+        let all: Vec<_> = (0..COLOUR_LEVEL_COUNT).map(level_colours).collect();
         assert_eq!(all[0][0], "#FEE838");
-        assert_eq!(all[LEVEL_COUNT - 1], ["#00224E", "#FEE838"]);
+        assert_eq!(all[COLOUR_LEVEL_COUNT - 1], ["#00224E", "#FEE838"]);
         assert!(all.is_sorted_by(|one, next| luminance(&one[0]) > luminance(&next[0])));
         assert!(all.is_sorted_by(|one, next| luminance(&one[1]) < luminance(&next[1])));
     }
 
     #[test]
     fn every_value_above_0_has_a_level() {
-        assert_eq!([1e-9, 0.5, 1.0, 7.0].map(|value| level(value, 1.0)), [0, 7, 15, 15]);
+        assert_eq!([1e-9, 0.5, 1.0, 7.0].map(|value| colour_level(value, 1.0)), [0, 7, 15, 15]);
     }
 }

@@ -16,7 +16,7 @@ fn figure(series: Vec<Series>) -> Figure {
 }
 
 fn line(points: &[(f64, f64)]) -> Series {
-    Series::new("a \"line\" & more", Shape::Line, points.to_vec())
+    Series::new("a \"line\" & more", SeriesShape::Line, points.to_vec())
 }
 
 /// Returns the lines with this CSS class, each as a list of positions in drawing units.
@@ -36,7 +36,7 @@ const SVG: &str = "http://www.w3.org/2000/svg";
 
 #[test]
 fn values_stand_where_the_axes_say() {
-    let text = draw(&figure(vec![line(&[(0.0, -1.0), (5.0, 0.0), (10.0, 1.0)])]));
+    let text = draw_figure(&figure(vec![line(&[(0.0, -1.0), (5.0, 0.0), (10.0, 1.0)])]));
     let document = Document::parse(&text).unwrap();
     let places = lines(&document, "c0-s");
     let [(left, bottom), (middle, half), (right, top)] = places[0][..] else { panic!("{places:?}") };
@@ -65,7 +65,7 @@ fn what_lies_outside_is_truncated_at_the_edge_and_a_gap_is_a_gap() {
     let inside = [(0.0, -1.0), (10.0, 1.0)];
     let beyond = [(0.0, -3.0), (5.0, 3.0), (10.0, -3.0)];
     let gap = [(0.0, 0.5), (2.0, 0.5), (3.0, f64::NAN), (4.0, 0.5), (6.0, 0.5)];
-    let text = draw(&figure(vec![line(&inside), line(&beyond), line(&gap)]));
+    let text = draw_figure(&figure(vec![line(&inside), line(&beyond), line(&gap)]));
     let document = Document::parse(&text).unwrap();
     let (frame, beyond, gap) = (lines(&document, "c0-s"), lines(&document, "c1-s"), lines(&document, "c2-s"));
     let [(left, bottom), (right, top)] = frame[0][..] else { panic!("{frame:?}") };
@@ -82,25 +82,31 @@ fn what_lies_outside_is_truncated_at_the_edge_and_a_gap_is_a_gap() {
 #[test]
 fn steps_hold_their_value_dashes_are_an_attribute_and_a_band_is_an_area() {
     let points = vec![(0.0, 0.0), (5.0, 0.5), (10.0, 0.5)];
-    let shape = |shape| draw(&figure(vec![Series::new("", shape, points.clone())]));
-    let steps = shape(Shape::Steps);
+    let shape = |shape| draw_figure(&figure(vec![Series::new("", shape, points.clone())]));
+    let steps = shape(SeriesShape::Steps);
     let steps = lines(&Document::parse(&steps).unwrap(), "c0-s");
     assert_eq!(steps[0].len(), 5);
     assert!(steps[0][0].1 > steps[0][2].1 && (steps[0][1].1 - steps[0][0].1).abs() < 0.5, "{steps:?}");
-    assert!(shape(Shape::Dashed).contains("stroke-dasharray"));
-    assert!(!shape(Shape::Line).contains("stroke-dasharray"));
-    assert!(shape(Shape::Band).contains("<polygon"));
-    assert_eq!(shape(Shape::Points).matches("<circle").count(), 3);
+    assert!(shape(SeriesShape::Dashed).contains("stroke-dasharray"));
+    assert!(!shape(SeriesShape::Line).contains("stroke-dasharray"));
+    assert!(shape(SeriesShape::Band).contains("<polygon"));
+    assert_eq!(shape(SeriesShape::Points).matches("<circle").count(), 3);
 }
 
 #[test]
 fn nothing_to_draw_is_drawn_as_axes() {
     for points in [vec![], vec![(f64::NAN, 1.0)], vec![(1.0, f64::INFINITY)], vec![(2.0, 3.0)]] {
-        for shape in [Shape::Line, Shape::Dashed, Shape::Points, Shape::Steps, Shape::Band] {
-            for scale in [Axis::new("x", ""), Axis::new("x", "").log()] {
+        for shape in [
+            SeriesShape::Line,
+            SeriesShape::Dashed,
+            SeriesShape::Points,
+            SeriesShape::Steps,
+            SeriesShape::Band,
+        ] {
+            for scale in [Axis::new("x", ""), Axis::new("x", "").with_log_scale()] {
                 let series = vec![Series::new("something", shape, points.clone())];
                 let figure = Figure { series, x: scale.clone(), y: scale, ..figure(Vec::new()) };
-                let text = draw(&figure);
+                let text = draw_figure(&figure);
                 let document = Document::parse(&text).unwrap();
                 assert!(document.descendants().any(|node| node.has_tag_name((SVG, "line"))), "{text}");
             }
@@ -112,19 +118,20 @@ fn nothing_to_draw_is_drawn_as_axes() {
 fn an_hour_at_500_hz_is_a_small_drawing() {
     let points: Vec<_> =
         (0..1_800_000).map(|n| (f64::from(n) / 180_000.0, f64::from(n % 17) / 17.0)).collect();
-    let text = draw(&figure(vec![line(&points)]));
+    let text = draw_figure(&figure(vec![line(&points)]));
     assert!(text.len() < 60_000, "{}", text.len());
 }
 
 #[test]
 fn every_colour_has_another_one_on_a_dark_screen() {
-    let rules = dark_rules();
-    for (_, class, colour) in CLASSES {
+    let rules = dark_css_rules();
+    for (_, class, colour) in COLOUR_CLASSES {
         assert!(rules.contains(&format!(".{class}-s{{stroke:{colour}}}")));
     }
-    let series =
-        (0..9).map(|n| Series::new(format!("s{n}"), Shape::Line, vec![(0.0, 0.0), (10.0, 0.1)])).collect();
-    let text = draw(&figure(series));
+    let series = (0..9)
+        .map(|n| Series::new(format!("s{n}"), SeriesShape::Line, vec![(0.0, 0.0), (10.0, 0.1)]))
+        .collect();
+    let text = draw_figure(&figure(series));
     let document = Document::parse(&text).unwrap();
     for node in document.descendants() {
         let coloured = ["fill", "stroke"]
@@ -138,14 +145,14 @@ fn every_colour_has_another_one_on_a_dark_screen() {
 #[test]
 fn a_diagram_below_has_its_own_scale_and_the_same_time() {
     let upper = [(0.0, -100_000.0), (10.0, 100_000.0)];
-    let lower = Series::new("", Shape::Line, vec![(0.0, -1e-4), (10.0, 1e-4)]);
+    let lower = Series::new("", SeriesShape::Line, vec![(0.0, -1e-4), (10.0, 1e-4)]);
     let below = LowerDiagram {
         y: Axis::new("difference", "Nm").with_ends(-1e-4, 1e-4),
         series: vec![lower],
         marks: Vec::new(),
     };
     let upper = Figure { y: Axis::new("torque", "Nm").with_ends(-1e5, 1e5), ..figure(vec![line(&upper)]) };
-    let text = draw(&upper.with_lower_diagram(below));
+    let text = draw_figure(&upper.with_lower_diagram(below));
     let document = Document::parse(&text).unwrap();
     let places = lines(&document, "c0-s");
     let ([(left, bottom), (right, top)], [(from, lowest), (to, highest)]) = (&places[0][..], &places[2][..])

@@ -64,7 +64,7 @@ impl Run {
     /// Sends address claims and configuration of all cells at once: more than a bus can carry for a while.
     fn start(&mut self, cells: i64) {
         for node in 1..=cells {
-            self.say(&heartbeat(node, State::CLAIMING));
+            self.say(&heartbeat(node, State::CLAIMING_NODE_ID));
             for tag in 0..4 {
                 let request = Request::Read { number: 1 };
                 self.say(&Message::Configure { to: Node::Cell(cell(node)), tag, request });

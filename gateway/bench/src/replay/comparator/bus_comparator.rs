@@ -9,12 +9,12 @@ use model::tracker::{AddressClaim, HeartbeatKind, PerCell};
 use protocol::id::CellId;
 use protocol::message::{Answer, Joints, Message, NetworkPage, ReceivedCounts};
 use protocol::packet::{Epoch, Words};
-use protocol::schema::Units;
+use protocol::schema::BusUnits;
 use protocol::time::Micros;
 
-use super::REPLY_WINDOW;
-use super::states::contact::{EndNow, RecordedContact};
-use super::states::first_joints::{self, FirstJoints};
+use super::REPLY_WINDOW_BROADCASTS;
+use super::states::contact::{RecordedContact, ReplayedContactEnd};
+use super::states::first_joints::{self, FirstJointsState};
 use super::states::line::{self, BusCondition};
 use super::states::pass::{self, CapturePass};
 use super::states::progress::{self, CellProgress};
@@ -30,7 +30,7 @@ use model::latched::LatchedState;
 const MAX_PENDING_REQUESTS: usize = 256;
 /// Number of the last joint broadcasts of the recording within which a request may lack its answer because the
 /// recording ended.
-const FINAL_JOINTS: u64 = 8;
+const FINAL_JOINT_BROADCASTS: u64 = 8;
 
 /// A cell on the bus now.
 #[derive(Clone, Copy, Debug, Default)]
@@ -111,12 +111,12 @@ pub(super) struct KnownCell {
     /// State of the cell's contact in the recording.
     pub(super) contact: RecordedContact,
     /// End of the cell's contact in this replay, compared with the recording.
-    pub(super) end: EndNow,
+    pub(super) end: ReplayedContactEnd,
 }
 
 impl KnownCell {
     pub(super) fn new(cell: Surveyed) -> Self {
-        Self { cell, contact: RecordedContact::default(), end: EndNow::default() }
+        Self { cell, contact: RecordedContact::default(), end: ReplayedContactEnd::default() }
     }
 }
 
@@ -164,7 +164,7 @@ impl PassState {
 pub(super) struct BusComparator {
     pub(super) name: String,
     /// Units of the bus's torques, as far as a skin gives them.
-    pub(super) units: Units,
+    pub(super) units: BusUnits,
     pub(super) present: BTreeMap<CellId, PresentCell>,
     pub(super) known: BTreeMap<CellId, KnownCell>,
     pub(super) announcements: u64,
@@ -183,7 +183,7 @@ pub(super) struct BusComparator {
     /// True if cells were configured to send sensor frames without request, which arrive at times of their own.
     pub(super) sends_unrequested_sensors: bool,
     /// State of each cell's first joints since its start, in the recording and in this replay.
-    pub(super) first_joints: RecordedAndNow<PerCell<FirstJoints>>,
+    pub(super) first_joints: RecordedAndNow<PerCell<FirstJointsState>>,
     reading: PassState,
     /// Number of announced rounds.
     pub(super) sent: u64,
@@ -194,7 +194,7 @@ pub(super) struct BusComparator {
 
 impl BusComparator {
     /// Returns the name of the bus and the units of its torques.
-    pub(super) fn name_and_units(&self) -> (&str, Units) {
+    pub(super) fn name_and_units(&self) -> (&str, BusUnits) {
         (&self.name, self.units)
     }
 
@@ -235,19 +235,19 @@ impl BusComparator {
     }
 
     /// Returns the latest announced joints of an epoch.
-    fn announced(&self, epoch: Epoch) -> Option<AnnouncedJoints> {
+    fn announced_joints(&self, epoch: Epoch) -> Option<AnnouncedJoints> {
         self.announced.get(usize::from(epoch.0)).copied().flatten()
     }
 
     /// Returns the number and the state of the round whose joints were sent last under an epoch.
     pub(super) fn announced_round(&mut self, epoch: Epoch) -> Option<(u64, &mut JointsRound)> {
-        let number = self.announced(epoch)?.round?;
+        let number = self.announced_joints(epoch)?.round?;
         Some((number, self.round(number)?))
     }
 
     /// Counts a torque or sum in the replayed part whose joints are not in that part, by the reason.
-    pub(super) fn count_without_joints(&self, epoch: Epoch, lacking: &mut UncomparedReplies) {
-        if self.is_earlier(epoch) {
+    pub(super) fn count_replies_without_joints(&self, epoch: Epoch, lacking: &mut UncomparedReplies) {
+        if self.is_before_replayed_part(epoch) {
             lacking.joints_earlier += 1;
         } else if !self.rounds.is_empty() {
             lacking.joints_unrecorded += 1;
@@ -255,7 +255,7 @@ impl BusComparator {
     }
 
     /// Requires from each cell another heartbeat, which confirms all messages announced so far.
-    pub(super) fn mark_all_awaited(&mut self) {
+    pub(super) fn await_all_cells(&mut self) {
         self.announcements += 1;
         let announced = |progress: CellProgress| progress.next(progress::CellEvent::Announced);
         self.present.values_mut().for_each(|present| present.progress = announced(present.progress));
@@ -283,7 +283,7 @@ impl BusComparator {
 
     /// Drops recorded replies to messages that were not sent. Replies to messages after the last joints are not
     /// expected either, because it is unknown whether those messages were sent.
-    pub(super) fn drop_unsent(&mut self) {
+    pub(super) fn drop_unsent_replies(&mut self) {
         let sent = self.sent;
         for answers in self.answers.values_mut() {
             answers.recorded.retain(|(rounds, ..)| *rounds < sent);
@@ -296,18 +296,18 @@ impl BusComparator {
     /// Starts another pass over the capture.
     pub(super) fn begin_pass(&mut self) {
         self.recorded_rounds.fill(None);
-        let mut reading = PassState { first_round: self.rounds_so_far(), ..PassState::default() };
+        let mut reading = PassState { first_round: self.round_count(), ..PassState::default() };
         reading.next(pass::ReadEvent::Begins);
         self.reading = reading;
     }
 
-    fn rounds_so_far(&self) -> u64 {
+    fn round_count(&self) -> u64 {
         self.base + self.rounds.len() as u64
     }
 
     /// Adds joints of the capture. Returns the number of their round if they will be sent.
     pub(super) fn record_joints(&mut self, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
-        let number = self.rounds_so_far();
+        let number = self.round_count();
         let last = self.reading.state.last_epoch();
         let input = if is_sent { pass::ReadEvent::Joints { last } } else { pass::ReadEvent::NotSent };
         let is_first = self.reading.next(input);
@@ -322,8 +322,8 @@ impl BusComparator {
     }
 
     fn apply_joints(&mut self, epoch: Epoch) -> KnownContacts {
-        self.reading.state.apply(&Message::Joints { epoch, joints: Joints::default() });
-        std::mem::replace(&mut self.reading.touched, self.reading.state.touched())
+        self.reading.state.apply_message(&Message::Joints { epoch, joints: Joints::default() });
+        std::mem::replace(&mut self.reading.touched, self.reading.state.cells_in_contact())
     }
 
     /// Adds any other message of the capture. `is_in_part` is true if the message is in the replayed part.
@@ -334,12 +334,12 @@ impl BusComparator {
         if let Message::Joints { epoch, .. } = *message {
             self.apply_joints(epoch);
         } else {
-            self.reading.state.apply(message);
+            self.reading.state.apply_message(message);
         }
         if let (Message::Configure { to, tag, .. }, true) = (*message, is_in_part) {
-            let round = self.rounds_so_far();
+            let round = self.round_count();
             let nanos = self.rounds.back().map_or(0, |round| round.nanos);
-            for cell in self.known.keys().filter(|cell| to.addresses(**cell)) {
+            for cell in self.known.keys().filter(|cell| to.addresses_cell(**cell)) {
                 let announced = &mut self.answers.entry(*cell).or_default().announced;
                 if announced.len() == MAX_PENDING_REQUESTS {
                     announced.pop_front();
@@ -351,21 +351,21 @@ impl BusComparator {
 
     /// Returns true if the recorded cell with this node id claims the id and does not own it yet.
     pub(super) fn is_claiming(&self, cell: CellId) -> bool {
-        self.reading.state.claim(cell).is_some_and(|claim| !claim.is_settled())
+        self.reading.state.node_id_claim(cell).is_some_and(|claim| !claim.is_settled())
     }
 
     /// Returns true if a reply of this epoch answers joints from before the replayed part. Call it only if no joints in
     /// the part have had this epoch yet.
-    fn is_earlier(&self, epoch: Epoch) -> bool {
+    fn is_before_replayed_part(&self, epoch: Epoch) -> bool {
         let PassState { pass, state, first_round, .. } = &self.reading;
         let last = pass.earlier_epoch(state.last_epoch());
-        self.rounds_so_far() - first_round < REPLY_WINDOW
+        self.round_count() - first_round < REPLY_WINDOW_BROADCASTS
             && last.is_some_and(|last| (0..100).contains(&last.epochs_since(epoch)))
     }
 
     /// Adds a recorded answer to `configure`. Returns true if its request is in the replayed part.
     pub(super) fn record_answer(&mut self, from: CellId, tag: u8, answer: Answer) -> bool {
-        let rounds = self.rounds_so_far();
+        let rounds = self.round_count();
         let answers = self.answers.entry(from).or_default();
         match answers.announced.iter().position(|announced| announced.tag == tag) {
             Some(at) => drop(answers.announced.remove(at)),
@@ -385,13 +385,13 @@ impl BusComparator {
     }
 
     /// Adds the parent that a cell reports in this replay.
-    fn note_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
-        let last = self.announced(epoch).and_then(|announced| announced.round);
+    fn observe_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
+        let last = self.announced_joints(epoch).and_then(|announced| announced.round);
         self.trees.now.set_parent(cell, parent, last.map_or(self.sent, |last| last + 1));
     }
 
     pub(super) fn observe_network_page(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {
-        let reported = self.announced(epoch).map(|announced| announced.announcement);
+        let reported = self.announced_joints(epoch).map(|announced| announced.announcement);
         let has_announced = self.announcements > 0;
         let found =
             || PresentCell { progress: CellProgress::initial_state(has_announced), ..PresentCell::default() };
@@ -409,13 +409,13 @@ impl BusComparator {
                 progress::CellEvent::ReportsOther
             });
             if !present.claim.is_settled() {
-                self.note_parent(cell, epoch, None);
+                self.observe_parent(cell, epoch, None);
             }
         } else if let NetworkPage::Received(counts) = *page {
             let first = present.counters.map_or(counts, |(first, _)| first);
             present.counters = Some((first, counts));
         } else if let NetworkPage::Tree(tree) = page {
-            self.note_parent(cell, epoch, tree.parent);
+            self.observe_parent(cell, epoch, tree.parent);
         }
     }
 
@@ -444,9 +444,9 @@ impl PendingAnswers {
         let Some(PendingRequest { round, nanos, .. }) = self.announced.remove(at) else { return false };
         if cell.is_silent_at(nanos) {
             lacking.silent += 1;
-        } else if round + FINAL_JOINTS >= rounds {
+        } else if round + FINAL_JOINT_BROADCASTS >= rounds {
             lacking.ended += 1;
-        } else if !cell.is_counted_at(nanos) {
+        } else if !cell.is_covered_by_counters(nanos) {
             lacking.uncounted += 1;
         } else if cell.unrecorded > 0 {
             cell.unrecorded -= 1;
@@ -459,7 +459,7 @@ impl PendingAnswers {
 }
 
 /// Updates the state of the message's sender: whether it has received joints since its start.
-pub(super) fn update_first_joints(cells: &mut PerCell<FirstJoints>, message: &Message) {
+pub(super) fn update_first_joints(cells: &mut PerCell<FirstJointsState>, message: &Message) {
     let Some((cell, input)) = first_joints::JointsEvidence::from_message(message) else { return };
     if let Some(place) = cells.get_mut(cell) {
         *place = place.next(input);

@@ -6,10 +6,10 @@ use protocol::id::CellId;
 use protocol::packet::Words;
 
 use super::bus_comparator::{BusComparator, JointsRound, KnownCell, RecordedAndNow};
-use super::states::contact::{self, EndNow};
+use super::states::contact::{self, ReplayedContactEnd};
 use super::sums::{EpochSums, MAX_ROUNDING_STEPS, OmitReason, SumComparison, compare};
 use super::tally::UncomparedReplies;
-use super::{Comparator, FirstDifference, Tally};
+use super::{Comparator, FirstDifference, ReplyTally};
 use crate::replay::difference::{DifferenceKind, ReplyKind, SentValue};
 
 impl Comparator {
@@ -30,16 +30,16 @@ impl Comparator {
             if let Some(how) =
                 bus_comparator.compare_reply(number, &round, (cell, what), pair, (tally, tolerance))
             {
-                tally.count(how, round.sending.is_unsent());
+                tally.count_difference(how, round.sending.is_unsent());
                 let said = [pair.recorded, pair.now].map(|words| Some(SentValue::Words(what, words?)));
-                first.keep_first(how, bus_comparator.name_and_units(), cell, at, said);
+                first.keep_first_difference(how, bus_comparator.name_and_units(), cell, at, said);
             }
         }
         if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
             bus_comparator.compare_sums(number, &round, (tally, tolerance), first);
         }
-        bus_comparator.trees.recorded.forget_before(number);
-        bus_comparator.trees.now.forget_before(number);
+        bus_comparator.trees.recorded.forget_changes_before(number);
+        bus_comparator.trees.now.forget_changes_before(number);
     }
 }
 
@@ -51,7 +51,7 @@ impl BusComparator {
         round: &JointsRound,
         (cell, what): (CellId, ReplyKind),
         RecordedAndNow { recorded, now }: RecordedAndNow<Option<Words>>,
-        (tally, tolerance): (&mut Tally, u16),
+        (tally, tolerance): (&mut ReplyTally, u16),
     ) -> Option<DifferenceKind> {
         let (is_last, begins_later) = (self.last_round == Some(number), self.has_earlier_messages());
         let is_torque = what == ReplyKind::Torque;
@@ -85,8 +85,8 @@ impl BusComparator {
                 // The cell had not received the joints at which the contact ended.
                 let was_over = contact.was_over_before_late_end(begins_later, round.may_answer(cell));
                 let is_later = |known_cell: &&mut KnownCell| {
-                    let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
-                    is_end && (known_cell.end == EndNow::Earlier || was_over)
+                    let was_over = was_over && !known_cell.cell.is_covered_by_counters(round.nanos);
+                    is_end && (known_cell.end == ReplayedContactEnd::Earlier || was_over)
                 };
                 let Some(known_cell) = known_cell.filter(is_later) else {
                     return Some(DifferenceKind::Missing);
@@ -115,7 +115,7 @@ impl BusComparator {
         &mut self,
         number: u64,
         round: &JointsRound,
-        (tally, tolerance): (&mut Tally, u16),
+        (tally, tolerance): (&mut ReplyTally, u16),
         first: &mut FirstDifference,
     ) {
         let then = EpochSums::new(&round.sums.recorded, &self.trees.recorded, number);
@@ -126,14 +126,14 @@ impl BusComparator {
             let known_cell = self.known.get_mut(&cell);
             let lacking = &mut tally.lacking;
             if known_cell.as_ref().is_some_and(|known_cell| known_cell.cell.measured) {
-                lacking.measured += u64::from(round.sums.recorded.has(cell));
+                lacking.measured += u64::from(round.sums.recorded.contains_cell(cell));
                 continue;
             }
             let mut outcome = compare(&then, &now, cell, tolerance, self.units.torque_format());
             let is_touched = round.is_touched(cell);
             let is_doubtful = || {
-                then.is_doubtful(cell, is_touched, false)
-                    || round.sending.is_repeated() && now.is_doubtful(cell, is_touched, true)
+                then.is_contribution_impossible(cell, is_touched, false)
+                    || round.sending.is_repeated() && now.is_contribution_impossible(cell, is_touched, true)
             };
             if matches!(outcome, SumComparison::Different | SumComparison::Missing | SumComparison::Extra)
                 && is_doubtful()
@@ -144,7 +144,7 @@ impl BusComparator {
             if let ([Some(then), Some(now)], SumComparison::Equal | SumComparison::Different) =
                 (&owns, outcome)
             {
-                let max = tally.sum_words.count(then.differences(now));
+                let max = tally.sum_words.count_step_differences(then.step_differences(now));
                 tally.tolerated += u64::from(outcome == SumComparison::Equal && max > MAX_ROUNDING_STEPS);
             }
             let how = match outcome {
@@ -178,9 +178,9 @@ impl BusComparator {
                 }
                 SumComparison::Extra => DifferenceKind::Extra,
             };
-            tally.count(how, round.sending.is_unsent());
+            tally.count_difference(how, round.sending.is_unsent());
             let said = owns.map(|own| own.map(SentValue::Sum));
-            first.keep_first(
+            first.keep_first_difference(
                 how,
                 self.name_and_units(),
                 cell,
@@ -188,7 +188,7 @@ impl BusComparator {
                 said,
             );
         }
-        for (cell, count) in round.sums.recorded.counts() {
+        for (cell, count) in round.sums.recorded.contributor_counts() {
             if count > 0 {
                 self.contributing.insert(cell);
             } else {
@@ -198,7 +198,7 @@ impl BusComparator {
     }
 
     /// Compares the answers to `configure` with the recorded ones, in order.
-    pub(super) fn compare_answers(&mut self, tally: &mut Tally, first: &mut FirstDifference) {
+    pub(super) fn compare_answers(&mut self, tally: &mut ReplyTally, first: &mut FirstDifference) {
         for (cell, mut answers) in std::mem::take(&mut self.answers) {
             loop {
                 let known_cell = self.known.get_mut(&cell);
@@ -221,10 +221,10 @@ impl BusComparator {
                     (Some(_), None) => DifferenceKind::Missing,
                     (None, Some(_)) => DifferenceKind::Extra,
                 };
-                tally.count(how, false);
+                tally.count_difference(how, false);
                 let said =
                     [recorded, now].map(|said| said.map(|(tag, answer)| SentValue::Answer(tag, answer)));
-                first.keep_first(how, self.name_and_units(), cell, None, said);
+                first.keep_first_difference(how, self.name_and_units(), cell, None, said);
             }
         }
     }
@@ -249,7 +249,7 @@ fn explain_extra_reply(
     if cell.measured {
         return true;
     }
-    let is_counted = cell.is_counted_at(round.nanos);
+    let is_counted = cell.is_covered_by_counters(round.nanos);
     if cell.is_silent_at(round.nanos) {
         lacking.silent += 1;
     } else if is_last && !is_counted {

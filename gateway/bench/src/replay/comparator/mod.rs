@@ -22,24 +22,24 @@ use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Message, NetworkPage, Request};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::{Parameter, Sensing};
-use protocol::schema::Units;
+use protocol::schema::BusUnits;
 use protocol::skin::Skin;
 
 pub use bus_comparator::PresentCell;
 use bus_comparator::{AnnouncedJoints, BusComparator, RecordedAndNow, update_first_joints};
-use states::first_joints::FirstJoints;
+use states::first_joints::FirstJointsState;
 use states::progress::CellProgress;
 use states::{line, sending};
 pub use sums::OwnContribution;
 use sums::{CellSum, EpochSums};
-pub use tally::{StepHistogram, Tally, UncomparedReplies};
+pub use tally::{ReplyTally, StepHistogram, UncomparedReplies};
 
-use super::difference::{Difference, DifferenceKind, JointsPosition, ReplyKind, SentValue};
+use super::difference::{Difference, DifferenceKind, RecordingPosition, ReplyKind, SentValue};
 use super::survey::SurveyedCell as Surveyed;
 
 /// Maximum number of joint broadcasts between the joints that a reply answers and the arrival of the reply. It is far
 /// below the number of epochs, 256.
-const REPLY_WINDOW: u64 = 100;
+const REPLY_WINDOW_BROADCASTS: u64 = 100;
 
 /// The first difference found.
 #[derive(Debug)]
@@ -51,10 +51,10 @@ struct FirstDifference {
 
 impl FirstDifference {
     /// Keeps the first difference, with the number, the epoch and the time of the joints that the reply answers.
-    fn keep_first(
+    fn keep_first_difference(
         &mut self,
         how: DifferenceKind,
-        (bus, units): (&str, Units),
+        (bus, units): (&str, BusUnits),
         cell: CellId,
         round: Option<(u64, Epoch, u64)>,
         [recorded, now]: [Option<SentValue>; 2],
@@ -64,7 +64,7 @@ impl FirstDifference {
         }
         let when = round.map(|(joints, epoch, nanos)| {
             let at_s = std::time::Duration::from_nanos(nanos.saturating_sub(self.nanos)).as_secs_f64();
-            JointsPosition { joints, epoch: epoch.0, at_s }
+            RecordingPosition { joints, epoch: epoch.0, at_s }
         });
         self.difference =
             Some(Difference::new(how, (bus, units), cell, when, recorded.as_ref(), now.as_ref()));
@@ -79,7 +79,7 @@ pub struct Comparator {
     tolerance: Option<u16>,
     /// True while a state is restored: replies then differ from the capture's.
     is_muted: bool,
-    tally: Tally,
+    tally: ReplyTally,
     first: FirstDifference,
     other_gateway: Option<usize>,
 }
@@ -99,7 +99,7 @@ impl Comparator {
             buses: bus_comparators,
             tolerance,
             is_muted: true,
-            tally: Tally::default(),
+            tally: ReplyTally::default(),
             first: FirstDifference { nanos: first_nanos, difference: None },
             other_gateway: None,
         }
@@ -108,8 +108,8 @@ impl Comparator {
     /// Sets the units of the buses that the skin describes, by name.
     pub fn set_units(&mut self, skin: &Skin) {
         for bus in &mut self.buses {
-            if let Some(index) = skin.bus_named(&bus.name) {
-                bus.units = Units::for_bus(skin, index);
+            if let Some(index) = skin.bus_index(&bus.name) {
+                bus.units = BusUnits::for_bus(skin, index);
             }
         }
     }
@@ -147,7 +147,7 @@ impl Comparator {
         } else if let Message::Sum { from, epoch, torque, count } = *message {
             match bus_comparator.recorded_round(epoch) {
                 Some(round) => round.sums.recorded.insert(from, CellSum { torque, count }),
-                None if is_in_part => bus_comparator.count_without_joints(epoch, &mut tally.lacking),
+                None if is_in_part => bus_comparator.count_replies_without_joints(epoch, &mut tally.lacking),
                 None => {}
             }
         } else if let Message::Configure { request: Request::Write { number, words }, .. } = *message {
@@ -158,7 +158,7 @@ impl Comparator {
         }
         update_first_joints(&mut bus_comparator.first_joints.recorded, message);
         let Some((cell, epoch, what, words)) = decode_reply(message) else { return };
-        let untaken = FirstJoints::Awaited { epoch };
+        let untaken = FirstJointsState::Awaited { epoch };
         if what != ReplyKind::Torque && bus_comparator.first_joints.recorded.get(cell) == Some(&untaken) {
             // The reply answers joints outside the replayed part, even if joints of its epoch were on the bus by then.
             return;
@@ -169,7 +169,7 @@ impl Comparator {
             Some(round) => round.replies.entry((cell, what)).or_default().recorded = Some(words),
             // Before the first joints, sensor frames belong to no joints.
             None if is_in_part && what == ReplyKind::Torque => {
-                bus_comparator.count_without_joints(epoch, &mut tally.lacking)
+                bus_comparator.count_replies_without_joints(epoch, &mut tally.lacking)
             }
             None => {}
         }
@@ -177,7 +177,7 @@ impl Comparator {
 
     /// Starts another pass over the capture. Replies before the first joints of this pass do not answer joints of the
     /// pass before.
-    pub fn expect_restart(&mut self) {
+    pub fn expect_next_pass(&mut self) {
         self.buses.iter_mut().for_each(BusComparator::begin_pass);
     }
 
@@ -193,7 +193,7 @@ impl Comparator {
     /// state.
     pub fn announce_joints(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
         let Some(it) = self.buses.get_mut(bus_index) else { return };
-        it.mark_all_awaited();
+        it.await_all_cells();
         let announced = AnnouncedJoints { announcement: it.announcements, round };
         if let Some(place) = it.announced.get_mut(usize::from(epoch.0)) {
             *place = Some(announced);
@@ -204,7 +204,7 @@ impl Comparator {
         while self
             .buses
             .get(bus_index)
-            .is_some_and(|bus_comparator| bus_comparator.base + REPLY_WINDOW < number)
+            .is_some_and(|bus_comparator| bus_comparator.base + REPLY_WINDOW_BROADCASTS < number)
         {
             self.close_round(bus_index);
         }
@@ -213,7 +213,7 @@ impl Comparator {
     /// Notes a sync without joints, after which all cells must confirm all messages sent so far.
     pub fn announce_sync(&mut self, bus_index: usize) {
         let Some(it) = self.buses.get_mut(bus_index) else { return };
-        it.mark_all_awaited();
+        it.await_all_cells();
         let (announcement, last) = (it.announcements, it.announcements - 1);
         if let Some(announced) =
             it.announced.iter_mut().flatten().find(|announced| announced.announcement == last)
@@ -230,7 +230,7 @@ impl Comparator {
     }
 
     /// Handles a message that another sender has sent on a bus.
-    pub fn observe(&mut self, index: usize, message: &Message) {
+    pub fn observe_message(&mut self, index: usize, message: &Message) {
         let Some(bus_comparator) = self.buses.get_mut(index) else { return };
         bus_comparator.handle_bus_event(line::BusConditionEvent::Message);
         update_first_joints(&mut bus_comparator.first_joints.now, message);
@@ -253,7 +253,7 @@ impl Comparator {
             round.sums.now.insert(from, CellSum { torque, count });
         }
         let Some((cell, epoch, what, words)) = decode_reply(message) else { return };
-        let untaken = FirstJoints::Awaited { epoch };
+        let untaken = FirstJointsState::Awaited { epoch };
         if what != ReplyKind::Torque && bus_comparator.first_joints.now.get(cell) == Some(&untaken) {
             return;
         }
@@ -269,7 +269,7 @@ impl Comparator {
             Some(_) => {
                 self.tally.extra += 1;
                 let said = [None, Some(SentValue::Words(what, words))];
-                self.first.keep_first(
+                self.first.keep_first_difference(
                     DifferenceKind::Extra,
                     bus_comparator.name_and_units(),
                     cell,
@@ -282,7 +282,7 @@ impl Comparator {
 
     /// Returns true if all awaited cells of a bus have processed the joints that were announced last.
     #[must_use]
-    pub fn is_done(&self, bus_index: usize) -> bool {
+    pub fn are_joints_processed(&self, bus_index: usize) -> bool {
         self.buses.get(bus_index).is_none_or(|bus_comparator| {
             bus_comparator.is_down() || bus_comparator.awaited_cells().next().is_none()
         })
@@ -290,7 +290,7 @@ impl Comparator {
 
     /// Returns the number of cells that have processed the joints announced last, to show progress.
     #[must_use]
-    pub fn done_count(&self, bus_index: usize) -> usize {
+    pub fn processed_cell_count(&self, bus_index: usize) -> usize {
         self.buses.get(bus_index).map_or(0, |bus_comparator| {
             bus_comparator.present.values().filter(|present| present.progress == CellProgress::Done).count()
         })
@@ -304,7 +304,7 @@ impl Comparator {
     /// Returns the number of recorded torques and sums of a round that the cells on the bus have not sent in this
     /// replay yet.
     #[must_use]
-    pub fn unanswered(&self, bus_index: usize, number: u64) -> usize {
+    pub fn missing_reply_count(&self, bus_index: usize, number: u64) -> usize {
         let Some(bus_comparator) = self.buses.get(bus_index) else { return 0 };
         let Some(round) = number
             .checked_sub(bus_comparator.base)
@@ -322,7 +322,7 @@ impl Comparator {
             return torques;
         }
         let then = EpochSums::new(then, &bus_comparator.trees.recorded, number);
-        let misses = |cell: &CellId| is_there(cell) && !now.has(*cell) && then.is_in_contact(*cell);
+        let misses = |cell: &CellId| is_there(cell) && !now.contains_cell(*cell) && then.is_in_contact(*cell);
         torques + round.sums.recorded.cells().filter(misses).count()
     }
 
@@ -335,7 +335,7 @@ impl Comparator {
 
     /// Mutes or unmutes the comparison. While muted, it ignores replies. After unmuting, it compares replies to joints
     /// that are sent from then on.
-    pub fn mute(&mut self, is_muted: bool) {
+    pub fn set_muted(&mut self, is_muted: bool) {
         self.is_muted = is_muted;
         for announced in
             self.buses.iter_mut().flat_map(|bus_comparator| bus_comparator.announced.iter_mut().flatten())
@@ -346,7 +346,7 @@ impl Comparator {
 
     /// Index of the bus on which another gateway has sent.
     #[must_use]
-    pub const fn other_gateway(&self) -> Option<usize> {
+    pub const fn other_gateway_bus(&self) -> Option<usize> {
         self.other_gateway
     }
 
@@ -365,7 +365,7 @@ impl Comparator {
 
     /// Returns the cells that have no parent for their sums: they have reported none, or are unreachable.
     #[must_use]
-    pub fn unreachable(&self, bus_index: usize) -> Vec<CellId> {
+    pub fn unreachable_cells(&self, bus_index: usize) -> Vec<CellId> {
         let settled = self.settled_cells(bus_index);
         let Some(bus_comparator) = self.buses.get(bus_index) else { return Vec::new() };
         settled.map(|(cell, _)| cell).filter(|cell| !bus_comparator.trees.now.is_reachable(*cell)).collect()
@@ -375,7 +375,7 @@ impl Comparator {
     pub fn finish(&mut self, is_whole: bool) {
         self.is_muted = true;
         for bus_comparator in self.buses.iter_mut().filter(|_| !is_whole) {
-            bus_comparator.drop_unsent();
+            bus_comparator.drop_unsent_replies();
         }
         for bus_comparator in 0..self.buses.len() {
             while self
@@ -393,13 +393,13 @@ impl Comparator {
 
     /// Returns the counts so far.
     #[must_use]
-    pub const fn tally(&self) -> &Tally {
+    pub const fn tally(&self) -> &ReplyTally {
         &self.tally
     }
 
     /// Returns the first difference: a different, missing or extra reply.
     #[must_use]
-    pub const fn first(&self) -> Option<&Difference> {
+    pub const fn first_difference(&self) -> Option<&Difference> {
         self.first.difference.as_ref()
     }
 }

@@ -44,7 +44,7 @@ impl ParentHistory {
     }
 
     /// Returns the parent of a cell in a round, or `None` if it is unknown.
-    fn parent(&self, cell: CellId, round: u64) -> Option<Option<u8>> {
+    fn parent_in_round(&self, cell: CellId, round: u64) -> Option<Option<u8>> {
         let steps = self.0.get(&cell)?;
         steps.iter().rev().find(|step| step.since <= round).map(|step| step.parent)
     }
@@ -55,7 +55,7 @@ impl ParentHistory {
     fn cells_changing_parent(&self, round: u64) -> BTreeSet<CellId> {
         let mut all = BTreeSet::new();
         for (cell, steps) in &self.0 {
-            let is_away = self.parent(*cell, round) == Some(None);
+            let is_away = self.parent_in_round(*cell, round) == Some(None);
             if is_away && steps.back().is_some_and(|last| last.parent.is_some()) {
                 all.insert(*cell);
             }
@@ -71,7 +71,7 @@ impl ParentHistory {
     }
 
     /// Drops changes of parents from before a round.
-    pub(super) fn forget_before(&mut self, round: u64) {
+    pub(super) fn forget_changes_before(&mut self, round: u64) {
         for steps in self.0.values_mut() {
             // The entry before a change holds the former parent.
             while steps.get(2).is_some_and(|third| third.since < round) {
@@ -109,12 +109,12 @@ impl SumsByCell {
         self.0.is_empty()
     }
 
-    pub(super) fn has(&self, cell: CellId) -> bool {
+    pub(super) fn contains_cell(&self, cell: CellId) -> bool {
         self.0.contains_key(&cell)
     }
 
     /// Returns each cell with the number of cells that contribute to its sum.
-    pub(super) fn counts(&self) -> impl Iterator<Item = (CellId, u8)> {
+    pub(super) fn contributor_counts(&self) -> impl Iterator<Item = (CellId, u8)> {
         self.0.iter().map(|(cell, sum)| (*cell, sum.count))
     }
 
@@ -151,7 +151,7 @@ impl OwnContribution {
 
     /// Returns the differences in steps between the words of two contributions, for words that are saturated in
     /// neither.
-    pub(super) fn differences(&self, other: &Self) -> impl Iterator<Item = u32> {
+    pub(super) fn step_differences(&self, other: &Self) -> impl Iterator<Item = u32> {
         let both = self.steps.iter().zip(&other.steps);
         both.filter_map(|(own, it)| Some(own.as_ref()?.abs_diff(*it.as_ref()?)))
     }
@@ -195,11 +195,11 @@ impl<'a> EpochSums<'a> {
     pub(super) fn new(sums: &'a SumsByCell, trees: &ParentHistory, round: u64) -> Self {
         let mut children: BTreeMap<u8, Vec<CellId>> = BTreeMap::new();
         for cell in trees.0.keys() {
-            if let Some(parent) = trees.parent(*cell, round).flatten() {
+            if let Some(parent) = trees.parent_in_round(*cell, round).flatten() {
                 children.entry(parent).or_default().push(*cell);
             }
         }
-        let is_known = sums.cells().all(|cell| trees.parent(cell, round).is_some());
+        let is_known = sums.cells().all(|cell| trees.parent_in_round(cell, round).is_some());
         let parents = trees.0.iter().filter(|(_, steps)| steps.len() > 1);
         let parents = parents.map(|(cell, steps)| (*cell, steps.iter().filter_map(|it| it.parent).collect()));
         Self {
@@ -220,12 +220,12 @@ impl<'a> EpochSums<'a> {
         let CellSum { torque: sum, count } = *self.sums.0.get(&cell)?;
         let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
         let (mut children, mut cells) = (Vec::new(), i32::from(count));
-        let mut steps = sum.padded().map(unsaturated);
+        let mut steps = sum.padded().map(value_unless_saturated);
         for (child, its) in below {
             children.push(child);
             cells -= i32::from(its.count);
             for (own, &word) in steps.iter_mut().zip(its.torque.as_slice()) {
-                *own = own.zip(unsaturated(word)).map(|(own, word)| own - word);
+                *own = own.zip(value_unless_saturated(word)).map(|(own, word)| own - word);
             }
         }
         Some(OwnContribution { sum, count, children, steps, cells })
@@ -234,7 +234,12 @@ impl<'a> EpochSums<'a> {
     /// Returns true if a cell's sum minus its children's sums cannot be its own contribution, given whether stimuli
     /// touch the cell. Its children were then others than their pages report or, if joints were resent (`is_mixed`),
     /// sums of two sendings are mixed.
-    pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
+    pub(super) fn is_contribution_impossible(
+        &self,
+        cell: CellId,
+        is_touched: Option<bool>,
+        is_mixed: bool,
+    ) -> bool {
         self.own_contribution(cell).is_some_and(|own| {
             let adds = own.cells == 0 && !own.is_zero();
             is_touched.is_some_and(|is_touched| is_touched != (own.cells > 0)) || is_mixed && adds
@@ -248,7 +253,7 @@ impl<'a> EpochSums<'a> {
 
     /// Returns true if a cell's sum contains the received sums of all its children. The sum minus those sums is then
     /// the cell's own contribution.
-    fn contains_children(&self, cell: CellId, other: &Self) -> bool {
+    fn contains_child_sums(&self, cell: CellId, other: &Self) -> bool {
         let Some(own) = self.own_contribution(cell) else { return true };
         let adds_up = match own.cells {
             // The sum contains the cell's own contribution but lacks the sum of a child, which counts one cell.
@@ -257,20 +262,21 @@ impl<'a> EpochSums<'a> {
             _ => false,
         };
         // If a child's sum was received on one side only, it is unknown whether this sum contains it.
-        let silent = |child: &CellId| !self.sums.has(*child) && other.is_in_contact(*child);
+        let silent = |child: &CellId| !self.sums.contains_cell(*child) && other.is_in_contact(*child);
         adds_up && !self.children(cell).iter().any(silent)
     }
 
     /// Returns true if a cell's sum exceeds that of the other side by the sum of a former or later child. By its page,
     /// that cell is not a child in this epoch, because a page follows the change that it reports. Its sum must not be
     /// contained in another parent's sum.
-    fn contains_moved_cell(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
+    fn contains_moved_cell_sum(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
         let own_of = |cell| Some((self.own_contribution(cell)?, other.own_contribution(cell)?));
         let Some((own, its)) = own_of(cell) else { return false };
         let adds = |sum: &CellSum| {
             let words = own.steps.iter().zip(&its.steps).zip(sum.torque.padded());
-            let mut words = words
-                .filter_map(|((own, its), word)| Some(own.as_ref()? - its.as_ref()? - unsaturated(word)?));
+            let mut words = words.filter_map(|((own, its), word)| {
+                Some(own.as_ref()? - its.as_ref()? - value_unless_saturated(word)?)
+            });
             own.cells - its.cells == i32::from(sum.count) && words.all(|left| left.unsigned_abs() <= allowed)
         };
         let is_elsewhere = |mover: &CellId| {
@@ -290,7 +296,7 @@ impl<'a> EpochSums<'a> {
     fn subtree(&self, cell: CellId) -> BTreeSet<CellId> {
         let (mut all, mut next) = (BTreeSet::new(), vec![cell]);
         while let Some(cell) = next.pop() {
-            if self.sums.has(cell) && all.insert(cell) {
+            if self.sums.contains_cell(cell) && all.insert(cell) {
                 next.extend(self.children(cell));
             }
         }
@@ -298,7 +304,7 @@ impl<'a> EpochSums<'a> {
     }
 }
 
-fn unsaturated(word: i16) -> Option<i32> {
+fn value_unless_saturated(word: i16) -> Option<i32> {
     (!Q7_8::from_bits(word).is_saturated()).then(|| i32::from(word))
 }
 
@@ -318,7 +324,7 @@ pub(super) fn compare(
     if !recorded.is_known || !now.is_known {
         return SumComparison::Omitted(OmitReason::Unknown);
     }
-    if !recorded.contains_children(cell, now) || !now.contains_children(cell, recorded) {
+    if !recorded.contains_child_sums(cell, now) || !now.contains_child_sums(cell, recorded) {
         return SumComparison::Omitted(OmitReason::NotTaken);
     }
     let (then, today) = (recorded.own_contribution(cell), now.own_contribution(cell));
@@ -327,7 +333,7 @@ pub(super) fn compare(
             // A word can be saturated by the sum over a whole subtree, so in another tree other cells have saturated
             // words.
             let alike = |then: i16, today: i16| {
-                unsaturated(then).is_none() == unsaturated(today).is_none()
+                value_unless_saturated(then).is_none() == value_unless_saturated(today).is_none()
                     || recorded.subtree(cell) != now.subtree(cell)
             };
             // A cell that only forwards others' sums has no torque that could differ.
@@ -346,8 +352,8 @@ pub(super) fn compare(
                 });
             if same {
                 SumComparison::Equal
-            } else if now.contains_moved_cell(cell, recorded, allowed)
-                || recorded.contains_moved_cell(cell, now, allowed)
+            } else if now.contains_moved_cell_sum(cell, recorded, allowed)
+                || recorded.contains_moved_cell_sum(cell, now, allowed)
             {
                 SumComparison::Omitted(OmitReason::NotTaken)
             } else {

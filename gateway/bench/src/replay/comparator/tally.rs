@@ -7,7 +7,7 @@ use crate::replay::difference::DifferenceKind;
 
 /// Counts of compared replies.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Tally {
+pub struct ReplyTally {
     /// Replies equal to the recorded ones.
     pub equal: u64,
     /// Replies with other words.
@@ -43,7 +43,7 @@ pub struct StepHistogram {
 
 impl StepHistogram {
     /// Counts the differences between the words of one reply and the recorded ones. Returns the largest of them.
-    pub(super) fn count(&mut self, differences: impl IntoIterator<Item = u32>) -> u32 {
+    pub(super) fn count_step_differences(&mut self, differences: impl IntoIterator<Item = u32>) -> u32 {
         let mut max = 0;
         for steps in differences {
             max = max.max(steps);
@@ -97,10 +97,10 @@ pub struct UncomparedReplies {
     pub sums_not_taken: u64,
 }
 
-impl Tally {
+impl ReplyTally {
     /// Counts a reply that differs from the recorded one. A missing reply to joints that the bus refused (`is_unsent`)
     /// counts as not requested.
-    pub(super) const fn count(&mut self, how: DifferenceKind, is_unsent: bool) {
+    pub(super) const fn count_difference(&mut self, how: DifferenceKind, is_unsent: bool) {
         let count = match how {
             DifferenceKind::Missing if is_unsent => &mut self.not_requested,
             DifferenceKind::Missing => &mut self.missing,
@@ -117,7 +117,7 @@ impl Tally {
             .iter()
             .zip(now.as_slice())
             .map(|(recorded, now)| recorded.abs_diff(*now).into());
-        let max = self.torque_words.count(steps);
+        let max = self.torque_words.count_step_differences(steps);
         let is_equal = recorded.length() == now.length() && max <= u32::from(tolerance);
         self.tolerated += u64::from(is_equal && max > 0);
         is_equal
@@ -125,7 +125,7 @@ impl Tally {
 
     /// Returns true if sums had to be left out because their trees are unknown, and none could be compared.
     #[must_use]
-    pub const fn lacks_the_tree(&self) -> bool {
+    pub const fn lacks_known_trees(&self) -> bool {
         self.sums == 0 && self.lacking.tree_unknown > 0
     }
 
@@ -136,6 +136,6 @@ impl Tally {
             && self.missing == 0
             && self.extra == 0
             && self.not_requested == 0
-            && !self.lacks_the_tree()
+            && !self.lacks_known_trees()
     }
 }

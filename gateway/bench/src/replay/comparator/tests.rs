@@ -62,7 +62,7 @@ fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Compa
     survey.finish();
     let cells = survey.buses[0].cells.clone();
     comparator.buses[0].known = cells.into_iter().map(|(node, cell)| (node, KnownCell::new(cell))).collect();
-    comparator.mute(false);
+    comparator.set_muted(false);
     for (nanos, message) in times.zip(recording) {
         if let Message::Joints { epoch, .. } = *message {
             comparator.expect_joints(0, nanos, epoch, true);
@@ -77,7 +77,7 @@ fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Compa
             comparator.announce_joints(0, Some(round), epoch);
             round += 1;
         } else {
-            comparator.observe(0, message);
+            comparator.observe_message(0, message);
         }
     }
     comparator.finish(true);
@@ -85,7 +85,7 @@ fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Compa
 }
 
 fn counts(comparator: &Comparator) -> [u64; 4] {
-    let Tally { equal, different, missing, extra, .. } = comparator.tally;
+    let ReplyTally { equal, different, missing, extra, .. } = comparator.tally;
     [equal, different, missing, extra]
 }
 
@@ -121,7 +121,7 @@ fn one_step_is_a_difference() {
     now[5] = torque(1, 2, 7);
     let comparator = rated(&run(), &now);
     assert_eq!(counts(&comparator), [2, 1, 0, 0]);
-    let first = comparator.first().unwrap();
+    let first = comparator.first_difference().unwrap();
     assert_eq!(
         (first.how, first.when.map(|when| (when.joints, when.epoch))),
         (DifferenceKind::Different, Some((2, 2)))
@@ -135,13 +135,16 @@ fn missing_and_extra_replies_are_distinguished() {
     now.remove(5);
     let comparator = rated(&run(), &now);
     assert_eq!(
-        (counts(&comparator), comparator.first().unwrap().how),
+        (counts(&comparator), comparator.first_difference().unwrap().how),
         ([2, 0, 1, 0], DifferenceKind::Missing)
     );
     let mut now = run();
     now.insert(9, torque(1, 4, 9));
     let comparator = rated(&[&run()[..], &[joints(5)]].concat(), &now);
-    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([3, 0, 0, 1], DifferenceKind::Extra));
+    assert_eq!(
+        (counts(&comparator), comparator.first_difference().unwrap().how),
+        ([3, 0, 0, 1], DifferenceKind::Extra)
+    );
     // Two equal replies count as one, as for joints that were resent; two different ones do not.
     let mut now = run();
     now.insert(4, torque(1, 1, 5));
@@ -277,7 +280,7 @@ fn the_contact_of_a_cell_before_its_first_joints_belongs_to_no_joints() {
 #[test]
 fn joints_that_a_bus_did_not_take_have_no_answer() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
-    comparator.mute(false);
+    comparator.set_muted(false);
     comparator.expect_joints(0, 1, Epoch(1), true);
     comparator.expect_message(0, &torque(1, 1, 5), true);
     comparator.announce_joints(0, Some(0), Epoch(1));
@@ -300,7 +303,7 @@ fn answers_to_configure_are_compared_in_their_order() {
     let now = [joints(0), says(value(P::Identity, 9)), says(value(P::Pose, 1)), says(value(P::Pose, 3))];
     let comparator = rated(&recording, &now);
     assert_eq!(counts(&comparator), [1, 1, 0, 0], "a cell's identity is not compared");
-    let text = comparator.first().unwrap().text.clone();
+    let text = comparator.first_difference().unwrap().text.clone();
     assert!(text.contains("recorded  configured 1 tag 3: wrote pose"), "{text}");
 }
 
@@ -357,7 +360,12 @@ fn sums_less_their_children_are_equal_in_another_tree() {
     let comparator = rated(&row(), &row());
     assert_eq!((counts(&comparator), comparator.tally.sums), ([18, 0, 0, 0], 18), "all three sent");
     let comparator = rated(&row(), &beside([10, 30]));
-    assert_eq!((counts(&comparator), comparator.tally.sums), ([12, 0, 0, 0], 12), "{:?}", comparator.first());
+    assert_eq!(
+        (counts(&comparator), comparator.tally.sums),
+        ([12, 0, 0, 0], 12),
+        "{:?}",
+        comparator.first_difference()
+    );
     assert!(comparator.tally.has_only_equal_replies());
     let comparator = rated(&row(), &beside([11, 29]));
     assert_eq!(counts(&comparator), [12, 0, 0, 0], "one step is rounding");
@@ -367,7 +375,7 @@ fn sums_less_their_children_are_equal_in_another_tree() {
 fn a_sum_that_differs_is_shown_with_its_children() {
     let comparator = rated(&row(), &beside([16, 30]));
     assert_eq!(counts(&comparator), [6, 6, 0, 0]);
-    let text = comparator.first().unwrap().text.clone();
+    let text = comparator.first_difference().unwrap().text.clone();
     let expected = "the first difference: cell 1 on vcan0, joints 0 (epoch 0, 0.007 s into the recording)
   recorded  sum 1 epoch 0: 0.156 0.000 0.000 0.000 0.000 0.000 Nm, cells 2; less its child 2: 0.039 0.000 0.000 \
                     0.000 0.000 0.000 Nm
@@ -386,7 +394,7 @@ fn a_cell_that_adds_nothing_any_more_is_missing() {
     let comparator = rated(&row(), &now);
     // It is unknown whether the parent received it then.
     assert_eq!(
-        (counts(&comparator), comparator.first().unwrap().how),
+        (counts(&comparator), comparator.first_difference().unwrap().how),
         ([11, 0, 1, 0], DifferenceKind::Missing)
     );
 }
@@ -445,53 +453,26 @@ fn without_a_tree_nothing_is_compared_and_that_is_no_success() {
 #[test]
 fn joints_that_are_retried_have_the_sums_of_the_last_time() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
-    comparator.mute(false);
+    comparator.set_muted(false);
     for message in &row()[3..6] {
         comparator.expect_message(0, message, true);
-        comparator.observe(0, message);
+        comparator.observe_message(0, message);
     }
-    comparator.observe(0, &heartbeat(1, 0, 0, Flags::TEST_MODE));
+    comparator.observe_message(0, &heartbeat(1, 0, 0, Flags::TEST_MODE));
     comparator.expect_joints(0, 1, Epoch(7), true);
     comparator.expect_message(0, &sum(1, 7, 40, 1), true);
     comparator.announce_joints(0, Some(0), Epoch(7));
-    comparator.observe(0, &sum(1, 7, 90, 2));
-    assert_eq!(comparator.unanswered(0, 0), 0);
+    comparator.observe_message(0, &sum(1, 7, 90, 2));
+    assert_eq!(comparator.missing_reply_count(0, 0), 0);
     comparator.announce_joints(0, Some(0), Epoch(6));
-    assert_eq!(comparator.unanswered(0, 0), 1);
-    comparator.observe(0, &sum(1, 7, 90, 2));
-    comparator.observe(0, &sum(1, 6, 40, 1));
-    assert_eq!(comparator.unanswered(0, 0), 0);
+    assert_eq!(comparator.missing_reply_count(0, 0), 1);
+    comparator.observe_message(0, &sum(1, 7, 90, 2));
+    comparator.observe_message(0, &sum(1, 6, 40, 1));
+    assert_eq!(comparator.missing_reply_count(0, 0), 0);
     comparator.finish(true);
     assert_eq!(counts(&comparator), [1, 0, 0, 0]);
 }
 
-#[test]
-fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
-    let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
-    let beat = |node, epoch| heartbeat(node, epoch, 0, Flags::TEST_MODE);
-    comparator.observe(0, &beat(1, 0));
-    comparator.observe(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
-    assert!(comparator.is_done(0), "nothing was sent");
-    comparator.announce_joints(0, None, Epoch(9));
-    assert!(!comparator.is_done(0));
-    comparator.observe(0, &beat(1, 8));
-    assert!(!comparator.is_done(0), "sent before it took them");
-    comparator.observe(0, &beat(1, 9));
-    assert!(comparator.is_done(0), "a cell that claims its node id is not waited for");
-    comparator.announce_joints(0, None, Epoch(10));
-    // A cell that refuses these joints sends its old epoch: once in its periodic heartbeat, once because of the sync.
-    comparator.observe(0, &beat(1, 9));
-    assert!(!comparator.is_done(0));
-    comparator.observe(0, &beat(1, 9));
-    assert!(comparator.is_done(0));
-    comparator.announce_joints(0, None, Epoch(11));
-    assert_eq!(comparator.time_out_cells(0), [cell(1)]);
-    assert!(comparator.is_done(0), "given up");
-    comparator.observe(0, &beat(1, 10));
-    assert!(!comparator.is_done(0), "it sends again");
-    comparator.mark_down(0);
-    assert!(comparator.is_done(0), "no cell is waited for on a bus that is down");
-}
-
 mod claims;
+mod lockstep;
 mod tolerance;

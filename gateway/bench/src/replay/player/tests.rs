@@ -23,7 +23,7 @@ struct Fake {
 }
 
 impl PlayerBackend for Fake {
-    fn now(&self) -> u64 {
+    fn now_ns(&self) -> u64 {
         self.clock
     }
     fn wait_until(&mut self, at: u64) {
@@ -35,7 +35,7 @@ impl PlayerBackend for Fake {
     fn is_over(&self) -> bool {
         self.stops_at.is_some_and(|at| self.clock >= at)
     }
-    fn announce(&mut self, bus_link: usize, round: Option<u64>, _: Epoch) {
+    fn announce_joints(&mut self, bus_link: usize, round: Option<u64>, _: Epoch) {
         self.announced.push((bus_link, round));
     }
     fn send(&mut self, bus_link: usize, frames: &[Frame]) -> Result<(), SendError> {
@@ -43,18 +43,18 @@ impl PlayerBackend for Fake {
         self.clock += self.takes;
         if self.outcomes.is_empty() { Ok(()) } else { self.outcomes.remove(0) }
     }
-    fn mark_unsent(&mut self, bus_link: usize, round: u64) {
+    fn mark_round_unsent(&mut self, bus_link: usize, round: u64) {
         self.unsent.push((bus_link, round));
     }
     fn wait_for_answers(&mut self, bus_link: usize, _: &AwaitedJoints) {
         self.waited.push((self.sent.len(), bus_link));
     }
-    fn restore(&mut self, _: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
+    fn restore_latched_state(&mut self, _: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
         self.restored += 1;
         self.clock += 1_000_000_000;
         Ok(())
     }
-    fn show(&mut self, _: u64) {}
+    fn show_position(&mut self, _: u64) {}
 }
 
 /// The error of a bus that stayed full after `sent` frames.
@@ -276,7 +276,7 @@ proptest! {
         for ((at, bus_link, frame), step) in tried.iter().zip(&steps) {
             let PlayerStep::Frame(due) = step else { unreachable!() };
             prop_assert_eq!((*bus_link, *frame), (due.bus_index, due.frame));
-            prop_assert!(*at >= due.at - first + LEAD_NS, "early");
+            prop_assert!(*at >= due.at - first + START_DELAY_NS, "early");
         }
         let total: u64 = played.bus_links.iter().map(|bus_link| bus_link.sent + bus_link.refused + bus_link.lost).sum();
         prop_assert_eq!(total, steps.len() as u64);

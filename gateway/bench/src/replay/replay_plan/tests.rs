@@ -109,7 +109,7 @@ fn all_is_sent_but_what_never_was_on_a_bus() {
     let (due, plan_summary) = plan_summary(TimeRange::default(), |_| {}, 1);
     let ids = [(0, 0, 0x701), (1, 0, 1), (2, 1, 1), (3, 0, 0x201), (4, 0, 5), (6, 0, 1), (7, 1, 0x202)];
     assert_eq!(shown(&due), ids);
-    assert_eq!(plan_summary.skipped, BTreeMap::from([(reason::ERROR, 1)]));
+    assert_eq!(plan_summary.skipped, BTreeMap::from([(reason::ERROR_FRAME, 1)]));
     // Joints are numbered per bus.
     let rounds = due.iter().filter_map(|due| match due.role {
         FrameRole::Joints(AwaitedJoints { round, .. }) => Some((due.bus_index, round)),
@@ -123,11 +123,11 @@ fn inputs_and_replies_are_the_two_sides() {
     let (inputs, truncate_inputs) =
         plan_summary(TimeRange::default(), |selection| selection.only = SenderFilter::Inputs, 1);
     assert_eq!(shown(&inputs), [(0, 0, 0x701), (1, 0, 1), (2, 1, 1), (6, 0, 1)]);
-    assert_eq!(truncate_inputs.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_INPUT, 3)]));
+    assert_eq!(truncate_inputs.skipped, BTreeMap::from([(reason::ERROR_FRAME, 1), (reason::NO_INPUT, 3)]));
     let (replies, share_of_replies) =
         plan_summary(TimeRange::default(), |selection| selection.only = SenderFilter::Replies, 1);
     assert_eq!(shown(&replies), [(0, 0, 0x201), (4, 1, 0x202)], "the first one begins");
-    assert_eq!(share_of_replies.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_REPLY, 5)]));
+    assert_eq!(share_of_replies.skipped, BTreeMap::from([(reason::ERROR_FRAME, 1), (reason::NO_REPLY, 5)]));
 }
 
 #[test]
@@ -174,8 +174,12 @@ fn a_part_begins_and_ends_at_its_times_and_buses_are_mapped() {
     let part = TimeRange { from: Some(MS), to: Some(6 * MS) };
     let (due, plan_summary) = plan_summary(part, |selection| selection.destinations = vec![None, Some(0)], 1);
     assert_eq!(shown(&due), [(0, 0, 1)]);
-    let skipped =
-        [(reason::BEFORE_PART, 1), (reason::AFTER_PART, 2), (reason::NOT_PICKED, 3), (reason::ERROR, 1)];
+    let skipped = [
+        (reason::BEFORE_PART, 1),
+        (reason::AFTER_PART, 2),
+        (reason::BUS_NOT_SELECTED, 3),
+        (reason::ERROR_FRAME, 1),
+    ];
     assert_eq!(plan_summary.skipped, BTreeMap::from(skipped));
 }
 

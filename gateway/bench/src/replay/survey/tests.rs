@@ -23,13 +23,13 @@ fn a_part_has_counters_elsewhere_though_one_of_its_buses_began_lost() {
     let time = Timestamp { nanos: 5, nine_digits: true, min_digits: 0 };
     let of = |latched: &[LatchedFrame]| {
         let mut survey = Survey::new(TimeRange::default());
-        survey.add_latched(latched);
+        survey.add_latched_frames(latched);
         for interface in ["vcan0", "vcan1"] {
             survey.add_frame(&Record { time, interface, frame: frames[0], direction: None });
         }
         survey.finish();
         let buses = survey.buses.iter().filter(|bus| !bus.cells.is_empty());
-        buses.map(|bus| bus.cells.values().next().unwrap().is_counted_at(5)).collect::<Vec<_>>()
+        buses.map(|bus| bus.cells.values().next().unwrap().is_covered_by_counters(5)).collect::<Vec<_>>()
     };
     assert_eq!(of(&[]), [true, true], "a log of a bench that has no counters");
     let frame = Message::Resume.encode().frames(Format::Fd).next().unwrap();
@@ -88,7 +88,7 @@ fn a_cell_may_have_taken_joints_before_its_first_heartbeat() {
     bus.joints(1..=10);
     bus.page(10, heartbeat(900, Flags::default()));
     bus.joints(11..=20);
-    bus.page(20, heartbeat(0, Flags::CLAIMING));
+    bus.page(20, heartbeat(0, Flags::CLAIMING_NODE_ID));
     bus.joints(21..=30);
     // The cell began with epoch 15 and received all joints but three; which three is unknown.
     assert_eq!(bus.heard(30, 13), 4);

@@ -295,7 +295,7 @@ fn every_loss_is_looked_at() {
     assert_eq!(look_at(|it| it.buses[0].dropped_by_bus = 1).len(), 1, "of joints, for example");
     assert_eq!(look_at(|it| it.buses[0].epochs_complete -= 1), ["1 of 575 epochs not complete on vcan0"]);
     assert_eq!(look_at(|it| it.control.records_lost = 1).len(), 1);
-    for event in Event::ALL {
+    for event in FrameEvent::ALL {
         assert_eq!(look_at(|it| count(it, event.name(), 1)).len(), 1, "{event:?}");
     }
 }

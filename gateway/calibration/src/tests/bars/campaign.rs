@@ -153,12 +153,13 @@ fn campaign(kind: &str, clocks: &[Clock], many: impl Fn(f64) -> (u64, u64), refu
     for round in 0..rounds {
         let place = round as usize % DURATIONS.len();
         let settings = Settings {
-            bounds: Bounds { length_s: DURATIONS[place], ..Bounds::from_skin(&skin) },
+            bounds: PlanBounds { length_s: DURATIONS[place], ..PlanBounds::from_skin(&skin) },
             threads: 2,
             ..Settings::from_skin(&skin)
         };
-        let motion =
-            motions.entry(place).or_insert_with(|| plan(&skin, &settings.bounds, &sheet, GRAVITY).unwrap());
+        let motion = motions
+            .entry(place)
+            .or_insert_with(|| plan_motion(&skin, &settings.bounds, &sheet, GRAVITY).unwrap());
         let mut dice = Pcg64Mcg::seed_from_u64(round + 1_000);
         let (count, longest_ms) = many(motion.length_s());
         let gaps = gaps(&mut dice, count, longest_ms, motion.length_s());
@@ -184,7 +185,7 @@ fn campaign(kind: &str, clocks: &[Clock], many: impl Fn(f64) -> (u64, u64), refu
             let Some(found) = result.found.filter(|_| result.troubles.is_empty()) else { continue };
             let [x, y, z, w] = found.orientation;
             let turned = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-            let turn = turned.angle_to(&rotation(cell.orientation, cell.normal)).to_degrees();
+            let turn = turned.angle_to(&cell_rotation(cell.orientation, cell.normal)).to_degrees();
             let way = (Vector3::from(found.position) - Vector3::from(cell.position)).norm() * 1e3;
             let is_there = found.joint == cell.joint;
             tally.cells += 1;
@@ -254,8 +255,8 @@ fn small() -> (Skin, Settings, MotionPlan) {
     let skin =
         Skin::parse("skin.toml", &generate(&SkinRequest { cells: 6, ..SkinRequest::default() }).unwrap())
             .unwrap();
-    let bounds = Bounds { length_s: 20.0, ..Bounds::from_skin(&skin) };
-    let motion = plan(&skin, &bounds, &DataSheet::default(), GRAVITY).unwrap();
+    let bounds = PlanBounds { length_s: 20.0, ..PlanBounds::from_skin(&skin) };
+    let motion = plan_motion(&skin, &bounds, &DataSheet::default(), GRAVITY).unwrap();
     let settings = Settings { bounds, ..Settings::from_skin(&skin) };
     (skin, settings, motion)
 }
@@ -287,7 +288,7 @@ fn joints_of_another_robot_or_at_another_rate_are_refused() {
     described.timing.ticks_per_broadcast = 10;
     let refusal = refused(&described);
     assert!(matches!(refusal, Refusal::Rate { got: 62.0..63.0, hz: 50.0, .. }), "{refusal}");
-    let refusal = refused(&testing::panda());
+    let refusal = refused(&testing::panda_skin());
     assert!(matches!(refusal, Refusal::Joints { got: 6, joints: 7, .. }), "{refusal}");
 }
 
@@ -307,7 +308,7 @@ fn a_recording_of_gaps_alone_is_refused_with_their_number() {
 fn without_a_pose_there_is_no_number() {
     let (skin, settings, motion) = small();
     let sensors = Accelerometers::new(&skin, &settings.sheet, 3, GRAVITY);
-    let seen = observe(&skin, &motion, &sensors, &[Defect::Dead; 6]);
+    let seen = simulate_observations(&skin, &motion, &sensors, &[CellDefect::Dead; 6]);
     let calibration = calibrate(&skin, &seen, &settings).unwrap();
     let summary = calibration.summary;
     assert_eq!((summary.position_mm, summary.orientation_deg, summary.noise_mg), (None, None, None));

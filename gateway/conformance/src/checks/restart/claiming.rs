@@ -13,14 +13,14 @@ use crate::bus::StopReason;
 use crate::session::{CellPacket, Session};
 
 /// The maximum number of restarts for one check, which is repeated if the bench was late.
-const ATTEMPTS: usize = 4;
+const MAX_RESTARTS_PER_CHECK: usize = 4;
 /// The maximum time that a cell which waits for a processor takes to process a frame; beyond it, the whole group is
 /// repeated.
-const PROCESSING_MARGIN: Span = Span::from_millis(100);
-const CLAIM_OVER: &str = "the bench was late each time: the claim was over";
+const FRAME_PROCESSING_MARGIN: Span = Span::from_millis(100);
+const CLAIM_OVER_REMARK: &str = "the bench was late each time: the claim was over";
 
 /// Returns the earliest end of a cell's claim, from the time of its first heartbeat.
-fn earliest_end(session: &Session<'_>, claimed: Micros) -> Micros {
+fn earliest_claim_end(session: &Session<'_>, claimed: Micros) -> Micros {
     let Span(whole) = claim(session);
     claimed + Span(whole - whole / 100 - 2_000)
 }
@@ -34,15 +34,15 @@ pub(super) fn check_while_claiming(
     if session.about.test_mode {
         session.switch_test_mode(false)?;
     }
-    for _ in 0..ATTEMPTS {
+    for _ in 0..MAX_RESTARTS_PER_CHECK {
         if send_ignored_packets(session, after_test_mode)? {
             return Ok(());
         }
     }
-    session.findings.not_tested("CLAIM-2", CLAIM_OVER);
-    session.idle(claim(session))?;
+    session.findings.mark_not_tested("CLAIM-2", CLAIM_OVER_REMARK);
+    session.receive_for(claim(session))?;
     session.known.may_be_silent = false;
-    session.excuse_silence();
+    session.excuse_silence_until_now();
     session.prepare_cell(&arm::example_parameters(2))?;
     Ok(())
 }
@@ -50,22 +50,26 @@ pub(super) fn check_while_claiming(
 /// Sends packets that a claiming cell must ignore. Returns true if all of them arrived while it was claiming.
 fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, StopReason> {
     let claimed = restart(session)?;
-    let end = earliest_end(session, claimed);
-    let state =
-        session.answers().last().and_then(CellPacket::beat).map(|(beat, _)| beat.state).unwrap_or_default();
+    let end = earliest_claim_end(session, claimed);
+    let state = session
+        .answers()
+        .last()
+        .and_then(CellPacket::heartbeat_and_epoch)
+        .map(|(beat, _)| beat.state)
+        .unwrap_or_default();
     let presses = state.has(State::TEST_MODE);
     session.check("CONF-9", presses == after_test_mode || !session.about.test_mode, || {
         "test mode must have the same initial value after each restart, but kept an earlier one".to_owned()
     });
     session.begin_expected_exchange();
-    session.press(arm::press_with_sum(4_096))?;
+    session.send_stimulus(arm::press_with_sum(4_096))?;
     let first = session.next_epoch();
     let second = session.next_epoch();
     let own = Node::Cell(session.cell);
     let request = |number, request| Message::Configure { to: own, tag: number, request };
     let write = Request::Write { number: 1, words: padded_words([999, 999]) };
     let all = [
-        session.joints(first, &[0; MAX_JOINTS]),
+        session.joints_message(first, &[0; MAX_JOINTS]),
         Message::Sync,
         Message::Report,
         request(1, Request::Read { number: 0 }),
@@ -80,22 +84,22 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
             6,
             Request::Write { number: Parameter::Mode.number(), words: padded_words([(!presses).into()]) },
         ),
-        session.joints(second, &[0; MAX_JOINTS]),
+        session.joints_message(second, &[0; MAX_JOINTS]),
         Message::Halt,
     ];
     let mut last = claimed;
     for message in all {
         last = session.send_messages(&[message])?;
-        session.idle(Span::from_millis(3))?;
+        session.receive_for(Span::from_millis(3))?;
     }
-    if last + PROCESSING_MARGIN >= end {
+    if last + FRAME_PROCESSING_MARGIN >= end {
         // The cell had to answer some of them, and may send sensor values from now on.
-        session.idle(Span::from_millis(200))?;
-        session.mark_expected();
+        session.receive_for(Span::from_millis(200))?;
+        session.mark_packets_expected();
         session.known.senses = true;
         return Ok(false);
     }
-    session.idle(Span::from_millis(20))?;
+    session.receive_for(Span::from_millis(20))?;
     let came = session.answers().iter().filter(|it| it.at < end);
     let came: Vec<_> = came.map(|it| it.message.id().kind.name()).collect();
     session.check("CLAIM-2", came.is_empty(), || {
@@ -108,7 +112,7 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
     session.known.epoch = Some(second);
     session.known.halted = Some(true);
     session.known.hash = session.known.parameters.map(|it| it.hash());
-    let is_on = session.exchange_all(&[])?.state().has(State::TEST_MODE);
+    let is_on = session.exchange_messages(&[])?.state().has(State::TEST_MODE);
     session.check("CLAIM-2", is_on == presses, || {
         "a claiming cell must ignore a write of parameter 5, but obeyed it".to_owned()
     });
@@ -124,7 +128,7 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
         format!("a claiming cell must not count packets that it ignores, but the counters are {counters}")
     });
     if presses {
-        let report = session.report()?;
+        let report = session.request_report()?;
         let skin = report.iter().find_map(|it| match it.sensors() {
             Some((_, SensorPage::Skin(skin))) => Some(*skin),
             _ => None,
@@ -138,35 +142,37 @@ fn send_ignored_packets(session: &mut Session<'_>, after_test_mode: bool) -> Res
 }
 
 /// Checks that the cell does not give way to claims with a higher serial number, before and after its first heartbeat.
-pub(super) fn check_stays(session: &mut Session<'_>) -> Result<(), StopReason> {
+pub(super) fn check_keeps_node_id(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = session.about.serial.unwrap_or_default();
     let Some(higher) = own.checked_add(1) else {
-        session.findings.not_tested("CLAIM-3", "no serial number is higher than its own");
+        session.findings.mark_not_tested("CLAIM-3", "no serial number is higher than its own");
         return Ok(());
     };
     let Some(claimed) = claim_during_start(session, higher)? else { return Ok(()) };
     let low_is_lower = if own & 0xFFFF > 0 { own.checked_add(0xFFFF) } else { None };
-    let end = earliest_end(session, claimed);
+    let end = earliest_claim_end(session, claimed);
     for serial in [Some(higher), low_is_lower, Some(u32::MAX)].into_iter().flatten() {
         session.begin_expected_exchange();
         let claim = twin_heartbeat(session, serial, true);
         let at = session.send_messages(&[claim])?;
         if at + Span::from_millis(20) >= end {
-            session
-                .findings
-                .not_tested("CLAIM-3", "claims with a higher serial number: the cell had stopped claiming");
+            session.findings.mark_not_tested(
+                "CLAIM-3",
+                "claims with a higher serial number: the cell had stopped claiming",
+            );
             break;
         }
-        let came =
-            session.wait(at + Span::from_millis(100), |heard| heard.iter().any(|it| it.beat().is_some()))?;
-        let answer = session.answers().iter().find_map(|it| Some((it.at, it.beat()?.0.state)));
-        session.mark_expected();
+        let came = session.wait_for_packets(at + Span::from_millis(100), |heard| {
+            heard.iter().any(|it| it.heartbeat_and_epoch().is_some())
+        })?;
+        let answer = session.answers().iter().find_map(|it| Some((it.at, it.heartbeat_and_epoch()?.0.state)));
+        session.mark_packets_expected();
         session.check("CLAIM-3", came, || {
             format!("a claiming cell must answer a claim with the higher serial number {serial}, but did not")
         });
         if let Some((answered, state)) = answer {
-            session.note_time("heartbeat to a claimant", at, answered);
-            let is_so = state.has(State::CLAIMING) || answered >= end;
+            session.record_answer_time("heartbeat to a claimant", at, answered);
+            let is_so = state.has(State::CLAIMING_NODE_ID) || answered >= end;
             session.check("CLAIM-3", is_so, || {
                 "a claiming cell must set CLAIMING in its answer to a claim, but it is clear".to_owned()
             });
@@ -174,7 +180,7 @@ pub(super) fn check_stays(session: &mut Session<'_>) -> Result<(), StopReason> {
                 "a claiming cell must set DUPLICATE in its answer to a claim, but it is clear".to_owned()
             });
         }
-        session.idle(Span::from_millis(30))?;
+        session.receive_for(Span::from_millis(30))?;
     }
     session.begin_expected_exchange();
     let at = settled(session, claimed)?;
@@ -190,11 +196,11 @@ pub(super) fn check_stays(session: &mut Session<'_>) -> Result<(), StopReason> {
 /// heartbeat. That heartbeat is sent (serial mod 64) ms after the start, and must have DUPLICATE if a claim came before
 /// it. A late computer may delay the claims, so the check is then repeated.
 fn claim_during_start(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, StopReason> {
-    const ATTEMPTS: usize = 3;
+    const MAX_CHECK_ATTEMPTS: usize = 3;
     let rest = twin_heartbeat(session, higher, true);
     let is_long = session.about.serial.unwrap_or_default() % 64 >= 30;
     let longest = Span::from_millis(3_000);
-    for attempt in 1..=ATTEMPTS {
+    for attempt in 1..=MAX_CHECK_ATTEMPTS {
         // With pauses: each claim is answered only 10 ms after the last answer.
         let claimed = restart_with(session, longest, |session| session.send_messages(&[rest]).map(|_| ()))?;
         let Some(claimed) = claimed else {
@@ -206,11 +212,15 @@ fn claim_during_start(session: &mut Session<'_>, higher: u32) -> Result<Option<M
             return Ok(None);
         };
         // The answer, and then a regular heartbeat.
-        session.idle(Span::from_millis(80))?;
-        let new = session.answers().iter().filter(|it| it.at >= claimed).filter_map(CellPacket::beat);
+        session.receive_for(Span::from_millis(80))?;
+        let new = session
+            .answers()
+            .iter()
+            .filter(|it| it.at >= claimed)
+            .filter_map(CellPacket::heartbeat_and_epoch);
         let is_set = new.clone().next().is_some_and(|(beat, _)| beat.state.has(State::DUPLICATE));
         let is_answered = new.count() > 1;
-        if is_set && is_answered || !is_long || attempt == ATTEMPTS {
+        if is_set && is_answered || !is_long || attempt == MAX_CHECK_ATTEMPTS {
             session.check("CLAIM-7", is_set || !is_long, || {
                 "DUPLICATE must be set in the first heartbeat if claims came before it, but is clear"
                     .to_owned()
@@ -226,7 +236,7 @@ fn claim_during_start(session: &mut Session<'_>, higher: u32) -> Result<Option<M
 }
 
 /// Checks that a claiming cell ignores a `4nn` of a page that does not exist.
-pub(super) fn check_invalid_page(session: &mut Session<'_>) -> Result<(), StopReason> {
+pub(super) fn check_invalid_page_ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claimed = restart(session)?;
     session.begin_expected_exchange();
     let mut packet = twin_heartbeat(session, 0, true).encode();
@@ -243,7 +253,7 @@ pub(super) fn check_invalid_page(session: &mut Session<'_>) -> Result<(), StopRe
     let is_set = session
         .answers()
         .iter()
-        .filter_map(CellPacket::beat)
+        .filter_map(CellPacket::heartbeat_and_epoch)
         .any(|(beat, _)| beat.state.has(State::DUPLICATE));
     session.check("COUNT-1", !is_set, || {
         "DUPLICATE must not be set by a 4nn of a page that does not exist, but is set".to_owned()
@@ -258,32 +268,36 @@ pub(super) fn check_gives_way(
     what: &str,
     other: &Message,
 ) -> Result<(), StopReason> {
-    for _ in 0..ATTEMPTS {
+    for _ in 0..MAX_RESTARTS_PER_CHECK {
         let claimed = restart(session)?;
         session.begin_expected_exchange();
         let at = session.send_messages(&[*other])?;
-        if at + PROCESSING_MARGIN < earliest_end(session, claimed) {
-            return check_silent(session, claimed, what);
+        if at + FRAME_PROCESSING_MARGIN < earliest_claim_end(session, claimed) {
+            return check_silent_after_giving_way(session, claimed, what);
         }
     }
-    session.findings.not_tested("CLAIM-3", CLAIM_OVER);
+    session.findings.mark_not_tested("CLAIM-3", CLAIM_OVER_REMARK);
     Ok(())
 }
 
 /// Checks that a cell that gave way sends nothing.
-fn check_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(), StopReason> {
-    session.idle(Span::from_millis(3))?;
-    session.mark_expected();
+fn check_silent_after_giving_way(
+    session: &mut Session<'_>,
+    claimed: Micros,
+    what: &str,
+) -> Result<(), StopReason> {
+    session.receive_for(Span::from_millis(3))?;
+    session.mark_packets_expected();
     session.begin_expected_exchange();
     for message in [Message::Sync, Message::Report] {
         session.send_messages(&[message])?;
     }
     let claim = twin_heartbeat(session, u32::MAX, true);
     session.send_messages(&[claim])?;
-    let until = claimed + claim_end(session);
-    session.wait(until, |_| false)?;
+    let until = claimed + time_to_claim_end(session);
+    session.wait_for_packets(until, |_| false)?;
     let came = session.answers().len();
-    session.mark_expected();
+    session.mark_packets_expected();
     let serial = session.about.serial.unwrap_or_default();
     session.check("CLAIM-3", came == 0, || {
         format!("the cell (serial number {serial}) must give way to {what}, but sent {came} packets after it")
@@ -295,6 +309,6 @@ fn check_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Resul
 }
 
 /// Returns the time after which claiming is over and a further heartbeat is due.
-fn claim_end(session: &Session<'_>) -> Span {
+fn time_to_claim_end(session: &Session<'_>) -> Span {
     Span(claim(session).0 + 60_000)
 }

@@ -45,11 +45,11 @@ impl TestBus for Script {
         Ok(seen)
     }
 
-    fn lateness(&mut self) -> Span {
+    fn bench_lateness(&mut self) -> Span {
         Span(0)
     }
 
-    fn finish(&mut self) {}
+    fn ignore_signals(&mut self) {}
 
     fn can_restart(&self) -> bool {
         true
@@ -72,7 +72,7 @@ fn seen(at: Micros, frame: Frame) -> ObservedFrame {
 }
 
 fn beat(sent: u16, claiming: bool) -> Message {
-    let state = State::default().with(State::CLAIMING, claiming).with_joint(0);
+    let state = State::default().with_flags(State::CLAIMING_NODE_ID, claiming).with_joint(0);
     let beat = Heartbeat { sent, serial: 100_012, state, ..Heartbeat::default() };
     Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
 }
@@ -117,13 +117,13 @@ fn failed(format: Format, takes: Span, former: &[Frame], before: usize, new: &[F
     let mut bus = Script { now, wire, next: VecDeque::from([next]), takes, restarted: now };
     let mut session = Session::new(&mut bus, "vcan0", cell(), format, Span::from_millis(60_000));
     session.about.serial = Some(100_012);
-    session.idle(Span((before.len() as u64 + 1) * OLD.0)).unwrap();
-    session.mark_expected();
+    session.receive_for(Span((before.len() as u64 + 1) * OLD.0)).unwrap();
+    session.mark_packets_expected();
     let claimed = restart(&mut session).map(|claimed| settled(&mut session, claimed));
     assert!(matches!(claimed, Ok(Ok(_))), "{claimed:?}");
-    session.idle(Span::from_millis(500)).unwrap();
-    session.check_segments().unwrap();
-    session.findings.failed()
+    session.receive_for(Span::from_millis(500)).unwrap();
+    session.check_segment_times().unwrap();
+    session.findings.failed_requirements()
 }
 
 #[test]

@@ -23,7 +23,7 @@ pub(super) struct MeshElement<'a, 'i, 'n> {
 }
 
 /// The form in which a primitive lists its corners: as indices into a list of points.
-struct Corners {
+struct CornerFormat {
     kind: &'static str,
     /// The position of the vertex index among the indices of a corner.
     offset: usize,
@@ -47,14 +47,14 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         for element in self.mesh.children().filter(Node::is_element) {
             let kinds = ["triangles", "polylist", "polygons", "tristrips", "trifans"];
             let Some(kind) = kinds.into_iter().find(|kind| element.has_tag_name_of(kind)) else { continue };
-            let corners = self.corners(element, kind)?;
+            let corners = self.read_corner_format(element, kind)?;
             match kind {
                 "triangles" => self.read_triangles(element, &corners, &mut filled)?,
                 "polylist" => self.read_polylist(element, &corners, &mut filled)?,
                 "polygons" => self.read_polygons(element, &corners, &mut filled)?,
                 _ => {
                     for indices in children(element, "p") {
-                        let points = self.points(indices, &corners)?;
+                        let points = self.corner_points(indices, &corners)?;
                         if kind == "tristrips" {
                             add_strip(&points, &mut filled.triangles);
                         } else {
@@ -74,12 +74,12 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     fn read_triangles(
         &self,
         element: Node<'a, 'i>,
-        corners: &Corners,
+        corners: &CornerFormat,
         Triangulation { triangles, .. }: &mut Triangulation,
     ) -> Result<(), MeshError> {
         let before = triangles.len();
         for indices in children(element, "p") {
-            let points = self.points(indices, corners)?;
+            let points = self.corner_points(indices, corners)?;
             let (all, rest) = points.as_chunks();
             if !rest.is_empty() {
                 return Err(self.error(&format!(
@@ -96,12 +96,12 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     fn read_polylist(
         &self,
         element: Node<'a, 'i>,
-        corners: &Corners,
+        corners: &CornerFormat,
         filled: &mut Triangulation,
     ) -> Result<(), MeshError> {
         let sizes = child(element, "vcount").map(|node| numbers(self.name, node, str::parse::<usize>));
         let sizes = sizes.transpose()?.unwrap_or_default();
-        let points = child(element, "p").map(|node| self.points(node, corners)).transpose()?;
+        let points = child(element, "p").map(|node| self.corner_points(node, corners)).transpose()?;
         let points = points.unwrap_or_default();
         let announced = sizes.iter().fold(0_usize, |sum, size| sum.saturating_add(*size));
         if announced != points.len() {
@@ -114,7 +114,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         let mut rest = points.as_slice();
         for size in sizes {
             let Some((outline, after)) = rest.split_at_checked(size) else { break };
-            filled.add(outline, &[]);
+            filled.add_polygon(outline, &[]);
             rest = after;
         }
         Ok(())
@@ -124,7 +124,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     fn read_polygons(
         &self,
         element: Node<'a, 'i>,
-        corners: &Corners,
+        corners: &CornerFormat,
         filled: &mut Triangulation,
     ) -> Result<(), MeshError> {
         let mut count = 0;
@@ -132,13 +132,13 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             let (outline, holes) = match polygon.tag_name().name() {
                 "p" => (Some(polygon), Vec::new()),
                 "ph" => {
-                    let holes = children(polygon, "h").map(|hole| self.points(hole, corners));
+                    let holes = children(polygon, "h").map(|hole| self.corner_points(hole, corners));
                     (child(polygon, "p"), holes.collect::<Result<_, _>>()?)
                 }
                 _ => continue,
             };
             let outline = outline.ok_or_else(|| self.error("a polygon with holes has no outline"))?;
-            filled.add(&self.points(outline, corners)?, &holes);
+            filled.add_polygon(&self.corner_points(outline, corners)?, &holes);
             count += 1;
         }
         self.check_count(element, "polygons", count)
@@ -155,8 +155,12 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     }
 
     /// Returns the points of the corners in a list of indices.
-    fn points(&self, indices: Node<'_, '_>, corners: &Corners) -> Result<Vec<Point3<f64>>, MeshError> {
-        let Corners { kind, offset, stride, points } = corners;
+    fn corner_points(
+        &self,
+        indices: Node<'_, '_>,
+        corners: &CornerFormat,
+    ) -> Result<Vec<Point3<f64>>, MeshError> {
+        let CornerFormat { kind, offset, stride, points } = corners;
         let indices = numbers(self.name, indices, str::parse::<usize>)?;
         let groups = indices.chunks_exact(*stride);
         if !groups.remainder().is_empty() {
@@ -179,7 +183,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
 
     /// Returns the element of this kind to which an input of the mesh refers. It is an element within the mesh, or else
     /// the only one with this id in the file.
-    fn resolve(&self, kind: &'static str, input: Node<'_, '_>) -> Result<Node<'a, 'i>, MeshError> {
+    fn referenced_element(&self, kind: &'static str, input: Node<'_, '_>) -> Result<Node<'a, 'i>, MeshError> {
         let source = input.attribute("source").unwrap_or_default();
         let own = self.own.find(kind, source)?;
         let found = own.map_or_else(|| self.all.find(kind, source), |own| Ok(Some(own)))?;
@@ -187,7 +191,11 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     }
 
     /// Reads the inputs of a primitive, which state what the indices of its corners refer to.
-    fn corners(&self, element: Node<'a, 'i>, kind: &'static str) -> Result<Corners, MeshError> {
+    fn read_corner_format(
+        &self,
+        element: Node<'a, 'i>,
+        kind: &'static str,
+    ) -> Result<CornerFormat, MeshError> {
         let mut stride = 0;
         let mut vertex = None;
         for input in children(element, "input") {
@@ -201,26 +209,26 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
             })?;
             stride = stride.max(offset + 1);
             if input.attribute("semantic") == Some("VERTEX") {
-                vertex = Some((offset, self.resolve("vertices", input)?));
+                vertex = Some((offset, self.referenced_element("vertices", input)?));
             }
         }
         let (offset, vertices) = vertex.ok_or_else(|| self.error("a geometry has no vertices"))?;
         let position = |input: &Node<'_, '_>| input.attribute("semantic") == Some("POSITION");
         let position = children(vertices, "input").find(position);
         let position = position.ok_or_else(|| self.error("vertices have no position"))?;
-        let points = self.positions(self.resolve("source", position)?)?;
-        Ok(Corners { kind, offset, stride, points })
+        let points = self.source_points(self.referenced_element("source", position)?)?;
+        Ok(CornerFormat { kind, offset, stride, points })
     }
 
     /// Returns the points that a source lists.
-    fn positions(&self, source: Node<'a, 'i>) -> Result<Vec<Point3<f64>>, MeshError> {
+    fn source_points(&self, source: Node<'a, 'i>) -> Result<Vec<Point3<f64>>, MeshError> {
         let accessor = child(source, "technique_common").and_then(|common| child(common, "accessor"));
         let number = |name: &str| accessor?.attribute(name)?.trim().parse::<usize>().ok();
         let within = ElementIds::from_nodes(self.name, source.descendants());
         let named = accessor.filter(|accessor| accessor.has_attribute("source")).map(|accessor| {
             let reference = accessor.attribute("source").unwrap_or_default();
             let near = within.find("float_array", reference)?;
-            near.map_or_else(|| self.resolve("float_array", accessor), Ok)
+            near.map_or_else(|| self.referenced_element("float_array", accessor), Ok)
         });
         let array = named.or_else(|| child(source, "float_array").map(Ok));
         let array = array.ok_or_else(|| self.error("a source has no numbers"))??;

@@ -109,7 +109,7 @@ fn polygons_of_each_kind_have_their_own_area() {
         (format!("<polygons count=\"1\">{input}<ph><p>0 1 2 3 4</p><h>5 6 7 8</h></ph></polygons>"), 5.6),
     ] {
         let mesh = parse(&with(&primitives)).unwrap();
-        let got: f64 = mesh.triangles().iter().map(crate::surface::area).sum();
+        let got: f64 = mesh.triangles().iter().map(crate::surface::triangle_area).sum();
         assert!((got - area).abs() < 1e-9, "{primitives}: {got}");
     }
     for (primitives, words) in [

@@ -22,7 +22,8 @@ const HASH: u16 = 0x1234;
 
 /// Returns a skin whose cells have these neighbours at their ports; the first cell is a root.
 fn skin(neighbors: &[[usize; PORTS]]) -> Skin {
-    let head = crate::testing::SKIN.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 100");
+    let head =
+        crate::testing::ONE_CELL_SKIN_TOML.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 100");
     let (head, one) = head.split_at(head.find("[[cell]]").unwrap());
     let cells = neighbors.iter().enumerate().map(|(at, ports)| {
         let (node, root) = (at + 1, at == 0);
@@ -36,7 +37,7 @@ fn skin(neighbors: &[[usize; PORTS]]) -> Skin {
 
 /// The actual cells and wires of a network, damaged at random.
 struct Truth {
-    wires: Wires,
+    wires: BusWires,
     cells: usize,
     /// For each end, the end at which its messages arrive.
     leads: BTreeMap<WireEnd, WireEnd>,
@@ -165,7 +166,7 @@ impl Truth {
             8 => {
                 if self.touch(&[node]) {
                     let state = &mut self.beats.get_mut(&node).unwrap().state;
-                    *state = state.with(State::DUPLICATE, true);
+                    *state = state.with_flags(State::DUPLICATE, true);
                     self.expected.insert(Difference::Duplicate(node));
                 }
             }

@@ -3,19 +3,19 @@ use protocol::touch::contact_force;
 
 use super::*;
 use crate::scenario::{Scenario, Touches};
-use crate::testing::SKIN;
+use crate::testing::ONE_CELL_SKIN_TOML;
 
 const EPOCHS_PER_S: u64 = 62;
 
 /// Returns a skin with three cells in a row, wired one to the next.
 fn three() -> Skin {
-    let cell = SKIN.get(SKIN.find("[[cell]]").unwrap()..).unwrap();
+    let cell = ONE_CELL_SKIN_TOML.get(ONE_CELL_SKIN_TOML.find("[[cell]]").unwrap()..).unwrap();
     let at = |node: u8, neighbors: &str| {
         let text = cell.replace("node = 1", &format!("node = {node}"));
         let lines = text.lines().filter(|line| !line.starts_with("neighbors"));
         format!("{}\nneighbors = {neighbors}\n", lines.collect::<Vec<_>>().join("\n"))
     };
-    let head = SKIN.get(..SKIN.find("[[cell]]").unwrap()).unwrap();
+    let head = ONE_CELL_SKIN_TOML.get(..ONE_CELL_SKIN_TOML.find("[[cell]]").unwrap()).unwrap();
     let text =
         [head.to_owned(), at(1, "[2, 0, 0, 0]"), at(2, "[1, 3, 0, 0]"), at(3, "[2, 0, 0, 0]")].join("\n");
     Skin::parse("skin.toml", &text).unwrap()
@@ -123,8 +123,8 @@ fn changes_in_order_at_random_and_over_a_gap_are_the_same() {
         assert_eq!(words, [0, 1, 2].map(|cell| each.sensors(cell, epoch)));
     }
     let mut gap = touches(text);
-    let _ = gap.changes(None, 20).count();
-    for change in gap.changes(Some(20), 149) {
+    let _ = gap.stimuli_between(None, 20).count();
+    for change in gap.stimuli_between(Some(20), 149) {
         assert_eq!(change.readings.skin, words[change.cell]);
     }
     assert_eq!(gap.sensors(1, 60), touches(text).sensors(1, 60), "back in time");

@@ -89,7 +89,7 @@ proptest! {
         let mut known = [SkinSensors::default(); 3];
         let (mut before, mut epoch) = (None, 0);
         for step in steps {
-            for stimulus in touches.changes(before, epoch) {
+            for stimulus in touches.stimuli_between(before, epoch) {
                 known[stimulus.cell] = stimulus.readings.skin;
             }
             for (cell, known) in known.iter().enumerate() {

@@ -15,7 +15,7 @@ use super::life::Incarnation;
 
 /// Number of heartbeats in a row with a continuous counter that prove a start even if its claim was lost. This applies
 /// to a node id that two senders have used.
-const PROVING_HEARTBEATS: u8 = 3;
+const HEARTBEATS_PROVING_START: u8 = 3;
 
 /// Minimum interval of heartbeats with a continuous counter. Cells send them every 250 ms; old heartbeats that happen
 /// to be repeated in order arrive much faster.
@@ -43,7 +43,7 @@ impl Candidate {
     /// Returns true if the candidate owns the node id from its last heartbeat on; `owner` is the owner so far.
     pub(super) fn becomes_owner(&self, owner: Option<&Incarnation>) -> bool {
         let is_silent = owner.is_none_or(|owner| !owner.is_alive(self.last.at));
-        is_silent && (self.last.has_just_started() || self.consecutive >= PROVING_HEARTBEATS)
+        is_silent && (self.last.has_just_started() || self.consecutive >= HEARTBEATS_PROVING_START)
     }
 }
 
@@ -55,7 +55,7 @@ mod tests {
     use super::*;
 
     fn life(ms: u64, serial: u32, sent: u16) -> Incarnation {
-        let state = if sent == 0 { State::CLAIMING } else { State::default() };
+        let state = if sent == 0 { State::CLAIMING_NODE_ID } else { State::default() };
         Incarnation::new(Micros(ms * 1_000), &Heartbeat { serial, sent, state, ..Heartbeat::default() })
     }
 

@@ -17,7 +17,7 @@ pub(super) const MAX_PACKETS_BEFORE_DEAD: u16 = 2_048;
 pub(super) const MAX_PACKETS_PER_HEARTBEAT: u16 = 256;
 
 /// The time without a heartbeat after which a cell is no longer expected to continue its counter.
-pub(super) const GONE_AFTER: Span = Span::from_millis(10_000);
+pub(super) const COUNTER_FORGOTTEN_AFTER: Span = Span::from_millis(10_000);
 
 /// The minimum duration of a claim: 250 ms, minus 10 ms by which a frame may have been late.
 pub(super) const MIN_CLAIM_TIME: Span = Span::from_millis(240);
@@ -34,7 +34,7 @@ pub(super) struct Incarnation {
 impl Incarnation {
     /// Creates a life from its first heartbeat.
     pub(super) fn new(at: Micros, heartbeat: &Heartbeat) -> Self {
-        let claimed = heartbeat.state.has(State::CLAIMING).then_some(at);
+        let claimed = heartbeat.state.has(State::CLAIMING_NODE_ID).then_some(at);
         Self { heartbeat: *heartbeat, at, claimed }
     }
 
@@ -44,13 +44,13 @@ impl Incarnation {
     }
 
     /// Returns true if the cell owns the node id, and does not only claim it.
-    pub(super) fn is_settled(&self) -> bool {
-        !self.heartbeat.state.has(State::CLAIMING)
+    pub(super) fn owns_node_id(&self) -> bool {
+        !self.heartbeat.state.has(State::CLAIMING_NODE_ID)
     }
 
     /// Returns true if the last heartbeat is the first packet since the start of the cell, which is a claim.
     pub(super) fn has_just_started(&self) -> bool {
-        !self.is_settled() && self.heartbeat.sent == 0
+        !self.owns_node_id() && self.heartbeat.sent == 0
     }
 
     pub(super) const fn is_same_cell(&self, other: &Self) -> bool {
@@ -63,18 +63,18 @@ impl Incarnation {
 
     /// Returns true if the cell may still be alive at `at`, though silent because its bus was lost.
     pub(super) fn may_still_be_alive(&self, at: Micros) -> bool {
-        at.elapsed_since(self.at) <= GONE_AFTER
+        at.elapsed_since(self.at) <= COUNTER_FORGOTTEN_AFTER
     }
 
     /// Returns how far the counter of `other` is behind this one, modulo 2^16.
-    pub(super) const fn distance_behind(&self, other: &Self) -> u16 {
+    pub(super) const fn packets_ahead_of(&self, other: &Self) -> u16 {
         self.heartbeat.sent.wrapping_sub(other.heartbeat.sent)
     }
 
     /// Returns the number of packets that the cell sent between its last heartbeat and `next`; `None` if `next` cannot
     /// be its next heartbeat.
     pub(super) fn packets_until(&self, next: &Self) -> Option<u16> {
-        let sent = next.distance_behind(self);
+        let sent = next.packets_ahead_of(self);
         let is_next = self.is_same_cell(next) && self.may_still_be_alive(next.at) && sent.cast_signed() > 0;
         (is_next && self.can_have_sent(next.at, sent)).then_some(sent)
     }
@@ -86,15 +86,15 @@ impl Incarnation {
     }
 
     /// Returns true if a heartbeat is an old one of this life, or a copy of its last one.
-    pub(super) fn is_own_past(&self, old: &Self) -> bool {
-        let back = self.distance_behind(old);
+    pub(super) fn is_own_old_heartbeat(&self, old: &Self) -> bool {
+        let back = self.packets_ahead_of(old);
         self.is_same_cell(old) && (back == 0 || back <= MAX_OVERTAKEN_PACKETS && old.heartbeat.sent > 1)
     }
 
     /// Returns true if this life still claims the node id at the time of `next`, so that a heartbeat without CLAIMING
     /// cannot be from it.
     pub(super) fn is_still_claiming_at(&self, next: &Self) -> bool {
-        let settles = !self.is_settled() && next.is_settled();
+        let settles = !self.owns_node_id() && next.owns_node_id();
         settles && self.claimed.is_some_and(|claimed| next.at.elapsed_since(claimed) < MIN_CLAIM_TIME)
     }
 }

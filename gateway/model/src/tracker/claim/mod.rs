@@ -21,7 +21,7 @@ use protocol::time::Micros;
 
 use candidate::Candidate;
 use life::Incarnation;
-use ownership::{Evidence, Ownership};
+use ownership::{HeartbeatEvidence, Ownership};
 
 /// The meaning of a heartbeat for the owner of its node id.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -74,7 +74,7 @@ impl AddressClaim {
             let candidate = Candidate::after_heartbeat(self.candidate, new);
             self.candidate = Some(candidate);
             if candidate.becomes_owner(self.ownership.owner()) {
-                (next, word) = self.ownership.after_heartbeat(Evidence::Succeeds, new);
+                (next, word) = self.ownership.after_heartbeat(HeartbeatEvidence::Succeeds, new);
             }
         }
         match word {
@@ -94,7 +94,7 @@ impl AddressClaim {
 
     /// Returns true if an accepted start of the owner may still be taken back.
     pub(super) fn is_in_question(&self, at: Micros) -> bool {
-        self.ownership.former().is_some_and(|former| former.may_still_be_alive(at))
+        self.ownership.former_incarnation().is_some_and(|former| former.may_still_be_alive(at))
     }
 
     /// Returns the last heartbeat of the owner of the node id, or of the first cell to claim it.
@@ -124,6 +124,6 @@ impl AddressClaim {
     /// Returns true if a cell owns the node id, and so answers joints.
     #[must_use]
     pub fn is_settled(&self) -> bool {
-        self.ownership.owner().is_some_and(Incarnation::is_settled)
+        self.ownership.owner().is_some_and(Incarnation::owns_node_id)
     }
 }

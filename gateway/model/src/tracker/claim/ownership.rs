@@ -60,7 +60,7 @@ pub(super) enum Ownership {
 /// A fact about the sender that a heartbeat proves. If several hold, [`Ownership::evidence`] returns the first in this
 /// order.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Evidence {
+pub(super) enum HeartbeatEvidence {
     /// The heartbeat has CLAIMING, and a serial number other than the owner's, if there is an owner.
     Claims,
     /// The heartbeat does not have CLAIMING, and the node id has no owner, or an owner with another serial number that
@@ -105,7 +105,7 @@ impl Ownership {
     }
 
     /// Returns the life before the owner's start, if it may still disprove that start.
-    pub(super) const fn former(&self) -> Option<&Incarnation> {
+    pub(super) const fn former_incarnation(&self) -> Option<&Incarnation> {
         match self {
             Self::Doubted { former, .. } | Self::Inherited { former, .. } => Some(former),
             Self::Free | Self::Sole { .. } | Self::Shared { .. } => None,
@@ -129,55 +129,63 @@ impl Ownership {
     }
 
     /// Returns the fact that a heartbeat proves; `new` is the life that would begin with it.
-    pub(super) fn evidence(&self, new: &Incarnation) -> Evidence {
+    pub(super) fn evidence(&self, new: &Incarnation) -> HeartbeatEvidence {
         let Some(owner) = self.owner() else {
-            return if new.is_settled() { Evidence::Settles } else { Evidence::Claims };
+            return if new.owns_node_id() { HeartbeatEvidence::Settles } else { HeartbeatEvidence::Claims };
         };
-        let of_former = self.former().and_then(|former| former.packets_until(new));
+        let of_former = self.former_incarnation().and_then(|former| former.packets_until(new));
         if !owner.is_same_cell(new) {
-            return match (owner.is_settled(), new.is_settled()) {
-                (_, false) => Evidence::Claims,
-                (false, true) => Evidence::Settles,
-                (true, true) if of_former.is_some() => Evidence::FormerContinues,
-                (true, true) => Evidence::Intrudes,
+            return match (owner.owns_node_id(), new.owns_node_id()) {
+                (_, false) => HeartbeatEvidence::Claims,
+                (false, true) => HeartbeatEvidence::Settles,
+                (true, true) if of_former.is_some() => HeartbeatEvidence::FormerContinues,
+                (true, true) => HeartbeatEvidence::Intrudes,
             };
         }
         if new.has_just_started() {
-            return Evidence::Starts;
+            return HeartbeatEvidence::Starts;
         }
-        let is_old_of_former =
-            || self.former().is_some_and(|former| former.is_alive(new.at) && former.is_own_past(new));
-        if owner.is_own_past(new) || owner.claimed.is_none() && is_old_of_former() {
-            return Evidence::Repeats;
+        let is_old_of_former = || {
+            self.former_incarnation()
+                .is_some_and(|former| former.is_alive(new.at) && former.is_own_old_heartbeat(new))
+        };
+        if owner.is_own_old_heartbeat(new) || owner.claimed.is_none() && is_old_of_former() {
+            return HeartbeatEvidence::Repeats;
         }
         match (owner.packets_until(new), of_former) {
-            (Some(_), Some(_)) if owner.is_still_claiming_at(new) => Evidence::FormerContinues,
-            (Some(own), Some(its)) if owner.claimed.is_none() && self.fits_former_better(new, own, its) => {
-                Evidence::FormerContinues
-            }
-            (Some(_), _) => Evidence::Continues,
-            (None, Some(_)) => Evidence::FormerContinues,
-            (None, None)
-                if owner.distance_behind(new).cast_signed() < 0 && !owner.may_still_be_alive(new.at) =>
+            (Some(_), Some(_)) if owner.is_still_claiming_at(new) => HeartbeatEvidence::FormerContinues,
+            (Some(own), Some(its))
+                if owner.claimed.is_none() && self.fits_former_incarnation(new, own, its) =>
             {
-                Evidence::Returns
+                HeartbeatEvidence::FormerContinues
             }
-            (None, None) if !owner.can_have_sent(new.at, new.heartbeat.sent) => Evidence::Exceeds,
-            (None, None) => Evidence::Jumps,
+            (Some(_), _) => HeartbeatEvidence::Continues,
+            (None, Some(_)) => HeartbeatEvidence::FormerContinues,
+            (None, None)
+                if owner.packets_ahead_of(new).cast_signed() < 0 && !owner.may_still_be_alive(new.at) =>
+            {
+                HeartbeatEvidence::Returns
+            }
+            (None, None) if !owner.can_have_sent(new.at, new.heartbeat.sent) => HeartbeatEvidence::Exceeds,
+            (None, None) => HeartbeatEvidence::Jumps,
         }
     }
 
     /// Returns true if a heartbeat that continues both counters more likely belongs to the former life. Its counter is
     /// `own` ahead of the owner's and `its` ahead of the former's.
-    fn fits_former_better(&self, new: &Incarnation, own: u16, its: u16) -> bool {
-        let is_alive = self.former().is_some_and(|former| former.is_alive(new.at));
+    fn fits_former_incarnation(&self, new: &Incarnation, own: u16, its: u16) -> bool {
+        let is_alive = self.former_incarnation().is_some_and(|former| former.is_alive(new.at));
         its < own && (is_alive || own > MAX_PACKETS_PER_HEARTBEAT && its < own / 8)
     }
 
     /// Returns the state after a heartbeat with this evidence, and the meaning of the heartbeat; `new` is the life that
     /// would begin with it. Each arm names its rows of the table.
-    pub(super) fn after_heartbeat(self, evidence: Evidence, new: Incarnation) -> (Self, HeartbeatKind) {
-        use Evidence as E;
+    pub(super) fn after_heartbeat(
+        self,
+        evidence: HeartbeatEvidence,
+        new: Incarnation,
+    ) -> (Self, HeartbeatKind) {
+        use HeartbeatEvidence as E;
         const RESTARTED: HeartbeatKind = HeartbeatKind::Started { again: true };
         let left_of = |former: Incarnation, owner: Incarnation| {
             if former.may_still_be_alive(new.at) { former } else { owner }

@@ -60,7 +60,7 @@ fn old_heartbeats_in_order_do_not_take_the_id_of_a_cell_that_hangs() {
 
 #[test]
 fn a_restart_is_a_claim_or_a_counter_that_falls_back() {
-    let (claims, settled) = (State::CLAIMING, State::default());
+    let (claims, settled) = (State::CLAIMING_NODE_ID, State::default());
     let life = [(7, 0, claims), (7, 1, settled), (7, 65_535, settled), (7, 2, settled)];
     let started = HeartbeatKind::Started { again: false };
     assert_eq!(
@@ -84,7 +84,7 @@ fn a_restart_is_a_claim_or_a_counter_that_falls_back() {
 
 #[test]
 fn a_claimed_id_keeps_its_owner_until_the_claimant_settles() {
-    let (claims, settled) = (State::CLAIMING, State::default());
+    let (claims, settled) = (State::CLAIMING_NODE_ID, State::default());
     let said = [(7, 9, settled), (8, 0, claims), (7, 10, settled), (8, 1, settled), (8, 2, settled)];
     assert_eq!(
         words(&said),
@@ -122,7 +122,7 @@ fn two_cells_that_use_one_id_in_turn_do_not_restart_each_time() {
 
 #[test]
 fn old_heartbeats_that_are_sent_again_take_a_living_cells_id_once_at_most() {
-    let (claims, settled) = (State::CLAIMING, State::default());
+    let (claims, settled) = (State::CLAIMING_NODE_ID, State::default());
     let (shared, outsider, known) =
         (HeartbeatKind::Shared, HeartbeatKind::Outsider, HeartbeatKind::Continued);
     // Its own counter is at 900, an old one at 100.
@@ -154,7 +154,7 @@ fn old_heartbeats_that_are_sent_again_take_a_living_cells_id_once_at_most() {
 
 #[test]
 fn a_cell_whose_bus_was_lost_goes_on_whatever_is_sent_again_meanwhile() {
-    let (claims, settled) = (State::CLAIMING, State::default());
+    let (claims, settled) = (State::CLAIMING_NODE_ID, State::default());
     let (shared, outsider, known) =
         (HeartbeatKind::Shared, HeartbeatKind::Outsider, HeartbeatKind::Continued);
     // The id was shared before the bus was lost, or was not.
@@ -175,7 +175,7 @@ fn a_cell_whose_bus_was_lost_goes_on_whatever_is_sent_again_meanwhile() {
 
 #[test]
 fn a_quick_restart_is_not_taken_for_an_old_heartbeat() {
-    let (claims, settled) = (State::CLAIMING, State::default());
+    let (claims, settled) = (State::CLAIMING_NODE_ID, State::default());
     for sent in [1, 2, 9, 300] {
         let said =
             [(0, 7, sent, settled), (100, 7, 0, claims), (360, 7, 1, settled), (610, 7, sent + 1, settled)];
@@ -201,7 +201,7 @@ fn the_cell_that_had_the_id_before_is_remembered() {
         sent += 1;
         (claim.serial(), claim.previous(), claim.is_settled())
     };
-    let (claims, settled) = (State::CLAIMING, State::default());
+    let (claims, settled) = (State::CLAIMING_NODE_ID, State::default());
     assert_eq!(hear(7, claims), (Some(7), None, false));
     assert_eq!(hear(7, settled), (Some(7), None, true));
     assert_eq!(hear(8, claims), (Some(7), None, true));

@@ -104,7 +104,7 @@ impl ArmCase {
         let turn =
             |axis: Unit<Vector3<f64>>, angle: Q1_14| Rotation3::from_axis_angle(&axis, angle.to_radians());
         let mut frames = vec![IsometryMatrix3::identity()];
-        for (row, q) in self.parameters.chain().iter().zip(self.q) {
+        for (row, q) in self.parameters.rows_to_cell().iter().zip(self.q) {
             let about_z = turn(Vector3::z_axis(), row.theta_offset.wrapping_add(q));
             let link = Translation3::new(row.a.to_f64(), 0.0, row.d.to_f64());
             let next = frames.last().unwrap() * about_z * link * turn(Vector3::x_axis(), row.alpha);

@@ -9,10 +9,10 @@ use std::fmt;
 use protocol::candump::Timestamp;
 
 use super::console::LineTime;
-use crate::capture::last_times::LastTimes;
+use crate::capture::last_times::LastFrameTimes;
 
 /// The time between successive frames, in ns, that is assumed if the lines hold no times.
-const STEP_NS: u64 = 1_000;
+const ASSUMED_STEP_NS: u64 = 1_000;
 /// The maximum number of buses whose times are compared to find the reference.
 const MAX_BUSES: usize = 16;
 /// The number of comparisons after which the reference of relative times is decided.
@@ -21,7 +21,7 @@ const MIN_COMPARISONS: u32 = 20;
 /// A remark for the user on the times and flags of a log.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 #[non_exhaustive]
-pub enum Remark {
+pub enum LogRemark {
     /// The lines have no times.
     NoTimes,
     /// The lines have dates and times of day without a time zone; they are read as UTC.
@@ -34,7 +34,7 @@ pub enum Remark {
     NoFlags,
 }
 
-impl fmt::Display for Remark {
+impl fmt::Display for LogRemark {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::NoTimes => {
@@ -92,19 +92,19 @@ impl Clock {
     }
 
     /// Returns the time of the next frame, and a remark if the time is not absolute.
-    pub(super) fn time(&mut self, stamp: LineTime) -> (Timestamp, Option<Remark>) {
+    pub(super) fn next_frame_time(&mut self, stamp: LineTime) -> (Timestamp, Option<LogRemark>) {
         let (time, remark) = match stamp {
             LineTime::None => {
-                let nanos = self.last.map_or(0, |last| last.saturating_add(STEP_NS));
-                (Timestamp::with_six_digits(nanos), Some(Remark::NoTimes))
+                let nanos = self.last.map_or(0, |last| last.saturating_add(ASSUMED_STEP_NS));
+                (Timestamp::with_six_digits(nanos), Some(LogRemark::NoTimes))
             }
             LineTime::Absolute(time) => (time, None),
-            LineTime::Local(time) => (time, Some(Remark::LocalTimes)),
+            LineTime::Local(time) => (time, Some(LogRemark::LocalTimes)),
             LineTime::Relative(time) if self.relative == Some(TimeReference::Before) => {
                 let nanos = self.last_ns().saturating_add(time.nanos);
-                (Timestamp { nanos, ..time }, Some(Remark::Differences))
+                (Timestamp { nanos, ..time }, Some(LogRemark::Differences))
             }
-            LineTime::Relative(time) => (time, Some(Remark::SinceFirst)),
+            LineTime::Relative(time) => (time, Some(LogRemark::SinceFirst)),
         };
         self.set(time.nanos);
         (time, remark)
@@ -114,14 +114,14 @@ impl Clock {
 /// Compares the times of several lines to find out what they are relative to.
 #[derive(Debug, Default)]
 pub(super) struct TimeEvidence {
-    last: LastTimes<MAX_BUSES>,
+    last: LastFrameTimes<MAX_BUSES>,
     compared: u32,
     smaller: u32,
     same: u32,
 }
 
 impl TimeEvidence {
-    pub(super) fn add(&mut self, interface: &str, nanos: u64) {
+    pub(super) fn add_time(&mut self, interface: &str, nanos: u64) {
         let Some(last) = self.last.replace(interface, nanos) else { return };
         self.compared += 1;
         self.smaller += u32::from(nanos < last);
@@ -134,7 +134,7 @@ impl TimeEvidence {
 
     /// Returns the reference of the times. Times since the first frame grow on each bus, with few exceptions where the
     /// clock was set.
-    pub(super) const fn verdict(&self) -> TimeReference {
+    pub(super) const fn likely_reference(&self) -> TimeReference {
         if self.smaller * 8 > self.compared || self.same * 2 > self.compared {
             TimeReference::Before
         } else {

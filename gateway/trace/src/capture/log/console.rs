@@ -17,7 +17,7 @@
 //! further byte after its data.
 
 use protocol::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame, REMOTE, check_identifier};
-use protocol::candump::{self, Direction, LineError, Timestamp, eight_digit_identifier};
+use protocol::candump::{self, Direction, LineError, Timestamp, raw_id_from_eight_digits};
 
 /// A frame parsed from a line, with the information whether the line showed its flags.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,11 +60,11 @@ pub(super) fn parse(line: &[u8]) -> Option<Result<ConsoleLine<'_>, LineError>> {
     memchr::memchr3(b'[', b'{', b'#', text)?;
     let mut cursor = Cursor { text, at: 0 };
     cursor.skip_quotes();
-    if matches!(cursor.rest().first(), Some(b'#' | b';' | b'/')) {
+    if matches!(cursor.remaining_text().first(), Some(b'#' | b';' | b'/')) {
         return None;
     }
     let first = cursor.parse_line();
-    if first.is_some() || cursor.rest().starts_with(b"(") {
+    if first.is_some() || cursor.remaining_text().starts_with(b"(") {
         return first;
     }
     // Text before the frame may be a prompt. A malformed frame after such text is not an error, because the line may be
@@ -80,7 +80,7 @@ pub(super) fn parse(line: &[u8]) -> Option<Result<ConsoleLine<'_>, LineError>> {
 
 /// The length that a line prints in brackets.
 #[derive(Clone, Copy)]
-enum Length {
+enum PrintedLength {
     Classic(u8),
     /// The DLC of a classic frame.
     Dlc(u8),
@@ -88,12 +88,12 @@ enum Length {
     CanXl,
 }
 
-fn identifier_of(digits: &[u8]) -> Option<u32> {
+fn parse_identifier(digits: &[u8]) -> Option<u32> {
     let id = u32::from_str_radix(core::str::from_utf8(digits).ok()?, 16).ok()?;
     match digits.len() {
         3 => check_identifier(id, 0).ok(),
         // The text after the length shows whether the frame is remote.
-        _ => Some(eight_digit_identifier(id) & !REMOTE),
+        _ => Some(raw_id_from_eight_digits(id) & !REMOTE),
     }
 }
 
@@ -106,7 +106,7 @@ struct Cursor<'a> {
 impl<'a> Cursor<'a> {
     /// Parses a line from the position of the cursor on. Blanks are skipped first.
     fn parse_line(mut self) -> Option<Result<ConsoleLine<'a>, LineError>> {
-        let stamp = if self.accept(b'(') { self.stamp()? } else { LineTime::None };
+        let stamp = if self.accept_byte(b'(') { self.parse_timestamp()? } else { LineTime::None };
         self.skip_blanks();
         let interface = core::str::from_utf8(self.take_word()).ok().filter(|name| !name.is_empty())?;
         self.skip_blanks();
@@ -127,13 +127,13 @@ impl<'a> Cursor<'a> {
             return None;
         }
         let length = self.length()?;
-        if let Length::CanXl = length {
+        if let PrintedLength::CanXl = length {
             return Some(Ok(ConsoleLine::CanXl));
         }
         let (direction, flags) = marks.map_or((None, None), |(direction, flags)| (Some(direction), flags));
-        let has_flags = flags.is_some() || !matches!(length, Length::Fd(_));
+        let has_flags = flags.is_some() || !matches!(length, PrintedLength::Fd(_));
         let expected = "an identifier, at most 7FF in 3 digits";
-        let frame = identifier_of(id).ok_or(LineError { column: id_at + 1, expected });
+        let frame = parse_identifier(id).ok_or(LineError { column: id_at + 1, expected });
         let frame = frame.and_then(|id| self.frame(id, length, flags.unwrap_or(0)));
         if self.is_isotpsniffer_output(frame.is_ok()) {
             return None;
@@ -159,23 +159,23 @@ impl<'a> Cursor<'a> {
     /// joined from several frames.
     fn is_isotpsniffer_output(&self, has_frame: bool) -> bool {
         if has_frame {
-            self.rest().starts_with(b"- '")
+            self.remaining_text().starts_with(b"- '")
         } else {
             memchr::memmem::find(self.text, b"  - '").is_some()
         }
     }
 
-    fn rest(&self) -> &'a [u8] {
+    fn remaining_text(&self) -> &'a [u8] {
         self.text.get(self.at..).unwrap_or_default()
     }
 
-    fn accept(&mut self, byte: u8) -> bool {
-        let there = self.rest().first() == Some(&byte);
+    fn accept_byte(&mut self, byte: u8) -> bool {
+        let there = self.remaining_text().first() == Some(&byte);
         self.at += usize::from(there);
         there
     }
 
-    const fn error(&self, expected: &'static str) -> LineError {
+    const fn expected_error(&self, expected: &'static str) -> LineError {
         LineError { column: self.at + 1, expected }
     }
 
@@ -183,7 +183,7 @@ impl<'a> Cursor<'a> {
     fn skip_blanks(&mut self) -> bool {
         let from = self.at;
         loop {
-            match self.rest() {
+            match self.remaining_text() {
                 [b' ' | b'\t', ..] => self.at += 1,
                 [0x1B, b'[', rest @ ..] => {
                     let parameters = rest.iter().take_while(|byte| matches!(byte, 0x20..=0x3F)).count();
@@ -196,7 +196,7 @@ impl<'a> Cursor<'a> {
 
     /// Skips blanks, colours, and the quotation marks of mails and issues.
     fn skip_quotes(&mut self) {
-        while self.skip_blanks() || self.accept(b'>') || self.accept(b'|') {}
+        while self.skip_blanks() || self.accept_byte(b'>') || self.accept_byte(b'|') {}
     }
 
     /// Returns the text up to the next blank or colour.
@@ -206,7 +206,7 @@ impl<'a> Cursor<'a> {
 
     /// Returns the longest run of bytes from the cursor on that match `is`.
     fn take_while(&mut self, is: impl Fn(u8) -> bool) -> &'a [u8] {
-        let rest = self.rest();
+        let rest = self.remaining_text();
         let len = rest.iter().take_while(|&&byte| is(byte)).count();
         self.at += len;
         rest.get(..len).unwrap_or_default()
@@ -219,16 +219,16 @@ impl<'a> Cursor<'a> {
     }
 
     /// Parses the time in parentheses before the bus name, up to and including the closing parenthesis.
-    fn stamp(&mut self) -> Option<LineTime> {
-        let is_padded = self.rest().first() == Some(&b'0');
+    fn parse_timestamp(&mut self) -> Option<LineTime> {
+        let is_padded = self.remaining_text().first() == Some(&b'0');
         let (number, digits) = self.number()?;
-        let is_date = self.accept(b'-');
+        let is_date = self.accept_byte(b'-');
         let seconds = if is_date { self.parse_date(number)? } else { number };
-        let fraction = self.accept(b'.').then(|| self.take_while(|byte| byte.is_ascii_digit()))?;
+        let fraction = self.accept_byte(b'.').then(|| self.take_while(|byte| byte.is_ascii_digit()))?;
         let (fraction, fraction_digits) = candump::fraction_to_nanos(fraction)?;
         let nanos = seconds.checked_mul(1_000_000_000)?.checked_add(fraction)?;
         let time = Timestamp { nine_digits: fraction_digits > 6, ..Timestamp::with_six_digits(nanos) };
-        self.accept(b')').then_some(())?;
+        self.accept_byte(b')').then_some(())?;
         Some(match digits {
             _ if is_date => LineTime::Local(time),
             10.. => LineTime::Absolute(Timestamp { min_digits: if is_padded { 10 } else { 1 }, ..time }),
@@ -240,7 +240,7 @@ impl<'a> Cursor<'a> {
     fn parse_date(&mut self, year: u64) -> Option<u64> {
         let mut two_digits = |end: Option<u8>| {
             let (number, digits) = self.number()?;
-            (digits == 2 && end.is_none_or(|end| self.accept(end))).then_some(number)
+            (digits == 2 && end.is_none_or(|end| self.accept_byte(end))).then_some(number)
         };
         let (month, day) = (two_digits(Some(b'-'))?, two_digits(Some(b' '))?);
         let (hour, minute, second) = (two_digits(Some(b':'))?, two_digits(Some(b':'))?, two_digits(None)?);
@@ -271,47 +271,52 @@ impl<'a> Cursor<'a> {
         Some((direction, Some(flags)))
     }
 
-    fn length(&mut self) -> Option<Length> {
-        let is_dlc = self.accept(b'{');
+    fn length(&mut self) -> Option<PrintedLength> {
+        let is_dlc = self.accept_byte(b'{');
         if is_dlc {
             let digit = self.take_while(|byte| byte.is_ascii_hexdigit());
             let [digit] = digit else { return None };
             let dlc = char::from(*digit).to_digit(16).and_then(|dlc| u8::try_from(dlc).ok())?;
-            return self.accept(b'}').then_some(Length::Dlc(dlc));
+            return self.accept_byte(b'}').then_some(PrintedLength::Dlc(dlc));
         }
-        let (number, digits) = self.accept(b'[').then(|| self.number())??;
-        self.accept(b']').then_some(())?;
+        let (number, digits) = self.accept_byte(b'[').then(|| self.number())??;
+        self.accept_byte(b']').then_some(())?;
         let len = u8::try_from(number).unwrap_or(u8::MAX);
         match digits {
-            1 => Some(Length::Classic(len)),
-            2 => Some(Length::Fd(len)),
-            4 => Some(Length::CanXl),
+            1 => Some(PrintedLength::Classic(len)),
+            2 => Some(PrintedLength::Fd(len)),
+            4 => Some(PrintedLength::CanXl),
             _ => None,
         }
     }
 
-    fn frame(&mut self, id: u32, length: Length, flags: u8) -> Result<Frame, LineError> {
-        let wrong = self.error("a length of at most 8 bytes, or 64 in two digits");
+    fn frame(&mut self, id: u32, length: PrintedLength, flags: u8) -> Result<Frame, LineError> {
+        let wrong = self.expected_error("a length of at most 8 bytes, or 64 in two digits");
         let len = match length {
-            Length::Dlc(dlc) => dlc.min(8),
-            Length::Classic(len) | Length::Fd(len) => len,
-            Length::CanXl => 0,
+            PrintedLength::Dlc(dlc) => dlc.min(8),
+            PrintedLength::Classic(len) | PrintedLength::Fd(len) => len,
+            PrintedLength::CanXl => 0,
         };
         self.skip_blanks();
-        let made = if self.rest().starts_with(b"remote request") {
+        let made = if self.remaining_text().starts_with(b"remote request") {
             Frame::remote(id, len)
         } else {
             let data = self.data(usize::from(len), wrong)?;
             let data = data.get(..usize::from(len)).unwrap_or_default();
             match length {
-                Length::Fd(_) => Frame::fd(id, flags, data),
-                Length::Classic(_) | Length::Dlc(_) | Length::CanXl => Frame::classic(id, data),
+                PrintedLength::Fd(_) => Frame::fd(id, flags, data),
+                PrintedLength::Classic(_) | PrintedLength::Dlc(_) | PrintedLength::CanXl => {
+                    Frame::classic(id, data)
+                }
             }
         };
         let frame = made.map_err(|_| wrong)?;
         Ok(match length {
-            Length::Dlc(dlc @ 9..) => frame.with_raw_dlc(dlc),
-            Length::Dlc(_) | Length::Classic(_) | Length::Fd(_) | Length::CanXl => frame,
+            PrintedLength::Dlc(dlc @ 9..) => frame.with_raw_dlc(dlc),
+            PrintedLength::Dlc(_)
+            | PrintedLength::Classic(_)
+            | PrintedLength::Fd(_)
+            | PrintedLength::CanXl => frame,
         })
     }
 
@@ -320,12 +325,12 @@ impl<'a> Cursor<'a> {
         let mut data = [0; 64];
         let mut is_swapped = false;
         for place in data.get_mut(..len).ok_or(too_long)? {
-            let swap = self.accept(b'`');
+            let swap = self.accept_byte(b'`');
             is_swapped |= swap;
             if !swap {
                 self.skip_blanks();
             }
-            let missing = self.error("a data byte: there are fewer than the length says");
+            let missing = self.expected_error("a data byte: there are fewer than the length says");
             let digits = self.take_while(|byte| byte.is_ascii_hexdigit());
             *place = byte(digits).ok_or(missing)?;
         }

@@ -6,9 +6,9 @@ mod read;
 mod write;
 
 pub(super) use clock::Clock;
-pub use clock::Remark;
+pub use clock::LogRemark;
 pub use read::MAX_LINE_BYTES;
-pub(super) use read::{LogReader, known_time};
+pub(super) use read::{LogReader, frame_time_in_line};
 #[cfg(test)]
 mod tests;
 

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use protocol::candump::{self, CandumpLine, Record};
 
-use super::clock::{Clock, Remark, TimeEvidence};
+use super::clock::{Clock, LogRemark, TimeEvidence};
 use super::console::{self, ConsoleFrame, ConsoleLine, LineTime};
 use crate::capture::{CaptureEntry, CaptureNote, NoteKind};
 use crate::container::read_uninterrupted;
@@ -33,7 +33,7 @@ pub(crate) struct LogReader {
     lines: u64,
     clock: Clock,
     /// The remarks on the log, each listed once.
-    remarks: Vec<Remark>,
+    remarks: Vec<LogRemark>,
     /// The sample of lines before the first frame. It does not grow afterwards.
     sample: Vec<u8>,
     any_frame: bool,
@@ -77,12 +77,12 @@ impl LogReader {
     }
 
     /// Returns the remarks on the frames so far.
-    pub(crate) fn remarks(&self) -> &[Remark] {
+    pub(crate) fn remarks(&self) -> &[LogRemark] {
         &self.remarks
     }
 
     /// Returns the sample of the lines before the first frame.
-    pub(crate) fn sample(&self) -> &[u8] {
+    pub(crate) fn first_lines_sample(&self) -> &[u8] {
         &self.sample
     }
 
@@ -113,20 +113,20 @@ impl LogReader {
         self.lines += 1;
         let text = self.buffer.get(line).unwrap_or_default();
         if long {
-            return Ok(Some(CaptureEntry::Note(note(text, long, self.clock.last_ns(), self.lines))));
+            return Ok(Some(CaptureEntry::Note(line_note(text, long, self.clock.last_ns(), self.lines))));
         }
         if let Ok(CandumpLine::Frame(record)) = candump::parse_bytes(text) {
             self.clock.set(record.time.nanos);
             self.any_frame = true;
             return Ok(Some(CaptureEntry::Frame(record)));
         }
-        let mut note = note(text, long, self.clock.last_ns(), self.lines);
+        let mut note = line_note(text, long, self.clock.last_ns(), self.lines);
         match console::parse(text) {
             None => {}
             Some(Ok(ConsoleLine::CanXl)) => note.kind = NoteKind::CanXl,
             Some(Ok(ConsoleLine::Frame(ConsoleFrame { stamp, interface, frame, direction, has_flags }))) => {
-                let (time, remark) = self.clock.time(stamp);
-                let no_flags = (!has_flags).then_some(Remark::NoFlags);
+                let (time, remark) = self.clock.next_frame_time(stamp);
+                let no_flags = (!has_flags).then_some(LogRemark::NoFlags);
                 for remark in remark.into_iter().chain(no_flags) {
                     if !self.remarks.contains(&remark) {
                         self.remarks.push(remark);
@@ -156,7 +156,7 @@ impl LogReader {
             let line = fresh.get(..end.unwrap_or(fresh.len())).unwrap_or_default();
             if end.is_some() || self.at_end {
                 if let Some((interface, nanos)) = parse_relative_time(line) {
-                    evidence.add(interface, nanos);
+                    evidence.add_time(interface, nanos);
                 }
                 seen += line.len() + 1;
             }
@@ -167,7 +167,7 @@ impl LogReader {
                 self.fill()?;
             }
         }
-        self.clock.set_reference(evidence.verdict());
+        self.clock.set_reference(evidence.likely_reference());
         Ok(())
     }
 
@@ -289,7 +289,7 @@ fn parse_relative_time(line: &[u8]) -> Option<(&str, u64)> {
 
 /// Returns the time of the frame in a line, in ns since 1970. Returns `None` if the line holds no frame, and
 /// `Some(None)` if the time depends on the lines before it.
-pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
+pub(crate) fn frame_time_in_line(line: &[u8]) -> Option<Option<u64>> {
     let line = line.trim_ascii_end();
     if let Ok(CandumpLine::Frame(record)) = candump::parse_bytes(line) {
         return Some(Some(record.time.nanos));
@@ -306,7 +306,7 @@ pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
 /// Makes a note of a line that is not a frame. Only a line that begins with a parenthesis, as lines with frames do,
 /// counts as unreadable; others are text.
 #[cold]
-fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> CaptureNote<'_> {
+fn line_note(text: &[u8], long: bool, nanos: u64, line: u64) -> CaptureNote<'_> {
     let why = format!("the line has more than {MAX_LINE_BYTES} bytes, and the rest is left out");
     let kind = match candump::parse_bytes(text) {
         _ if long => NoteKind::Unreadable(why),

@@ -13,7 +13,7 @@ use crate::capture::{CaptureEntry, NoteKind};
 const CONSOLE: &str = include_str!("console.txt");
 
 /// Returns the entries of a log as text (frames as lines of a log, notes by their kind) and the remarks.
-fn entries(text: &[u8]) -> (Vec<String>, Vec<Remark>) {
+fn entries(text: &[u8]) -> (Vec<String>, Vec<LogRemark>) {
     let mut log = LogReader::new(&[], Box::new(std::io::Cursor::new(text.to_vec())));
     let mut all = Vec::new();
     while let Some(entry) = log.next().unwrap() {
@@ -36,7 +36,7 @@ fn entries(text: &[u8]) -> (Vec<String>, Vec<Remark>) {
     (all, log.remarks().to_vec())
 }
 
-fn frames(text: &str) -> (Vec<String>, Vec<Remark>) {
+fn frames(text: &str) -> (Vec<String>, Vec<LogRemark>) {
     entries(text.as_bytes())
 }
 
@@ -54,9 +54,13 @@ fn every_form_of_the_console_is_read() {
         remarks.extend(remark);
     }
     assert!(cases >= 30, "{cases}");
-    for remark in
-        [Remark::NoTimes, Remark::LocalTimes, Remark::SinceFirst, Remark::Differences, Remark::NoFlags]
-    {
+    for remark in [
+        LogRemark::NoTimes,
+        LogRemark::LocalTimes,
+        LogRemark::SinceFirst,
+        LogRemark::Differences,
+        LogRemark::NoFlags,
+    ] {
         assert!(remarks.contains(&remark), "{remark:?}");
     }
 }
@@ -69,8 +73,8 @@ fn differences_are_told_from_times_since_the_first_frame() {
         let (frames, remarks) = frames(&text);
         (frames.last().unwrap().split_once(')').unwrap().0[1..].to_owned(), remarks)
     };
-    let zero = || vec![Remark::SinceFirst];
-    let differences = || vec![Remark::Differences];
+    let zero = || vec![LogRemark::SinceFirst];
+    let differences = || vec![LogRemark::Differences];
     assert_eq!(last(&[0, 10, 20, 30]), ("0.030000".to_owned(), zero()));
     assert_eq!(last(&[0, 10, 9, 11]), ("0.030000".to_owned(), differences()));
     assert_eq!(last(&[0, 10, 10, 10, 10]), ("0.040000".to_owned(), differences()));
@@ -269,7 +273,7 @@ proptest! {
         }
         prop_assert!(log.next().unwrap().is_none());
         // A few differences may be indistinguishable from times since the first frame.
-        if print.time != 'd' || log.remarks().contains(&Remark::Differences) {
+        if print.time != 'd' || log.remarks().contains(&LogRemark::Differences) {
             prop_assert!(times.iter().all(|(found, expected)| found == expected), "{}\n{:?}", text, times);
         } else {
             prop_assert!(steps.len() < 16, "{}", text);

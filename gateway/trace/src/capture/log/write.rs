@@ -103,7 +103,7 @@ impl BusNames {
 
     /// Returns the name of `bus` in the log if it differs from its own name. Stores `bus` as the last one.
     #[inline]
-    fn replacement(&mut self, bus: &str) -> Option<&str> {
+    fn replacement_name(&mut self, bus: &str) -> Option<&str> {
         if self.last.0 != bus || self.taken.is_empty() {
             let written = self.assign(bus);
             self.last = (bus.to_owned(), Some(written).filter(|name| name != bus));
@@ -177,7 +177,7 @@ impl<W: Write> LogWriter<W> {
             less.raw_dlc = frame.raw_dlc() != 0;
             written.frame = frame.with_raw_dlc(0);
         }
-        if let Some(name) = self.names.replacement(interface) {
+        if let Some(name) = self.names.replacement_name(interface) {
             written.interface = name;
             less.name = true;
         }
@@ -202,7 +202,8 @@ impl<W: Write> LogWriter<W> {
             NoteKind::Dropped(frames) => {
                 let total = self.lost.entry(note.interface.to_owned()).or_default();
                 *total = total.saturating_add(frames);
-                let (bus, s) = (self.names.replacement(note.interface), if frames == 1 { "" } else { "s" });
+                let (bus, s) =
+                    (self.names.replacement_name(note.interface), if frames == 1 { "" } else { "s" });
                 let bus = bus.filter(|_| !note.interface.is_empty()).unwrap_or(note.interface);
                 let text = format!(
                     "DROPCOUNT: dropped {frames} CAN frame{s} on '{bus}' socket (total drops {total})"

@@ -14,13 +14,13 @@
 use std::collections::{HashMap, HashSet};
 
 /// The maximum number of pairs of topic and `frame_id`. Frames of further pairs are named by their `frame_id`.
-const MAX_PAIRS: usize = 4_096;
+const MAX_TOPIC_FRAME_ID_PAIRS: usize = 4_096;
 /// The maximum length of a bus name made from a topic, in bytes.
 const MAX_NAME_BYTES: usize = 255;
 
 /// The names of the buses in a recording of another program.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct ForeignBuses {
+pub(crate) struct ForeignBusNames {
     /// The name of the bus, by topic and `frame_id`.
     names: HashMap<String, HashMap<String, String>>,
     /// The topics that use each `frame_id`.
@@ -31,11 +31,11 @@ pub(crate) struct ForeignBuses {
     is_shared: bool,
 }
 
-impl ForeignBuses {
+impl ForeignBusNames {
     /// Returns the name of the bus for a message with this topic and `frame_id`.
     pub(super) fn name<'a>(&'a mut self, topic: &str, frame_id: &'a str) -> &'a str {
         let is_known = self.names.get(topic).is_some_and(|names| names.contains_key(frame_id));
-        if !is_known && self.pairs.len() < MAX_PAIRS {
+        if !is_known && self.pairs.len() < MAX_TOPIC_FRAME_ID_PAIRS {
             self.topics.entry(frame_id.to_owned()).or_default().insert(topic.to_owned());
             self.pairs.push((topic.to_owned(), frame_id.to_owned()));
             self.assign(topic, frame_id);
@@ -54,7 +54,7 @@ impl ForeignBuses {
     }
 
     /// Returns true if several topics share one `frame_id`.
-    pub(crate) const fn is_shared(&self) -> bool {
+    pub(crate) const fn is_frame_id_shared(&self) -> bool {
         self.is_shared
     }
 
@@ -86,26 +86,26 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn named(buses: &mut ForeignBuses, pairs: &[(&str, &str)]) -> Vec<String> {
+    fn named(buses: &mut ForeignBusNames, pairs: &[(&str, &str)]) -> Vec<String> {
         pairs.iter().map(|(topic, frame_id)| buses.name(topic, frame_id).to_owned()).collect()
     }
 
     #[test]
     fn a_frame_id_of_one_topic_is_the_bus() {
-        let mut buses = ForeignBuses::default();
+        let mut buses = ForeignBusNames::default();
         let pairs = [("/a", "can0"), ("/a", "can1"), ("/b", "can7"), ("/c", ""), ("/a", "can0")];
         assert_eq!(named(&mut buses, &pairs), ["can0", "can1", "can7", "/c", "can0"]);
-        assert!(!buses.is_shared());
+        assert!(!buses.is_frame_id_shared());
     }
 
     #[test]
     fn topics_with_one_frame_id_are_buses_of_their_own() {
         let pairs = [("/can0/in", "can"), ("/can1/in", "can"), ("/can1/in", "other")];
-        let mut buses = ForeignBuses::default();
+        let mut buses = ForeignBusNames::default();
         assert_eq!(named(&mut buses, &pairs), ["can", "/can1/in", "other"], "of a pipe");
         let mut buses = buses.renamed_with_all_pairs();
         assert_eq!(named(&mut buses, &pairs), ["/can0/in", "/can1/in", "other"], "of a file");
-        assert!(buses.is_shared());
+        assert!(buses.is_frame_id_shared());
     }
 
     proptest! {
@@ -114,7 +114,7 @@ mod tests {
             pairs in proptest::collection::vec(("/[ab]{1,2}(/x)?", "(/?[ab]{1,2}|can|/a/x|)"), 1..40), settled: bool
         ) {
             let pairs: Vec<_> = pairs.iter().map(|(topic, name)| (topic.as_str(), name.as_str())).collect();
-            let mut buses = ForeignBuses::default();
+            let mut buses = ForeignBusNames::default();
             let mut names = named(&mut buses, &pairs);
             if settled {
                 buses = buses.renamed_with_all_pairs();

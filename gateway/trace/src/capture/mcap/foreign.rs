@@ -13,18 +13,18 @@ use protocol::can::{ERROR, EXTENDED, FD_FORMAT, Format, Frame, REMOTE, check_ide
 use protocol::candump::{Record, Timestamp};
 
 use crate::ros2::cdr::{CdrError, CdrReader};
-use crate::ros2::{Header, nanos};
+use crate::ros2::{Header, stamp_to_nanos};
 
 /// A message type in which other programs record frames.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum ForeignType {
+pub(super) enum ForeignMessageType {
     Classic,
     /// A classic frame in the encoding of ROS 1.
     Ros1,
     Fd,
 }
 
-impl ForeignType {
+impl ForeignMessageType {
     /// Returns the type for an encoding and a schema name; `None` if it does not hold frames.
     pub(super) fn from_schema(encoding: &str, schema: &str) -> Option<Self> {
         match (encoding, schema) {
@@ -36,7 +36,7 @@ impl ForeignType {
     }
 
     /// Returns the header of a message, and the reader positioned after it.
-    fn header(self, message: &[u8]) -> Result<(Header<'_>, CdrReader<'_>), CdrError> {
+    fn read_header(self, message: &[u8]) -> Result<(Header<'_>, CdrReader<'_>), CdrError> {
         let mut from;
         let header = match self {
             Self::Classic | Self::Fd => {
@@ -44,9 +44,9 @@ impl ForeignType {
                 from.get()?
             }
             Self::Ros1 => {
-                from = CdrReader::ros1(message);
+                from = CdrReader::from_ros1(message);
                 let [_sequence, sec, nanosec]: [u32; 3] = from.get()?;
-                Header { nanos: nanos(sec.into(), nanosec)?, frame_id: from.get()? }
+                Header { nanos: stamp_to_nanos(sec.into(), nanosec)?, frame_id: from.get()? }
             }
         };
         Ok((header, from))
@@ -56,7 +56,7 @@ impl ForeignType {
     /// named by the header's `frame_id`. An `FdFrame` message holds no FD flags; the frame gets FDF and neither BRS nor
     /// ESI.
     pub(super) fn decode(self, message: &[u8], log_time: u64) -> Result<Record<'_>, CdrError> {
-        let (Header { nanos: stamp, frame_id: interface }, mut from) = self.header(message)?;
+        let (Header { nanos: stamp, frame_id: interface }, mut from) = self.read_header(message)?;
         let number = from.get::<u32>()?;
         let remote = if self != Self::Fd && from.get()? { REMOTE } else { 0 };
         let extended = if from.get()? { EXTENDED } else { 0 };
@@ -75,7 +75,7 @@ impl ForeignType {
                 if remote != 0 { Frame::remote(id, length) } else { Frame::classic(id, data) }
             }
             Self::Fd => {
-                let data = from.bytes()?.get(..usize::from(length)).ok_or(wrong)?;
+                let data = from.get_bytes()?.get(..usize::from(length)).ok_or(wrong)?;
                 Frame::with_data(id, Format::Fd, FD_FORMAT, data)
             }
         };
@@ -103,15 +103,15 @@ mod tests {
             out.put(byte);
         }
         let record =
-            ForeignType::from_schema("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
+            ForeignMessageType::from_schema("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
         // The length field is changed, first into that of a remote frame and then into one that is too long.
         let at = bytes.len() - 12;
         bytes[at] = 1;
-        let record = ForeignType::Classic.decode(&bytes, 9).unwrap();
+        let record = ForeignMessageType::Classic.decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#R2");
         bytes[at + 3] = 9;
-        assert!(ForeignType::Classic.decode(&bytes, 9).unwrap_err().to_string().starts_with("length"));
+        assert!(ForeignMessageType::Classic.decode(&bytes, 9).unwrap_err().to_string().starts_with("length"));
     }
 
     #[test]
@@ -123,18 +123,18 @@ mod tests {
             out.put(byte);
         }
         out.put_bytes(&[1, 2, 3]);
-        let foreign = ForeignType::from_schema("cdr", "ros2_socketcan_msgs/msg/FdFrame").unwrap();
+        let foreign = ForeignMessageType::from_schema("cdr", "ros2_socketcan_msgs/msg/FdFrame").unwrap();
         let record = foreign.decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(0.000000009)  22C##4010203");
-        assert_eq!(ForeignType::from_schema("cdr", "std_msgs/msg/String"), None);
-        assert_eq!(ForeignType::from_schema("ros1", "can_msgs/msg/Frame"), None);
+        assert_eq!(ForeignMessageType::from_schema("cdr", "std_msgs/msg/String"), None);
+        assert_eq!(ForeignMessageType::from_schema("ros1", "can_msgs/msg/Frame"), None);
     }
 
     #[test]
     fn a_frame_of_ros_1_is_read() {
         let mut bytes = vec![9, 0, 0, 0, 17, 0, 0, 0, 5, 0, 0, 0, 3, 0, 0, 0];
         bytes.extend(b"can\x55\x44\x33\x1F\0\x01\0\x02\xAA\xBB\0\0\0\0\0\0");
-        let foreign = ForeignType::from_schema("ros1", "can_msgs/Frame").unwrap();
+        let foreign = ForeignMessageType::from_schema("ros1", "can_msgs/Frame").unwrap();
         let record = foreign.decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
         assert!(foreign.decode(&bytes[..bytes.len() - 1], 9).is_err());
@@ -153,13 +153,13 @@ mod tests {
             let mut out = CdrWriter::new(&mut bytes);
             head(&mut out, 1, "can", id);
             [0, extended, 0, 1, 0xAA, 0, 0, 0, 0, 0, 0, 0].into_iter().for_each(|byte: u8| out.put(byte));
-            let read = ForeignType::Classic.decode(&bytes, 9).map(|record| record.frame.id());
+            let read = ForeignMessageType::Classic.decode(&bytes, 9).map(|record| record.frame.id());
             assert_eq!(read.ok(), fits.then_some(id), "{id:X}");
             let mut out = CdrWriter::new(&mut bytes);
             head(&mut out, 1, "can", id);
             [extended, 0, 1].into_iter().for_each(|byte| out.put(byte));
             out.put_bytes(&[0xAA]);
-            let read = ForeignType::Fd.decode(&bytes, 9).map(|record| record.frame.id());
+            let read = ForeignMessageType::Fd.decode(&bytes, 9).map(|record| record.frame.id());
             assert_eq!(read.ok(), fits.then_some(id), "{id:X}");
         }
     }

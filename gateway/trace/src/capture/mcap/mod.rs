@@ -8,7 +8,7 @@ mod state;
 mod survey;
 mod write;
 
-pub(super) use buses::ForeignBuses;
+pub(super) use buses::ForeignBusNames;
 pub(super) use read::McapReader;
 pub(super) use state::McapState;
 pub(super) use survey::TopicSurvey;
@@ -23,7 +23,7 @@ use crate::container::FormatError;
 
 /// Returns true if messages with this encoding and type are frames that another program recorded.
 pub(crate) fn is_foreign_frame(encoding: &str, schema: &str) -> bool {
-    foreign::ForeignType::from_schema(encoding, schema).is_some()
+    foreign::ForeignMessageType::from_schema(encoding, schema).is_some()
 }
 
 /// An error of reading a recording, without the name of the file, which the caller adds.

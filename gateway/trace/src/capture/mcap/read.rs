@@ -7,7 +7,7 @@ use std::os::unix::fs::FileExt;
 use ::mcap::records::op;
 
 use super::ReadFault;
-use super::buses::ForeignBuses;
+use super::buses::ForeignBusNames;
 use super::state::{MAX_KEPT_BYTES, McapState, RequestedMessage};
 use crate::capture::{RecordingExtras, RecordingItem};
 use crate::container::{
@@ -23,7 +23,7 @@ type Input = BufReader<Chain<Cursor<Vec<u8>>, Box<dyn Read + Send>>>;
 pub(crate) struct McapReader {
     source: RecordReader<Input>,
     chunk: Chunk,
-    place: Phase,
+    place: ReadPhase,
     state: McapState,
     /// The first requested message, or the error before it. It is read when the recording is opened.
     first: Option<Result<RequestedMessage, ReadFault>>,
@@ -40,7 +40,7 @@ pub(crate) struct McapReader {
 
 /// The section of the file that is read next.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Phase {
+enum ReadPhase {
     Magic,
     Records,
     InChunk,
@@ -61,7 +61,7 @@ impl McapReader {
         let mut reader = Self {
             source,
             chunk,
-            place: Phase::Magic,
+            place: ReadPhase::Magic,
             state,
             first: None,
             anchor: (0, 0),
@@ -71,7 +71,7 @@ impl McapReader {
         };
         // Attachments and metadata before the first message are read now, so that the caller has them from the
         // beginning.
-        reader.first = reader.advance().transpose();
+        reader.first = reader.read_to_next_message().transpose();
         reader
     }
 
@@ -89,7 +89,7 @@ impl McapReader {
         Self {
             source,
             chunk,
-            place: Phase::Records,
+            place: ReadPhase::Records,
             state,
             first: None,
             anchor: (bytes, 0),
@@ -113,7 +113,7 @@ impl McapReader {
         self.state.extras()
     }
 
-    pub(crate) const fn buses(&self) -> &ForeignBuses {
+    pub(crate) const fn buses(&self) -> &ForeignBusNames {
         self.state.buses()
     }
 
@@ -126,7 +126,7 @@ impl McapReader {
     /// afterwards.
     pub(crate) fn is_at_its_end(&mut self) -> Result<bool, ReadFault> {
         if self.first.is_none() {
-            self.first = self.advance()?.map(Ok);
+            self.first = self.read_to_next_message()?.map(Ok);
         }
         Ok(self.first.is_none())
     }
@@ -135,23 +135,23 @@ impl McapReader {
     pub(crate) fn next(&mut self) -> Result<Option<RecordingItem<'_>>, ReadFault> {
         let target = match self.first.take() {
             Some(first) => Some(first?),
-            None => self.advance()?,
+            None => self.read_to_next_message()?,
         };
         let Some(RequestedMessage { channel, times, in_chunk }) = target else { return Ok(None) };
         self.anchor.1 += 1;
         let body = if in_chunk { self.chunk.body() } else { self.source.body() };
         let Ok(Record::Message { data, .. }) = parse(op::MESSAGE, body) else { return Ok(None) };
-        Ok(Some(self.state.item(channel, times, data)))
+        Ok(Some(self.state.decode_item(channel, times, data)))
     }
 
     /// Reads up to the next requested message.
-    fn advance(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
-        while self.place != Phase::Finished {
-            match self.step() {
+    fn read_to_next_message(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
+        while self.place != ReadPhase::Finished {
+            match self.read_record() {
                 Ok(None) => {}
                 Ok(target) => return Ok(target),
                 Err(fault) => {
-                    self.place = Phase::Finished;
+                    self.place = ReadPhase::Finished;
                     return Err(fault);
                 }
             }
@@ -160,7 +160,7 @@ impl McapReader {
     }
 
     /// Reads one record.
-    fn step(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
+    fn read_record(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
         let Self { source, chunk, place, state, anchor, messages, .. } = self;
         let began = source.bytes_read();
         let mut take = |opcode, body: &[u8], in_chunk| {
@@ -170,38 +170,38 @@ impl McapReader {
             state.process_record(opcode, body, in_chunk)
         };
         match place {
-            Phase::Finished => {}
-            Phase::Magic => {
-                *place = Phase::Records;
+            ReadPhase::Finished => {}
+            ReadPhase::Magic => {
+                *place = ReadPhase::Records;
                 self.expect_magic()?;
             }
-            Phase::InChunk => match chunk.next() {
+            ReadPhase::InChunk => match chunk.next() {
                 Some((opcode @ (op::SCHEMA | op::CHANNEL | op::MESSAGE), body)) => {
                     return take(opcode, body, true);
                 }
                 Some(_) => {}
-                None => *place = Phase::Records,
+                None => *place = ReadPhase::Records,
             },
-            Phase::Records => {
+            ReadPhase::Records => {
                 let framed = source.next()?;
                 source.check(framed)?;
                 match framed {
                     FramedRecord::Record(op::CHUNK) => {
                         chunk.unpack(source.body(), source.bytes_read())?;
-                        (*place, *anchor) = (Phase::InChunk, (began, 0));
+                        (*place, *anchor) = (ReadPhase::InChunk, (began, 0));
                     }
                     FramedRecord::Record(op::DATA_END) => {
-                        source.check_section(op::DATA_END)?;
+                        source.check_section_checksum(op::DATA_END)?;
                         source.begin_summary();
                     }
                     FramedRecord::Record(op::FOOTER) => {
-                        *place = Phase::Finished;
+                        *place = ReadPhase::Finished;
                         // A damaged summary is ignored; the records after it are still read.
-                        if source.check_section(op::FOOTER).is_err() {
+                        if source.check_section_checksum(op::FOOTER).is_err() {
                             self.stated = None;
                         }
                         self.expect_magic()?;
-                        self.check_end()?;
+                        self.check_end_of_file()?;
                     }
                     FramedRecord::Record(opcode) => {
                         let target = take(opcode, source.body(), false)?;
@@ -243,7 +243,7 @@ impl McapReader {
     }
 
     /// Checks that as many messages were read as the statistics state, and that the input ends here.
-    fn check_end(&self) -> Result<(), ReadFault> {
+    fn check_end_of_file(&self) -> Result<(), ReadFault> {
         if let (Some(found), Some(stated)) = (self.messages, self.stated)
             && found != stated
         {
@@ -260,7 +260,7 @@ impl McapReader {
     /// Handles an input that ends within a record, after `bytes` bytes of it. The recording was cut off, unless its end
     /// or other records follow the beginning of this record; then the length of the record is wrong.
     fn handle_truncation(&mut self, bytes: u64) -> Result<(), ReadFault> {
-        self.place = Phase::Finished;
+        self.place = ReadPhase::Finished;
         if self.source.ends_with_magic() && self.source.bytes_read() > 2 * MAGIC.len() as u64 {
             let is_footer = bytes == MAGIC.len() as u64;
             return Err(if is_footer { FormatError::Footer } else { FormatError::Beyond { bytes } }.into());
@@ -272,7 +272,7 @@ impl McapReader {
             let any = self.source.uncompressed_chunk_length().is_none();
             // An earlier message may have a wrong length that led into the middle of a record and skipped those
             // between.
-            let before = self.source.message_before().filter(|_| any);
+            let before = self.source.offset_of_message_before().filter(|_| any);
             let began = before.unwrap_or_else(|| self.source.record_offset());
             if first_record(&mut OffsetReader { file, at: 0 }, began + 1, read, any)?.is_some() {
                 return Err(FormatError::Beyond { bytes }.into());

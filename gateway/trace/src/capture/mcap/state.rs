@@ -8,9 +8,9 @@ use ::mcap::records::op;
 use protocol::candump::{Direction, Record, Timestamp};
 
 use super::ReadFault;
-use super::buses::{ForeignBuses, truncate_topic};
-use super::foreign::ForeignType;
-use super::write::{SECONDS_DIGITS, TIME_DIGITS};
+use super::buses::{ForeignBusNames, truncate_topic};
+use super::foreign::ForeignMessageType;
+use super::write::{SECONDS_DIGITS_KEY, TIME_DIGITS_KEY};
 use crate::capture::log::MAX_LINE_BYTES as LONGEST_LINE;
 use crate::capture::{
     CaptureEntry, CaptureNote, LatchedFrame, NoteKind, OtherMessage, RecordingExtras, RecordingItem, Topic,
@@ -43,7 +43,7 @@ pub(crate) struct McapState {
     knows_files: bool,
     any_frame: bool,
     /// The bus names for frames of other programs.
-    buses: ForeignBuses,
+    buses: ForeignBusNames,
     /// True if the caller requests messages of other topics too, which are otherwise only counted.
     others: bool,
     /// True in the first part of a recording.
@@ -80,7 +80,7 @@ enum ChannelUsage {
     /// Frames that were sent before the recording began and were still latched then.
     Latched,
     Notes,
-    Foreign(ForeignType),
+    Foreign(ForeignMessageType),
     /// Messages that are only counted, with the index of the topic.
     Counted(usize),
 }
@@ -102,22 +102,22 @@ impl McapState {
             kept: 0,
             knows_files: !is_first,
             any_frame: false,
-            buses: ForeignBuses::default(),
+            buses: ForeignBusNames::default(),
             others,
             is_first,
         }
     }
 
     /// Uses bus names that were found in advance.
-    pub(crate) fn with_buses(self, buses: ForeignBuses) -> Self {
+    pub(crate) fn with_buses(self, buses: ForeignBusNames) -> Self {
         Self { buses, ..self }
     }
 
-    pub(super) const fn buses(&self) -> &ForeignBuses {
+    pub(super) const fn buses(&self) -> &ForeignBusNames {
         &self.buses
     }
 
-    pub(super) fn into_buses(self) -> ForeignBuses {
+    pub(super) fn into_buses(self) -> ForeignBusNames {
         self.buses
     }
 
@@ -287,7 +287,7 @@ impl McapState {
         let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
         // The topic and the type of a message may be stored twice each.
         self.names.add(2 * (topic.len() + schema.len()))?;
-        let what = if let Some(foreign) = ForeignType::from_schema(encoding, &schema) {
+        let what = if let Some(foreign) = ForeignMessageType::from_schema(encoding, &schema) {
             Some(ChannelUsage::Foreign(foreign))
         } else if encoding != "cdr" {
             None
@@ -313,7 +313,7 @@ impl McapState {
         Ok(())
     }
 
-    pub(super) fn item<'a>(
+    pub(super) fn decode_item<'a>(
         &'a mut self,
         channel: u16,
         times: MessageTimes,
@@ -334,18 +334,21 @@ impl McapState {
             ChannelUsage::Latched => decode_latched_frame(message).map(CaptureEntry::Frame),
             ChannelUsage::Frames(form) => {
                 let time = Timestamp { nanos: published, ..form };
-                decode(message, MAX_FRAME_MESSAGE, |message| messages::frame(message, time))
+                decode_limited(message, MAX_FRAME_MESSAGE, |message| messages::decode_frame(message, time))
                     .map(CaptureEntry::Frame)
             }
             ChannelUsage::Foreign(foreign) => {
-                let record = decode(message, MAX_FRAME_MESSAGE, |message| foreign.decode(message, log_time));
+                let record =
+                    decode_limited(message, MAX_FRAME_MESSAGE, |message| foreign.decode(message, log_time));
                 let buses = &mut self.buses;
                 record.map(|record| {
                     CaptureEntry::Frame(Record { interface: buses.name(topic, record.interface), ..record })
                 })
             }
             ChannelUsage::Notes => {
-                let note = decode(message, MAX_NOTE_MESSAGE, |message| messages::note(message, published));
+                let note = decode_limited(message, MAX_NOTE_MESSAGE, |message| {
+                    messages::decode_note(message, published)
+                });
                 note.map(|mut note| {
                     if note.line > 0 && !self.any_frame {
                         note.nanos = 0;
@@ -362,13 +365,13 @@ impl McapState {
 
 /// Returns the form of times that is stated in the metadata of a channel.
 fn timestamp_format(facts: &MetadataMap<'_>) -> Timestamp {
-    let nine_digits = facts.get(TIME_DIGITS).is_none_or(|digits| digits != "6");
-    let min_digits = facts.get(SECONDS_DIGITS).and_then(|digits| digits.parse().ok()).unwrap_or(1);
+    let nine_digits = facts.get(TIME_DIGITS_KEY).is_none_or(|digits| digits != "6");
+    let min_digits = facts.get(SECONDS_DIGITS_KEY).and_then(|digits| digits.parse().ok()).unwrap_or(1);
     Timestamp { nanos: 0, nine_digits, min_digits }
 }
 
 /// Decodes a message, unless it is too long.
-fn decode<'a, T>(
+fn decode_limited<'a, T>(
     message: &'a [u8],
     limit: usize,
     decode: impl FnOnce(&'a [u8]) -> Result<T, CdrError>,
@@ -379,8 +382,8 @@ fn decode<'a, T>(
 
 /// Decodes a latched frame with the time at which it was on the bus.
 fn decode_latched_frame(message: &[u8]) -> Result<Record<'_>, MessageError> {
-    decode(message, MAX_FRAME_MESSAGE, |message| {
-        messages::frame(message, Timestamp::with_nine_digits(messages::stamp(message)?))
+    decode_limited(message, MAX_FRAME_MESSAGE, |message| {
+        messages::decode_frame(message, Timestamp::with_nine_digits(messages::decode_stamp_nanos(message)?))
     })
 }
 

@@ -6,8 +6,8 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
 use ::mcap::records::op;
 
-use super::buses::ForeignBuses;
-use super::foreign::ForeignType;
+use super::buses::ForeignBusNames;
+use super::foreign::ForeignMessageType;
 use super::read::McapReader;
 use super::state::McapState;
 use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, Record, parse, seek_record};
@@ -48,7 +48,7 @@ impl TopicSurvey {
                 Ok(Record::Channel { schema, topic, encoding, .. }) => {
                     says = true;
                     let is_of = |name: &&(u16, String)| {
-                        name.0 == schema && ForeignType::from_schema(encoding, &name.1).is_some()
+                        name.0 == schema && ForeignMessageType::from_schema(encoding, &name.1).is_some()
                     };
                     if self.topics.len() < MAX_TOPICS && schemas.iter().any(|name| is_of(&name)) {
                         self.topics.insert(topic.to_owned());
@@ -62,12 +62,16 @@ impl TopicSurvey {
     }
 
     /// Returns true if all messages must be read to find the bus names.
-    pub(crate) fn is_needed(&self) -> bool {
+    pub(crate) fn must_read_messages(&self) -> bool {
         self.has_hidden_channels || self.topics.len() > 1
     }
 
     /// Reads the frames of a recording and returns the `known` bus names with those of these frames.
-    pub(crate) fn buses_of(&self, input: Box<dyn Read + Send>, known: ForeignBuses) -> ForeignBuses {
+    pub(crate) fn bus_names_of(
+        &self,
+        input: Box<dyn Read + Send>,
+        known: ForeignBusNames,
+    ) -> ForeignBusNames {
         let mut reader = McapReader::new(&[], input, McapState::new(false, None).with_buses(known), None);
         // If the topics are unknown, the types of the first messages show whether there are frames of other programs.
         if self.topics.len() > 1 || reader.has_foreign() {

@@ -23,10 +23,10 @@ pub(crate) const LOG_ORIGIN: (&str, &str) = ("from", "candump log");
 /// The entry of [`ORIGIN`] in a recording that was converted from another recording.
 const RECORDING_ORIGIN: (&str, &str) = ("from", "MCAP recording");
 /// The metadata key of a channel for the number of decimals of its times: 6 or 9.
-pub(super) const TIME_DIGITS: &str = "time_digits";
+pub(super) const TIME_DIGITS_KEY: &str = "time_digits";
 /// The metadata key of a channel for the number of digits to which seconds are padded. It is missing if they are not
 /// padded.
-pub(super) const SECONDS_DIGITS: &str = "seconds_digits";
+pub(super) const SECONDS_DIGITS_KEY: &str = "seconds_digits";
 /// The maximum size of notes that wait for the first frame, in bytes.
 const MAX_WAITING_BYTES: usize = 1 << 20;
 
@@ -160,8 +160,10 @@ impl<W: Write> McapWriter<W> {
             let proposed = || format!("{BUS_TOPIC_PREFIX}{}", name.trim_start_matches('/'));
             let topic = self.topics.entry(name.to_owned()).or_insert_with(|| self.taken.assign(proposed()));
             let padded = form.min_digits.to_string();
-            let facts =
-                [(TIME_DIGITS, if form.nine_digits { "9" } else { "6" }), (SECONDS_DIGITS, padded.as_str())];
+            let facts = [
+                (TIME_DIGITS_KEY, if form.nine_digits { "9" } else { "6" }),
+                (SECONDS_DIGITS_KEY, padded.as_str()),
+            ];
             let facts = facts.get(..if form.min_digits > 1 { 2 } else { 1 }).unwrap_or_default();
             let channel = self.file.channel::<Record<'_>>(topic, facts)?;
             self.channels.push(BusChannel { interface: name.to_owned(), form, channel });

@@ -50,7 +50,7 @@ fn a_reader_goes_on_where_it_was_and_no_moment_is_before_its_place() {
         let mut reader = Reader::open_all(&paths).unwrap();
         let (mut here, mut all) = (Vec::new(), Vec::new());
         loop {
-            here.push(reader.place());
+            here.push(reader.seek_point());
             let Some(&one) = next(&mut reader, 1).first() else { break };
             all.push(one);
         }
@@ -123,11 +123,11 @@ fn messages_outside_chunks_and_files_without_an_end_have_places() {
         writer.write_to_known_channel(&header, &[0; 40]).unwrap();
     }
     drop(writer);
-    let whole = SeekIndex::with_min_distance(std::slice::from_ref(&path), 1_000).unwrap();
+    let whole = SeekIndex::open_with_min_distance(std::slice::from_ref(&path), 1_000).unwrap();
     assert!(whole.marks.len() > 100 && whole.latest_ns() == 2_999);
     let bytes = std::fs::read(&path).unwrap();
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-    let cut = SeekIndex::with_min_distance(&[path], 1_000).unwrap();
+    let cut = SeekIndex::open_with_min_distance(&[path], 1_000).unwrap();
     assert!(cut.marks.len() > 40 && (1_000..2_000).contains(&cut.latest_ns()), "{}", cut.latest_ns());
 }
 

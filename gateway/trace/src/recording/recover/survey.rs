@@ -15,7 +15,7 @@ use super::described::{DescriptionSet, DescriptionTrust};
 use super::{MAX_ATTACHMENT_BYTES, RecoverError, RecoveryResult};
 use crate::container::{
     Chunk, FormatError, FramedRecord, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER_BYTES, Record, RecordReader,
-    first_record, is_record, parse,
+    can_begin_record, first_record, parse,
 };
 
 /// The number of records before a wrong one that are examined again, because their lengths may have been wrong.
@@ -160,7 +160,7 @@ impl<R: Read + Seek> Surveyor<R> {
         let framed = self.source.next()?;
         let is_header = framed == FramedRecord::Record(op::HEADER) && self.source.check(framed).is_ok();
         let end = self.source.bytes_read();
-        Ok(is_header && is_record(self.source.input(), end, self.size)?)
+        Ok(is_header && can_begin_record(self.source.input(), end, self.size)?)
     }
 
     fn find_first_record(&mut self, from: u64, until: u64, any: bool) -> io::Result<Option<u64>> {
@@ -169,7 +169,7 @@ impl<R: Read + Seek> Surveyor<R> {
 
     /// Returns the offset of the first record: a chunk or attachment at or after `from`, or several records in a row at
     /// or after `rows`.
-    fn first_record_or_row(&mut self, from: u64, rows: u64, until: u64) -> io::Result<Option<u64>> {
+    fn find_record_or_row(&mut self, from: u64, rows: u64, until: u64) -> io::Result<Option<u64>> {
         match self.find_first_record(from, rows.min(until), false)? {
             None => self.find_first_record(rows, until, true),
             found => Ok(found),
@@ -234,7 +234,7 @@ impl<R: Read + Seek> Surveyor<R> {
             _ => {}
         }
         match code {
-            op::CHUNK if self.chunk.is_checked() => self.unsure.clear(),
+            op::CHUNK if self.chunk.has_checksum() => self.unsure.clear(),
             op::ATTACHMENT if !self.source.body().ends_with(&[0; 4]) => self.unsure.clear(),
             op::CHUNK | op::ATTACHMENT => self.queue_unsure_record(began, end),
             _ => self.queue_unsure_record(began, content),
@@ -266,10 +266,10 @@ impl<R: Read + Seek> Surveyor<R> {
         // Either the length field or the lengths in the contents may be wrong. Other records follow after the correct
         // length, but not after the wrong one.
         let by_length = content.saturating_add(bytes);
-        let is_shorter = by_length < end && is_record(self.source.input(), by_length, self.limit)?;
+        let is_shorter = by_length < end && can_begin_record(self.source.input(), by_length, self.limit)?;
         // Chunks and attachments have two lengths in their contents, which prove that they are complete.
         let is_sure = matches!(code, op::CHUNK | op::ATTACHMENT);
-        if !is_sure && !is_record(self.source.input(), end, self.limit)? {
+        if !is_sure && !can_begin_record(self.source.input(), end, self.limit)? {
             return Ok(None);
         }
         let is_right = self.source.read_with_length(content - RECORD_HEADER_BYTES as u64, own)?
@@ -294,7 +294,8 @@ impl<R: Read + Seek> Surveyor<R> {
             parse(code, body)?;
         }
         chunk.rewind();
-        let trust = if chunk.is_checked() { DescriptionTrust::Certain } else { DescriptionTrust::Unchecked };
+        let trust =
+            if chunk.has_checksum() { DescriptionTrust::Certain } else { DescriptionTrust::Unchecked };
         while let Some((code, body)) = chunk.next() {
             if matches!(code, op::SCHEMA | op::CHANNEL) {
                 described.add(code, body, trust)?;
@@ -305,7 +306,7 @@ impl<R: Read + Seek> Surveyor<R> {
 
     /// Handles a record that ends the data section. If other records follow it, it is damage that looks like the end.
     fn examine_data_end(&mut self, began: u64) -> io::Result<ExaminedRecord> {
-        let checked = self.source.check_section(op::DATA_END).is_ok();
+        let checked = self.source.check_section_checksum(op::DATA_END).is_ok();
         let end = self.source.bytes_read();
         if self.limit < self.size && end < self.limit {
             return Ok(ExaminedRecord::Damaged { end: Some(end), rows: 0 });
@@ -327,9 +328,9 @@ impl<R: Read + Seek> Surveyor<R> {
                 }
                 FramedRecord::Record(op::FOOTER) => {
                     let has_none = self.source.body().ends_with(&[0; 4]);
-                    let is_right = self.source.check_section(op::FOOTER).is_ok();
+                    let is_right = self.source.check_section_checksum(op::FOOTER).is_ok();
                     self.survey.recovered.is_checksum_wrong |= !is_right;
-                    of_all = trust(is_right, has_none);
+                    of_all = summary_trust(is_right, has_none);
                     self.survey.recovered.has_end = self.source.read_magic()?;
                     break;
                 }
@@ -358,14 +359,14 @@ impl<R: Read + Seek> Surveyor<R> {
     /// Continues at the next intact records after a wrong one. Returns false if there are no more.
     fn resume_after_damage(&mut self, began: u64, end: Option<u64>, rows: u64) -> io::Result<bool> {
         let end = match end.filter(|end| *end <= self.limit) {
-            Some(end) => is_record(self.source.input(), end, self.limit)?.then_some(end),
+            Some(end) => can_begin_record(self.source.input(), end, self.limit)?.then_some(end),
             None => None,
         };
         // An earlier record with a wrong length may have led into the middle of another one, to bytes that look like a
         // record.
         let mut until = began;
         while let Some((at, within)) = self.unsure.pop_back() {
-            if let Some(found) = self.first_record_or_row(at + 1, within.max(at + 1), until)? {
+            if let Some(found) = self.find_record_or_row(at + 1, within.max(at + 1), until)? {
                 self.unsure.clear();
                 self.truncate_intact(at);
                 self.count_lost(found - at);
@@ -377,7 +378,7 @@ impl<R: Read + Seek> Surveyor<R> {
         let from = began + 1;
         let found = match end {
             Some(end) => self.find_first_record(from, end, false)?.or(Some(end)),
-            None => self.first_record_or_row(from, rows.max(from), self.limit)?,
+            None => self.find_record_or_row(from, rows.max(from), self.limit)?,
         };
         let Some(found) = found else {
             let rest = self.limit.saturating_sub(began);
@@ -433,7 +434,7 @@ impl<R: Read + Seek> Surveyor<R> {
                 return Ok(None);
             }
             match framed {
-                FramedRecord::Record(op::FOOTER) => break of_summary.check_section(op::FOOTER),
+                FramedRecord::Record(op::FOOTER) => break of_summary.check_section_checksum(op::FOOTER),
                 FramedRecord::Record(code @ (op::SCHEMA | op::CHANNEL)) => {
                     all.push((code, of_summary.body().to_vec()))
                 }
@@ -454,7 +455,7 @@ impl<R: Read + Seek> Surveyor<R> {
             return Ok(None);
         }
         let is_right = checksum.is_ok();
-        let trust = trust(is_right, at_end.ends_with(&[&[0; 4][..], MAGIC].concat()));
+        let trust = summary_trust(is_right, at_end.ends_with(&[&[0; 4][..], MAGIC].concat()));
         for (code, body) in all {
             // Descriptions that cannot be decoded are ignored.
             let _ = self.survey.described.add(code, &body, trust);
@@ -464,7 +465,7 @@ impl<R: Read + Seek> Surveyor<R> {
 }
 
 /// Returns how reliable the descriptions in a summary are, by its checksum.
-const fn trust(is_right: bool, has_none: bool) -> DescriptionTrust {
+const fn summary_trust(is_right: bool, has_none: bool) -> DescriptionTrust {
     match (is_right, has_none) {
         (false, _) => DescriptionTrust::Doubtful,
         (true, true) => DescriptionTrust::Unchecked,

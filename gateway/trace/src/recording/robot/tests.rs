@@ -49,7 +49,10 @@ fn near(one: &[f64], other: &[f64]) -> bool {
 #[test]
 fn a_robot_is_shown_by_the_urdf_that_its_skin_names() {
     let robot = arm(&skin(0.5)).unwrap();
-    assert_eq!((robot.base(), robot.link((0, 1)), robot.link((0, 2))), ("world", Some("upper"), None));
+    assert_eq!(
+        (robot.root_link_name(), robot.link_moved_by((0, 1)), robot.link_moved_by((0, 2))),
+        ("world", Some("upper"), None)
+    );
     let moving = robot.moving_transforms(&[0.3]);
     let names: Vec<_> = moving.iter().map(|it| (it.parent, it.child)).collect();
     assert_eq!(names, [("world", "upper"), ("upper", "other")]);
@@ -83,7 +86,7 @@ fn a_urdf_of_another_robot_is_refused() {
 
 #[test]
 fn each_cell_of_a_skin_without_a_urdf_is_on_its_link() {
-    let skin = testing::skin();
+    let skin = testing::one_cell_skin();
     let robot = RecordedRobot::from_rows(&skin).unwrap();
     let still = robot.fixed_transforms();
     let cells = still.iter().filter(|it| it.child.contains('/')).count();

@@ -48,7 +48,7 @@ impl Bench {
     /// Returns all messages of the file, and the number of those that arrived after later ones had been written.
     fn end(mut self) -> (Vec<WrittenMessage>, u64) {
         self.window.write_all(&mut self.file).unwrap();
-        assert_eq!(self.window.count(), MessageCount::default());
+        assert_eq!(self.window.waiting_count(), MessageCount::default());
         self.file.finish().unwrap();
         let bytes = self.file.into_inner();
         let seen = mcap::MessageStream::new(&bytes).unwrap().map(|message| {
@@ -146,7 +146,7 @@ fn another_file_begins_with_the_same_buffers_and_an_order_of_its_own() {
     assert_eq!((bench.at(START + 101 * MS).others, bench.window.late_messages()), (1, 1));
     bench.frame(START + 99 * MS);
     bench.window.begin(START + 100 * MS);
-    assert_eq!(bench.window.count(), MessageCount::default(), "it was for the file before");
+    assert_eq!(bench.window.waiting_count(), MessageCount::default(), "it was for the file before");
     let Bench { file, frames, joints, .. } = Bench::new();
     let mut bench = Bench { file, frames, joints, window: bench.window };
     bench.frame(START);

@@ -94,7 +94,7 @@ impl SkinDraft {
     }
 
     /// Adds a key with an array of inline tables, one per line.
-    pub fn set_rows<'v>(
+    pub fn set_table_rows<'v>(
         &mut self,
         key: &str,
         remark: Option<&str>,
@@ -167,7 +167,7 @@ impl SkinDraft {
 
     /// Returns the complete text of the file.
     #[must_use]
-    pub fn text(self) -> String {
+    pub fn into_text(self) -> String {
         self.0
     }
 }

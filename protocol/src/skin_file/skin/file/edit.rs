@@ -47,7 +47,7 @@ impl<'a> SkinEdit<'a> {
     /// Returns an error if the text is not TOML, or its number of cells differs from that of the skin.
     pub fn new(skin: &Skin, text: &'a str) -> Result<Self, EditError> {
         let edit = Self { text, document: Document::parse(text)?, changes: Vec::new() };
-        let (found, expected) = (edit.count().ok_or(EditError::NoCells)?, skin.cells.len());
+        let (found, expected) = (edit.cell_count().ok_or(EditError::NoCells)?, skin.cells.len());
         if found != expected {
             return Err(EditError::Count { found, expected });
         }
@@ -55,12 +55,12 @@ impl<'a> SkinEdit<'a> {
     }
 
     /// Counts the cells in the text: `[[cell]]` tables, or inline tables in an array.
-    fn count(&self) -> Option<usize> {
+    fn cell_count(&self) -> Option<usize> {
         let cells = self.document.get("cell")?;
         if let Item::ArrayOfTables(cells) = cells { Some(cells.len()) } else { Some(cells.as_array()?.len()) }
     }
 
-    fn cell(&self, index: usize) -> Option<&dyn TableLike> {
+    fn cell_table(&self, index: usize) -> Option<&dyn TableLike> {
         let cells = self.document.get("cell")?;
         if let Item::ArrayOfTables(cells) = cells {
             return cells.get(index).map(|table: &Table| table as &dyn TableLike);
@@ -70,13 +70,13 @@ impl<'a> SkinEdit<'a> {
 
     /// Returns the byte ranges of a key of a cell and of its value.
     fn key_and_value_ranges(&self, cell: usize, key: &str) -> Option<(Range<usize>, Range<usize>)> {
-        let (key, item) = self.cell(cell)?.get_key_value(key)?;
+        let (key, item) = self.cell_table(cell)?.get_key_value(key)?;
         Some((Key::span(key)?, item.span()?))
     }
 
     /// Returns true if a cell has the key.
     #[must_use]
-    pub fn has(&self, cell: usize, key: &str) -> bool {
+    pub fn has_key(&self, cell: usize, key: &str) -> bool {
         self.key_and_value_ranges(cell, key).is_some()
     }
 
@@ -89,14 +89,14 @@ impl<'a> SkinEdit<'a> {
 
     /// Replaces one element of an array of a cell, if the element exists.
     pub fn set_element(&mut self, cell: usize, key: &str, index: usize, value: Value<'_>) {
-        let array = self.cell(cell).and_then(|cell| cell.get(key)?.as_array());
+        let array = self.cell_table(cell).and_then(|cell| cell.get(key)?.as_array());
         if let Some(place) = array.and_then(|array| array.get(index)?.span()) {
             self.changes.push((place, value.to_string()));
         }
     }
 
     /// Replaces a key of a cell and its value by the key `other` and another value, if the cell has the key.
-    pub fn replace(&mut self, cell: usize, key: &str, other: &str, value: Value<'_>) {
+    pub fn replace_key(&mut self, cell: usize, key: &str, other: &str, value: Value<'_>) {
         if let Some((name, place)) = self.key_and_value_ranges(cell, key) {
             self.changes.push((name, other.to_owned()));
             self.changes.push((place, value.to_string()));
@@ -104,7 +104,7 @@ impl<'a> SkinEdit<'a> {
     }
 
     /// Adds a key to a cell after the key `after`: on a new line in a table, or behind the value in an inline table.
-    pub fn insert(&mut self, cell: usize, key: &str, value: Value<'_>, after: &str) {
+    pub fn insert_key_after(&mut self, cell: usize, key: &str, value: Value<'_>, after: &str) {
         let Some((name, place)) = self.key_and_value_ranges(cell, after) else { return };
         let rest = self.text.get(place.end..).unwrap_or_default();
         let is_inline = self.document.get("cell").is_some_and(Item::is_value);
@@ -127,7 +127,7 @@ impl<'a> SkinEdit<'a> {
 
     /// Returns the text with all changes applied.
     #[must_use]
-    pub fn text(mut self) -> String {
+    pub fn edited_text(mut self) -> String {
         // The sort is stable: insertions at one position keep the order of the calls.
         self.changes.sort_by_key(|(place, _)| (place.start, place.end));
         let mut out = String::with_capacity(self.text.len());

@@ -56,7 +56,7 @@ fn a_text_without_changes_is_the_given_one() {
     let example = std::fs::read_to_string(example).unwrap();
     for text in [HAND, INLINE, &example].into_iter().flat_map(forms) {
         let skin = parsed(&text);
-        assert_eq!(SkinEdit::new(&skin, &text).unwrap().text(), text);
+        assert_eq!(SkinEdit::new(&skin, &text).unwrap().edited_text(), text);
     }
 }
 
@@ -67,7 +67,7 @@ fn values_change_and_no_other_byte() {
         edit.set(0, "node", Value::Integer(50));
         edit.set(0, "joint", Value::Integer(1));
         edit.set(0, "position", Value::Numbers(&[0.5, -0.25, 1.0]));
-        edit.replace(0, "normal", "orientation", Value::Numbers(&[0.0, 0.0, 0.6, 0.8]));
+        edit.replace_key(0, "normal", "orientation", Value::Numbers(&[0.0, 0.0, 0.6, 0.8]));
         edit.set(1, "node", Value::Integer(7));
         edit.set_element(0, "neighbors", 0, Value::Integer(7));
         edit.set(1, "row", Value::Integer(9));
@@ -80,7 +80,7 @@ fn values_change_and_no_other_byte() {
             .replace("normal = [0, 1.0, 0]#", "orientation = [0.0, 0.0, 0.6, 0.8]#")
             .replace("[ 2 , 0,", "[ 7 , 0,")
             .replace("\"node\" = 2", "\"node\" = 7");
-        assert_eq!(edit.text(), expected);
+        assert_eq!(edit.edited_text(), expected);
     }
 }
 
@@ -88,13 +88,13 @@ fn values_change_and_no_other_byte() {
 fn a_new_key_has_a_line_of_its_own() {
     for (text, end) in forms(HAND).iter().zip(["\n", "\r\n", "\n", "\n"]) {
         let mut edit = SkinEdit::new(&parsed(text), text).unwrap();
-        edit.insert(0, "serial", Value::Integer(12), "node");
-        edit.insert(1, "root", Value::Flag(true), "orientation");
-        edit.insert(1, "serial", Value::Integer(13), "nothing");
+        edit.insert_key_after(0, "serial", Value::Integer(12), "node");
+        edit.insert_key_after(1, "root", Value::Flag(true), "orientation");
+        edit.insert_key_after(1, "serial", Value::Integer(13), "nothing");
         let expected = text.replace("1 # one", &format!("1 # one{end}  serial = 12")) + end + "root = true";
         // The last line has no line ending to copy.
         let expected = expected.replace("\r\nroot = true", "\nroot = true");
-        let new = edit.text();
+        let new = edit.edited_text();
         assert_eq!(new, expected);
         let new = parsed(&new);
         assert_eq!((new.cells[0].serial, new.cells[1].root), (12, true));
@@ -105,14 +105,14 @@ fn a_new_key_has_a_line_of_its_own() {
 fn cells_in_an_array_are_edited_in_their_places() {
     let mut edit = SkinEdit::new(&parsed(INLINE), INLINE).unwrap();
     edit.set(0, "node", Value::Integer(3));
-    edit.insert(0, "serial", Value::Integer(1), "node");
+    edit.insert_key_after(0, "serial", Value::Integer(1), "node");
     edit.set_element(1, "neighbors", 0, Value::Integer(3));
-    edit.replace(0, "normal", "orientation", Value::Numbers(&[0.0, 0.0, 0.0, 1.0]));
+    edit.replace_key(0, "normal", "orientation", Value::Numbers(&[0.0, 0.0, 0.0, 1.0]));
     let expected = INLINE
         .replace("{ node = 1,", "{ node = 3, serial = 1,")
         .replace("neighbors=[1,", "neighbors=[3,")
         .replace("normal = [0.0, 1.0, 0.0]", "orientation = [0.0, 0.0, 0.0, 1.0]");
-    let new = edit.text();
+    let new = edit.edited_text();
     assert_eq!(new, expected);
     assert_eq!(parsed(&new).cells[0].serial, 1);
 }
@@ -156,7 +156,7 @@ fn a_draft_is_a_skin() {
     draft.add_comment("made\nby a test");
     draft.add_comment("");
     draft.add_table_header("[robot]", Some("of one joint"));
-    draft.set_rows("joints", None, [vec![("d", Value::Number(0.1))]].into_iter());
+    draft.set_table_rows("joints", None, [vec![("d", Value::Number(0.1))]].into_iter());
     draft.add_paper_settings(50.0);
     draft.add_bus(&DraftBus { name: "can0", chain: None, slot_us: Some(900), format: Format::Classic });
     draft.add_cell(&DraftCell {
@@ -171,7 +171,7 @@ fn a_draft_is_a_skin() {
         neighbors: Some([0; 4]),
         root: true,
     });
-    let text = draft.text();
+    let text = draft.into_text();
     assert!(text.starts_with("# made\\u{a}by a test\n#\n\n[robot]   # of one joint\n"), "{text}");
     let skin = parsed(&text);
     assert_eq!((skin.cells[0].serial, skin.cells[0].root, skin.buses[0].name.as_str()), (33, true, "can0"));

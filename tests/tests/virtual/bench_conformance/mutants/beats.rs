@@ -120,7 +120,7 @@ pub(crate) const CLAIMS: &[FaultCase] = &[
     ("claims with a higher serial number are not answered", "CLAIM-6", |it| {
         it.hear = |_, message, frame| match message {
             Some(Message::Network { page: NetworkPage::Heartbeat(beat), .. })
-                if beat.serial > 100_000 + u32::from(NODE) && beat.state.has(State::CLAIMING) =>
+                if beat.serial > 100_000 + u32::from(NODE) && beat.state.has(State::CLAIMING_NODE_ID) =>
             {
                 Vec::new()
             }
@@ -143,7 +143,7 @@ pub(crate) const CLAIMS: &[FaultCase] = &[
             Some(message @ Message::Network { page, .. }) if memory.settled && !is_claim(Some(&message)) => {
                 let mut beat =
                     protocol::message::Heartbeat { serial: 100_000 + u32::from(NODE), ..Default::default() };
-                beat.state = State::DUPLICATE.with(State::CONFIGURED, true).with_joint(2);
+                beat.state = State::DUPLICATE.with_flags(State::CONFIGURED, true).with_joint(2);
                 let _ = page;
                 let from = protocol::id::Node::from_byte(NODE);
                 let epoch = memory.last.map(|(epoch, _)| epoch).unwrap_or_default();

@@ -58,7 +58,7 @@ pub(crate) const FLASH: &[FaultCase] = &[
                 memory.kept = vec![words];
             }
             let is_on = memory.kept.first().is_some_and(|words| words[0] == 1);
-            let claims = beat(&mut message).is_some_and(|beat| beat.state.has(State::CLAIMING));
+            let claims = beat(&mut message).is_some_and(|beat| beat.state.has(State::CLAIMING_NODE_ID));
             vec![(0, if claims { with(message, State::TEST_MODE, is_on) } else { message })]
         };
     }),

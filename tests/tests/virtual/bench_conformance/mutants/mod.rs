@@ -50,7 +50,7 @@ pub(crate) fn decoded(frame: &Frame) -> Option<Message> {
 fn is_claim(message: Option<&Message>) -> bool {
     matches!(
         message,
-        Some(Message::Network { page: NetworkPage::Heartbeat(beat), .. }) if beat.state.has(State::CLAIMING)
+        Some(Message::Network { page: NetworkPage::Heartbeat(beat), .. }) if beat.state.has(State::CLAIMING_NODE_ID)
     )
 }
 

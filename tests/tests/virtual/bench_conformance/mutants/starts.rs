@@ -12,7 +12,7 @@ pub(crate) const STARTS: &[FaultCase] = &[
     ("the first heartbeat has no CLAIMING", "CLAIM-1", |it| {
         it.say = |memory, message| {
             let first = core::mem::replace(&mut memory.at, Micros(1)) == Micros(0);
-            vec![(0, if first { with(message, State::CLAIMING, false) } else { message })]
+            vec![(0, if first { with(message, State::CLAIMING_NODE_ID, false) } else { message })]
         };
     }),
     ("sensors pages come before the claim", "CLAIM-1", |it| {
@@ -83,7 +83,7 @@ pub(crate) const STARTS: &[FaultCase] = &[
     ("a cell that gave way goes on", "CLAIM-4", |it| it.yields = false),
     ("claiming ends 80 ms late", "CLAIM-5", |it| {
         it.say = |memory, mut message| {
-            let settles = beat(&mut message).is_some_and(|beat| !beat.state.has(State::CLAIMING));
+            let settles = beat(&mut message).is_some_and(|beat| !beat.state.has(State::CLAIMING_NODE_ID));
             let is_first = settles
                 && core::mem::replace(&mut memory.count, memory.starts as u64) != memory.starts as u64;
             vec![(if is_first { 80_000 } else { 0 }, message)]

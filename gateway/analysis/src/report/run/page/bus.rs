@@ -2,31 +2,31 @@
 
 use super::super::bus_figures::{BusFigures, Latency};
 use super::{PageDraft, without_empty_series};
-use crate::fit::limits::MAX_NODES;
-use crate::fit::verdict::{FitSummary, percent};
+use crate::fit::limits::MAX_NODES_PER_BUS;
+use crate::fit::verdict::{FitSummary, format_percent};
 use crate::report::figure::{
-    Axis, Figure, Finding, MarkLine, Section, Series, Shape, Table, number, quantity,
+    Axis, Figure, Finding, MarkLine, Section, Series, SeriesShape, Table, format_number, format_quantity,
 };
-use crate::report::svg::stairs;
+use crate::report::svg::stair_points;
 use crate::report::thin::{BinnedSums, ThinnedLine};
 use crate::shadow::BusShadow;
 use model::quantiles::Quantiles;
-use model::table::{CellState, Event};
+use model::table::{CellState, FrameEvent};
 
 /// Maximum number of cells in the table of the cells with most problems.
 const MAX_WORST_CELLS: usize = 12;
 
 impl PageDraft<'_> {
-    pub(super) fn replies(&self) -> Section {
+    pub(super) fn replies_section(&self) -> Section {
         let due = self.run.bus_figures.iter().filter(|bus_figures| bus_figures.reply_counts().due > 0);
         let mut section = Section::new("replies", "Replies")
-            .text(
+            .with_paragraph(
                 "A reply is due from every cell that is configured, awake and in contact; it is in time before the next \
                  joints, late within three more.",
             )
-            .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)).filter_map(without_empty_series))
-            .tables([self.account_table()])
-            .tables(self.worst_cells_table());
+            .with_figures(due.flat_map(|bus_figures| self.reply_figures(bus_figures)).filter_map(without_empty_series))
+            .with_tables([self.reply_account_table()])
+            .with_tables(self.worst_cells_table());
         let none_due = |bus_figures: &&BusFigures| bus_figures.reply_counts().due == 0;
         let complete = |bus_figures: &&BusFigures| {
             let account = bus_figures.reply_counts();
@@ -39,20 +39,21 @@ impl PageDraft<'_> {
             let names: Vec<_> =
                 self.run.bus_figures.iter().filter(which).map(|it| it.name.as_str()).collect();
             if !names.is_empty() {
-                section = section.text(format!("{}: {sentence}.", names.join(", ")));
+                section = section.with_paragraph(format!("{}: {sentence}.", names.join(", ")));
             }
         }
         section
     }
 
-    fn replies_of(&self, bus_figures: &BusFigures) -> Vec<Figure> {
+    fn reply_figures(&self, bus_figures: &BusFigures) -> Vec<Figure> {
         let name = &bus_figures.name;
         let unit = if bus_figures.sums { "cells in sums" } else { "replies" };
         let steps = |figure: &str, title: &str, y: Axis, of: [(&str, &ThinnedLine); 2]| {
-            let of = of.map(|(caption, thinned)| Series::new(caption, Shape::Steps, self.points(thinned)));
-            self.figure(format!("{figure}-{name}"), format!("{name}: {unit} {title}"), y)
-                .half_width()
-                .series(of)
+            let of =
+                of.map(|(caption, thinned)| Series::new(caption, SeriesShape::Steps, self.points(thinned)));
+            self.time_figure(format!("{figure}-{name}"), format!("{name}: {unit} {title}"), y)
+                .with_half_width()
+                .with_series(of)
         };
         let y = Axis::new(unit, "");
         let lost = bus_figures.reply_counts().late + bus_figures.reply_counts().missing;
@@ -63,17 +64,17 @@ impl PageDraft<'_> {
         ];
         let mut figures = vec![steps("replies", "due and in time, epoch by epoch", y.clone(), due)];
         figures.extend((lost > 0).then(|| steps("late", "late and missing, once known", y, late)));
-        let slowest = self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
-        let slowest = slowest.series([self.line("", &bus_figures.lines.slowest)]);
-        figures.push(if lost > 0 { slowest } else { slowest.half_width() });
+        let slowest = self.time_figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
+        let slowest = slowest.with_series([self.thinned_series("", &bus_figures.lines.slowest)]);
+        figures.push(if lost > 0 { slowest } else { slowest.with_half_width() });
         figures
     }
 
-    fn account_table(&self) -> Table {
+    fn reply_account_table(&self) -> Table {
         let row = |bus_figures: &BusFigures| {
             let account = bus_figures.reply_counts();
             let counters = bus_figures.table.counters();
-            let reply = Quantiles::from_histogram(bus_figures.table.delays().last_replies(), 1.0);
+            let reply = Quantiles::from_histogram(bus_figures.table.delays().last_reply_delays(), 1.0);
             let numbers = [
                 account.due,
                 account.in_time,
@@ -84,7 +85,8 @@ impl PageDraft<'_> {
             ];
             let numbers = numbers.map(|count| count.to_string());
             let times = [reply.p50, reply.p99, reply.max];
-            let times = times.map(|micros| quantity(if reply.count > 0 { micros } else { f64::NAN }, "µs"));
+            let times =
+                times.map(|micros| format_quantity(if reply.count > 0 { micros } else { f64::NAN }, "µs"));
             [bus_figures.name.clone()].into_iter().chain(numbers).chain(times).collect::<Vec<_>>()
         };
         let rows = self.run.bus_figures.iter().map(row);
@@ -138,7 +140,11 @@ impl PageDraft<'_> {
             [format!("{}\u{a0}{}", bus_figures.name, cell.node), joint.to_string()]
                 .into_iter()
                 .chain(counts)
-                .chain([cell.uplink().restarts.to_string(), quantity(mean, "µs"), quantity(slowest, "µs")])
+                .chain([
+                    cell.uplink().restarts.to_string(),
+                    format_quantity(mean, "µs"),
+                    format_quantity(slowest, "µs"),
+                ])
                 .collect::<Vec<_>>()
         };
         let rows: Vec<_> = cells.iter().take(MAX_WORST_CELLS).map(row).collect();
@@ -167,22 +173,22 @@ impl PageDraft<'_> {
     /// Returns the load in % from the first tick or joints on. Before that the load is not typical, because all cells
     /// start at once.
     pub(super) fn load_percent(&self, binned: &BinnedSums) -> Vec<(f64, f64)> {
-        let rates = binned.rates().into_iter().map(|(x, part)| (x - self.zero, part * 100.0));
+        let rates = binned.bin_rates().into_iter().map(|(x, part)| (x - self.zero, part * 100.0));
         rates.filter(|(x, _)| *x >= 0.0).collect()
     }
 
     /// Returns the timing on the real bus, for each bus with frames.
-    fn shadows(&self) -> impl Iterator<Item = BusShadow> {
+    fn bus_shadows(&self) -> impl Iterator<Item = BusShadow> {
         let buses = self.run.shadow.report().buses;
-        buses.into_iter().filter(|bus| self.run.skin.bus_named(&bus.bus).is_some())
+        buses.into_iter().filter(|bus| self.run.skin.bus_index(&bus.bus).is_some())
     }
 
     /// Creates the findings on whether real buses can carry the traffic, in this run and in the worst case. They are
     /// rated only if the bit rates were chosen, not for defaults.
     pub(super) fn fit_findings(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
-        let limits = format!("at most 100 %, replies before the next joints, {MAX_NODES} nodes");
-        for bus in self.shadows() {
+        let limits = format!("at most 100 %, replies before the next joints, {MAX_NODES_PER_BUS} nodes");
+        for bus in self.bus_shadows() {
             let bus_figures = self.run.bus_figures.iter().find(|bus_figures| bus_figures.name == bus.bus);
             let origin = bus_figures.and_then(|bus_figures| bus_figures.rates_from);
             for answer in bus.this_run.iter().chain(&bus.worst_case) {
@@ -201,33 +207,37 @@ impl PageDraft<'_> {
     }
 
     /// Creates the section on the load of real buses.
-    pub(super) fn load(&self) -> Section {
+    pub(super) fn load_section(&self) -> Section {
         let figure = |bus_figures: &BusFigures| {
             let BusFigures { name, load, load_of_all, rates, .. } = bus_figures;
-            let (rates, width) = (rates.rates, quantity(load.width(), "s"));
+            let (rates, width) = (rates.rates, format_quantity(load.bin_width(), "s"));
             let title = format!("{name}: load of a real bus at {rates}, averaged over {width}");
-            self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
-                .draw("load of a real bus", Shape::Steps, self.load_percent(load))
-                .draw("including bench-only frames", Shape::Dashed, stairs(&self.load_percent(load_of_all)))
-                .marks([MarkLine::at_y(100.0, "full load")])
+            self.time_figure(format!("load-{name}"), title, Axis::new("load", "%"))
+                .draw_series("load of a real bus", SeriesShape::Steps, self.load_percent(load))
+                .draw_series(
+                    "including bench-only frames",
+                    SeriesShape::Dashed,
+                    stair_points(&self.load_percent(load_of_all)),
+                )
+                .with_marks([MarkLine::at_y(100.0, "full load")])
         };
         let text = "On this bus a frame took no time. On a real bus it takes the time of its bits, including its stuff bits. \
                     This run is rated by its second with the highest load; the worst case assumes that all cells answer \
                     with the longest possible frames. Frames that only a bench sends are left out: stimuli, sync and \
                     report with their answers, and simulated wires. Start-up, before the first joints, is shown separately.";
         let assumed = self.run.bus_figures.iter().any(|bus_figures| !bus_figures.rates.is_chosen);
-        let mut section = Section::new("load", "Load of the buses").text(text);
+        let mut section = Section::new("load", "Load of the buses").with_paragraph(text);
         if assumed {
-            section = section.text(
+            section = section.with_paragraph(
                 "The skin does not give bit rates for every bus; common ones are shown for information.",
             );
         }
         section
-            .figures(self.run.bus_figures.iter().map(figure).filter_map(without_empty_series))
-            .tables(self.shadows().map(|bus| load_table(&bus)))
+            .with_figures(self.run.bus_figures.iter().map(figure).filter_map(without_empty_series))
+            .with_tables(self.bus_shadows().map(|bus| load_table(&bus)))
     }
 
-    pub(super) fn losses(&self) -> Section {
+    pub(super) fn losses_section(&self) -> Section {
         let (run, ticks) = (self.run, &self.run.motion.counts);
         let mut rows: Vec<Vec<String>> = Vec::new();
         let mut row = |what: String, count: u64, always: bool| {
@@ -252,39 +262,49 @@ impl PageDraft<'_> {
             row(format!("{name}: packets lost, of those that cells sent"), uplink.lost, true);
             row(format!("{name}: packets refused, of those that cells sent"), uplink.rejected, false);
             row(format!("{name}: restarts of cells during the run"), u64::from(uplink.restarts), false);
-            for event in Event::ALL {
-                row(format!("{name}: {}", event.name()), bus_figures.table.counters().events(event), false);
+            for event in FrameEvent::ALL {
+                row(
+                    format!("{name}: {}", event.name()),
+                    bus_figures.table.counters().event_count(event),
+                    false,
+                );
             }
         }
         row("packets of any network in the kernel's backlog".to_owned(), run.backlog, false);
         row("frames of buses that the skin does not have".to_owned(), run.others, false);
         row("messages or lines that cannot be read".to_owned(), run.unreadable, false);
         let mut section = Section::new("losses", "Losses")
-            .text("Rows of possible losses are always shown; other rows only when they are not 0.");
+            .with_paragraph("Rows of possible losses are always shown; other rows only when they are not 0.");
         section.text.extend(self.missing_sentence("skipped ticks and bad cycles"));
-        section.tables(self.loss_table()).tables([Table::new("All counts", ["what", "count"], rows)])
+        section.with_tables(self.loss_table()).with_tables([Table::new(
+            "All counts",
+            ["what", "count"],
+            rows,
+        )])
     }
 }
 
 /// Creates the table of a bus's load, with a column for operation and one for start-up.
 fn load_table(bus: &BusShadow) -> Table {
-    let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
+    let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), format_percent);
     let mut rows = Vec::new();
     let mut row = |cells: [&str; 6]| rows.push(cells.map(str::to_owned));
     if let Some(worst) = &bus.worst_case {
         let (verdict, load, cells) =
-            (worst.verdict.to_string(), percent(worst.load), worst.cells.to_string());
+            (worst.verdict.to_string(), format_percent(worst.load), worst.cells.to_string());
         row([worst.case_name(), &verdict, &load, "", "", &cells]);
     }
     if let Some(run) = &bus.this_run {
         let mean = bus.answering.and_then(|it| it.mean).unwrap_or(0.0);
-        let cells = format!("{}, {} on average", run.cells, number(round_to_tenths(mean)));
-        let [second, short] = [run.load, bus.load.worst_16_ms.value].map(percent);
+        let cells = format!("{}, {} on average", run.cells, format_number(round_to_tenths(mean)));
+        let [second, short] = [run.load, bus.load.worst_16_ms.value].map(format_percent);
         row([run.case_name(), &run.verdict.to_string(), &share(bus.load.mean), &second, &short, &cells]);
     }
     if let Some(start) = &bus.start_up {
-        let frames = format!("{} frames in {} without joints", start.frames, quantity(start.duration_s, "s"));
-        let [second, short] = [start.load.worst_1_s, start.load.worst_16_ms].map(|it| percent(it.value));
+        let frames =
+            format!("{} frames in {} without joints", start.frames, format_quantity(start.duration_s, "s"));
+        let [second, short] =
+            [start.load.worst_1_s, start.load.worst_16_ms].map(|it| format_percent(it.value));
         row(["start-up", "", &share(start.load.mean), &second, &short, &frames]);
     }
     if bus.counts.bench.total() > 0 {

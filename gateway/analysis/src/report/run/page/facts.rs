@@ -1,28 +1,28 @@
 //! The facts at the head of a report: the capture, its origin, and the machine.
 
 use super::super::RunData;
-use crate::report::figure::quantity;
+use crate::report::figure::format_quantity;
 
 /// Formats a time in µs from the recording's metadata.
-pub(super) fn micros(text: &str) -> String {
-    text.parse().map_or_else(|_| text.to_owned(), |micros| quantity(micros, "µs"))
+pub(super) fn format_micros(text: &str) -> String {
+    text.parse().map_or_else(|_| text.to_owned(), |micros| format_quantity(micros, "µs"))
 }
 
 /// Returns the facts about the capture, each with its name.
-pub(super) fn facts(run: &RunData, command: &str) -> Vec<(String, String)> {
+pub(super) fn capture_facts(run: &RunData, command: &str) -> Vec<(String, String)> {
     if let Some(frames_only) = &run.frames_only {
-        let began = frames_only.began.map(utc).map(|began| ("first frame", began));
+        let began = frames_only.began.map(format_utc).map(|began| ("first frame", began));
         let capture = ("capture", format!("{}, {}, {} bytes", run.name, frames_only.format, run.bytes));
         let skin = ("skin", frames_only.skin_file.clone());
         let all = [Some(capture), Some(skin), began, Some(("report's command", command.to_owned()))];
         return all.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect();
     }
-    let fact = |record: &str, key: &str| run.fact(record, key).unwrap_or("unknown");
+    let fact = |record: &str, key: &str| run.metadata_value(record, key).unwrap_or("unknown");
     let [machine, program] = ["machine", "program"].map(|record| move |key: &str| fact(record, key));
-    let began = program("began_ns").parse().map_or_else(|_| "unknown".to_owned(), utc);
-    let idle = run.fact("machine", "idle_late_p50_us").map(|idle| {
+    let began = program("began_ns").parse().map_or_else(|_| "unknown".to_owned(), format_utc);
+    let idle = run.metadata_value("machine", "idle_late_p50_us").map(|idle| {
         let (p99, max) = (machine("idle_late_p99_us"), machine("idle_late_max_us"));
-        let [idle, p99, max] = [idle, p99, max].map(micros);
+        let [idle, p99, max] = [idle, p99, max].map(format_micros);
         format!("woke a thread {idle} late (median), 99 % within {p99}, at most {max}")
     });
     let clock = format!(
@@ -50,7 +50,7 @@ pub(super) fn facts(run: &RunData, command: &str) -> Vec<(String, String)> {
 }
 
 /// Formats a time in ns since 1970 as UTC (Hinnant's `civil_from_days`).
-fn utc(nanos: u64) -> String {
+fn format_utc(nanos: u64) -> String {
     let seconds = nanos / 1_000_000_000;
     let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);
     let (era, day) = (days / 146_097, days % 146_097);

@@ -5,7 +5,7 @@ use protocol::fixed::TorqueFormat;
 
 use super::super::bus_figures::BusFigures;
 use super::PageDraft;
-use crate::report::figure::{Finding, Table, quantity};
+use crate::report::figure::{Finding, Table, format_quantity};
 
 /// The rounding errors in each torque format, for the torques of one bus.
 struct FormatComparison<'a> {
@@ -15,7 +15,7 @@ struct FormatComparison<'a> {
 }
 
 impl FormatComparison<'_> {
-    fn rounding(&self, format: TorqueFormat) -> RoundingErrors {
+    fn rounding_errors(&self, format: TorqueFormat) -> RoundingErrors {
         self.all
             .iter()
             .find(|(it, _)| *it == format)
@@ -29,11 +29,12 @@ impl FormatComparison<'_> {
     }
 
     /// Returns a sentence on what a better format gains and costs; `None` if the format of the bus is the best.
-    fn advice(&self) -> Option<String> {
+    fn advice_on_format(&self) -> Option<String> {
         let (used, best) = (self.used, self.best_format());
-        let beyond = self.rounding(used).beyond;
-        let cost =
-            |format: TorqueFormat| quantity(self.rounding(format).errors.mean().unwrap_or(f64::NAN), "Nm");
+        let beyond = self.rounding_errors(used).beyond;
+        let cost = |format: TorqueFormat| {
+            format_quantity(self.rounding_errors(format).errors.mean().unwrap_or(f64::NAN), "Nm")
+        };
         let (costs, instead) = (cost(best), cost(used));
         let (name, bus) = (best.name(), self.bus);
         match (best == used, beyond) {
@@ -45,7 +46,7 @@ impl FormatComparison<'_> {
             (false, _) => Some(format!(
                 "{bus}: {name} would have fitted better: {beyond} torques are beyond {}, the range of {}. It rounds by \
                  {costs} instead of {instead} on average.",
-                quantity(used.upper_bound(), "Nm"),
+                format_quantity(used.upper_bound(), "Nm"),
                 used.name(),
             )),
         }
@@ -54,7 +55,7 @@ impl FormatComparison<'_> {
 
 impl PageDraft<'_> {
     /// Returns the comparison of formats for each bus whose torques were compared.
-    fn choices(&self) -> impl Iterator<Item = FormatComparison<'_>> {
+    fn format_comparisons(&self) -> impl Iterator<Item = FormatComparison<'_>> {
         let buses = self.run.bus_figures.iter().zip(&self.run.skin.buses);
         buses.filter_map(|(BusFigures { name, table, .. }, bus)| {
             let formats = table.accuracy().formats;
@@ -66,32 +67,33 @@ impl PageDraft<'_> {
     }
 
     /// Creates the findings on torques beyond the range of a bus's format.
-    pub(super) fn beyond_range(&self) -> impl Iterator<Item = Finding> {
-        self.choices().map(|choice| {
+    pub(super) fn range_findings(&self) -> impl Iterator<Item = Finding> {
+        self.format_comparisons().map(|choice| {
             let (bus, used) = (choice.bus, choice.used);
-            let bound = quantity(used.upper_bound(), "Nm");
+            let bound = format_quantity(used.upper_bound(), "Nm");
             let what = format!("{bus}: torques beyond the range of {}, {bound}", used.name());
-            super::zero_required(what, choice.rounding(used).beyond).with_origin("skin: torque_format")
+            super::zero_required_finding(what, choice.rounding_errors(used).beyond)
+                .with_origin("skin: torque_format")
         })
     }
 
     /// Returns advice on better formats, by bus.
-    pub(super) fn advice(&self) -> Option<String> {
-        let all: Vec<_> = self.choices().filter_map(|choice| choice.advice()).collect();
+    pub(super) fn advice_by_bus(&self) -> Option<String> {
+        let all: Vec<_> = self.format_comparisons().filter_map(|choice| choice.advice_on_format()).collect();
         (!all.is_empty()).then(|| all.join(" "))
     }
 
-    pub(super) fn formats(&self) -> Option<Table> {
+    pub(super) fn formats_table(&self) -> Option<Table> {
         let unit = self.torque_unit();
-        let rows = self.choices().flat_map(|choice| {
+        let rows = self.format_comparisons().flat_map(|choice| {
             choice.all.map(|(format, rounded)| {
                 let used = if format == choice.used { ", used" } else { "" };
                 [
                     format!("{} {}{used}", choice.bus, format.name()),
-                    quantity(format.upper_bound(), unit),
+                    format_quantity(format.upper_bound(), unit),
                     rounded.beyond.to_string(),
-                    quantity(rounded.errors.mean().unwrap_or(f64::NAN), unit),
-                    quantity(rounded.errors.max(), unit),
+                    format_quantity(rounded.errors.mean().unwrap_or(f64::NAN), unit),
+                    format_quantity(rounded.errors.max(), unit),
                 ]
                 .to_vec()
             })

@@ -2,12 +2,12 @@
 
 use model::table::Notice;
 
-use super::super::moments::Loss;
+use super::super::moments::ListedLoss;
 use super::PageDraft;
-use crate::report::figure::{Table, quantity};
+use crate::report::figure::{Table, format_quantity};
 
 /// Maximum number of rows of a table of moments.
-const MAX_ROWS: usize = 25;
+const MAX_MOMENT_ROWS: usize = 25;
 
 /// The headings of a table of times.
 const MOMENT_TABLE_HEAD: [&str; 3] = ["at", "what", "command"];
@@ -23,8 +23,8 @@ impl PageDraft<'_> {
     /// Returns the command that shows the recording around a time, given in s after its first message.
     pub(super) fn view_command(&self, at: f64) -> String {
         let seconds = (at - self.run.zero.unwrap_or(0.0)).max(0.0);
-        let files: Vec<_> = self.run.files.iter().map(|file| quoted(file)).collect();
-        let skin = self.run.frames_only.as_ref().map(|it| format!(" --skin {}", quoted(&it.skin_file)));
+        let files: Vec<_> = self.run.files.iter().map(|file| shell_quoted(file)).collect();
+        let skin = self.run.frames_only.as_ref().map(|it| format!(" --skin {}", shell_quoted(&it.skin_file)));
         format!("skinbus view {}{} --at {seconds:.3}", files.join(" "), skin.unwrap_or_default())
     }
 
@@ -42,8 +42,8 @@ impl PageDraft<'_> {
                 let link = self.link_name((chain, touch.row), Some(bus));
                 let (cells, node) = (touch.cells.len(), nodes.get(place));
                 let cell = node.map_or_else(String::new, |node| format!(" {node}"));
-                let long = quantity(to - from, "s");
-                let force_n = quantity(force, "N");
+                let long = format_quantity(to - from, "s");
+                let force_n = format_quantity(force, "N");
                 let what = if cells == 1 {
                     format!("{link}: cell{cell}, at most {force_n}, {long}")
                 } else {
@@ -52,7 +52,7 @@ impl PageDraft<'_> {
                 WeightedMoment { at: from, weight: force * cells as f64, what }
             }));
         }
-        self.table("Touches, cells of a link together", all, further)
+        self.moment_table("Touches, cells of a link together", all, further)
     }
 
     /// Creates the table of losses, and of cells that fell silent, came back or restarted.
@@ -66,7 +66,7 @@ impl PageDraft<'_> {
                 let what = format!(
                     "{name}: {} within {}",
                     loss_text(loss),
-                    quantity(loss.seconds.1 - loss.seconds.0, "s")
+                    format_quantity(loss.seconds.1 - loss.seconds.0, "s")
                 );
                 WeightedMoment { at: loss.seconds.0, weight: loss.total() as f64, what }
             }));
@@ -84,21 +84,21 @@ impl PageDraft<'_> {
                 Some(WeightedMoment { at: *at, weight: f64::INFINITY, what })
             }));
         }
-        self.table("Moments of losses", all, further)
+        self.moment_table("Moments of losses", all, further)
     }
 
     /// Creates a table of the events with the highest weights, in order of time. `further` is the number of events that
     /// were not kept.
-    fn table(&self, title: &str, mut all: Vec<WeightedMoment>, further: u64) -> Option<Table> {
+    fn moment_table(&self, title: &str, mut all: Vec<WeightedMoment>, further: u64) -> Option<Table> {
         if all.is_empty() {
             return None;
         }
         all.sort_by(|one, other| other.weight.total_cmp(&one.weight).then(one.at.total_cmp(&other.at)));
-        let out = all.len().saturating_sub(MAX_ROWS) as u64 + further;
-        all.truncate(MAX_ROWS);
+        let out = all.len().saturating_sub(MAX_MOMENT_ROWS) as u64 + further;
+        all.truncate(MAX_MOMENT_ROWS);
         all.sort_by(|one, other| one.at.total_cmp(&other.at));
         let title = if out > 0 {
-            format!("{title}: the {MAX_ROWS} largest, {out} more are left out")
+            format!("{title}: the {MAX_MOMENT_ROWS} largest, {out} more are left out")
         } else {
             title.to_owned()
         };
@@ -110,7 +110,7 @@ impl PageDraft<'_> {
 }
 
 /// Formats the counts of a loss.
-fn loss_text(loss: &Loss) -> String {
+fn loss_text(loss: &ListedLoss) -> String {
     let all =
         [(loss.late, "replies late"), (loss.missing, "replies missing"), (loss.packets, "packets lost")];
     let all = all.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
@@ -118,7 +118,7 @@ fn loss_text(loss: &Loss) -> String {
 }
 
 /// Quotes a word for a shell.
-fn quoted(word: &str) -> String {
+fn shell_quoted(word: &str) -> String {
     let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+=:,@%".contains(letter);
     if !word.is_empty() && word.chars().all(is_plain) {
         return word.to_owned();
@@ -128,14 +128,14 @@ fn quoted(word: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::quoted;
+    use super::shell_quoted;
 
     #[test]
     fn names_of_files_are_one_word_for_a_shell() {
         for (name, word) in
             [("runs/a-1.mcap", "runs/a-1.mcap"), ("a b", "'a b'"), ("it's", r"'it'\''s'"), ("", "''")]
         {
-            assert_eq!(quoted(name), word);
+            assert_eq!(shell_quoted(name), word);
         }
     }
 }

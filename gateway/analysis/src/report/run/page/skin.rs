@@ -7,7 +7,8 @@ use model::surface::lay_flat;
 use super::super::bus_figures::BusFigures;
 use super::PageDraft;
 use crate::report::figure::{
-    CellMap, CellStrip, Drawing, Legend, MapCell, Panel, Section, StripGroup, StripRow, quantity,
+    CellMap, CellStrip, ColourLegend, Drawing, LinkPanel, MapCell, Section, StripGroup, StripRow,
+    format_quantity,
 };
 
 /// Maximum number of rows of the strip of touched cells.
@@ -18,7 +19,7 @@ type ChainRow = (usize, u8);
 
 impl PageDraft<'_> {
     /// Creates the section on touches, with their times and forces.
-    pub(super) fn skin(&self) -> Section {
+    pub(super) fn touch_section(&self) -> Section {
         let section = Section::new("skin", "The skin");
         let forces = self.values_by_cell(|bus, place| {
             self.run.bus_figures.get(bus).and_then(|it| it.touched.max.get(place)).copied().flatten()
@@ -29,26 +30,26 @@ impl PageDraft<'_> {
         });
         let title =
             "Largest force on each cell, seen from outside; links are unrolled, with the tip at the bottom";
-        let force = self.map("map-force", title, "force", "N", &forces);
+        let force = self.cell_map("map-force", title, "force", "N", &forces);
         let title = "Late and missing replies and lost packets, by cell";
-        let loss = self.map("map-losses", title, "losses", "", &losses);
-        let section = match (self.strip(), force) {
+        let loss = self.cell_map("map-losses", title, "losses", "", &losses);
+        let section = match (self.touch_strip(), force) {
             (Some(strip), Some(force)) => section
-                .text("A force is that of Algorithm 1 on the cell's sensors, from the joints at which it was latched to the next.")
-                .drawings([Drawing::Strip(strip), Drawing::Map(force)])
-                .tables(self.touch_table()),
-            (..) if self.lacks_forces() => section.text(
+                .with_paragraph("A force is that of Algorithm 1 on the cell's sensors, from the joints at which it was latched to the next.")
+                .with_drawings([Drawing::Strip(strip), Drawing::Map(force)])
+                .with_tables(self.touch_table()),
+            (..) if self.lacks_forces() => section.with_paragraph(
                 self.missing_sentence("stimuli or sensors of the cells that sent torques, and so the forces on them").unwrap_or_default(),
             ),
-            (..) => section.text("The frames show no touch of a cell."),
+            (..) => section.with_paragraph("The frames show no touch of a cell."),
         };
         let sums = self.run.bus_figures.iter().any(|bus_figures| bus_figures.sums);
         match (loss, sums) {
-            (Some(loss), _) => section.drawings([Drawing::Map(loss)]),
+            (Some(loss), _) => section.with_drawings([Drawing::Map(loss)]),
             (None, false) => {
-                section.text("No cell's reply was late or missing, and no packet of a cell was lost.")
+                section.with_paragraph("No cell's reply was late or missing, and no packet of a cell was lost.")
             }
-            (None, true) => section.text(
+            (None, true) => section.with_paragraph(
                 "No packet of a cell was lost. Frames do not show which cells were late or missing in a sum, so there is no \
                  map of them.",
             ),
@@ -59,16 +60,16 @@ impl PageDraft<'_> {
     pub(super) fn lacks_forces(&self) -> bool {
         let lines = self.run.motion.distributed.iter();
         let is_loaded = lines.flat_map(|line| line.points()).any(|(_, torque)| torque != 0.0);
-        let is_untouched = |it: &BusFigures| it.touched.cells().next().is_none();
+        let is_untouched = |it: &BusFigures| it.touched.touch_bins_by_cell().next().is_none();
         self.run.frames_only.is_some() && is_loaded && self.run.bus_figures.iter().all(is_untouched)
     }
 
     /// Creates the strip of touched cells over time.
-    fn strip(&self) -> Option<CellStrip> {
+    fn touch_strip(&self) -> Option<CellStrip> {
         let mut rows = Vec::new();
         for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
             let nodes: Vec<_> = self.run.skin.cells_on_bus(bus).collect();
-            for (place, values) in bus_figures.touched.cells() {
+            for (place, values) in bus_figures.touched.touch_bins_by_cell() {
                 let Some(cell) = nodes.get(place) else { continue };
                 let max = values.iter().map(|value| value.2).fold(0.0, f64::max);
                 let values =
@@ -84,7 +85,7 @@ impl PageDraft<'_> {
         }
         rows.sort_by(|one, other| other.1.total_cmp(&one.1).then(one.0.cmp(&other.0)));
         let rest = rows.split_off(touched.min(MAX_STRIP_ROWS));
-        let legend = Legend::for_values("force", "N", rows.iter().map(|(_, max, _)| *max));
+        let legend = ColourLegend::for_values("force", "N", rows.iter().map(|(_, max, _)| *max));
         let title = match rest.first() {
             None => {
                 format!("Force over time on the {touched} touched cells (of {})", self.run.skin.cells.len())
@@ -92,7 +93,7 @@ impl PageDraft<'_> {
             Some((_, max, _)) => format!(
                 "Force over time on the {MAX_STRIP_ROWS} cells with the largest forces; {} more were touched, with at most {}",
                 rest.len(),
-                quantity(*max, "N")
+                format_quantity(*max, "N")
             ),
         };
         rows.sort_by_key(|(key, ..)| *key);
@@ -108,7 +109,7 @@ impl PageDraft<'_> {
             }
         }
         let groups = groups.into_iter().map(|(_, group)| group).collect();
-        let seconds = (0.0, self.run.motion.seconds());
+        let seconds = (0.0, self.run.motion.duration_s());
         Some(CellStrip { name: "touches".to_owned(), title, seconds, legend, groups })
     }
 
@@ -125,7 +126,7 @@ impl PageDraft<'_> {
     }
 
     /// Creates a map of the cells with their values; `None` if all of them are 0.
-    fn map(
+    fn cell_map(
         &self,
         name: &str,
         title: &str,
@@ -134,7 +135,7 @@ impl PageDraft<'_> {
         values: &[Option<f64>],
     ) -> Option<CellMap> {
         let skin = &self.run.skin;
-        let legend = Legend::for_values(caption, unit, values.iter().copied().flatten());
+        let legend = ColourLegend::for_values(caption, unit, values.iter().copied().flatten());
         if legend.max <= 0.0 {
             return None;
         }
@@ -150,7 +151,7 @@ impl PageDraft<'_> {
                 let bus = skin.buses.get(cell.bus).map_or("", |bus| &bus.name);
                 MapCell { at, value: *value, caption: format!("{bus} {}", cell.node) }
             });
-            Panel { title: self.link_name(link, None), radius: flat.radius, cells: spots.collect() }
+            LinkPanel { title: self.link_name(link, None), radius: flat.radius, cells: spots.collect() }
         });
         let panels = panels.collect();
         Some(CellMap { name: name.to_owned(), title: title.to_owned(), legend, panels })

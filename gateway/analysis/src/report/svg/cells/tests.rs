@@ -4,8 +4,8 @@ use roxmltree::Document;
 
 const SVG: &str = "http://www.w3.org/2000/svg";
 
-fn newtons(max: f64) -> Legend {
-    Legend { caption: "force".to_owned(), unit: "N".to_owned(), max }
+fn newtons(max: f64) -> ColourLegend {
+    ColourLegend { caption: "force".to_owned(), unit: "N".to_owned(), max }
 }
 
 /// Returns the positions and sizes of the rectangles in a path, as written.
@@ -47,7 +47,7 @@ fn a_strip_has_each_value_at_its_time_in_its_row_and_colour() {
         groups,
         ..CellStrip::default()
     };
-    let text = draw(&Drawing::Strip(strip));
+    let text = draw_cells(&Drawing::Strip(strip));
     let document = Document::parse(&text).unwrap();
     let tracks = rectangles(path(&document, "track").unwrap());
     let [first, second, third] = tracks[..] else { panic!("{tracks:?}") };
@@ -79,8 +79,9 @@ fn a_map_has_each_cell_once_apart_and_inside() {
         let angle = (f64::from(at % 10) - 4.5) / 10.0 * core::f64::consts::TAU;
         spot([0.05 * angle, f64::from(at / 10) * 0.03], if at == 4 { None } else { Some(f64::from(at)) })
     });
-    let tube = Panel { title: "link 2".to_owned(), radius: Some(0.05), cells: cells.collect() };
-    let plate = Panel { title: "link 3".to_owned(), radius: None, cells: vec![spot([0.3, -0.2], Some(0.0))] };
+    let tube = LinkPanel { title: "link 2".to_owned(), radius: Some(0.05), cells: cells.collect() };
+    let plate =
+        LinkPanel { title: "link 3".to_owned(), radius: None, cells: vec![spot([0.3, -0.2], Some(0.0))] };
     let map = CellMap { legend: newtons(29.0), panels: vec![tube, plate], ..CellMap::default() };
     for width in [960, 470] {
         let text = draw_inline(&Drawing::Map(map.clone()), width, "both");

@@ -44,7 +44,7 @@ pub(in super::super) enum RecordedTorque {
 
 /// End of a contact in this replay, compared with the recorded end.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(in super::super) enum EndNow {
+pub(in super::super) enum ReplayedContactEnd {
     #[default]
     AsRecorded,
     /// The end came earlier than recorded, because the cell received joints that it had missed in the capture.
@@ -87,7 +87,7 @@ impl RecordedContact {
     }
 }
 
-impl EndNow {
+impl ReplayedContactEnd {
     /// Returns the state after an input.
     pub(in super::super) const fn next(self, input: RoundTorques) -> Self {
         match (self, input) {
@@ -104,8 +104,8 @@ impl EndNow {
 mod tests {
     use super::*;
     use crate::replay::comparator::states::check_table;
-    use EndNow::{AsRecorded, Earlier};
     use RecordedContact::{Lasts, Over, Unknown};
+    use ReplayedContactEnd::{AsRecorded, Earlier};
 
     #[test]
     fn the_recorded_contact_follows_the_last_torque() {
@@ -139,7 +139,7 @@ mod tests {
                 ("extra_torque", &both, &[torque], |_| AsRecorded),
                 ("late_end", &both, &[RoundTorques::LateEnd], |_| AsRecorded),
             ],
-            EndNow::next,
+            ReplayedContactEnd::next,
         );
     }
 }

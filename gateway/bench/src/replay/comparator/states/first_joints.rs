@@ -18,7 +18,7 @@ use protocol::packet::Epoch;
 
 /// State of a cell by the joints since its start.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(in super::super) enum FirstJoints {
+pub(in super::super) enum FirstJointsState {
     /// The cell has received joints, or its state is unknown.
     #[default]
     Taken,
@@ -57,7 +57,7 @@ impl JointsEvidence {
     }
 }
 
-impl FirstJoints {
+impl FirstJointsState {
     /// Returns the state after an input.
     pub(in super::super) fn next(self, input: JointsEvidence) -> Self {
         match (self, input) {
@@ -83,10 +83,10 @@ impl FirstJoints {
 mod tests {
     use super::*;
     use crate::replay::comparator::states::check_table;
-    use FirstJoints::Taken;
+    use FirstJointsState::Taken;
     use JointsEvidence::{CountsSome, Torque};
 
-    const AWAITED: FirstJoints = FirstJoints::Awaited { epoch: Epoch(5) };
+    const AWAITED: FirstJointsState = FirstJointsState::Awaited { epoch: Epoch(5) };
 
     #[test]
     fn a_cell_has_taken_joints_when_its_counters_a_torque_or_its_epoch_show_it() {
@@ -98,7 +98,7 @@ mod tests {
             (&[Taken, AWAITED], &[none, none_later, CountsSome, Torque, same, other]),
             &[
                 ("counts_none", &[Taken, AWAITED], &[none], |_| AWAITED),
-                ("counts_none", &[Taken, AWAITED], &[none_later], |_| FirstJoints::Awaited {
+                ("counts_none", &[Taken, AWAITED], &[none_later], |_| FirstJointsState::Awaited {
                     epoch: Epoch(6),
                 }),
                 ("counts_some", &[Taken, AWAITED], &[CountsSome], |_| Taken),
@@ -107,7 +107,7 @@ mod tests {
                 ("other_epoch", &[AWAITED], &[other], |_| Taken),
                 ("known", &[Taken], &[same, other], |_| Taken),
             ],
-            FirstJoints::next,
+            FirstJointsState::next,
         );
     }
 }

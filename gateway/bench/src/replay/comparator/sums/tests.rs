@@ -217,9 +217,9 @@ fn trees_drop_past_rounds() {
     let mut trees = ParentHistory::default();
     for round in 0..1_000_u64 {
         trees.set_parent(cell(1), Some((round % 2).to_le_bytes()[0]), round);
-        trees.forget_before(round.saturating_sub(100));
+        trees.forget_changes_before(round.saturating_sub(100));
         assert!(trees.0[&cell(1)].len() <= 104);
-        assert_eq!(trees.parent(cell(1), round), Some(Some((round % 2).to_le_bytes()[0])));
+        assert_eq!(trees.parent_in_round(cell(1), round), Some(Some((round % 2).to_le_bytes()[0])));
     }
 }
 

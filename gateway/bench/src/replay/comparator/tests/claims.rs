@@ -4,7 +4,7 @@ use super::*;
 
 /// Heartbeat of another cell that claims cell 1's node id.
 fn claim() -> Message {
-    let intruder = Heartbeat { serial: 99, state: Flags::CLAIMING, ..Heartbeat::default() };
+    let intruder = Heartbeat { serial: 99, state: Flags::CLAIMING_NODE_ID, ..Heartbeat::default() };
     Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page: NetworkPage::Heartbeat(intruder) }
 }
 
@@ -80,8 +80,8 @@ fn a_claim_of_a_taken_node_id_is_no_packet_and_no_silence_of_its_owner() {
 fn another_sender_of_joints_is_another_gateway() {
     let mut comparator =
         Comparator::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, None);
-    comparator.observe(1, &Message::Resume);
-    assert_eq!(comparator.other_gateway(), None, "anybody may resume");
-    comparator.observe(1, &joints(0));
-    assert_eq!(comparator.other_gateway(), Some(1));
+    comparator.observe_message(1, &Message::Resume);
+    assert_eq!(comparator.other_gateway_bus(), None, "anybody may resume");
+    comparator.observe_message(1, &joints(0));
+    assert_eq!(comparator.other_gateway_bus(), Some(1));
 }

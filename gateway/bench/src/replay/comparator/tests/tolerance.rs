@@ -19,7 +19,7 @@ fn torques_within_the_tolerance_are_equal_and_counted() {
     let comparator = rated_within(2, &run(), &off([1, -2]));
     assert_eq!((counts(&comparator), comparator.tally.tolerated), ([3, 0, 0, 0], 2));
     assert_eq!(steps(&comparator.tally.torque_words), ([16, 1, 1, 0], 2));
-    assert!(comparator.tally.has_only_equal_replies() && comparator.first().is_none());
+    assert!(comparator.tally.has_only_equal_replies() && comparator.first_difference().is_none());
     // Without a tolerance, with one that is too small, and without a difference.
     for (tolerance, by, equal, tolerated, words) in [
         (0, [1, -2], 1, 0, ([16, 1, 1, 0], 2)),
@@ -28,7 +28,7 @@ fn torques_within_the_tolerance_are_equal_and_counted() {
         (2, [0, 0], 3, 0, ([18, 0, 0, 0], 0)),
     ] {
         let comparator = rated_within(tolerance, &run(), &off(by));
-        let Tally { tolerated: found, torque_words, .. } = comparator.tally;
+        let ReplyTally { tolerated: found, torque_words, .. } = comparator.tally;
         assert_eq!((counts(&comparator), found), ([equal, 3 - equal, 0, 0], tolerated), "{tolerance} {by:?}");
         assert_eq!(steps(&torque_words), words, "{tolerance} {by:?}");
     }
@@ -72,7 +72,7 @@ fn in_sums_each_cell_that_adds_its_own_may_be_off_and_one_that_passes_on_may_not
     };
     let of = |tolerance, now: &[Message], count| {
         let comparator = rated_within(tolerance, &said(if count > 1 { 40 } else { 0 }, 20, count), now);
-        let Tally { equal, different, tolerated, sum_words, .. } = comparator.tally;
+        let ReplyTally { equal, different, tolerated, sum_words, .. } = comparator.tally;
         (equal, different, tolerated, sum_words.max)
     };
     // 16 steps of a torque are one of a sum's, and one step is rounding.

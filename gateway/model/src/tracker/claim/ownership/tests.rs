@@ -3,7 +3,7 @@
 use protocol::message::{Heartbeat, State};
 use protocol::time::Micros;
 
-use super::{Evidence as E, HeartbeatKind, Incarnation, Ownership};
+use super::{HeartbeatEvidence as E, HeartbeatKind, Incarnation, Ownership};
 use Sample::{Doubted, DoubtedLong, Free, Inherited, InheritedLong, Shared, Sole};
 
 const AGAIN: HeartbeatKind = HeartbeatKind::Started { again: true };
@@ -141,7 +141,8 @@ fn each_state_does_with_each_evidence_what_its_row_says() {
             let rows: Vec<_> = ROWS.iter().filter(is_of).collect();
             assert_eq!(rows.len(), 1, "rows of {from:?} and {evidence:?}: {rows:?}");
             let (name, _, _, to, word, whose) = *rows[0];
-            let lives = [ownership.owner(), ownership.former()].map(Option::<&Incarnation>::copied);
+            let lives =
+                [ownership.owner(), ownership.former_incarnation()].map(Option::<&Incarnation>::copied);
             let [owner, former] = [0, 1].map(|place| match whose[place] {
                 Nobody => None,
                 Same => lives[place],
@@ -152,7 +153,7 @@ fn each_state_does_with_each_evidence_what_its_row_says() {
             let (next, means) = ownership.after_heartbeat(evidence, new);
             assert_eq!(means, word, "{name}: {from:?}, {evidence:?}");
             assert!(places(&next, evidence).0.contains(&to.unwrap_or(from)), "{name}: {next:?}");
-            let lives = [next.owner(), next.former()].map(Option::<&Incarnation>::copied);
+            let lives = [next.owner(), next.former_incarnation()].map(Option::<&Incarnation>::copied);
             assert_eq!(lives, [owner, former], "{name}: {from:?}, {evidence:?}");
         }
     }
@@ -160,7 +161,7 @@ fn each_state_does_with_each_evidence_what_its_row_says() {
 
 #[test]
 fn each_evidence_is_shown_by_heartbeats() {
-    let claims = State::CLAIMING;
+    let claims = State::CLAIMING_NODE_ID;
     let shown = |ownership: Ownership, ms: u64, serial, sent, state| {
         ownership.evidence(&life(20_000 + ms, serial, sent, state))
     };
@@ -212,7 +213,7 @@ fn each_evidence_is_shown_by_heartbeats() {
 fn of_two_lives_the_one_whose_counter_is_nearer_continues() {
     let doubted = |claimed: Option<u64>, own: u16, its: u16, ago: u64| {
         let claimed = claimed.map(|ms| Micros(ms * 1_000));
-        let state = if claimed.is_some() { State::CLAIMING } else { SETTLED };
+        let state = if claimed.is_some() { State::CLAIMING_NODE_ID } else { SETTLED };
         let owner = Incarnation { claimed, ..life(20_000, 7, 10_000 - own, state) };
         Ownership::Doubted { owner, former: life(20_250 - ago, 7, 10_000 - its, SETTLED) }
     };
