@@ -1,4 +1,4 @@
-//! Instruction counts of one Jacobian and of the sines: `cargo bench -p cell-node --bench instructions`
+//! Instruction counts of one Jacobian, of the sines and of a reply: `cargo bench -p cell-node --bench instructions`
 //!
 //! Valgrind counts them, so the results do not depend on the load of the machine.
 //! `docs/explanation/benchmarks.md` lists the required programs.
@@ -15,13 +15,16 @@ use std::hint::black_box;
 use cell_node::kernel::Kernel;
 use cell_node::sine;
 use gungraun::{library_benchmark, library_benchmark_group};
+use protocol::can::{Format, Frame};
 use protocol::fixed::Q1_14;
 use protocol::parameters::MAX_JOINTS;
 
 #[path = "../../protocol/benches/counted/mod.rs"]
 mod counted;
+mod reply;
 mod setting;
 
+use reply::PressedCell;
 use setting::BenchSetting;
 
 /// Creates the setting outside the counted part, and never drops it, so that neither is counted.
@@ -70,23 +73,40 @@ fn fifth_order() -> i16 {
     fold_full_circle(sine::paper_sine)
 }
 
+/// Creates a pressed cell outside the counted part, and never drops it.
+fn pressed(format: Format) -> &'static mut PressedCell {
+    Box::leak(Box::new(PressedCell::new(format)))
+}
+
+#[library_benchmark]
+#[bench::fd(pressed(Format::Fd))]
+#[bench::classic(pressed(Format::Classic))]
+fn reply_to_joints(cell: &mut PressedCell) -> &Frame {
+    cell.reply()
+}
+
 library_benchmark_group!(
     name = jacobian;
     compare_by_id = true;
     benchmarks = wrench, projection, nalgebra_f64, nalgebra_f32
 );
 library_benchmark_group!(name = sines; benchmarks = seventh_order, fifth_order);
+library_benchmark_group!(name = replies; benchmarks = reply_to_joints);
 
 /// Runs each benchmark once and checks its result.
 fn check_all_once() {
     cell().check();
     assert_ne!(fold_full_circle(sine::sine), fold_full_circle(sine::paper_sine));
+    for format in [Format::Fd, Format::Classic] {
+        let last = *pressed(format).reply();
+        assert_eq!((last.id(), last.format()), (0x20C, format));
+    }
 }
 
 mod all {
-    use super::{jacobian, sines};
+    use super::{jacobian, replies, sines};
 
-    gungraun::main!(library_benchmark_groups = jacobian, sines);
+    gungraun::main!(library_benchmark_groups = jacobian, sines, replies);
 
     pub(super) fn run() {
         main();

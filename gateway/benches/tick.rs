@@ -25,7 +25,6 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Skin, SkinBus};
 use protocol::time::{Micros, Span};
 
-/// Maximum number of cells per bus.
 const CELLS_PER_BUS: usize = 253;
 /// Number of ticks per broadcast.
 const TICKS_PER_EPOCH: u64 = 8;

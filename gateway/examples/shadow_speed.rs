@@ -25,7 +25,6 @@ mod watched;
 
 /// Time between joints in µs.
 const JOINTS_INTERVAL_US: u64 = 16_000;
-/// Number of cells.
 const CELLS: i64 = 253;
 
 /// Writes the frames of one epoch as candump does.

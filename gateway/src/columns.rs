@@ -71,7 +71,6 @@ impl<'a> CsvTable<'a> {
         Ok(Self { file: file.to_owned(), names, rows: reader.into_records(), lines })
     }
 
-    /// Returns the next row.
     pub(crate) fn next_row(&mut self) -> Result<Option<CsvRow<'_>>, Failure> {
         let Some(values) = self.rows.next() else { return Ok(None) };
         let file = self.file.as_str();

@@ -222,7 +222,6 @@ impl DumpCommand {
     }
 }
 
-/// Returns the statistics as JSON.
 fn statistics_json(
     source: &str,
     format: &str,

@@ -209,7 +209,6 @@ fn report_answers(
     Ok(())
 }
 
-/// Returns the lines for cansend.
 fn cansend_lines(message: &Message, format: Format) -> String {
     let mut text = String::new();
     for frame in message.encode().frames(format) {

@@ -239,7 +239,6 @@ impl KeyValueTable {
         }
     }
 
-    /// Adds a row unless the count is zero.
     pub(crate) fn add_row_unless_zero(
         &mut self,
         name: impl Display,

@@ -20,7 +20,7 @@ struct PlacedPart {
     chain: usize,
     /// Row in whose frame the part is, from 1; 0 is the start of the chain.
     row: usize,
-    /// The part, whose pose is relative to the frame of the row.
+    /// The mesh, with its pose relative to the frame of the row.
     part: LinkMesh,
 }
 

@@ -75,7 +75,7 @@ pub(crate) struct ViewCommand {
     /// - is standard output
     #[arg(long, value_name = "FILE")]
     address_file: Option<PathBuf>,
-    /// Let pages display only, without pressing, halting or resuming
+    /// Let pages only show the bench: they cannot press cells, halt or resume
     #[arg(long)]
     read_only: bool,
     /// Wait for buses that do not exist yet

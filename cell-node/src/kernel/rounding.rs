@@ -14,7 +14,6 @@ pub(super) trait Rounding {
     fn subtract_product<N: Number>(number: N, product: N::WideSum) -> N;
     /// Rounds a number plus the product `more` minus the product `less`.
     fn add_and_subtract<N: Number>(number: N, more: N::WideSum, less: N::WideSum) -> N;
-    /// Negates a number.
     fn negated<N: Number>(number: N) -> N;
 }
 

@@ -112,7 +112,7 @@ pub trait Number: Copy + Debug + PartialEq {
 pub trait Word: Copy + Debug + PartialEq {
     /// Creates the number from a word.
     fn from_word(word: Q1_14) -> Self;
-    /// Returns the word.
+    /// Returns the number as a word.
     fn to_word(self) -> Q1_14;
     /// Returns sine and cosine of an angle in quarter turns, in steps of 2^-14. The default is the
     /// seventh-order polynomial.

@@ -29,7 +29,6 @@ use crate::phase;
 use node_ids::NodeIdState;
 use port::Port;
 
-/// Interval of hellos.
 const HELLO_INTERVAL: Span = Span::from_millis(250);
 /// Maximum time to wait for the answer to a join before another port is tried.
 const JOIN_TIMEOUT: Span = Span::from_millis(5);

@@ -87,7 +87,6 @@ impl NetworkSums {
         Self { network: Network::new(now), report, ..Self::default() }
     }
 
-    /// Returns the parent if its sums are received.
     pub(super) fn parent_with_received_sums(&self) -> Option<CellId> {
         self.received.get(self.network.parent_port()?).copied().flatten()
     }

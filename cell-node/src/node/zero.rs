@@ -5,7 +5,6 @@ use protocol::message::{Message, SensorPage, SensorReadings};
 use super::Node;
 use crate::baseline::BaselineStatus;
 
-/// Number of heartbeats per report.
 const HEARTBEATS_PER_ZERO_REPORT: u8 = 4;
 
 /// The state of the zero in the last report.

@@ -24,7 +24,6 @@ pub(crate) const READING_AGE_COUNT: usize = 3;
 pub(crate) const READING_AGE_STEP_S: f64 = 0.006;
 /// The count of the numbers of a [`Moment`].
 pub(crate) const MODEL_INPUT_COUNT: usize = READING_AGE_COUNT * NUMBERS_PER_ROW_MOTION + 1;
-/// The number of unknowns of a cell.
 pub(crate) const CELL_UNKNOWN_COUNT: usize = 19;
 
 /// The unknowns of the orientation: a rotation vector, in the frame of the cell, from the present estimate.

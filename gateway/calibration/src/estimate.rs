@@ -61,7 +61,6 @@ pub(crate) struct Estimate {
 }
 
 impl Estimate {
-    /// Returns the covariance of the position, in m².
     pub(crate) fn position_covariance(&self) -> Matrix3<f64> {
         let own: Matrix3<f64> =
             self.covariance.fixed_view::<3, 3>(POSITION_UNKNOWNS.start, POSITION_UNKNOWNS.start).into_owned();

@@ -72,11 +72,9 @@ pub enum PlanError {
     },
 }
 
-/// The number of candidate poses.
 const CANDIDATE_POSES: usize = 24;
 /// The time that the robot stands at a pose, in s.
 const POSE_HOLD_S: f64 = 0.6;
-/// The duration of a swing, in s.
 pub(crate) const SWING_DURATION_S: f64 = 3.2;
 /// The assumed duration of a move to another pose, in s.
 const ASSUMED_MOVE_DURATION_S: f64 = 1.6;
@@ -410,7 +408,6 @@ fn push_move(skin: &Skin, bounds: &PlanBounds, motion: &mut MotionPlan, at: &mut
     }
 }
 
-/// Returns the duration of a move, in s.
 fn move_duration_s(skin: &Skin, bounds: &PlanBounds, from: &[f64], to: &[f64]) -> f64 {
     let [speed_peak, acceleration_peak] = RISING_CURVE_PEAKS;
     let joints = from.iter().zip(to).zip(&skin.controller.max_speed);

@@ -9,7 +9,6 @@ use crate::cell::{
     NUMBERS_PER_ROW_MOTION, Unknowns,
 };
 
-/// The maximum number of least-squares steps.
 const MAX_LEAST_SQUARES_STEPS: usize = 60;
 
 /// Weighted sums over the readings of a cell, from which least squares compute residuals and derivatives.

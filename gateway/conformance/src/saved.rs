@@ -15,7 +15,6 @@ use crate::session::{Reply, Session};
 const RESTORE_TIMEOUT: Span = Span::from_millis(8_000);
 /// The time after which no more answers to requests of the test come.
 const ANSWER_SETTLE_TIME: Span = Span::from_millis(60);
-/// The number of attempts to restore a value.
 const RESTORE_ATTEMPTS: usize = 3;
 
 /// The volatile parameters, which are saved and restored.

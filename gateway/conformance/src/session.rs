@@ -194,7 +194,6 @@ impl<'a> Session<'a> {
         self.clock.last = self.bus.now();
     }
 
-    /// Returns the remaining time.
     pub(crate) fn remaining_time(&self) -> Span {
         self.clock.end.elapsed_since(self.bus.now())
     }

@@ -309,7 +309,6 @@ pub(crate) fn tangents(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
     (s, normal.cross(&s))
 }
 
-/// Returns the area of a triangle, in m².
 pub(crate) fn triangle_area([a, b, c]: &Triangle) -> f64 {
     (b - a).cross(&(c - a)).norm() / 2.0
 }

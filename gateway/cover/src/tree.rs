@@ -7,7 +7,6 @@ use nalgebra::{Point3, Vector3};
 
 use crate::mesh::Triangle;
 
-/// The maximum number of triangles in a leaf.
 const MAX_LEAF_TRIANGLES: usize = 4;
 
 /// A bounding box.

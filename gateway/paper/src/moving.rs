@@ -236,7 +236,7 @@ pub fn fig8_section(run: &BenchRun) -> Section {
              it. Unlike the paper's, T_total does not hold the robot's own driver: the robot is simulated.",
         )
         .with_paragraph(format!(
-            "The axis ends at twice the 99th percentile; {beyond} of {} ticks, in which the machine was busy otherwise, lie \
+            "The axis ends at twice the 99th percentile; {beyond} of {} ticks, during which the machine was busy with other work, lie \
              beyond it, but are in the data.",
             run.rows.len()
         ))

@@ -190,7 +190,7 @@ pub fn sums_section(skin: &Skin, errors: &[SumErrors]) -> Section {
              carries what rounding took away into its next value errs more in one epoch and not at all in the long run.",
         )
         .with_paragraph(format!(
-            "The paper's {} Nm is the error that cutting off causes with about twenty active cells.",
+            "The paper's {} Nm is the error of truncated sums with about twenty active cells.",
             format_number(paper::SUMMED_ERROR_NM)
         ))
         .with_figures([figure.with_series(series)])

@@ -18,7 +18,6 @@ use crate::print::{
     to_pretty_json as pretty,
 };
 
-/// Maximum number of values listed one by one.
 const MAX_LISTED_VALUES: usize = 8;
 
 /// Checks the text of a scenario file against a skin, and describes the scenario.

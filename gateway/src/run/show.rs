@@ -19,7 +19,6 @@ use crate::print::{
     hanging_indent, or_else_text, space_separated,
 };
 
-/// Maximum number of halts listed one by one.
 const MAX_LISTED_HALTS: usize = 10;
 /// Maximum number of a bus's conspicuous cells that are listed one by one.
 const MAX_LISTED_CELLS: usize = 5;

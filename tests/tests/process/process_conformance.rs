@@ -5,6 +5,7 @@
 use skinbus_tests::process;
 
 use std::fs;
+use std::os::unix::fs::symlink;
 use std::time::Duration;
 
 use process::{Running, TestDir, program, until};
@@ -14,19 +15,23 @@ use protocol::message::{Heartbeat, Message, NetworkPage, State};
 use protocol::packet::Epoch;
 use rustix::process::Signal;
 use serde_json::Value;
+use tempfile::TempDir;
 
 /// A cell on a bus, which a script switches off and on.
 struct Cell {
     place: TestDir,
     format: Format,
     _bus: Running,
+    /// The cell's flash is in memory: a cell that waits for a busy disk answers nothing.
+    _flash: TempDir,
 }
 
 impl Cell {
     fn new(format: Format) -> Self {
         let place = TestDir::new();
         place.write("skin.toml", &process::skin_of(8, 1, format));
-        fs::create_dir(place.path("flash")).unwrap();
+        let flash = TempDir::new_in("/dev/shm").or_else(|_| TempDir::new()).unwrap();
+        symlink(flash.path(), place.path("flash")).unwrap();
         let bus = place.start("vcan-setup", "serve vcan0");
         until("the bus", || place.buses().exists().then_some(()));
         let script = format!(
@@ -37,7 +42,7 @@ impl Cell {
             program("cell-node").display()
         );
         place.script("restart", &script);
-        let cell = Self { place, format, _bus: bus };
+        let cell = Self { place, format, _bus: bus, _flash: flash };
         cell.restart();
         cell
     }

@@ -429,7 +429,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
     run(&place, "explain skin.toml --cell 1 --force 1 --joints -3.14159,0.5").succeeded();
     for (joints, expected) in [
         ("-6.3,0", "position -6.3 rad: shoulder allows -6.2832 to 6.2832 rad"),
-        ("0,0.6", "position 0.6 m: elbow takes 0.0000 to 0.5000 m"),
+        ("0,0.6", "position 0.6 m: elbow allows 0.0000 to 0.5000 m"),
     ] {
         refused(&place, &format!("explain skin.toml --cell 1 --force 1 --joints {joints}"), expected);
     }

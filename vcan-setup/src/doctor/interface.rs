@@ -75,7 +75,7 @@ impl MachineFacts {
                 "there is no interface {name}: a run that starts its cells makes an embedded bus; for SocketCAN:"
             ))
             .with_hint(up),
-            (true, true) => Finding::ok(format!("there is no interface {name}, and an embedded bus is served")),
+            (true, true) => Finding::ok(format!("there is no interface {name}, but an embedded bus of this name runs")),
             (true, false) => Finding::fault(format!(
                 "there is no interface {name}, and no embedded bus of this name is served"
             ))

@@ -5,7 +5,6 @@ pub(super) const NEEDS_TURNED_FX: u32 = 1;
 pub(super) const NEEDS_TURNED_FY: u32 = 2;
 pub(super) const NEEDS_TURNED_MX: u32 = 4;
 pub(super) const NEEDS_TURNED_MY: u32 = 8;
-/// All results of the turn.
 pub(super) const TURN_RESULTS_MASK: u32 =
     NEEDS_TURNED_FX | NEEDS_TURNED_FY | NEEDS_TURNED_MX | NEEDS_TURNED_MY;
 /// The shift of moments by d.
@@ -23,7 +22,6 @@ pub(super) const TWISTS_QUARTER_TURN_BACK: u32 = 1 << 12;
 pub(super) const TWISTS_HALF_TURN: u32 = 1 << 13;
 /// The row has no joint.
 pub(super) const HAS_NO_JOINT: u32 = 1 << 14;
-/// All results of the turn are read.
 pub(super) const ALL_TURN_RESULTS_READ: u32 = 1 << 15;
 /// The row has a twist or no joint.
 pub(super) const HAS_TWIST_OR_NO_JOINT: u32 = 1 << 16;

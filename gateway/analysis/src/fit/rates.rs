@@ -4,7 +4,6 @@ use protocol::can::Format;
 use protocol::skin::SkinBus;
 use protocol::wire_time::{BitRates, BitRatesError};
 
-/// The default nominal bit rate, in bit/s.
 const DEFAULT_NOMINAL_BIT_RATE: u32 = 1_000_000;
 /// The default data bit rate of FD frames, in bit/s.
 const DEFAULT_DATA_BIT_RATE: u32 = 5_000_000;

@@ -82,7 +82,6 @@ impl ShadowOptions {
         }
     }
 
-    /// Returns the given properties of a bus.
     fn bus_properties(&self, bus: &str) -> BusProperties {
         let named = self.rates_by_bus.iter().find(|(name, _)| name == bus);
         let rates = named.map_or(self.rates, |(_, rates)| *rates);

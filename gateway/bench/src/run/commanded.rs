@@ -101,7 +101,6 @@ impl Bench<'_> {
         }
     }
 
-    /// Returns the process of a cell, if it has one.
     fn cell_process(&self, bus: usize, node: u8) -> Option<ProcessState> {
         self.processes.states().find(|process| process.runs_cell(bus, node))
     }

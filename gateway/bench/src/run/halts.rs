@@ -14,7 +14,6 @@ use control::cycle::turn::TimedRecord;
 
 /// Number of kept ticks: 0.4 s at 500 Hz.
 const HALT_HISTORY_TICKS: usize = 200;
-/// Maximum number of halts listed one by one.
 const MAX_LISTED_HALTS: usize = 100;
 
 /// Halts of a run.

@@ -67,7 +67,6 @@ pub(super) struct ScenarioProgress {
 }
 
 impl ScenarioProgress {
-    /// Returns true if no stimulus has been sent.
     pub(super) const fn has_sent_no_stimulus(&self) -> bool {
         self.epoch == 0
     }

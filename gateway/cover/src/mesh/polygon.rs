@@ -324,7 +324,7 @@ mod tests {
             filled.finish()
         };
         assert!(folded(0.2).is_ok());
-        assert!(folded(4.0).unwrap_err().starts_with("a polygon with 4 corners is bent"));
+        assert!(folded(4.0).unwrap_err().starts_with("a polygon with 4 corners is not flat"));
     }
 
     #[test]

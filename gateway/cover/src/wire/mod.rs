@@ -20,7 +20,6 @@ pub const PORTS_PER_CELL: usize = 4;
 /// The maximum number of cells per bus.
 pub const MAX_CELLS_PER_BUS: usize = 250;
 
-/// The maximum length of a wire, in pitches.
 const MAX_WIRE_LENGTH_PITCHES: f64 = 1.5;
 
 /// The minimum cosine between the normals of two wired cells. Cells are wired around a sharp edge, but not through a
@@ -179,7 +178,6 @@ fn nearby_pairs(places: &[UnwiredCell], pitch: f64) -> Vec<[usize; 2]> {
     found.into_iter().map(|(_, pair)| pair).collect()
 }
 
-/// Returns the cells that each cell is wired to.
 fn wires_by_cell(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
     let mut wires: Vec<Vec<usize>> = vec![Vec::new(); count];
     let mut groups: Vec<_> = (0..count).collect();

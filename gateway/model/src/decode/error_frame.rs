@@ -66,7 +66,6 @@ pub fn error_classes(id: u32) -> impl Iterator<Item = &'static str> {
     set_bit_names(id, &ERROR_CLASSES)
 }
 
-/// Returns the names of the bits that are set in `bits`.
 fn set_bit_names<'a>(bits: u32, names: &'a [&str]) -> impl Iterator<Item = &'a str> {
     names.iter().enumerate().filter(move |(bit, _)| bits >> bit & 1 != 0).map(|(_, name)| *name)
 }

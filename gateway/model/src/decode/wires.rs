@@ -23,7 +23,6 @@ pub(super) fn encode_with_layout(message: PortMessage) -> (Bytes, &'static Layou
     )
 }
 
-/// Returns the epoch of a message, if it has one.
 pub(super) const fn message_epoch(message: PortMessage) -> Option<u8> {
     if let PortMessage::State(epoch) | PortMessage::Nack(epoch) = message { Some(epoch.0) } else { None }
 }

@@ -21,7 +21,6 @@ use super::GenerateError;
 const CELL_PITCH_MM: usize = 28;
 /// The smallest distance in mm that is plausible for hardware.
 const MIN_CELL_PITCH_MM: usize = 3;
-/// Number of ports of a cell.
 const PORTS_PER_CELL: usize = 4;
 
 /// An arm that can carry a skin.

@@ -25,7 +25,6 @@ pub struct SensorFrames {
     requested: u8,
 }
 
-/// Minimum number of frames for a rate.
 const MIN_RATE_FRAMES: u64 = 3;
 /// Minimum time for a rate.
 const MIN_RATE_SPAN: Span = Span::from_millis(1_000);

@@ -22,7 +22,6 @@ struct CountsSinceStart {
 }
 
 impl SentJointCounts {
-    /// Counts a broadcast.
     pub(super) const fn count_broadcast(&mut self) {
         self.since.joints += 1;
     }

@@ -25,7 +25,6 @@ fn words<const N: usize>(value: &Value) -> [i16; N] {
     words.try_into().unwrap()
 }
 
-/// Returns the Jacobian and the force.
 fn jacobian_and_force(of: &Value) -> ([Q1_14; WORDS], Force) {
     (words(&of["jacobian"]).map(Q1_14::from_bits), Force::from_steps(of["force"].as_i64().unwrap()))
 }

@@ -193,7 +193,7 @@ fn a_faulty_shape_is_an_error_when_it_is_used() {
         ),
         ("<geometry><mesh/></geometry>", "has no filename: add it"),
         ("<geometry><mesh filename=\"\"/></geometry>", "has no filename: add it"),
-        ("<geometry><mesh filename=\"$(find p)/a.stl\"/></geometry>", "expression $(find p) is left"),
+        ("<geometry><mesh filename=\"$(find p)/a.stl\"/></geometry>", "expression $(find p) is not expanded"),
         ("<geometry><box/></geometry>", "has no size: add it"),
         ("<geometry><box size=\"1 2\"/></geometry>", "size = \"1 2\": three lengths in m"),
         ("<geometry><sphere/></geometry>", "has no radius: add it"),

@@ -236,7 +236,6 @@ impl<'a> UrdfParser<'a> {
         self.children(node, name).next()
     }
 
-    /// Returns the value of a required attribute.
     fn required_attribute(
         &self,
         node: Node<'a, 'a>,

@@ -79,7 +79,6 @@ impl<W: Write> SharedOutput<W> {
         self.lock_state().end = Some(Vec::new());
     }
 
-    /// Flushes the output.
     pub(super) fn flush_output(&self) -> io::Result<()> {
         self.lock_state().out.flush()
     }

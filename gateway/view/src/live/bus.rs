@@ -119,7 +119,6 @@ impl LiveBus {
         joints
     }
 
-    /// Restarts all counters.
     pub(super) fn restart_counters(&mut self) {
         self.table.reset_counts();
     }

@@ -9,7 +9,6 @@ use crate::document::{Checked, KeyPath, span_from_seconds};
 use crate::fixed::Q;
 use crate::parameters::Contact;
 
-/// Checks a whole skin.
 pub(super) fn check_whole_skin(raw: raw::RawSkin) -> Checked<Skin> {
     names::check_names(&raw)?;
     check_skin(raw, |_| true)

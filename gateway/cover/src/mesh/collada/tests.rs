@@ -119,7 +119,7 @@ fn polygons_of_each_kind_have_their_own_area() {
         ),
         (
             format!("<polylist>{input}<vcount>3</vcount><p>0 1 2 3</p></polylist>"),
-            "has 4 corners, but its vcount 3",
+            "has 4 corners, but its vcount announces 3",
         ),
         (
             format!("<triangles>{input}<p>0 1 2 3</p></triangles>"),

@@ -159,7 +159,6 @@ impl McapReader {
         Ok(None)
     }
 
-    /// Reads one record.
     fn read_record(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
         let Self { source, chunk, place, state, anchor, messages, .. } = self;
         let began = source.bytes_read();
