@@ -110,7 +110,7 @@ fn product_fitting_i32(lhs: i32, rhs: i32) -> i32 {
     lhs.wrapping_mul(rhs)
 }
 
-/// Number of fraction bits of [`fine_sine_cosine`].
+/// Number of fraction bits of [`precise_sine_cosine`].
 pub(crate) const PRECISE_SINE_FRACTION_BITS: u32 = 28;
 
 /// Returns sine and cosine with 28 fraction bits, for constants that are computed once. They are exact at the quarter

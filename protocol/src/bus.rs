@@ -110,7 +110,7 @@ pub struct Bus {
     receive_buffer: usize,
     fd: bool,
     send_timeout: Duration,
-    /// The directory of embedded buses, as in [`Options`].
+    /// The directory of embedded buses, as in [`BusOptions`].
     directory: Option<PathBuf>,
     /// Set when a send fails because the interface is down. The next receive reports it, because the kernel
     /// reports it to a socket only once.
@@ -314,7 +314,7 @@ impl Bus {
         self.send_items(frames.len(), |sent| self.send_batch(frames.get(sent..).unwrap_or_default()))
     }
 
-    /// Returns true if the bus was opened for the formats of all these frames: FD frames need [`Options::fd`].
+    /// Returns true if the bus was opened for the formats of all these frames: FD frames need [`BusOptions::fd`].
     fn accepts_formats(&self, frames: &[Frame]) -> bool {
         self.fd || frames.iter().all(|frame| frame.format() == Format::Classic)
     }

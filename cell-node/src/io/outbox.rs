@@ -20,7 +20,7 @@ impl Outbox {
         }
     }
 
-    /// Appends a frame that is not counted in any cell's number of sent packets, as those of wires.
+    /// Appends a frame of a simulated wire, which no cell counts as a sent packet.
     pub(super) fn push_uncounted(&mut self, frame: Frame) {
         self.frames.push(frame);
         self.ends.push(None);

@@ -13,7 +13,7 @@ pub trait Scalar: Copy {
     /// The number type of the computation.
     type Number: Number;
 
-    /// Converts a result of the computation to the result type.
+    /// Converts an element of J from the number that the kernel computes with to the type that it returns.
     fn from_number(number: Self::Number) -> Self;
 }
 
@@ -100,7 +100,7 @@ pub trait Number: Copy + Debug + PartialEq {
         lhs.wrapping_add(rhs)
     }
 
-    /// Converts a word of the parameters for the computation of a constant.
+    /// Converts a word of the parameters to the wide number in which constants are computed before they are rounded.
     fn unrounded_from_word(word: Q1_14) -> Self::UnroundedConstant;
     /// Returns the sine and cosine of an angle in quarter turns, and one, all in the same steps: 2^-28 for integers.
     fn unrounded_sine_cosine_one(angle: Q1_14) -> [Self::UnroundedConstant; 3];

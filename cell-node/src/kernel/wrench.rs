@@ -15,7 +15,7 @@
 //! does not change m_z and f_z, so J_l can be read before it, and the base's own angle theta_1 is never
 //! needed. Twist and shift of the row that carries the cell are constant, except for the position of a
 //! prismatic joint, as are fixed rows right below it: they are folded into the six stored words. Components
-//! that no row further down reads are not computed: [`Live`] tracks them, once per configuration.
+//! that no row further down reads are not computed: [`UsedComponents`] tracks them, once per configuration.
 
 mod due;
 mod fold;
@@ -46,7 +46,7 @@ pub struct Wrench<S: Scalar = Q1_14> {
     /// The links from joint k's row down to the base. Only the first `rows` are in use.
     links: [ChainLink<S::Number>; MAX_ROWS],
     rows: usize,
-    /// Upper bound of |J| in steps of 2^-14, for any joint positions. If it is below [`MAX_J`], no intermediate number
+    /// Upper bound of |J| in steps of 2^-14, for any joint positions. If it is below [`MAX_JACOBIAN_STEPS`], no intermediate number
     /// can leave the range of a word, and saturation is omitted.
     bound: u16,
     /// The conversion of the torques for this J to words.
@@ -213,7 +213,7 @@ fn write_jacobian_bounded<S: Scalar>(
     }
 }
 
-/// Like [`down_bounded`], with saturation, for any chain.
+/// Like [`write_jacobian_bounded`], with saturation, for any chain.
 #[inline(never)]
 fn write_jacobian_saturating<'a, S: Scalar + 'a>(
     mut wrench: PerComponent<S::Number>,

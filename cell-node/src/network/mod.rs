@@ -6,7 +6,7 @@
 //!   no sum was taken ──> lose_parent ┘             └─> given ─────────> a node id for this cell
 //! ```
 //!
-//! A cell with a route to the root announces it in its hellos with a [`Rank`]: its depth, and the round
+//! A cell with a route to the root announces it in its hellos with a [`TreeRank`]: its depth, and the round
 //! (version) of the tree. A cell without a parent sends a join to the nearest port whose rank is better than
 //! any rank it had itself, and the neighbour answers with a grant. A cell's rank only improves, and a
 //! parent's is better than its child's, so the tree has no loops, even if messages are lost or late. While no
@@ -229,7 +229,7 @@ impl Network {
         self.outbox.pop_front()
     }
 
-    /// Returns the time at which [`Network::handle_time`] must be called next.
+    /// Returns the time at which [`Network::handle_timeout`] must be called next.
     pub(crate) fn poll_timeout(&self) -> Micros {
         if !self.has_wires() {
             return Micros(u64::MAX);

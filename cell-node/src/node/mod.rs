@@ -233,7 +233,7 @@ impl Node {
         self.configuration.active_parameters().map(ActiveParameters::packet_length)
     }
 
-    /// Returns the identifier for each of the [`HEARD`] reassembly buffers.
+    /// Returns the identifier for each of the [`MAX_RECEIVED_IDS`] reassembly buffers.
     fn received_id_slots(&self) -> impl Iterator<Item = Option<Id>> + use<'_> {
         let sums = self.summing.received.iter().map(|cell| Some(Id::new(Kind::Sum, Address::Cell((*cell)?))));
         self.identity.received_ids().into_iter().chain(sums)

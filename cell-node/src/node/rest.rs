@@ -7,7 +7,7 @@ const QUIET_JOINTS_BEFORE_REST: u8 = 16;
 /// The state of a cell that may rest.
 #[derive(Debug, Default)]
 pub(super) struct RestState {
-    /// Number of consecutive joints without a reply, at most [`QUIET`].
+    /// Number of consecutive joints without a reply, at most [`QUIET_JOINTS_BEFORE_REST`].
     quiet: u8,
     /// True if the cell rested at the last poll.
     rests: bool,

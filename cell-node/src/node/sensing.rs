@@ -36,7 +36,7 @@ impl DuePages {
     const NONE: Self = Self { skin: false, acceleration: false, others: false };
     pub(super) const ALL: Self = Self { skin: true, acceleration: true, others: true };
 
-    /// Returns true if they contain the page with this index in [`Readings::pages`].
+    /// Returns true if they contain the page with this index in [`SensorReadings::simulated_pages`].
     const fn contains_page(self, index: usize) -> bool {
         match index {
             0 => self.skin,

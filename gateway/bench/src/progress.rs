@@ -72,7 +72,7 @@ impl Progress {
         }
     }
 
-    /// Writes an error above the line, even if quiet.
+    /// Writes an error above the progress bar, also with `--quiet`.
     pub fn print_error(&self, text: &str) {
         self.bar.suspend(|| eprint_line(text));
     }

@@ -20,9 +20,9 @@ use model::accelerometer::sensor::DataSheet;
 pub(crate) const NUMBERS_PER_ROW_MOTION: usize = 12;
 /// The number of ages of readings for which motions are computed.
 pub(crate) const READING_AGE_COUNT: usize = 3;
-/// The interval between two of the [`AGES`], in s.
+/// The interval between two of the [`READING_AGE_COUNT`], in s.
 pub(crate) const READING_AGE_STEP_S: f64 = 0.006;
-/// The count of the numbers of a [`Moment`].
+/// The count of the numbers of a [`ModelInput`].
 pub(crate) const MODEL_INPUT_COUNT: usize = READING_AGE_COUNT * NUMBERS_PER_ROW_MOTION + 1;
 pub(crate) const CELL_UNKNOWN_COUNT: usize = 19;
 
@@ -36,12 +36,12 @@ pub(crate) const GAIN_UNKNOWNS: Range<usize> = 9..12;
 const CROSS_AXIS_UNKNOWNS: Range<usize> = 12..18;
 pub(crate) const AGE_UNKNOWN_INDEX: usize = 18;
 
-/// Row and column of each element of [`CROSS`].
+/// Row and column of each element of [`CROSS_AXIS_UNKNOWNS`].
 const OFF_DIAGONAL_ENTRIES: [(usize, usize); 6] = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)];
 
 /// The input of the linear model at one moment: the motion of a row at all ages, and 1.
 pub(crate) type ModelInput = [f64; MODEL_INPUT_COUNT];
-/// The coefficients by which each axis of a sensor depends on the numbers of a [`Moment`].
+/// The coefficients by which each axis of a sensor depends on the numbers of a [`ModelInput`].
 pub(crate) type Coefficients = SMatrix<f64, MODEL_INPUT_COUNT, 3>;
 pub(crate) type Unknowns = SVector<f64, CELL_UNKNOWN_COUNT>;
 pub(crate) type InformationMatrix = SMatrix<f64, CELL_UNKNOWN_COUNT, CELL_UNKNOWN_COUNT>;
@@ -221,7 +221,7 @@ fn interpolation_weights(age: f64) -> [f64; READING_AGE_COUNT] {
     [x * (x - 1.0) / 2.0, 1.0 - x * x, x * (x + 1.0) / 2.0]
 }
 
-/// Returns the derivatives of the weights of [`parabola`] with respect to the age, in 1/s.
+/// Returns the derivatives of the weights of [`interpolation_weights`] with respect to the age, in 1/s.
 fn interpolation_slopes(age: f64) -> [f64; READING_AGE_COUNT] {
     let x = age / READING_AGE_STEP_S;
     [(x - 0.5) / READING_AGE_STEP_S, -2.0 * x / READING_AGE_STEP_S, (x + 0.5) / READING_AGE_STEP_S]

@@ -20,7 +20,7 @@ const JOINT_SEARCH_READINGS: usize = 1_500;
 const SHORTLISTED_JOINT_COUNT: usize = 3;
 /// The number of times that the weights of readings are recomputed.
 const REWEIGHT_ROUNDS: usize = 2;
-/// Residuals beyond this many standard deviations get a lower weight; see [`weight`].
+/// Residuals beyond this many standard deviations get a lower huber_weight; see [`huber_weight`].
 const HUBER_THRESHOLD_DEVIATIONS: f64 = 3.5;
 /// The number of broadcasts in a batch, over which scores are summed before their correlation is computed.
 const BROADCASTS_PER_BATCH: u32 = 4;
@@ -227,7 +227,7 @@ fn squared_length(of: &[f64; 3]) -> f64 {
     of.iter().map(|part| part * part).sum()
 }
 
-/// Returns the weight of a reading by Huber: 1, or less if its residual exceeds [`TOLERATED`] standard deviations.
+/// Returns the weight of a reading by Huber: 1, or less if its residual exceeds [`HUBER_THRESHOLD_DEVIATIONS`] standard deviations.
 pub(crate) fn huber_weight(residual: &[f64; 3], variance: f64) -> f64 {
     let off = (squared_length(residual) / variance).sqrt();
     if off <= HUBER_THRESHOLD_DEVIATIONS { 1.0 } else { HUBER_THRESHOLD_DEVIATIONS / off }

@@ -84,7 +84,7 @@ pub(crate) fn suggest_motion(
     best.1
 }
 
-/// Returns the standard deviation of a pose in its least certain direction, relative to [`AIM`](crate::plan::AIM).
+/// Returns the standard deviation of a pose in its least certain direction, relative to [`TARGET_DEVIATIONS`].
 fn worst_uncertainty(information: &InformationMatrix) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return f64::INFINITY };
     let part = |start: usize, aim: f64| {

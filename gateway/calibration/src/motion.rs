@@ -118,7 +118,7 @@ fn rising_curve(time: f64, length: f64) -> [f64; 3] {
     ]
 }
 
-/// The maximum speed and acceleration of [`rise`] for a length of 1 s.
+/// The maximum speed and acceleration of [`rising_curve`] for a length of 1 s.
 pub(crate) const RISING_CURVE_PEAKS: [f64; 2] = [2.187_5, 7.513_2];
 
 /// Returns a curve that rises from 0 to 1 and falls to 0 within `length`: its value and its first two derivatives at

@@ -47,7 +47,7 @@ pub struct BusObservations {
     epochs: Vec<Option<u32>>,
     /// The times of consecutive broadcasts.
     times: Vec<Micros>,
-    /// The durations of [`SPAN`] periods, in us.
+    /// The durations of [`PERIOD_MEASURING_BROADCASTS`] periods, in us.
     spans: Vec<u64>,
     period_us: f64,
     first: Option<Micros>,

@@ -27,7 +27,7 @@ pub(crate) struct ReadingSums {
 /// The coefficients of the 12 numbers of a motion at the middle age, and of 1, without the constraints of a model.
 pub(crate) type UnconstrainedCoefficients = SMatrix<f64, 13, 3>;
 
-/// Converts an index into [`Free`] to the index among all numbers of a moment.
+/// Converts an index into [`UnconstrainedCoefficients`] to the index among all numbers of a moment.
 const fn model_input_index(number: usize) -> usize {
     if number < NUMBERS_PER_ROW_MOTION { NUMBERS_PER_ROW_MOTION + number } else { MODEL_INPUT_COUNT - 1 }
 }
@@ -81,7 +81,7 @@ impl ReadingSums {
     }
 
     /// Returns the information of the readings on the unknowns, for noise of variance 1, and the gradient of half of
-    /// [`Self::residual`].
+    /// [`Self::squared_residual_sum`].
     pub(crate) fn information_and_gradient(&self, model: &CellModel) -> (InformationMatrix, Unknowns) {
         let derivatives = model.derivatives();
         let coefficients = model.coefficients();

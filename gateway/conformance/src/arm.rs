@@ -59,7 +59,7 @@ fn revolute_row(a: i16, d: i16, alpha: i16, theta_offset: i16) -> Row {
     Row { kind: RowKind::Revolute, a, d, alpha, theta_offset }
 }
 
-/// Returns the cell of the protocol's complete configuration, on joint k of a UR5, with [`PLAIN`] contact.
+/// Returns the cell of the protocol's complete configuration, on joint k of a UR5, with [`UNIT_GAIN_CONTACT`] contact.
 pub(crate) fn example_parameters(joint: u8) -> Parameters {
     let mut rows = [Row::default(); MAX_ROWS];
     let ur5 = [
@@ -89,7 +89,7 @@ pub(crate) fn example_parameters(joint: u8) -> Parameters {
     }
 }
 
-/// Returns the configuration of [`document`] with a period of 16 ms (62.5 joints a second), for checks of times.
+/// Returns the configuration of [`example_parameters`] with a period of 16 ms (62.5 joints a second), for checks of times.
 pub(crate) fn fast_example_parameters(joint: u8) -> Parameters {
     Parameters { period_us: 16_000, ..example_parameters(joint) }
 }
@@ -288,7 +288,7 @@ pub(crate) fn press_with_sum(sum: i32) -> SkinSensors {
     SkinSensors { contact: contact_words(sum), ..SkinSensors::default() }
 }
 
-/// Returns the sum of contact words for which, with [`PLAIN`], a torque word equals the word of J.
+/// Returns the sum of contact words for which, with [`UNIT_GAIN_CONTACT`], a torque word equals the word of J.
 pub(crate) fn unit_press_sum(format: TorqueFormat) -> i32 {
     1 << (24 - format.fraction_bits())
 }

@@ -78,7 +78,7 @@ pub(crate) fn place_cells(surface: &Surface<'_>, options: &CoverOptions, link: u
     best.map_or_else(Vec::new, |(_, spots)| spots)
 }
 
-/// Removes places that are closer than [`CLOSEST`] to an earlier place on the same side.
+/// Removes places that are closer than [`MIN_SPACING_PITCHES`] to an earlier place on the same side.
 fn remove_close_cells(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition> {
     let apart = MIN_SPACING_PITCHES * pitch;
     let mut grid = PointGrid::new(apart);
@@ -148,7 +148,7 @@ fn cell_positions(
     sites.iter().zip(best).filter_map(spot).collect()
 }
 
-/// Returns the unit vector that is nearest to `requested` and at most [`MAX_TILT`] away from `face`.
+/// Returns the unit vector that is nearest to `requested` and at most [`MAX_TILT_RAD`] away from `face`.
 fn limit_tilt(face: &Vector3<f64>, requested: &Vector3<f64>) -> Vector3<f64> {
     let angle = face.angle(requested);
     if angle <= MAX_TILT_RAD {

@@ -12,18 +12,19 @@ use crate::{CoverError, CoverOptions, KeepOut, RobotLink};
 /// The number of samples on the area of a cell.
 const SAMPLES_PER_CELL: f64 = 64.0;
 
-/// The maximum number of cells whose area the triangles of a link may have.
+/// The maximum area of the triangles of a link, as a number of cells.
 const MAX_CELLS: usize = 6000;
 
 /// The minimum number of samples, so that the measures of a small link are precise enough.
 const MIN_SAMPLES: f64 = 2000.0;
 
-/// The number of rays from a side of a sample. Further rays are not cast if the first [`FEW`] all agree.
+/// The number of rays that are cast from each side of the surface at a sample point. No more are cast if the first
+/// [`MIN_RAYS_PER_TEST`] agree.
 const RAYS_PER_TEST: u32 = 32;
 const MIN_RAYS_PER_TEST: u32 = 8;
 
-/// The minimum share of rays that leave the link from a side that is part of the outer surface. It is higher than
-/// through a screw hole, and lower than from between the arms of a fork.
+/// The minimum share of rays that leave the link, for a side that counts as outer surface. Through a screw hole a
+/// smaller share leaves; from between the arms of a fork a larger one.
 const MIN_ESCAPING_RAY_SHARE: f64 = 0.3;
 
 /// The maximum share of rays that leave another link from its inside, through gaps of its mesh.
@@ -33,7 +34,7 @@ const MAX_LEAKING_RAY_SHARE: f64 = 0.1;
 /// only through the gap between two links, where nothing can touch a cell.
 const MIN_REACHED_RAY_SHARE: f64 = 0.05;
 
-/// The number of rays by which [`REACHED`] is tested. Further rays are not cast if half of the first [`FEW`] leave.
+/// The number of rays by which [`MIN_REACHED_RAY_SHARE`] is tested. Further rays are not cast if half of the first [`MIN_RAYS_PER_TEST`] leave.
 const REACH_TEST_RAYS: u32 = 128;
 
 /// The height above the surface from which rays start, in pitches.
@@ -277,7 +278,7 @@ impl<'a> Surface<'a> {
     }
 }
 
-/// Returns the share of rays for which `escapes` is true. Only the first [`FEW`] rays are cast if they all agree.
+/// Returns the share of rays for which `escapes` is true. Only the first [`MIN_RAYS_PER_TEST`] rays are cast if they all agree.
 fn share_of_rays(escapes: impl Fn(&u32) -> bool) -> f64 {
     let few = count_rays((0..MIN_RAYS_PER_TEST).filter(&escapes));
     if few == 0 || few == MIN_RAYS_PER_TEST {

@@ -95,8 +95,8 @@ pub fn measure_distributed(
     })
 }
 
-/// Measures ticks with and without the central computation for each of some numbers. `ticks` creates the loop for the
-/// number with this index and for a mode.
+/// Measures ticks with and without the central computation, for each of several numbers of cells. `ticks` creates the
+/// loop for the number with this index and for a mode.
 pub(super) fn measure_tick_times(
     numbers: &[usize],
     rounds: usize,

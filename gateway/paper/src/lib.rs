@@ -38,7 +38,7 @@ use analysis::report::figure::Section;
 use arm::ReplyMode;
 use moving::BenchRun;
 
-/// An experiment that can be performed.
+/// An experiment of the paper, named by the figure or table that it measures again.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
 pub enum Experiment {
     /// Fig. 6: the torques of the moving arm.

@@ -13,7 +13,7 @@ use trace::ros2::read;
 use trace::ros2::skin::{LoopTiming, Torques};
 use trace::ros2::standard::JointState;
 
-/// The values that a recording holds of one tick.
+/// The values of one tick in a recording.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TickRow {
     /// The scheduled start of the tick, in s since the first tick.

@@ -141,7 +141,7 @@ fn average_sum(
     (mean, last)
 }
 
-/// A kind of sum: its heading in a table, the text of its finding, and its value in [`Errors`].
+/// A kind of sum: its heading in a table, the text of its finding, and its value in [`SumErrors`].
 type SumMethod = (&'static str, &'static str, fn(&SumErrors) -> f64);
 
 /// All kinds of sums that are compared.

@@ -41,7 +41,7 @@ struct Origin {
 }
 
 impl Origin {
-    /// Returns the origin for the constant part of a row.
+    /// Returns the pose of a row at joint position 0, as the origin of a URDF joint.
     fn from_row(row: &DhRow) -> Self {
         let (sine, cosine) = row.theta_offset.sin_cos();
         Self { xyz: [row.a * cosine, row.a * sine, row.d], rpy: [row.alpha, 0.0, row.theta_offset] }

@@ -62,7 +62,7 @@ impl Drop for AddressFile {
     }
 }
 
-/// Returns true if an earlier page left the file.
+/// Returns true if the file contains the address of a page that was served earlier.
 fn is_address_file(path: &Path) -> bool {
     read_beginning(path).is_ok_and(|text| text.starts_with("http://") && text.lines().count() == 1)
 }

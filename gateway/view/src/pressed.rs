@@ -7,7 +7,7 @@ use protocol::id::CellId;
 use protocol::message::SkinSensors;
 use protocol::time::Micros;
 
-/// The maximum force of a touch by one page, in N.
+/// The maximum force with which one browser page can press a cell, in N.
 pub const MAX_FORCE_N: f64 = 90.0;
 /// The time after which a stimulus is sent again if the cell has not latched it, in µs.
 const RETRY_INTERVAL_US: u64 = 150_000;

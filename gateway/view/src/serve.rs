@@ -85,7 +85,7 @@ struct SharedBus {
     name: String,
     format: Format,
     bus: Mutex<Option<Arc<Bus>>>,
-    /// The time of the last frame that was read, in µs, while more frames wait to be read; otherwise [`UP_TO_DATE`].
+    /// The time of the last frame that was read, in µs, while more frames wait to be read; otherwise [`ALL_FRAMES_READ`].
     read_to: AtomicU64,
 }
 

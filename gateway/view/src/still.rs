@@ -49,7 +49,7 @@ struct StaticPageData<'a> {
     positions: &'a [f64],
     details: &'a [Vec<(String, String)>],
     moved: &'a [PreviousCellPlace],
-    /// The corners of the surface in base64, in the format of [`pack`].
+    /// The corners of the surface in base64, in the format of [`pack_meshes`].
     surface: String,
 }
 

@@ -21,7 +21,7 @@ pub const MAX_BATCH_DATAGRAMS: usize = 64;
 /// more than receiving a datagram.
 const FIRST_BATCH_SIZE: usize = 4;
 /// Capacity of the smaller of the two send calls, which suffices for most sends. Preparing fewer slots is faster; see
-/// [`FEW`].
+/// [`FIRST_BATCH_SIZE`].
 pub(super) const SMALL_BATCH_SIZE: usize = 8;
 
 /// A receive buffer for up to [`MAX_BATCH_DATAGRAMS`] datagrams of at most 72 bytes.

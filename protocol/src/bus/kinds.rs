@@ -1,6 +1,6 @@
 //! Kinds of buses, and the choice of a kind for each bus of a bench: `--bus-kind embedded --bus-kind can0=socketcan`.
 //!
-//! A new kind is added here and implements [`Carrier`].
+//! A new kind is added here and implements [`BusBackend`].
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -44,7 +44,7 @@ impl Display for ExitReason {
 }
 
 impl ExitReason {
-    /// Parses a line of standard error. Returns `None` for any line that does not have this form.
+    /// Parses a line of standard error. Returns `None` for a line that [`Display`] does not produce.
     #[must_use]
     pub fn parse(line: &str) -> Option<Self> {
         let (head, why) = line.split_once(": ")?;

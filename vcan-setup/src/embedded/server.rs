@@ -79,9 +79,9 @@ pub struct Server {
 
 /// A source of datagrams. Tests replace it to simulate errors.
 trait Receive {
-    /// Receives datagrams from a socket, as [`Batch::receive`] does.
+    /// Receives datagrams from a socket, as [`ReceiveBatch::receive`] does.
     fn receive(&mut self, socket: &OwnedFd) -> io::Result<usize>;
-    /// Returns the datagrams as [`Batch::datagrams`] does.
+    /// Returns the datagrams as [`ReceiveBatch::datagrams`] does.
     fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>>;
 }
 
@@ -324,7 +324,7 @@ impl Server {
         Ok(ready > 0)
     }
 
-    /// Stops polling a client whose reception failed. Disconnects it after [`FAILURES`] consecutive failures.
+    /// Stops polling a client whose reception failed. Disconnects it after [`MAX_FAILURES`] consecutive failures.
     fn handle_failure(&mut self, id: ClientId, errno: Errno) {
         let Some(client) = self.client(id) else { return };
         client.failures += 1;

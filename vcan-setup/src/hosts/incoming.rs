@@ -136,7 +136,7 @@ pub struct HostsToBusQueue {
     waiting: VecDeque<Frame>,
     /// The hosts that the queued frames came from: each entry is a host and the number of consecutive frames.
     runs: VecDeque<(String, usize)>,
-    /// The number of messages from hosts beyond [`SOURCES`].
+    /// The number of messages from hosts beyond [`MAX_SOURCES`].
     unknown_hosts: u64,
     frames: Vec<StampedFrame>,
 }

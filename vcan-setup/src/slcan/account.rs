@@ -90,7 +90,7 @@ impl From<RejectedLines> for RefusedLineCounts {
     }
 }
 
-/// The counts of a line, in both directions.
+/// The counts of the frames and refusals of a line, in both directions.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct LineAccount {
     /// The address of the line, as on the command line.

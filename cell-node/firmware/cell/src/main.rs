@@ -11,7 +11,7 @@ mod start {
     use cell::board::Board as _;
     use cell::boards::SelectedBoard;
     use cell::place;
-    use cell::run::{Cell, InitialState};
+    use cell::run::{InitialState, RunningCell};
     use cell_node::node::Node;
     use cortex_m::peripheral::SCB;
     use cortex_m_rt::{ExceptionFrame, entry, exception};
@@ -24,7 +24,7 @@ mod start {
         let mut board = SelectedBoard::start();
         // Without a factory record the cell has no identity and must not send; it waits to be loaded again.
         let Some((factory, node)) = begin(&mut board, NODE) else { board.idle() };
-        match Cell::start(board, factory, node).run() {}
+        match RunningCell::start(board, factory, node).run() {}
     }
 
     /// Returns the factory record, and the node before its flash contents are restored.

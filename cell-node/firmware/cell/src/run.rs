@@ -17,7 +17,7 @@ use crate::store::{self, StoredImage};
 
 /// A cell that runs on a board.
 #[derive(Debug)]
-pub struct Cell<'a, B> {
+pub struct RunningCell<'a, B> {
     board: B,
     factory: FactoryRecord,
     node: &'a mut Node,
@@ -65,7 +65,7 @@ impl InitialState {
     }
 }
 
-impl<'a, B: Board> Cell<'a, B> {
+impl<'a, B: Board> RunningCell<'a, B> {
     /// Starts a cell and joins its bus.
     pub fn start(mut board: B, factory: FactoryRecord, node: &'a mut Node) -> Self {
         board.open(&factory);

@@ -14,7 +14,7 @@
 //! The savings are those of the paper's count: `a_l x_l` is the joint's own translation without a further
 //! product; joints with parallel axes (alpha = 0) turn by one sum of angles, so that X and Y are those of the
 //! first of them; and components that are 0 or 1 for all joint positions are neither multiplied nor added.
-//! [`Frame`] records these, once per configuration. Values that no later step reads are not computed.
+//! [`AxisFrame`] records these, once per configuration. Values that no later step reads are not computed.
 
 mod axes;
 mod range;

@@ -160,7 +160,7 @@ impl<'a> ComparedCapture<'a> {
         is_new
     }
 
-    /// Handles a joints packet by the same rules as [`Watch`]. Returns true if it begins a new epoch.
+    /// Handles a joints packet by the same rules as [`JointsWatcher`]. Returns true if it begins a new epoch.
     fn receive_joints(&mut self, at: usize, nanos: u64, epoch: Epoch, joints: &Joints) -> bool {
         let Some(bus) = self.buses.get_mut(at) else { return false };
         if usize::from(joints.in_use) != bus.chain || bus.last == Some(epoch) {

@@ -45,7 +45,7 @@ pub struct TorqueExplanation {
     pub missing: Vec<String>,
 }
 
-/// The joints that were sent on a bus in the epoch.
+/// The explanation of one joint broadcast on a bus, with the torques of all its cells.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusExplanation {
     /// Name of the bus.
@@ -154,7 +154,7 @@ pub struct Explainer<'a> {
 }
 
 impl<'a> Explainer<'a> {
-    /// Prepares a skin for explanations.
+    /// Prepares the central computation of a skin, from which torques are explained.
     #[must_use]
     pub fn new(skin: &'a Skin) -> Self {
         let parts = (0..skin.buses.len()).map(|bus| {

@@ -387,7 +387,7 @@ impl BusWatch {
         }
     }
 
-    /// Returns the cell as of the newest joints of this epoch, and true if an answer to them is still in time.
+    /// Returns the state of the cell at the newest joints of this epoch, and true if an answer is still in time.
     fn answering_cell(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut ObservedCellState, bool)> {
         let open = self.open.iter_mut().rev().find(|open| open.epoch == epoch)?;
         let in_time = !open.is_too_late();

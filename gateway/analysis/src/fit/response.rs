@@ -97,7 +97,7 @@ pub fn response_time(streams: &[FrameStream], at: usize, bit_ns: u64) -> Option<
 }
 
 /// Returns the lowest fixed point of an increasing function, found by iterating from below; `None` if it exceeds
-/// [`HORIZON_NS`].
+/// [`MAX_BUSY_PERIOD_NS`].
 fn lowest_fixed_point(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
     let mut at_ns = from_ns;
     while at_ns <= MAX_BUSY_PERIOD_NS {

@@ -103,7 +103,7 @@ pub struct TrafficClassifier {
     owed: Vec<PendingReplies>,
 }
 
-/// Outstanding replies of a cell to sync and report that it also sends at other times.
+/// The outstanding replies of a cell to sync and report. The cell also sends messages of these kinds unrequested.
 #[derive(Clone, Copy, Debug, Default)]
 struct PendingReplies {
     heartbeat: bool,

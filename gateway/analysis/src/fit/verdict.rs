@@ -108,12 +108,12 @@ impl Display for AnsweringCells {
 /// The load and the verdict of a bus, in the worst case or in a run.
 ///
 /// ```
-/// # use analysis::fit::verdict::{Answer, Cells, Verdict};
+/// # use analysis::fit::verdict::{AnsweringCells, FitSummary, FitVerdict};
 /// let rates = "1M/5M".to_owned();
-/// let verdict = Verdict::Bandwidth;
-/// let answer = Answer { load: 1.1889, rates, cells: Cells::All { cells: 253 }, verdict };
+/// let verdict = FitVerdict::Bandwidth;
+/// let summary = FitSummary { load: 1.1889, rates, cells: AnsweringCells::All { cells: 253 }, verdict };
 /// assert_eq!(
-///     answer.to_string(),
+///     summary.to_string(),
 ///     "worst case: 118.9 % of 1M/5M: does not fit: bandwidth (all 253 cells answer)"
 /// );
 /// ```

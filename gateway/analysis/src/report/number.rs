@@ -53,12 +53,12 @@ fn round_to_three_digits(value: f64) -> f64 {
 /// Formats a number with its unit, which may be empty. A value that is not finite becomes a dash.
 ///
 /// ```
-/// # use analysis::report::figure::quantity;
-/// assert_eq!(quantity(1.06e-4, "Nm"), "106\u{a0}µNm");
-/// assert_eq!(quantity(1_968.0, "µs"), "1.97\u{a0}ms");
-/// assert_eq!(quantity(62.5, "Hz"), "62.5\u{a0}Hz");
-/// assert_eq!(quantity(253.0, ""), "253");
-/// assert_eq!(quantity(0.25, "rad"), "0.25\u{a0}rad");
+/// # use analysis::report::figure::format_quantity;
+/// assert_eq!(format_quantity(1.06e-4, "Nm"), "106\u{a0}µNm");
+/// assert_eq!(format_quantity(1_968.0, "µs"), "1.97\u{a0}ms");
+/// assert_eq!(format_quantity(62.5, "Hz"), "62.5\u{a0}Hz");
+/// assert_eq!(format_quantity(253.0, ""), "253");
+/// assert_eq!(format_quantity(0.25, "rad"), "0.25\u{a0}rad");
 /// ```
 #[must_use]
 pub fn format_quantity(value: f64, unit: &str) -> String {
@@ -118,11 +118,11 @@ fn format_unitless(value: f64) -> String {
 /// digits; very small and very large ones with a power of ten. A value that is not finite becomes a dash.
 ///
 /// ```
-/// # use analysis::report::figure::number;
-/// assert_eq!(number(24_364.0), "24364");
-/// assert_eq!(number(0.005_4), "0.0054");
-/// assert_eq!(number(6.25e-5), "6.25e-5");
-/// assert_eq!(number(1_919.4), "1919");
+/// # use analysis::report::figure::format_number;
+/// assert_eq!(format_number(24_364.0), "24364");
+/// assert_eq!(format_number(0.005_4), "0.0054");
+/// assert_eq!(format_number(6.25e-5), "6.25e-5");
+/// assert_eq!(format_number(1_919.4), "1919");
 /// ```
 #[must_use]
 pub fn format_number(value: f64) -> String {

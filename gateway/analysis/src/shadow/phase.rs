@@ -18,7 +18,7 @@ const MAX_FIRST_JOINTS_NS: u64 = 100_000_000;
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum BusPhase {
     /// Cells claim node ids, are configured and build the tree. This phase lasts until the first joints, and begins
-    /// again when no joints were sent for [`PAUSE_NS`].
+    /// again when no joints were sent for [`OPERATION_PAUSE_NS`].
     StartUp,
     /// Joints are sent, or the bus carries another protocol.
     Operation,

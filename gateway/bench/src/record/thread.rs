@@ -28,7 +28,7 @@ use trace::ros2::standard::{Diagnosis, DiagnosisLevel, Point};
 
 /// Pause between rounds of the thread.
 const DRAIN_PAUSE: Duration = Duration::from_millis(10);
-/// Interval between flushes: a killed run may lose the data of this time plus one [`LOOK`].
+/// Interval between flushes: a killed run may lose the data of this time plus one [`DRAIN_PAUSE`].
 const FLUSH_INTERVAL: Duration = Duration::from_millis(40);
 /// Interval between readings of the kernel's backlog drops.
 const BACKLOG_READ_INTERVAL: Duration = Duration::from_millis(100);
@@ -80,7 +80,7 @@ pub(super) struct RecorderThread {
     scratch: (Vec<ContactState>, Vec<Point>),
 }
 
-/// A period, and the time at which it was over the last time.
+/// A timer: its period, and when it last expired.
 struct PeriodicTimer(Duration, Instant);
 
 impl PeriodicTimer {

@@ -122,7 +122,7 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     // Until here, a signal may end the program, because there is nothing to clean up.
     let signalled = catch_signals(&[SIGHUP, SIGINT, SIGTERM])?;
     // In lockstep, frames are sent when cells have answered, not at a time.
-    let timed = matches!(options.pace, ReplaySpeed::Timed(_)) && !options.lockstep;
+    let timed = options.is_timed();
     let idle = timed.then(|| idle_lateness(WAKEUP_PERIOD_NS));
     let recorded = start::recorded_skin(&extras);
     let mut buses = start::open_buses(options, &survey, &routes, skin_override.as_ref(), recorded.as_ref())?;

@@ -323,9 +323,9 @@ fn classify_frame(
 
 /// Reasons why frames are not sent.
 pub mod reason {
-    /// Frame before `--from`.
+    /// The reason for not sending a frame: it was recorded before `--from`.
     pub const BEFORE_PART: &str = "before --from";
-    /// Frame at `--to` or after it.
+    /// The reason for not sending a frame: it was recorded at `--to` or later.
     pub const AFTER_PART: &str = "after --to";
     /// Frame of a bus that is not replayed (`--bus`).
     pub const BUS_NOT_SELECTED: &str = "not picked";

@@ -104,9 +104,11 @@ impl ReplaySession {
             down: BTreeSet::new(),
             bus_links,
         };
+        let is_timed = options.is_timed();
         let began = Instant::now();
         let player = spawn("player", move || {
-            let granted = realtime::request_realtime();
+            // Without a schedule the thread never sleeps, and would keep all others from the processor.
+            let granted = if is_timed { realtime::request_realtime() } else { GrantedPrivileges::default() };
             if hears {
                 for bus_link in 0..live.bus_links.len() {
                     // Request the initial values of the counters. If the bus is down, the first frame reports it.

@@ -13,6 +13,7 @@ use protocol::message::{Message, Request};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 
+use super::player::ReplaySpeed;
 use super::replay_plan::SenderFilter;
 use super::survey::Survey;
 use super::{ReplayError, ReplayOptions, SpawnOptions};
@@ -286,6 +287,12 @@ const fn sender_node(decoded: &Decoded) -> Option<Node> {
 }
 
 impl ReplayOptions {
+    /// Returns true if frames are sent at the times of the capture, and not as fast as possible or when cells have
+    /// answered.
+    pub(super) fn is_timed(&self) -> bool {
+        matches!(self.pace, ReplaySpeed::Timed(_)) && !self.lockstep
+    }
+
     /// Returns true if the replay receives messages of cells.
     pub(super) fn receives_cell_messages(&self) -> bool {
         self.expect.is_some() || self.lockstep || self.only == SenderFilter::Inputs

@@ -51,7 +51,7 @@ impl SwitchedBuses {
     /// Checks that a command may take a bus down, or bring it up.
     ///
     /// # Errors
-    /// Returns [`Refused`] if the bus is in the requested state already, or will be as soon as its receiver has noticed
+    /// Returns an error if the bus is in the requested state already, or will be as soon as its receiver has noticed
     /// the last change.
     pub(super) fn check_switch(&self, down: bool, bus: usize) -> Result<(), CommandError> {
         match (down, self.0.get(&bus)) {

@@ -19,9 +19,9 @@ const MAX_LISTED_HALTS: usize = 100;
 /// Halts of a run.
 #[derive(Debug, Default)]
 pub(super) struct HaltHistory {
-    /// Latest ticks, at most [`TICKS`].
+    /// Latest ticks, at most [`HALT_HISTORY_TICKS`].
     ring: VecDeque<TimedRecord>,
-    /// Ticks up to the last halt, at most [`TICKS`].
+    /// Ticks up to the last halt, at most [`HALT_HISTORY_TICKS`].
     before: Vec<TimedRecord>,
     halts: Vec<HaltSummary>,
     /// Number of ended halts that are not listed one by one.

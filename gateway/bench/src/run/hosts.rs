@@ -22,7 +22,7 @@ pub(super) struct OtherHosts {
     known: KnownHosts,
 }
 
-/// Changes that the reports of a link show.
+/// The differences between two reports of a link to other hosts.
 #[derive(Debug, Default, Eq, PartialEq)]
 pub(super) struct HostChanges {
     /// Messages for the user.

@@ -26,7 +26,7 @@ pub(super) struct LoopTotals {
     pub(super) ticks: u64,
     pub(super) skipped: u64,
     pub(super) bad: BTreeMap<String, u64>,
-    /// Number of ticks without data from a bus, by the bus's bit in [`control::cycle::Record::missing`].
+    /// Number of ticks without data from a bus, by the bus's bit in the record of a tick.
     pub(super) missing: [u64; 32],
     pub(super) halts: HaltHistory,
     last: Option<TimedRecord>,

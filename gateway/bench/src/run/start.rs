@@ -53,7 +53,7 @@ const MAX_GATHER_TIME: Duration = Duration::from_millis(10);
 const SMALL_BUFFER_REMARK: &str =
     ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 
-/// Claims files and opens buses; [`Bench::begin`] starts the cells.
+/// Claims files and opens buses; [`Bench::bring_up_cells`] starts the cells.
 pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let began = Instant::now();
     let emulator = check_options(options)?;

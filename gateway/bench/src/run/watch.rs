@@ -223,7 +223,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
+    /// Sends the stimuli of all epochs up to [`STIMULUS_LEAD_EPOCHS`] ahead.
     fn send_stimuli(&self, script: &mut ScenarioProgress, moved: Option<TickMotion>) -> Result<(), RunError> {
         let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
         // Skipped broadcasts have no epoch, but the scenario's time continues.

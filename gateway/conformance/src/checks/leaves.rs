@@ -25,7 +25,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Puts the cell in contact with a pending stimulus, and returns the epoch of that stimulus.
+/// Presses the cell, and sends it a stimulus that stays pending. Returns the epoch of the pending stimulus.
 fn touch_with_pending_stimulus(session: &mut Session<'_>) -> Result<u8, StopReason> {
     session.stimulate_and_send_joints(&POSITIONS, arm::press_with_sum(LATCHED_CONTACT_SUM))?;
     let later = session.known.last_epoch.wrapping_add(20);

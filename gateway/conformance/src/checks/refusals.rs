@@ -139,7 +139,7 @@ const ROW_TABLE_FLAWS: &[ConfigurationFlaw] = &[
     (16, |it| (it.table_rows, it.row) = (6, 2)),
 ];
 
-/// Checks defects that are refused at the commit. The hash is wrong too, so that a faulty cell commits nothing.
+/// Checks that a commit of invalid parameters is refused. The hash is wrong too, so that a faulty cell commits nothing.
 fn check_refused_commits(session: &mut Session<'_>) -> Result<(), StopReason> {
     let can_rows = session.about.abilities.word() != 0;
     let is_apt = |flaw: &&ConfigurationFlaw| can_rows || !matches!(flaw.0, 7 | 8);

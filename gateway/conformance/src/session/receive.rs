@@ -46,7 +46,7 @@ impl Session<'_> {
         if is_silent { Err(StopReason::Silent) } else { Ok(()) }
     }
 
-    /// Checks that no segment has waited longer than [`PATIENT`] for the others of its packet.
+    /// Checks that no segment has waited too long for the others of its packet.
     fn check_waiting_segments(&mut self, now: Micros) {
         if self.held.is_some() {
             // It may be a part of the life that was cut off.

@@ -208,7 +208,7 @@ impl ReceivedDatagram {
     /// Decodes a datagram for a robot with `joints` joints. Never panics.
     ///
     /// # Errors
-    /// Returns [`Nonsense`] if the datagram is neither an answer nor a hello.
+    /// Returns [`InvalidDatagram`] if the datagram is neither an answer nor a hello.
     pub(super) fn decode(bytes: &[u8], joints: usize) -> Result<Self, InvalidDatagram> {
         let mut from = Reader(bytes);
         let expected = match from.read_header()? {

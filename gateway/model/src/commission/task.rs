@@ -15,7 +15,7 @@ const REQUEST_RETRY_LIMITS: RetryLimits = RetryLimits {
     max_timeout: Span::from_millis(800),
     max_transmissions: 6,
 };
-/// Retry limit and timeouts of a commit request; longer than [`ANSWER`], because the cell writes its flash.
+/// Retry limit and timeouts of a commit request; longer than [`REQUEST_RETRY_LIMITS`], because the cell writes its flash.
 const COMMIT_RETRY_LIMITS: RetryLimits =
     RetryLimits { first_timeout: Span::from_millis(400), ..REQUEST_RETRY_LIMITS };
 /// Maximum number of times that the writing of a cell starts over after the cell restarted meanwhile.
@@ -289,7 +289,7 @@ impl Task {
         }
     }
 
-    /// Returns the time of the next call of [`Task::time`]; `None` if no timeout is running.
+    /// Returns the time of the next call of [`Task::handle_timeout`]; `None` if no timeout is running.
     pub(super) fn next_timeout(&self) -> Option<Micros> {
         let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + NODE_ID_SETTLE_TIMEOUT);
         let beat = if let Stage::AwaitHeartbeat(since) = self.stage {

@@ -87,7 +87,7 @@ fn add_cell(draft: &mut SkinDraft, bus: usize, place: &PlacedCell, node: usize) 
 }
 
 /// Returns the slot duration in µs, a multiple of 10. The slots of all levels of the tree together take at most
-/// [`SLOTS_SHARE`] of the broadcast period.
+/// [`MAX_SLOT_PERIOD_SHARE`] of the broadcast period.
 #[expect(
     clippy::cast_precision_loss,
     clippy::cast_possible_truncation,

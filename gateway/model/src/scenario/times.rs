@@ -33,7 +33,7 @@ impl ScenarioDuration {
 /// The longest duration in s: one year.
 pub(super) const MAX_DURATION_S: f64 = 3.2e7;
 
-/// Checks a duration in s: above 0 and at most [`LONGEST_S`].
+/// Checks a duration in s: above 0 and at most [`MAX_DURATION_S`].
 pub(super) fn check_duration(at: &KeyPath, seconds: f64) -> Checked<Span> {
     if (1e-6..=MAX_DURATION_S).contains(&seconds) {
         return Ok(span_from_seconds(seconds));

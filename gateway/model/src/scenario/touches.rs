@@ -2,7 +2,7 @@
 //!
 //! The words are a pure function of the scenario and the epoch: epoch 0 is the start of the scenario, epoch k follows k
 //! broadcast periods later. A cell answers the joints of an epoch with these words. Imperfect sensors are computed
-//! epoch by epoch ([`Measured`]).
+//! epoch by epoch.
 
 use protocol::id::CellId;
 use protocol::message::{SensorPage, SensorReadings, SkinSensors};
@@ -25,7 +25,7 @@ pub struct Stimulus {
     pub node: CellId,
     /// Its readings.
     pub readings: SensorReadings,
-    /// The pages to send, by [`SensorPage::simulated`].
+    /// The pages to send, by [`SensorPage::simulated_index`].
     sent: [bool; SensorPage::SIMULATED_PAGE_NAMES.len()],
 }
 
@@ -49,13 +49,13 @@ pub struct Touches {
     touches: Vec<Touch>,
     /// The period with which all touches repeat, if they do.
     repeat: Option<Span>,
-    /// Scratch memory of [`Touches::changes`]: for each touch, its forces in N in the previous and in the present
+    /// Scratch memory of [`Touches::stimuli_between`]: for each touch, its forces in N in the previous and in the present
     /// epoch.
     levels: Vec<[Option<f64>; 2]>,
     cells: Vec<AffectedCell>,
     /// The imperfect sensors, if there are any; `cells` then contains every cell of the skin.
     measured: Option<ImperfectSensors>,
-    /// Scratch memory of [`Touches::changes`]; the next two fields are, too.
+    /// Scratch memory of [`Touches::stimuli_between`]; the next two fields are, too.
     changed: Vec<Stimulus>,
     there: Vec<TrueSensorInput>,
     before: Vec<SensorReadings>,
@@ -345,7 +345,7 @@ impl AffectedCell {
     }
 }
 
-/// Returns the pages that differ, by [`SensorPage::simulated`].
+/// Returns the pages that differ, by [`SensorPage::simulated_index`].
 fn differing_pages(
     before: &SensorReadings,
     now: &SensorReadings,

@@ -142,7 +142,7 @@ pub struct BusTable {
     snapshot: Snapshot,
     counters: Counters,
     accuracy: TorqueAccuracy,
-    /// The difference of the last closed epoch, see [`Table::difference`].
+    /// The difference of the last closed epoch, see [`BusTable::torque_difference`].
     difference: Option<[f64; MAX_JOINTS]>,
     delays: Delays,
     notices: VecDeque<Notice>,

@@ -6,7 +6,7 @@ use protocol::id::CellId;
 use protocol::message::Heartbeat;
 use protocol::time::{Micros, Span};
 
-/// Number of joints from another sender within [`WITHIN`] that prove another gateway.
+/// Number of joints from another sender within [`GATEWAY_DETECTION_TIME`] that prove another gateway.
 const MIN_GATEWAY_JOINTS: usize = 4;
 /// The time window for these joints; the slowest gateway sends fifteen in it.
 const GATEWAY_DETECTION_TIME: Span = Span::from_millis(1_000);

@@ -26,7 +26,7 @@ impl SentJointCounts {
         self.since.joints += 1;
     }
 
-    /// Sets the count to zero.
+    /// Sets the number of broadcasts since the first page to zero.
     pub(super) const fn reset_count(&mut self) {
         self.since.joints = 0;
     }

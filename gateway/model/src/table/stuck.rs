@@ -23,7 +23,7 @@ const MIN_EXPECTED_CHANGES: u32 = 4;
 /// Smallest change of an expected word that counts, in steps of the word.
 const MIN_CHANGE_STEPS: u16 = 16;
 
-/// Name of the torques in [`Stuck::longest`]; pages have their own.
+/// Name of the torques in the longest run of equal words; pages have their own.
 const TORQUE_NAME: &str = "torque";
 
 /// The words that a cell sends in torques and sensors pages, compared with the expected ones.

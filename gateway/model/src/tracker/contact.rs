@@ -22,7 +22,7 @@ pub const MAX_PENDING_STIMULI: usize = 8;
 pub struct ContactState<T> {
     pending: Vec<(StimulusStart, SensorPage, T)>,
     skin: Option<(SkinSensors, T)>,
-    /// The other pages, by [`SensorPage::simulated`].
+    /// The other pages, by [`SensorPage::simulated_index`].
     others: [Option<(SensorPage, T)>; SensorPage::SIMULATED_PAGE_NAMES.len()],
     obeys: Option<bool>,
     /// True if `skin` reflects all stimuli that the cell has received.

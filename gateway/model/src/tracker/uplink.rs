@@ -38,7 +38,7 @@ pub struct UplinkCounts {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct UplinkAccount {
     now: CountsSinceStart,
-    /// The counts before the cell's last start; [`Account::take_back`] restores them.
+    /// The counts before the cell's last start; [`UplinkAccount::revoke_start`] restores them.
     before: Option<CountsSinceStart>,
 }
 

@@ -25,7 +25,7 @@ pub struct RecordingExtras {
 
 /// The name of the metadata record that holds the time of a run's first tick.
 pub const RUN_METADATA: &str = "run";
-/// The key of the first tick's time in [`RUN`], in ns since 1970.
+/// The key of the first tick's time in [`RUN_METADATA`], in ns since 1970.
 const BEGAN_KEY: &str = "began_ns";
 
 /// Returns the contents of the metadata record [`RUN_METADATA`] for a first tick at `nanos` ns since 1970.

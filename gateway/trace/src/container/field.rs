@@ -170,7 +170,7 @@ impl<'a> Fields<'a> {
     /// Returns the next `count` bytes.
     ///
     /// # Errors
-    /// Returns [`Damage::Short`] if the record has fewer.
+    /// Returns [`FormatError::Short`] if the record has fewer.
     pub(super) fn bytes(&mut self, count: u64, field: &'static str) -> Result<&'a [u8], FormatError> {
         let split = usize::try_from(count).ok().and_then(|count| self.rest.split_at_checked(count));
         let (bytes, rest) = split.ok_or_else(|| self.too_short_error(field))?;

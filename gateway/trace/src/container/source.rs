@@ -346,7 +346,7 @@ impl<R: Read + Seek> RecordReader<R> {
     }
 }
 
-/// Stores the last bytes of the input for [`Source::ends_with_magic`].
+/// Stores the last bytes of the input for the check that it ends with the magic.
 fn keep_last_bytes(last: &mut [u8; MAGIC.len()], came: &[u8]) {
     let came = came.get(came.len().saturating_sub(last.len())..).unwrap_or_default();
     last.rotate_left(came.len());

@@ -98,7 +98,7 @@ pub(super) fn exists_error() -> io::Error {
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
 
-/// Replaces an error of the kind `AlreadyExists` by [`exists`], which has advice for the user. Returns other errors
+/// Replaces an error of the kind `AlreadyExists` by [`exists_error`], which has advice for the user. Returns other errors
 /// unchanged.
 pub(super) fn with_exists_hint(error: io::Error) -> io::Error {
     if error.kind() == io::ErrorKind::AlreadyExists { exists_error() } else { error }
@@ -235,7 +235,7 @@ pub(crate) fn write_with_retries(file: &mut impl Write, bytes: &[u8]) -> io::Res
     }
 }
 
-/// Writes all bytes, and retries like [`write_patiently`].
+/// Writes all bytes, and retries like [`write_with_retries`].
 ///
 /// # Errors
 /// Returns the error if it persists, and an error if the file accepts no bytes.

@@ -33,7 +33,7 @@ const MESSAGE_OVERHEAD: u64 = 31;
 
 /// Returns the options for the writer of the crate `mcap`. Seeking is off, so that flushed data stays readable even if
 /// the program is killed. Threads are off, because they cost more than they save. Chunk ends and the checksum of the
-/// data section are left to [`FileWriter`] and [`Output`].
+/// data section are left to [`FileWriter`] and [`SharedOutput`](super::output).
 fn mcap_write_options() -> WriteOptions {
     WriteOptions::new()
         .profile(MCAP_PROFILE)
@@ -48,7 +48,7 @@ fn mcap_write_options() -> WriteOptions {
 /// The name of the metadata record that stores the identity of the file. A copy of a recording has another identity
 /// than it stores.
 const IDENTITY_METADATA: &str = "recorder";
-/// The key of the file's inode in [`MARK`].
+/// The key of the file's inode in [`IDENTITY_METADATA`].
 const INODE_KEY: &str = "inode";
 const BIRTH_TIME_KEY: &str = "born_ns";
 /// The MCAP profile of a recording: the conventions that it follows.
@@ -334,7 +334,7 @@ impl<W: Write> FileWriter<W> {
         Ok(())
     }
 
-    /// Ends the chunk. Writes all schemas and channels after it if one is new or [`DESCRIBED_EVERY`] chunks have
+    /// Ends the chunk. Writes all schemas and channels after it if one is new or [`CHUNKS_PER_DESCRIPTION`] chunks have
     /// passed.
     fn end_chunk(&mut self) -> io::Result<()> {
         if self.open_bytes == 0 {

@@ -69,7 +69,7 @@ impl<W: Write> SharedOutput<W> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Inserts complete records. The crate must be between two records.
+    /// Inserts complete records. The `mcap` writer must have finished its last record.
     pub(super) fn insert_records(&self, records: &[u8]) -> io::Result<()> {
         self.lock_state().write_checked(records)
     }

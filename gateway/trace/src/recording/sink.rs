@@ -67,7 +67,7 @@ impl FileGauge {
     }
 }
 
-/// A file that can be finished although its disk becomes full.
+/// A file that can be finished even if its disk becomes full, because room for its end is reserved.
 #[derive(Debug)]
 pub struct ReservedFile {
     file: File,

@@ -164,7 +164,7 @@ impl SensorReading {
     }
 }
 
-/// The gains and thresholds of Algorithm 1.
+/// The gains and thresholds with which a cell fuses contact and proximity (the paper's Algorithm 1).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct GainsAndThresholds {
     /// The gains α_c (a number) and α_p (in N).

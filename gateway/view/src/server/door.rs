@@ -1,7 +1,7 @@
 //! The door of the server: one thread that reads and answers the requests of all clients. It passes clients that become
 //! pages on to their own threads.
 //!
-//! A client must send the whole head of its request within [`HEAD_TIME`]. If too many clients wait, the one that has
+//! A client must send the whole head of its request within [`HEAD_TIMEOUT`]. If too many clients wait, the one that has
 //! waited longest is refused. A client with the token sends its head at once and is answered before that, so clients
 //! without a token cannot keep it out, however many they are. The number of pages is limited separately.
 

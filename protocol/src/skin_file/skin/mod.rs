@@ -35,7 +35,7 @@ pub use wires::BusWires;
 
 /// Keys at the top level that only skin files have. They distinguish a skin from a scenario.
 pub const SKIN_KEYS: &[&str] = &["robot", "cell"];
-/// Keys at the top level that only scenarios have; see [`KEYS`].
+/// Keys at the top level that only scenarios have; see [`SKIN_KEYS`].
 const SCENARIO_KEYS: &[&str] = &["duration_s", "motion", "mode", "touch", "fault", "sensors"];
 
 /// A checked skin description.

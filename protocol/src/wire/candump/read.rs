@@ -4,7 +4,7 @@ use super::write::MAX_SECOND_DIGITS;
 use super::{Direction, LineError, Timestamp};
 use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, check_identifier};
 
-/// The value of each byte as a hexadecimal digit; [`NONE`] for bytes that are not digits.
+/// The value of each byte as a hexadecimal digit; [`NOT_A_DIGIT`] for bytes that are not digits.
 #[expect(clippy::indexing_slicing, reason = "when this is compiled")]
 const HEX_DIGIT_VALUES: [u8; 256] = {
     let mut nibbles = [NOT_A_DIGIT; 256];
@@ -18,7 +18,7 @@ const HEX_DIGIT_VALUES: [u8; 256] = {
 };
 const NOT_A_DIGIT: u8 = 0xFF;
 
-/// Returns the value of a hexadecimal digit; [`NONE`] for any other byte.
+/// Returns the value of a hexadecimal digit; [`NOT_A_DIGIT`] for any other byte.
 #[expect(clippy::indexing_slicing, reason = "a byte is less than 256")]
 #[inline]
 pub(super) const fn hex_digit_value(digit: u8) -> u8 {

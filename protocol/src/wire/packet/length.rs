@@ -127,7 +127,7 @@ impl Lengths {
         self.iter().next().unwrap_or_default()
     }
 
-    /// Returns the longest length.
+    /// Returns the longest length of the set, by default six words.
     pub(super) fn longest(self) -> Length {
         Length::ALL.into_iter().rfind(|&length| self.contains(length)).unwrap_or_default()
     }

@@ -42,7 +42,7 @@ use crate::packet::{MAX_WORDS, WORDS, crc16_of_parts, padded_words};
 pub const MAX_JOINTS: usize = MAX_WORDS;
 /// Maximum number of rows of a chain's table.
 pub const MAX_ROWS: usize = 32;
-/// Minimum number of rows in a flash image. The rows of a chain with more than six follow.
+/// Minimum number of rows in a flash image. An image with more rows has them after these.
 const MIN_IMAGE_ROWS: usize = 6;
 /// The parameter number of row 1.
 const FIRST_ROW_NUMBER: u8 = 16;

@@ -92,7 +92,7 @@ pub struct Field {
     pub name: String,
     /// Name of the signal in a DBC file, if it differs from `name`; `{}` stands for the label of an element.
     pub signal: String,
-    /// Index of the word with the field's first bit; see [`Field::at`].
+    /// Index of the word with the field's first bit; see the field's offset.
     word: u8,
     byte: u8,
     bit: u8,

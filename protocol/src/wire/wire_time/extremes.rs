@@ -125,7 +125,7 @@ const REMOTE_EXTENDED_STUFF_BITS: [BitRange; 9] =
 struct StuffBits([Option<BitRange>; stuffing::STATE_COUNT]);
 
 impl StuffBits {
-    /// The idle bus before SOF: only state 4 is possible, as in [`stuffing::Run::IDLE`].
+    /// The idle bus before SOF: only state 4 is possible, as in [`stuffing::BitRun::IDLE_BUS`].
     const IDLE_BUS: Self = Self([None, None, None, None, Some((0, 0)), None, None, None]);
 
     /// Appends the lowest `count` bits of a word with their values.

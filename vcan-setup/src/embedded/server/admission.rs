@@ -21,7 +21,7 @@ const MAX_SEND_BUFFER_BYTES: usize = 64 << 20;
 const MAX_ADMISSIONS: usize = 64;
 
 impl Server {
-    /// Accepts waiting clients, at most [`ADMISSIONS`].
+    /// Accepts waiting clients, at most [`MAX_ADMISSIONS`].
     pub(super) fn accept_clients(&mut self) {
         for _ in 0..MAX_ADMISSIONS {
             match self.accept_socket() {
@@ -44,7 +44,7 @@ impl Server {
     }
 
     /// Accepts a client with the reserved file descriptor and disconnects it, because no other descriptor is free. If
-    /// the client's hello has not arrived yet, the descriptor is in use until [`Server::part`] is called.
+    /// the client's hello has not arrived yet, the descriptor is in use until [`Server::close_parting_client`] is called.
     fn reject_client(&mut self) -> Result<(), Errno> {
         drop(self.spare.take());
         let accepted = self.accept_socket();

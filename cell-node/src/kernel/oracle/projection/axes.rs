@@ -3,7 +3,7 @@
 //!
 //! The first two components of an axis are alike: both depend on the joints, except in vertical axes and in those of
 //! the base. An axis is therefore characterised by its third component, [`Axis`]. Two axes that are rotated together
-//! are characterised by the combination of both, [`Mix`].
+//! are characterised by the combination of both, [`RotationProducts`].
 
 use crate::kernel::{Number, Twist};
 

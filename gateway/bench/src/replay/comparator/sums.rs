@@ -89,7 +89,7 @@ pub(super) struct CellSum {
     pub(super) count: u8,
 }
 
-/// Last sum of each cell for one epoch, which is the sum of the most cells.
+/// Each cell's last sum for one epoch. The last sum of a cell contains the most cells.
 #[derive(Clone, Debug, Default)]
 pub(super) struct SumsByCell(BTreeMap<CellId, CellSum>);
 

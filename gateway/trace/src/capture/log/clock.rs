@@ -15,7 +15,7 @@ use crate::capture::last_times::LastFrameTimes;
 const ASSUMED_STEP_NS: u64 = 1_000;
 /// The maximum number of buses whose times are compared to find the reference.
 const MAX_BUSES: usize = 16;
-/// The number of comparisons after which the reference of relative times is decided.
+/// The number of compared times after which it is decided to what the relative times of a log refer.
 const MIN_COMPARISONS: u32 = 20;
 
 /// A remark for the user on the times and flags of a log.

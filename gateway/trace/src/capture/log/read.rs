@@ -12,7 +12,7 @@ use crate::container::read_uninterrupted;
 
 /// The maximum length of a line in bytes, with its line end: twice the longest CAN XL frame. Longer lines are cut.
 pub const MAX_LINE_BYTES: usize = 8_192;
-/// The number of bytes requested from the input at once. It must be a multiple of [`LONGEST`].
+/// The number of bytes requested from the input at once. It must be a multiple of [`MAX_LINE_BYTES`].
 const READ_BYTES: usize = 1 << 18;
 /// The maximum size in bytes of the sample of lines before the first frame. The kind of a text without frames is
 /// recognised from this sample.

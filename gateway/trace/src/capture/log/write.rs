@@ -27,7 +27,7 @@ pub enum TimeDigits {
     Nine,
 }
 
-/// The style in which a log is written.
+/// The form of the lines of a log: the decimals of times, the directions of frames, and what is left out.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LogStyle {
     /// The number of decimals of the times.
@@ -50,7 +50,7 @@ pub enum WriteOutcome {
     Nothing,
 }
 
-/// The kinds of information that a line omits of its frame.
+/// The properties of a frame that a line of a log cannot show.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct OmittedProperties {
     /// True if digits of the time are omitted.

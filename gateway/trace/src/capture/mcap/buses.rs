@@ -75,7 +75,7 @@ impl ForeignBusNames {
     }
 }
 
-/// Returns the beginning of a topic's name, at most [`LONGEST`] bytes long.
+/// Returns the beginning of a topic's name, at most [`MAX_NAME_BYTES`] bytes long.
 pub(super) fn truncate_topic(topic: &str) -> &str {
     let ends = (0..=MAX_NAME_BYTES.min(topic.len())).rev();
     ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()

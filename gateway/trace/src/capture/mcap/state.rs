@@ -252,7 +252,7 @@ impl McapState {
         }
     }
 
-    /// Calls `keep` if `size` more bytes fit into the limit [`KEPT`].
+    /// Calls `keep` if `size` more bytes fit into the limit [`MAX_KEPT_BYTES`].
     fn keep_if_it_fits(&mut self, size: usize, keep: impl FnOnce(&mut RecordingExtras)) {
         self.kept = self.kept.saturating_add(size);
         if self.is_first && self.kept <= MAX_KEPT_BYTES {

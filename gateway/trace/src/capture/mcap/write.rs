@@ -14,13 +14,13 @@ use crate::recording::{BUS_TOPIC_PREFIX, NOTES_TOPIC};
 /// The maximum number of channels for frames. Each channel costs a reader memory, and a log may contain any number of
 /// buses.
 const MAX_CHANNELS: usize = 64;
-/// The topic for frames of all buses beyond [`CHANNELS`]. Each message holds the name of its bus.
+/// The topic for frames of all buses beyond [`MAX_CHANNELS`]. Each message holds the name of its bus.
 const FURTHER_BUSES_TOPIC: &str = "/further";
 /// The name of the metadata record that states what a recording was converted from.
 pub const ORIGIN_METADATA: &str = "capture";
-/// The entry of [`ORIGIN`] in a recording that was converted from a log.
+/// The entry of [`ORIGIN_METADATA`] in a recording that was converted from a log.
 pub(crate) const LOG_ORIGIN: (&str, &str) = ("from", "candump log");
-/// The entry of [`ORIGIN`] in a recording that was converted from another recording.
+/// The entry of [`ORIGIN_METADATA`] in a recording that was converted from another recording.
 const RECORDING_ORIGIN: (&str, &str) = ("from", "MCAP recording");
 /// The metadata key of a channel for the number of decimals of its times: 6 or 9.
 pub(super) const TIME_DIGITS_KEY: &str = "time_digits";
@@ -35,7 +35,7 @@ const MAX_WAITING_BYTES: usize = 1 << 20;
 pub(crate) struct McapWriter<W: Write> {
     file: FileWriter<W>,
     channels: Vec<BusChannel>,
-    /// The topic of each bus, for at most [`CHANNELS`] buses.
+    /// The topic of each bus, for at most [`MAX_CHANNELS`] buses.
     topics: HashMap<String, String>,
     taken: UniqueNames,
     /// The index of the channel that the last frame was written to.
