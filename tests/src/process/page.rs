@@ -1,5 +1,6 @@
 //! A client of the live page's WebSocket, for tests without a browser.
 
+use std::io::ErrorKind;
 use std::net::TcpStream;
 use std::time::Instant;
 
@@ -123,7 +124,7 @@ impl Page {
         loop {
             assert!(Instant::now() < give_up, "not there after {TIMEOUT:?}: {what}");
             // The history before a position is not a snapshot.
-            if let Message::Binary(bytes) = self.socket.read().unwrap()
+            if let Message::Binary(bytes) = self.read_message()
                 && bytes[12] == 0
             {
                 let snapshot = Snapshot::read(&bytes);
@@ -134,12 +135,22 @@ impl Page {
         }
     }
 
+    /// Reads a message. A signal to the test program interrupts a read, which is then repeated.
+    fn read_message(&mut self) -> Message {
+        loop {
+            match self.socket.read() {
+                Err(Error::Io(error)) if error.kind() == ErrorKind::Interrupted => {}
+                message => return message.unwrap(),
+            }
+        }
+    }
+
     /// Waits for a status message for which a condition holds.
     pub fn wait_for_status(&mut self, what: &str, mut is: impl FnMut(&Value) -> bool) -> Value {
         let give_up = Instant::now() + TIMEOUT;
         loop {
             assert!(Instant::now() < give_up, "not there after {TIMEOUT:?}: {what}");
-            if let Message::Text(text) = self.socket.read().unwrap() {
+            if let Message::Text(text) = self.read_message() {
                 let said = serde_json::from_str(text.as_str()).unwrap();
                 if is(&said) {
                     return said;
