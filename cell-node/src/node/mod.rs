@@ -459,6 +459,8 @@ impl Node {
 
     /// Queues a message. There is always room, because one frame causes at most four packets and the caller collects
     /// them after each frame.
+    // Not inlined: joints, which a cell receives most often, are not handled here.
+    #[inline(never)]
     fn queue_message(&mut self, message: Message) {
         let slot = self.outbox.push();
         debug_assert!(slot.is_some(), "a shell takes what is to be sent after each call");

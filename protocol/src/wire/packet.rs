@@ -207,7 +207,6 @@ impl Packet {
     }
 
     /// Encodes the packet to `bytes`, which has its size.
-    #[inline(always)]
     fn write_all(&self, bytes: &mut [u8]) {
         self.write_pairs(bytes.as_chunks_mut::<2>().0, 0);
         if let Some((rest, crc)) = bytes.split_last_chunk_mut::<2>() {
@@ -216,7 +215,6 @@ impl Packet {
     }
 
     /// Writes the words from the one with index `first`, and epoch and count if there is room after them.
-    #[inline(always)]
     fn write_pairs(&self, pairs: &mut [[u8; 2]], first: usize) {
         let words = self.words.as_slice().get(first..).unwrap_or_default();
         for (pair, word) in pairs.iter_mut().zip(words) {
@@ -296,7 +294,6 @@ pub fn data_frame_id(frame: &Frame) -> Result<Id, PacketError> {
 }
 
 /// Returns the CRC of a packet, of its bytes before the CRC.
-#[inline(always)]
 fn checksum(id: Id, bytes: &[u8]) -> u16 {
     let mut digest = CRC.digest();
     digest.update(&id.to_bits().to_le_bytes());

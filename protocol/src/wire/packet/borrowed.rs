@@ -45,7 +45,6 @@ impl<'b> PacketRef<'b> {
     }
 
     /// Splits the bytes of a packet of this length. Also returns its CRC, which is not checked.
-    #[inline]
     pub(super) fn split(id: Id, length: Length, bytes: &'b [u8]) -> Option<(Self, u16)> {
         let [words @ .., [epoch, count], crc] = bytes.as_chunks::<2>().0 else { return None };
         let packet = Self { id, length, words, epoch: Epoch(*epoch), count: *count };
@@ -83,7 +82,6 @@ impl<'b> PacketRef<'b> {
 
     /// Returns a copy of the packet that does not borrow the bytes.
     #[must_use]
-    #[inline]
     pub fn to_packet(&self) -> Packet {
         let words = Words::from_words(self.length, self.words());
         Packet { id: self.id, words, epoch: self.epoch, count: self.count }
