@@ -80,8 +80,8 @@ pub struct BusToLineQueue {
     is_up: bool,
     stage: OpeningStage,
     since_open: u64,
-    /// True if a frame was written since the adapter was opened.
-    has_written_frame: bool,
+    /// True if a setting was written, and no frame since then.
+    is_setting_unproven: bool,
     /// The counts of the frames.
     pub account: BusToLineCounts,
 }
@@ -127,11 +127,15 @@ impl BusToLineQueue {
         self.stage
     }
 
-    /// Returns true if a frame was written since the adapter was opened. Without one, all that the adapter can have
-    /// refused are the commands that opened it.
+    /// Returns the stage of what the adapter may be refusing now. Before the first frame, a refusal by an open adapter
+    /// is a late answer to a setting, if there was one.
     #[must_use]
-    pub const fn has_written_frame(&self) -> bool {
-        self.has_written_frame
+    pub const fn refused_stage(&self) -> OpeningStage {
+        if self.is_setting_unproven && matches!(self.stage, OpeningStage::Open) {
+            OpeningStage::Setting
+        } else {
+            self.stage
+        }
     }
 
     /// Records that the adapter refused `lines` lines. As many sent frames are counted as refused instead of sent.
@@ -206,11 +210,13 @@ impl BusToLineQueue {
                 QueuedTextKind::Frame => {
                     self.account.sent += 1;
                     self.since_open += 1;
-                    self.has_written_frame = true;
+                    self.is_setting_unproven = false;
                 }
                 QueuedTextKind::Command(stage) => {
-                    if stage == OpeningStage::Open {
-                        (self.since_open, self.has_written_frame) = (0, false);
+                    match stage {
+                        OpeningStage::Away | OpeningStage::Closed => self.is_setting_unproven = false,
+                        OpeningStage::Setting => self.is_setting_unproven = true,
+                        OpeningStage::Open => self.since_open = 0,
                     }
                     self.stage = stage;
                 }

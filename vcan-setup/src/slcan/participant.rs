@@ -10,7 +10,7 @@ use super::account::{FaultCounts, LineAccount, describe_faults_since};
 use super::event::LineEvent;
 use super::incoming::LineToBusQueue;
 use super::link::{LinePort, PortOpener};
-use super::options::{LineOptions, OpeningStage, OpeningStep};
+use super::options::{LineOptions, OpeningStage};
 use super::outgoing::{BusToLineQueue, closing_command};
 use super::refusals::{RefusalAction, RefusalHistory};
 use super::settings::{BridgeSettings, open};
@@ -280,23 +280,19 @@ impl LineParticipant {
     /// Handles lines that the adapter refused.
     fn handle_refusals(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         let (bells, replies) = (self.incoming.account().bells, self.incoming.replies());
-        let opening = self.opener.options().opening_steps();
-        let settings: Vec<_> = opening.iter().filter(|step| step.stage == OpeningStage::Setting).collect();
-        // Before the first frame, a refusal is a late answer to a setting.
-        let is_of_setting = self.outgoing.opening_stage() == OpeningStage::Open
-            && !self.outgoing.has_written_frame()
-            && !settings.is_empty();
-        let stage = if is_of_setting { OpeningStage::Setting } else { self.outgoing.opening_stage() };
+        let stage = self.outgoing.refused_stage();
         match self.refusals.evaluate_refusals(now - self.began, stage, bells, replies) {
             RefusalAction::Nothing => {}
             RefusalAction::Count(lines) => self.outgoing.count_refused(lines),
             RefusalAction::ReportSettings => {
-                let name = |step: &&OpeningStep| String::from_utf8_lossy(&step.bytes).trim_end().to_owned();
-                report(LineEvent::SettingRefused(settings.iter().map(name).collect::<Vec<_>>().join(", ")));
+                let opening = self.opener.options().opening_steps();
+                let settings = opening.iter().filter(|step| step.stage == OpeningStage::Setting);
+                let names = settings.map(|step| String::from_utf8_lossy(&step.bytes).trim_end().to_owned());
+                report(LineEvent::SettingRefused(names.collect::<Vec<_>>().join(", ")));
             }
             RefusalAction::Reopen(lines) => {
                 self.outgoing.count_refused(lines);
-                self.outgoing.queue_reopening(&opening);
+                self.outgoing.queue_reopening(&self.opener.options().opening_steps());
                 report(LineEvent::Reopened);
             }
         }

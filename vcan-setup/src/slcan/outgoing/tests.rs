@@ -70,6 +70,29 @@ fn the_commands_of_an_opening_leave_one_by_one() {
 }
 
 #[test]
+fn before_the_first_frame_a_refusal_is_of_a_setting_if_there_is_one() {
+    for (line, expected) in [("/dev/x,rates=1M/5M", OpeningStage::Setting), ("/dev/x", OpeningStage::Open)] {
+        let options: LineOptions = line.parse().unwrap();
+        let mut outgoing = BusToLineQueue::from_options(&options);
+        outgoing.handle_line_opened(&options.opening_steps());
+        let mut now = NOW;
+        // Also after a frame, when the adapter is opened again.
+        for _ in 0..2 {
+            while outgoing.opening_stage() != OpeningStage::Open {
+                now += Duration::from_millis(10);
+                drain(&mut outgoing, now);
+            }
+            assert_eq!(outgoing.refused_stage(), expected, "{line}");
+            outgoing.push_frame(&frame(1));
+            now += Duration::from_secs(1);
+            drain(&mut outgoing, now);
+            assert_eq!(outgoing.refused_stage(), OpeningStage::Open, "{line}");
+            outgoing.queue_reopening(&options.opening_steps());
+        }
+    }
+}
+
+#[test]
 fn frames_switch_to_no_bit_rate_that_equals_the_nominal_one() {
     let frames = [Frame::fd(0x123, 1, &[2]).unwrap(), Frame::fd(0x123, 0, &[2]).unwrap(), frame(3)];
     for (rates, expected) in [
