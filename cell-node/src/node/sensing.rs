@@ -63,7 +63,13 @@ pub(super) struct SensorPageState {
 }
 
 impl SensorPageState {
-    /// Returns the pages to send after sensor values or the mode may have changed.
+    /// Returns true if changed sensor values or a changed mode can require pages.
+    fn follows_changes(&self, mode: Mode) -> bool {
+        mode != self.mode || mode == Mode::Event
+    }
+
+    /// Returns the pages to send after sensor values or the mode may have changed, if it [follows
+    /// changes](Self::follows_changes).
     fn update_due_pages(
         &mut self,
         now: Micros,
@@ -74,9 +80,6 @@ impl SensorPageState {
         let VolatileParameters { sensing, events, .. } = switches;
         if *sensing != self.mode {
             return self.switch_mode(now, switches, cell, sensed);
-        }
-        if *sensing != Mode::Event {
-            return DuePages::NONE;
         }
         let SensorReadings { skin, acceleration, .. } = sensed;
         let turned = self.update_touch_states(skin, events);
@@ -174,7 +177,7 @@ impl Node {
         // Pages are sent only once the cell owns its node id. The comparison with the last sent values
         // ensures that no change is lost.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.owns_node_id()) else { return };
-        if self.sensing.mode == self.switches.sensing && self.sensing.mode != Mode::Event {
+        if !self.sensing.follows_changes(self.switches.sensing) {
             return;
         }
         let pages = self.sensing.update_due_pages(now, &self.switches, cell, &self.net_readings());
