@@ -1,7 +1,8 @@
 //! The path from a cell's sensor words to joint torques: the paper's Algorithm 1 and `tau = J F_z`.
 //!
-//! The code uses integers only. It is exact except for three roundings: [`Force`] (16 fraction bits), [`Torque::torque_words`]
-//! (the torque format), and the rounding of a sum of [`Torque::exact_torques`]. It never panics, and its work is bounded.
+//! The code uses integers only. It is exact except for three roundings: [`Force`] (16 fraction bits),
+//! [`Torque::torque_words`] (the torque format), and the rounding of a sum of [`Torque::exact_torques`]. It never
+//! panics, and its work is bounded.
 
 use protocol::fixed::{Accumulator, Q1_14, Q5_10, TorqueFormat};
 use protocol::parameters::{Contact, MAX_JOINTS};
@@ -91,8 +92,8 @@ impl<'a> Torque<'a> {
         self.rounded_words(&TorqueRounding::new(format, MAX_JACOBIAN_STEPS))
     }
 
-    /// Like [`Torque::torque_words`], with a rounding computed once per configuration. J must not exceed the bound for which
-    /// the rounding was created.
+    /// Like [`Torque::torque_words`], with a rounding computed once per configuration. J must not exceed the bound for
+    /// which the rounding was created.
     #[must_use]
     #[inline]
     pub fn rounded_words(&self, rounding: &TorqueRounding) -> [i16; MAX_JOINTS] {
@@ -161,8 +162,8 @@ pub struct TorqueRounding {
 }
 
 impl TorqueRounding {
-    /// Creates the conversion for |J| up to `bound`, in steps of 2^-14. `bound` is [`MAX_JACOBIAN_STEPS`] if no lower bound is
-    /// known.
+    /// Creates the conversion for |J| up to `bound`, in steps of 2^-14. `bound` is [`MAX_JACOBIAN_STEPS`] if no lower
+    /// bound is known.
     #[must_use]
     pub fn new(format: TorqueFormat, bound: u16) -> Self {
         // J F is at most the largest word, so rounding cannot exceed it.

@@ -15,8 +15,8 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Returns the identifiers that this cell receives in every network state ([`Id::ids_received_by_cell`]). A cell without a node
-    /// id receives no identifiers, only messages at its ports.
+    /// Returns the identifiers that this cell receives in every network state ([`Id::ids_received_by_cell`]). A cell
+    /// without a node id receives no identifiers, only messages at its ports.
     #[must_use]
     pub fn received_ids(&self) -> [Option<Id>; CELL_RECEIVED_ID_COUNT] {
         self.cell.map_or([None; CELL_RECEIVED_ID_COUNT], |cell| Id::ids_received_by_cell(cell).map(Some))

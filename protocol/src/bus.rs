@@ -59,8 +59,8 @@ pub use kinds::{BusKind, KindChoice, KindChoices, KindOption, KindsError, Unknow
 /// Options for opening a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct BusOptions {
-    /// Filters for received frames, at most [`Filter::MAX_COUNT`]. Without filters the socket receives nothing, which suits a
-    /// program that only sends.
+    /// Filters for received frames, at most [`Filter::MAX_COUNT`]. Without filters the socket receives nothing, which
+    /// suits a program that only sends.
     pub filters: Vec<Filter>,
     /// True to receive the frames that this socket sends, marked as own.
     pub own_frames: bool,

@@ -320,8 +320,8 @@ impl Plan {
 /// Plans the steps that remove the target interfaces, as far as this program has made them.
 ///
 /// # Errors
-/// Returns [`PlanRefusal`] if an interface that this program has not made was named on the command line. If it was named by
-/// a skin, it is left as it is.
+/// Returns [`PlanRefusal`] if an interface that this program has not made was named on the command line. If it was
+/// named by a skin, it is left as it is.
 pub fn plan_down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, PlanRefusal> {
     let mut plan = Plan::default();
     for target in target {

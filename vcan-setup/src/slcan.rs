@@ -6,9 +6,9 @@
 //!        <──── [LineToBusQueue: decoder] <──
 //! ```
 //!
-//! [`BusToLineQueue`](outgoing::BusToLineQueue), [`LineToBusQueue`](incoming::LineToBusQueue) and the account process bytes, frames and times
-//! without input or output. A [`Bridge`] is one thread that serves all lines of a bus. It never waits for a line or for
-//! the bus: frames that do not fit into a queue are dropped, and counted by reason.
+//! [`BusToLineQueue`](outgoing::BusToLineQueue), [`LineToBusQueue`](incoming::LineToBusQueue) and the account process
+//! bytes, frames and times without input or output. A [`Bridge`] is one thread that serves all lines of a bus. It never
+//! waits for a line or for the bus: frames that do not fit into a queue are dropped, and counted by reason.
 
 pub mod account;
 mod bridge;

@@ -46,8 +46,8 @@ pub struct Wrench<S: Scalar = Q1_14> {
     /// The links from joint k's row down to the base. Only the first `rows` are in use.
     links: [ChainLink<S::Number>; MAX_ROWS],
     rows: usize,
-    /// Upper bound of |J| in steps of 2^-14, for any joint positions. If it is below [`MAX_JACOBIAN_STEPS`], no intermediate number
-    /// can leave the range of a word, and saturation is omitted.
+    /// Upper bound of |J| in steps of 2^-14, for any joint positions. If it is below [`MAX_JACOBIAN_STEPS`], no
+    /// intermediate number can leave the range of a word, and saturation is omitted.
     bound: u16,
     /// The conversion of the torques for this J to words.
     rounding: TorqueRounding,
@@ -94,7 +94,8 @@ struct ChainLink<N> {
 }
 
 impl<S: Scalar> Wrench<S> {
-    /// Returns an upper bound of |J| in steps of 2^-14, for any joint positions; [`MAX_JACOBIAN_STEPS`] if it is unknown.
+    /// Returns an upper bound of |J| in steps of 2^-14, for any joint positions; [`MAX_JACOBIAN_STEPS`] if it is
+    /// unknown.
     #[must_use]
     pub const fn jacobian_bound(&self) -> u16 {
         self.bound

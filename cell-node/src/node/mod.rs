@@ -23,7 +23,7 @@ mod zero;
 
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q7_8};
-use protocol::id::{Command, Id, Kind, Node as Address};
+use protocol::id::{CellId, Command, Id, Kind, Node as Address};
 use protocol::message::{
     Message, NetworkPage, ReceivedCounts, SensorPage, State, StimulusStart, read_joints,
 };
@@ -59,6 +59,10 @@ pub const MAX_RECEIVED_IDS: usize = CELL_RECEIVED_ID_COUNT + PORTS;
 const JOINTS: Id = Id::command(Command::Joints);
 /// The reassembly buffer of joints, of those of [`Identity::received_ids`].
 const JOINTS_SLOT: usize = 1;
+const _: () = {
+    let [_, joints, ..] = Id::ids_received_by_cell(CellId::MAX);
+    assert!(joints.to_bits() == JOINTS.to_bits(), "the buffer of joints is another one");
+};
 
 /// A cell: the state machine without input and output.
 #[derive(Debug)]

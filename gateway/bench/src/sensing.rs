@@ -74,8 +74,8 @@ pub enum SensingError {
     },
 }
 
-/// Switches the sensor frames of one cell, or of all cells that send, on a bus from [`open_bus`]. Returns the names of the
-/// switched cells.
+/// Switches the sensor frames of one cell, or of all cells that send, on a bus from [`open_bus`]. Returns the names of
+/// the switched cells.
 ///
 /// # Errors
 /// Returns [`SensingError`] if a cell does not confirm, or the bus fails.

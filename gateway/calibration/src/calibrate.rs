@@ -137,8 +137,8 @@ fn shift_refusal(
     Refusal::Shifted { bus: bus_name(skin, bus), at_s, ms, disturbance }
 }
 
-/// Checks that the lags of a bus' stretches differ by at most [`MAX_LAG_DIFFERENCE_SHARE`] of the duration, because many large
-/// shifts cannot be estimated accurately.
+/// Checks that the lags of a bus' stretches differ by at most [`MAX_LAG_DIFFERENCE_SHARE`] of the duration, because
+/// many large shifts cannot be estimated accurately.
 fn check_lag_differences(
     skin: &Skin,
     seen: &Observations,

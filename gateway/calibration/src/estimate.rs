@@ -227,7 +227,8 @@ fn squared_length(of: &[f64; 3]) -> f64 {
     of.iter().map(|part| part * part).sum()
 }
 
-/// Returns the weight of a reading by Huber: 1, or less if its residual exceeds [`HUBER_THRESHOLD_DEVIATIONS`] standard deviations.
+/// Returns the weight of a reading by Huber: 1, or less if its residual exceeds [`HUBER_THRESHOLD_DEVIATIONS`] standard
+/// deviations.
 pub(crate) fn huber_weight(residual: &[f64; 3], variance: f64) -> f64 {
     let off = (squared_length(residual) / variance).sqrt();
     if off <= HUBER_THRESHOLD_DEVIATIONS { 1.0 } else { HUBER_THRESHOLD_DEVIATIONS / off }

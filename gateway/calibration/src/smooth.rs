@@ -26,8 +26,8 @@ pub(crate) type JointPositions = [f64; MAX_JOINTS];
 /// A least-squares fit of polynomials to windows of consecutive positions.
 #[derive(Clone, Debug)]
 pub(crate) struct Smoother {
-    /// The matrix that maps the positions in a window to the polynomial's coefficients, with time in units of [`HALF_WINDOW`]
-    /// periods.
+    /// The matrix that maps the positions in a window to the polynomial's coefficients, with time in units of
+    /// [`HALF_WINDOW`] periods.
     fit: SMatrix<f64, POLYNOMIAL_TERMS, WINDOW_LENGTH>,
     /// The matrix that maps the positions in a window to the residuals of the polynomial.
     left: SMatrix<f64, WINDOW_LENGTH, WINDOW_LENGTH>,

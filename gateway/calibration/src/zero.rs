@@ -28,7 +28,7 @@ const PRIOR_OFFSET_DEVIATION: f64 = 0.1;
 const MAX_OFFSET_DEVIATION: f64 = 0.0175;
 /// The step of numerical derivatives.
 const DERIVATIVE_STEP: f64 = 1e-5;
-/// Of this many successive readings, one is used.
+/// The number of successive readings of which one is used.
 const READING_STRIDE: usize = 4;
 /// The fraction of an independent reading that each reading counts as, because errors of readings close in time are
 /// correlated.

@@ -89,7 +89,8 @@ pub(crate) fn example_parameters(joint: u8) -> Parameters {
     }
 }
 
-/// Returns the configuration of [`example_parameters`] with a period of 16 ms (62.5 joints a second), for checks of times.
+/// Returns the configuration of [`example_parameters`] with a period of 16 ms (62.5 joints a second), for checks of
+/// times.
 pub(crate) fn fast_example_parameters(joint: u8) -> Parameters {
     Parameters { period_us: 16_000, ..example_parameters(joint) }
 }

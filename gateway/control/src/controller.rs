@@ -5,8 +5,8 @@
 //!                                                                  └─> Bad(reason)
 //! ```
 //!
-//! [`KinestheticController`] moves the arm with the torque of a push. [`PlannedController`] follows a motion that is known in advance and
-//! ignores torques. [`crate::external::ExternalController`] asks another program for each command.
+//! [`KinestheticController`] moves the arm with the torque of a push. [`PlannedController`] follows a motion that is
+//! known in advance and ignores torques. [`crate::external::ExternalController`] asks another program for each command.
 
 use protocol::packet::pad_with_defaults;
 use protocol::skin::{ControllerKind, MAX_ROBOT_JOINTS, Skin};

@@ -34,7 +34,8 @@ const MAX_LEAKING_RAY_SHARE: f64 = 0.1;
 /// only through the gap between two links, where nothing can touch a cell.
 const MIN_REACHED_RAY_SHARE: f64 = 0.05;
 
-/// The number of rays by which [`MIN_REACHED_RAY_SHARE`] is tested. Further rays are not cast if half of the first [`MIN_RAYS_PER_TEST`] leave.
+/// The number of rays by which [`MIN_REACHED_RAY_SHARE`] is tested. Further rays are not cast if half of the first
+/// [`MIN_RAYS_PER_TEST`] leave.
 const REACH_TEST_RAYS: u32 = 128;
 
 /// The height above the surface from which rays start, in pitches.
@@ -278,7 +279,8 @@ impl<'a> Surface<'a> {
     }
 }
 
-/// Returns the share of rays for which `escapes` is true. Only the first [`MIN_RAYS_PER_TEST`] rays are cast if they all agree.
+/// Returns the share of rays for which `escapes` is true. Only the first [`MIN_RAYS_PER_TEST`] rays are cast if they
+/// all agree.
 fn share_of_rays(escapes: impl Fn(&u32) -> bool) -> f64 {
     let few = count_rays((0..MIN_RAYS_PER_TEST).filter(&escapes));
     if few == 0 || few == MIN_RAYS_PER_TEST {

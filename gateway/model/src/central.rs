@@ -8,9 +8,9 @@
 //!  sensor words ─> Central::force  ─> F_z ────┘
 //! ```
 //!
-//! [`CentralComputation::new`] computes with the quantised parameters, as the cells do, so that a difference is the error of the
-//! cells' arithmetic. [`CentralComputation::without_quantisation`] computes with the numbers of the file: the difference then includes the
-//! rounding of poses, lengths and angles to words.
+//! [`CentralComputation::new`] computes with the quantised parameters, as the cells do, so that a difference is the
+//! error of the cells' arithmetic. [`CentralComputation::without_quantisation`] computes with the numbers of the file:
+//! the difference then includes the rounding of poses, lengths and angles to words.
 //!
 //! A contact pushes against the outward normal: force = -F_z * normal.
 

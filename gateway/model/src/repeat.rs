@@ -55,8 +55,8 @@ impl RetryState {
         self.due
     }
 
-    /// Handles the timeout and returns the next action; [`RetryAction::Resend`] counts as a transmission. A call before the
-    /// timeout has no effect.
+    /// Handles the timeout and returns the next action; [`RetryAction::Resend`] counts as a transmission. A call before
+    /// the timeout has no effect.
     pub fn handle_timeout(&mut self, now: Micros) -> RetryAction {
         if now < self.due {
             return RetryAction::Wait;

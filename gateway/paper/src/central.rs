@@ -1,8 +1,9 @@
 //! Fig. 9 and 10: the time of the central computation, as a function of the number of cells and of active cells.
 //!
-//! The functions [`CentralComputation::link_frames`] and [`CentralComputation::total_torque`] are timed. In a bench, a tick that compares runs them for
-//! each bus; here they run for one list of cells. Each measurement covers several computations in a row, so that the
-//! time for reading the clock is negligible and code and data are mostly in the caches.
+//! The functions [`CentralComputation::link_frames`] and [`CentralComputation::total_torque`] are timed. In a bench, a
+//! tick that compares runs them for each bus; here they run for one list of cells. Each measurement covers several
+//! computations in a row, so that the time for reading the clock is negligible and code and data are mostly in the
+//! caches.
 
 use std::hint::black_box;
 

@@ -6,8 +6,8 @@
 //!   Effort (how much) ────────────┘                          └─> report::page, report::svg, files::csv, files::results
 //! ```
 //!
-//! All computations here are pure, except that they read a clock. The implementation of [`ExperimentLab`] runs benches of
-//! processes. Each verdict is computed from the measurements of its run.
+//! All computations here are pure, except that they read a clock. The implementation of [`ExperimentLab`] runs benches
+//! of processes. Each verdict is computed from the measurements of its run.
 //!
 //! This crate and `reference` use the code of the cells: it counts the operations of that code, and computes sums along
 //! a tree without a bus. In every other crate the gateway communicates with cells only over the bus, which

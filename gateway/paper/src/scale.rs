@@ -2,8 +2,8 @@
 //! share of replies in time at the highest rate that the bench holds.
 //!
 //! A bench has the fewest buses that have enough node ids for its cells. The cells of each bus are one process. A bench
-//! holds a rate if the share [`MIN_IN_TIME_SHARE`] of the replies arrives in time while the share [`ACTIVE_SHARE`] of the cells is
-//! touched, and if the reason for every loss is known.
+//! holds a rate if the share [`MIN_IN_TIME_SHARE`] of the replies arrives in time while the share [`ACTIVE_SHARE`] of
+//! the cells is touched, and if the reason for every loss is known.
 
 mod section;
 

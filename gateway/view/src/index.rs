@@ -1,8 +1,8 @@
 //! The index of a recording: the state of the skin at intervals, and the recording's events. It is built in one pass
 //! over the recording.
 //!
-//! To show a position, the player continues from the last [`Checkpoint`] state before it. Counts, such as those of losses,
-//! are exact only at positions that the index has already passed.
+//! To show a position, the player continues from the last [`Checkpoint`] state before it. Counts, such as those of
+//! losses, are exact only at positions that the index has already passed.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};

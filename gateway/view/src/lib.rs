@@ -9,8 +9,8 @@
 //! The view only receives on the buses, like any other node. It therefore does not disturb a control loop, and shows
 //! what the buses actually carry. A touch on the page becomes a stimulus on the bus, which cells in test mode obey.
 //!
-//! A recording is shown in the same way: [`tape`] applies its frames to [`LiveState`] up to a position in time, [`index`]
-//! stores the state at intervals, and [`player`] continues from a stored state to any position.
+//! A recording is shown in the same way: [`tape`] applies its frames to [`LiveState`] up to a position in time,
+//! [`index`] stores the state at intervals, and [`player`] continues from a stored state to any position.
 //!
 //! A skin without buses is shown as a [`StaticSkinPage`]: one HTML file with the same scene, drawn by the same scripts.
 //!

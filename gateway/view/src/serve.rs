@@ -85,7 +85,8 @@ struct SharedBus {
     name: String,
     format: Format,
     bus: Mutex<Option<Arc<Bus>>>,
-    /// The time of the last frame that was read, in µs, while more frames wait to be read; otherwise [`ALL_FRAMES_READ`].
+    /// The time of the last frame that was read, in µs, while more frames wait to be read; otherwise
+    /// [`ALL_FRAMES_READ`].
     read_to: AtomicU64,
 }
 

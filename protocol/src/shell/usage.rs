@@ -73,7 +73,8 @@ pub fn eprint_line(line: &str) {
     let _ = InterruptibleWriter::new(io::stderr()).write_all(format!("{}\n", printable(line)).as_bytes());
 }
 
-/// Writes text of several lines to standard error in one write, made printable by [`printable_lines`]. Errors are ignored.
+/// Writes text of several lines to standard error in one write, made printable by [`printable_lines`]. Errors are
+/// ignored.
 pub fn eprint_lines(text: &str) {
     let _ = InterruptibleWriter::new(io::stderr()).write_all(printable_lines(text).as_bytes());
 }

@@ -2,8 +2,8 @@
 //! and allowed values.
 //!
 //! The file is deserialised into a plain struct with `serde`, which refuses unknown keys. A `check` function then
-//! converts the struct to checked types or returns a [`DocumentFault`]. Deserialisation records no positions, which makes it
-//! fast; after an error, the file is parsed again with positions.
+//! converts the struct to checked types or returns a [`DocumentFault`]. Deserialisation records no positions, which
+//! makes it fast; after an error, the file is parsed again with positions.
 
 mod mistakes;
 

@@ -26,8 +26,8 @@ pub enum TouchState {
 }
 
 impl TouchState {
-    /// Returns the state after a new value. Value and threshold are in the same steps; the value may be a sum of several
-    /// words. A threshold of 0 counts as one step.
+    /// Returns the state after a new value. Value and threshold are in the same steps; the value may be a sum of
+    /// several words. A threshold of 0 counts as one step.
     #[must_use]
     pub fn next(self, value: i32, threshold: i16, hysteresis: Q1_14) -> Self {
         let threshold = i32::from(threshold).max(1);

@@ -54,7 +54,8 @@ pub struct Bridge {
 }
 
 impl Bridge {
-    /// Opens the lines, and one client of the bus for each. With [`BridgeSettings::wait`], lines may be unavailable at first.
+    /// Opens the lines, and one client of the bus for each. With [`BridgeSettings::wait`], lines may be unavailable at
+    /// first.
     ///
     /// # Errors
     /// Returns [`BridgeError`] if the bus or a line cannot be opened.

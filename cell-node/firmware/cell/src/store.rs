@@ -116,8 +116,8 @@ fn newest(flash: &impl Flash) -> (Option<(Page, PageHeader)>, bool) {
     (newest, damaged)
 }
 
-/// Reads the newest image into `into`. If a page is damaged, returns [`StoredImage::Damaged`], because that page may have
-/// held a newer image.
+/// Reads the newest image into `into`. If a page is damaged, returns [`StoredImage::Damaged`], because that page may
+/// have held a newer image.
 pub fn read(flash: &impl Flash, into: &mut [u8]) -> StoredImage {
     let (newest, damaged) = newest(flash);
     if damaged {

@@ -64,7 +64,8 @@ pub(crate) fn configure(node: &mut Node, parameters: &Parameters) {
     node.restore(&FlashState::Valid(*parameters));
 }
 
-/// Runs a cell until it owns its node id, and applies a force of 3 N. Writes the frames with the joints for it to answer.
+/// Runs a cell until it owns its node id, and applies a force of 3 N. Writes the frames with the joints for it to
+/// answer.
 pub(crate) fn press(node: &mut Node, joints: Joints, format: Format, frames: &mut Frames) -> Option<()> {
     let mut now = Micros(0);
     for _ in 0..2 {

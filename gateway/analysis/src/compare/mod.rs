@@ -7,7 +7,8 @@
 //! ```
 //!
 //! A `Key` is the number of a joints packet since the run began. The captures are read in lockstep, always the one that
-//! is behind ([`Comparison::next_side`]), so that memory does not grow with their length: about 100 joints per bus are held.
+//! is behind ([`Comparison::next_side`]), so that memory does not grow with their length: about 100 joints per bus are
+//! held.
 
 mod align;
 mod numbering;

@@ -7,8 +7,9 @@
 //! ```
 //!
 //! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of its contact state, so a word
-//! that is not the step nearest to the exact product comes from the cell's own J: [`TorqueRow::verdict`] looks for a J near
-//! the exact one that gives this word. Information that the capture lacks is listed in [`TorqueExplanation::missing`].
+//! that is not the step nearest to the exact product comes from the cell's own J: [`TorqueRow::verdict`] looks for a J
+//! near the exact one that gives this word. Information that the capture lacks is listed in
+//! [`TorqueExplanation::missing`].
 
 mod not_found;
 mod observed;

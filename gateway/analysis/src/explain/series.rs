@@ -64,8 +64,8 @@ pub struct CaptureExtent {
 /// 1970. Memory is bounded.
 ///
 /// # Errors
-/// Returns [`EpochSeriesError`] if the capture cannot be read or has no joints of the skin, or with the first error that
-/// `take` returns.
+/// Returns [`EpochSeriesError`] if the capture cannot be read or has no joints of the skin, or with the first error
+/// that `take` returns.
 pub fn for_each_epoch<E>(
     reader: &mut Reader,
     skin: &Skin,

@@ -98,8 +98,8 @@ pub fn draw_figure(figure: &Figure) -> String {
     svg_document(figure, (width, height), &attributes, &style)
 }
 
-/// Draws a figure as an element of a page that contains the CSS rules of [`dark_css_rules()`]; `size` is the size in pixels
-/// before scaling.
+/// Draws a figure as an element of a page that contains the CSS rules of [`dark_css_rules()`]; `size` is the size in
+/// pixels before scaling.
 #[must_use]
 pub fn draw_inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
     svg_document(figure, size, &format!("class=\"{class}\""), "")

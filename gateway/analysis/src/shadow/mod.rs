@@ -8,7 +8,8 @@
 //!
 //! A frame's time stamp is taken as the time of its sender's request, which is correct on a bus without bit rate (vcan,
 //! the embedded bus). Each sender has a transmit buffer for each of its identifiers. Memory is bounded: frames out of
-//! order are sorted within [`REORDER_WINDOW_NS`] and [`MAX_WAITING_FRAMES`], and at most [`MAX_QUEUED_FRAMES`] frames wait on a bus.
+//! order are sorted within [`REORDER_WINDOW_NS`] and [`MAX_WAITING_FRAMES`], and at most [`MAX_QUEUED_FRAMES`] frames
+//! wait on a bus.
 
 mod bus_timing;
 mod epochs;

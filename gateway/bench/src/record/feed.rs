@@ -12,7 +12,8 @@ use model::table::CellStatus;
 use trace::capture::BusNote;
 
 /// Queue length in frames for a bus. The queues of many buses together have at most four times this length, which
-/// limits memory. The queue of each bus has at least [`MIN_FRAME_QUEUE_LENGTH`] frames, more than a second of a full bus.
+/// limits memory. The queue of each bus has at least [`MIN_FRAME_QUEUE_LENGTH`] frames, more than a second of a full
+/// bus.
 const FRAME_QUEUE_LENGTH: usize = 65_536;
 /// Minimum queue length in frames for a bus, if there are many buses.
 const MIN_FRAME_QUEUE_LENGTH: usize = 16_384;

@@ -25,8 +25,8 @@ const STOP_POLL_INTERVAL_NS: u64 = 100_000_000;
 /// Pause while the queue of steps is empty.
 const EMPTY_QUEUE_PAUSE: Duration = Duration::from_micros(100);
 const BUS_DOWN_PAUSE: Duration = Duration::from_millis(50);
-/// Time without any answer after which cells are queried again, because a frame may have been lost. After [`ANSWER_TIMEOUT`]
-/// they are given up.
+/// Time without any answer after which cells are queried again, because a frame may have been lost. After
+/// [`ANSWER_TIMEOUT`] they are given up.
 const RESYNC_INTERVAL: Duration = Duration::from_millis(500);
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Maximum number of times that joints are resent when cells processed them too late to answer.

@@ -11,8 +11,8 @@
 //! ```
 //!
 //! The logic is pure: [`survey`], [`model::latched::state`], [`trace::order`], [`replay_plan`], [`player`] (its clock
-//! and buses are a [`player::PlayerBackend`]), [`comparator`] and [`difference`]. The other modules hold threads, sockets and
-//! the clock.
+//! and buses are a [`player::PlayerBackend`]), [`comparator`] and [`difference`]. The other modules hold threads,
+//! sockets and the clock.
 
 mod checks;
 pub mod comparator;

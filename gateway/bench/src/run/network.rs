@@ -137,7 +137,8 @@ impl Network {
     /// Adapts the number of slots to the present tree.
     ///
     /// # Errors
-    /// Returns [`TreeTooDeep`] if the slots do not fit between two joint broadcasts. The error names values that would fit.
+    /// Returns [`TreeTooDeep`] if the slots do not fit between two joint broadcasts. The error names values that would
+    /// fit.
     pub(super) fn fit_slots(&mut self, view: &BusView) -> Result<(), TreeTooDeep> {
         let deepest = Self::reported_tree(view).max_depth().unwrap_or(0);
         let slots = u32::from(deepest) + 1;

@@ -26,8 +26,8 @@ use trace::capture::BusNote;
 
 /// Interval between checks of timeouts and updates of the view, if no frame arrives.
 const CHECK_INTERVAL: Duration = Duration::from_millis(20);
-/// Maximum total number of cells for which the interval is [`CHECK_INTERVAL`]. With more cells the interval grows proportionally,
-/// up to [`MAX_CHECK_INTERVAL`].
+/// Maximum total number of cells for which the interval is [`CHECK_INTERVAL`]. With more cells the interval grows
+/// proportionally, up to [`MAX_CHECK_INTERVAL`].
 const CELLS_PER_CHECK_INTERVAL: usize = 1_000;
 /// Maximum interval between checks of timeouts; a cell counts as dead after 600 ms.
 const MAX_CHECK_INTERVAL: Duration = Duration::from_millis(100);

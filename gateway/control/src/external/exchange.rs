@@ -28,7 +28,8 @@ pub(super) struct ExchangeCounts {
     pub(super) gone: u64,
     /// Number of datagrams that could not be received, and of hellos from senders without an address.
     pub(super) failed: u64,
-    /// Numbers of invalid datagrams from the peer, by reason, in the order of [`InvalidDatagram::ALL`](super::datagram::InvalidDatagram::ALL).
+    /// Numbers of invalid datagrams from the peer, by reason, in the order of
+    /// [`InvalidDatagram::ALL`](super::datagram::InvalidDatagram::ALL).
     pub(super) nonsense: [u64; InvalidDatagram::ALL.len()],
 }
 

@@ -15,7 +15,8 @@ const REQUEST_RETRY_LIMITS: RetryLimits = RetryLimits {
     max_timeout: Span::from_millis(800),
     max_transmissions: 6,
 };
-/// Retry limit and timeouts of a commit request; longer than [`REQUEST_RETRY_LIMITS`], because the cell writes its flash.
+/// Retry limit and timeouts of a commit request; longer than [`REQUEST_RETRY_LIMITS`], because the cell writes its
+/// flash.
 const COMMIT_RETRY_LIMITS: RetryLimits =
     RetryLimits { first_timeout: Span::from_millis(400), ..REQUEST_RETRY_LIMITS };
 /// Maximum number of times that the writing of a cell starts over after the cell restarted meanwhile.

@@ -115,8 +115,8 @@ impl<'de> Deserialize<'de> for CellReference {
 }
 
 impl Scenario {
-    /// Returns the duration in s from the file. The default is [`DEFAULT_DURATION`], or one second after the last start or end of
-    /// an event if that is later.
+    /// Returns the duration in s from the file. The default is [`DEFAULT_DURATION`], or one second after the last start
+    /// or end of an event if that is later.
     pub(super) fn duration_s(&self) -> f64 {
         let end = |at_s: f64, for_s: Option<f64>| at_s + for_s.unwrap_or(0.0);
         let touches = self.touch.iter().map(|touch| end(touch.at_s, touch.touch_duration_s()));

@@ -49,8 +49,8 @@ pub struct Touches {
     touches: Vec<Touch>,
     /// The period with which all touches repeat, if they do.
     repeat: Option<Span>,
-    /// Scratch memory of [`Touches::stimuli_between`]: for each touch, its forces in N in the previous and in the present
-    /// epoch.
+    /// Scratch memory of [`Touches::stimuli_between`]: for each touch, its forces in N in the previous and in the
+    /// present epoch.
     levels: Vec<[Option<f64>; 2]>,
     cells: Vec<AffectedCell>,
     /// The imperfect sensors, if there are any; `cells` then contains every cell of the skin.

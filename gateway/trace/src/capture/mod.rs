@@ -6,8 +6,8 @@
 //!   MCAP ─────────┘                      └── dump, replay, explain
 //! ```
 //!
-//! An [`CaptureEntry`] keeps all information that either format holds of a frame, so that a capture survives the round trip
-//! through the other format. Entries are in the order of the file, which is not always the order of their times.
+//! An [`CaptureEntry`] keeps all information that either format holds of a frame, so that a capture survives the round
+//! trip through the other format. Entries are in the order of the file, which is not always the order of their times.
 
 pub mod convert;
 mod error;

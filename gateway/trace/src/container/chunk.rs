@@ -15,8 +15,8 @@ const BASE_LIMIT_BYTES: u64 = 256 << 20;
 const MAX_EXPANSION_RATIO: u64 = 1_000;
 /// The total number of records that the chunks of any file may hold, even if the file is short.
 const BASE_LIMIT_RECORDS: u64 = 1 << 17;
-/// The number of records that are allowed for each byte of the file, in addition to [`BASE_LIMIT_RECORDS`]. A real recording
-/// has an index entry of 16 bytes for each record.
+/// The number of records that are allowed for each byte of the file, in addition to [`BASE_LIMIT_RECORDS`]. A real
+/// recording has an index entry of 16 bytes for each record.
 const MAX_RECORDS_PER_BYTE: u64 = 1;
 /// The length of a record's header in bytes: operation code and length.
 const RECORD_HEADER_BYTES: usize = 9;

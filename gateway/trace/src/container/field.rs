@@ -199,9 +199,8 @@ impl<'a> Fields<'a> {
 /// Decodes a record. Chunks, indexes and statistics are returned as [`Record::Other`].
 ///
 /// # Errors
-/// Returns [`FormatError`] if the record is shorter than its fields, if a schema or another description is too long, if a
-/// name is not UTF-8,
-/// or if an attachment's checksum is wrong.
+/// Returns [`FormatError`] if the record is shorter than its fields, if a schema or another description is too long, if
+/// a name is not UTF-8, or if an attachment's checksum is wrong.
 pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, FormatError> {
     let description = |record| match body.len() as u64 {
         bytes if body.len() > MAX_DESCRIPTION_BYTES => {

@@ -27,7 +27,8 @@ pub enum FramedRecord {
     /// A skipped record with this operation code and length: an index, statistics, or a record of an application. Its
     /// beginning is in [`RecordReader::body`].
     Skipped(u8, u64),
-    /// A record with this operation code and length that is too long for memory. Its beginning is in [`RecordReader::body`].
+    /// A record with this operation code and length that is too long for memory. Its beginning is in
+    /// [`RecordReader::body`].
     Oversized(u8, u64),
     /// A record with an operation code that the format does not define, and its length.
     Unknown(u8, u64),
@@ -90,7 +91,8 @@ impl<R: Read> RecordReader<R> {
         Self { read, checksum: None, ..Self::new(input, attachments) }
     }
 
-    /// Reads the magic bytes at the beginning or end of a file into [`RecordReader::body`]. Returns true if they are correct.
+    /// Reads the magic bytes at the beginning or end of a file into [`RecordReader::body`]. Returns true if they are
+    /// correct.
     ///
     /// # Errors
     /// Returns an error if the input fails.
@@ -333,8 +335,8 @@ impl<R: Read + Seek> RecordReader<R> {
         Ok(())
     }
 
-    /// Reads the contents of the record at offset `began` into [`RecordReader::body`]. Uses `length` instead of the record's
-    /// own length field, which is wrong. Returns true if the input has all these bytes.
+    /// Reads the contents of the record at offset `began` into [`RecordReader::body`]. Uses `length` instead of the
+    /// record's own length field, which is wrong. Returns true if the input has all these bytes.
     ///
     /// # Errors
     /// Returns an error if the input fails.

@@ -98,8 +98,8 @@ pub(super) fn exists_error() -> io::Error {
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
 
-/// Replaces an error of the kind `AlreadyExists` by [`exists_error`], which has advice for the user. Returns other errors
-/// unchanged.
+/// Replaces an error of the kind `AlreadyExists` by [`exists_error`], which has advice for the user. Returns other
+/// errors unchanged.
 pub(super) fn with_exists_hint(error: io::Error) -> io::Error {
     if error.kind() == io::ErrorKind::AlreadyExists { exists_error() } else { error }
 }

@@ -15,9 +15,9 @@ impl Skin {
         Self::parse_for_bus(&path.display().to_string(), &document::read_text(path)?, bus)
     }
 
-    /// Like [`Skin::parse`], but with the cells of one bus only, as [`Skin::with_cells_of_bus`] returns them. If the skin has no
-    /// bus of this name, it keeps all cells. The cells of other buses are not checked, unless the rest of the text has
-    /// an error: then the whole text is parsed, to report its first error.
+    /// Like [`Skin::parse`], but with the cells of one bus only, as [`Skin::with_cells_of_bus`] returns them. If the
+    /// skin has no bus of this name, it keeps all cells. The cells of other buses are not checked, unless the rest of
+    /// the text has an error: then the whole text is parsed, to report its first error.
     ///
     /// # Errors
     /// Returns the first error in the text.

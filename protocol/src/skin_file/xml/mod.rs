@@ -2,8 +2,8 @@
 //!
 //! [`decode`] decodes a file by its byte order mark or its declaration. [`prepare`] repairs common errors without
 //! changing any value: it binds undeclared prefixes, blanks comments that contain `--` and document types without
-//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`detect_unexpected_file`] detects files that are not XML
-//! or not of the expected kind. [`escaped`] escapes a text for XML or HTML.
+//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`detect_unexpected_file`] detects files
+//! that are not XML or not of the expected kind. [`escaped`] escapes a text for XML or HTML.
 
 mod encoding;
 mod escape;

@@ -3,7 +3,8 @@
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use crate::packet::{self, WORDS};
 
-/// The message with which a cell replies to joints, parameter 6. It is volatile: a cell starts with [`ReplyKind::Torque`].
+/// The message with which a cell replies to joints, parameter 6. It is volatile: a cell starts with
+/// [`ReplyKind::Torque`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum ReplyKind {
     /// The cell's own torque, in the torque format of its parameters.

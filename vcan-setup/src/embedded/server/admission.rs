@@ -44,7 +44,8 @@ impl Server {
     }
 
     /// Accepts a client with the reserved file descriptor and disconnects it, because no other descriptor is free. If
-    /// the client's hello has not arrived yet, the descriptor is in use until [`Server::close_parting_client`] is called.
+    /// the client's hello has not arrived yet, the descriptor is in use until [`Server::close_parting_client`] is
+    /// called.
     fn reject_client(&mut self) -> Result<(), Errno> {
         drop(self.spare.take());
         let accepted = self.accept_socket();

@@ -8,8 +8,8 @@
 //! ```
 //!
 //! A recording contains the frames, but no counts of replies, losses and errors. The frames pass through the same
-//! [`BusTable`](model::table::BusTable) as in the gateway, and so give the same accounts. The load of a real bus is that of
-//! `skinbus fit` for the same recording.
+//! [`BusTable`](model::table::BusTable) as in the gateway, and so give the same accounts. The load of a real bus is
+//! that of `skinbus fit` for the same recording.
 
 mod bus_figures;
 mod frames_only;

@@ -36,8 +36,8 @@ pub fn draw_cells(drawing: &Drawing) -> String {
     svg_document(drawing, (width.into(), height), &attributes, &format!("{style}{body}"))
 }
 
-/// Draws cells as an element of a page that contains the CSS rules of [`dark_rules`](super::dark_css_rules); `width` is the width in pixels before
-/// scaling.
+/// Draws cells as an element of a page that contains the CSS rules of [`dark_rules`](super::dark_css_rules); `width` is
+/// the width in pixels before scaling.
 #[must_use]
 pub fn draw_inline(drawing: &Drawing, width: u32, class: &str) -> String {
     let (height, body) = draw_body(drawing, width.into());

@@ -166,7 +166,8 @@ fn a_cell_that_is_wrong_about_its_packets_is_still_found() {
     let without = |frames: &[Frame], place: usize| -> Vec<_> {
         frames.iter().enumerate().filter(|(at, _)| *at != place).map(|(_, frame)| *frame).collect()
     };
-    // A segment is missing before or after the restart, but not in the first and last packet of its identifier before it.
+    // A segment is missing before or after the restart, but not in the first and last packet of its identifier before
+    // it.
     for place in 4..8 {
         let failed = failed(format, takes, &without(&former, place), 0, &new);
         assert!(failed.contains(&"SEND-1"), "former, without {place}: {failed:?}");

@@ -1,4 +1,4 @@
-//! What a recording reports while it is written.
+//! Reports of a recording while it is written.
 
 /// An event of a recording that is to be reported.
 #[derive(Clone, Debug, Eq, PartialEq)]

@@ -1,5 +1,5 @@
-//! Writers of skin files: an [`SkinEdit`] changes values in an existing text and keeps all other bytes; a [`SkinDraft`] creates
-//! a new text.
+//! Writers of skin files: an [`SkinEdit`] changes values in an existing text and keeps all other bytes; a [`SkinDraft`]
+//! creates a new text.
 
 mod draft;
 mod edit;
