@@ -1,9 +1,9 @@
 //! Sums of torques along a tree: the paper's Eq. 28, in Q7.8.
 //!
 //! ```text
-//!   joints ──> begin: own torque, exact      ┐                ┌─> due ──> when to send next
-//!   sum of a child ──> take: largest count ──┼─ [Sum] ────────┼─> say ──> six words and a count
-//!   state of a child ──> state               ┘                └─> missing: children whose sums did not come
+//!             joints ─> begin_epoch: own torque, exact ─┐                ┌─> poll_timeout: when to send next
+//!     sum of a child ─> receive_sum: largest count ─────┼─ [SubtreeSum] ─┼─> poll_sum: the words and a count
+//!   state of a child ─> handle_state_message ───────────┘                └─> take_missing_children: without a sum
 //! ```
 //!
 //! The parent accepts a child's sums while the child's *lease* runs: from the epoch in the child's state message until

@@ -53,7 +53,7 @@ pub(crate) fn print_beside_files<'a>(
     print_text(text)
 }
 
-/// Prints a table like [`print_beside`], in colours if standard output supports them.
+/// Prints a table like [`print_beside_files`], in colours if standard output supports them.
 pub(crate) fn print_table<'a>(
     files: impl IntoIterator<Item = Option<&'a Path>>,
     text: impl FnOnce(bool) -> String,

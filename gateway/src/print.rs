@@ -150,7 +150,7 @@ pub(crate) struct KeyValueTable {
 }
 
 impl KeyValueTable {
-    /// Creates a [`readable`] table with this header and no rows.
+    /// Creates a table of [limited width](limit_width) with this header and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
         Self::with_terminal_width(None, name, value, beside)
     }
@@ -217,7 +217,7 @@ impl KeyValueTable {
         self.add_section(format!("  {name}"), value, beside);
     }
 
-    /// Adds a row whose last text is coloured if colours are enabled ([`Rows::coloured`]).
+    /// Adds a row whose last text is coloured if colours are enabled ([`with_colours`](KeyValueTable::with_colours)).
     pub(crate) fn add_coloured_row(
         &mut self,
         name: impl Display,

@@ -2,8 +2,8 @@
 //!
 //! ```text
 //!   skin or names --+
-//!                   +--> look --> Facts --> assess --> findings: ok, note, fault, each with hints
-//!   this machine ---+  (queries)           (decides)
+//!                   +--> collect_facts --> MachineFacts --> assess_machine --> findings: ok, note, fault
+//!   this machine ---+    (queries)                           (decides)
 //! ```
 
 use std::collections::BTreeSet;

@@ -1,9 +1,9 @@
 //! The formation and repair of the tree of wired cells.
 //!
 //! ```text
-//!   message of a port ─> handle ─────┐             ┌─> poll_transmit ─> message for a port
-//!                now ──> handle_time ┼─ [Network] ─┼─> up, children ──> whose sums are whose
-//!   no sum was taken ──> lose_parent ┘             └─> given ─────────> a node id for this cell
+//!   message of a port ─> handle_message ─────┐             ┌─> poll_transmit ───────────> message for a port
+//!                now ──> handle_timeout ─────┼─ [Network] ─┼─> parent_port, child_mask ─> whose sums are whose
+//!   no sum was taken ──> handle_parent_loss ─┘             └─> take_assigned_id ────────> a node id for this cell
 //! ```
 //!
 //! A cell with a route to the root announces it in its hellos with a [`TreeRank`]: its depth, and the round

@@ -4,7 +4,7 @@
 //!   frame, now, age ─> handle_frame ───┐          ┌─> poll_transmit ─> packet
 //!              now ─> handle_timeout ──┼─ [Node] ─┼─> poll_timeout ──> when to call again
 //!       ok or not ─> handle_stored ────┘          ├─> poll_store ────> parameters for flash
-//!                                                 └─> taken ─────────> who owns this node id already
+//!                                                 └─> other_owner ───> who owns this node id already
 //! ```
 //!
 //! A node never blocks, allocates or panics, and reads no clock. Frames that it cannot use are counted by reason and

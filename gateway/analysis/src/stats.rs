@@ -1,7 +1,7 @@
 //! Statistics of a capture: `skinbus dump --stats`.
 //!
 //! ```text
-//!   frames, each decoded ──> Stats ──> Report: buses, kinds, epochs, refused frames, losses, cells
+//!   frames, each decoded ──> CaptureStats ──> StatsReport: buses, kinds, epochs, refused frames, losses, cells
 //! ```
 //!
 //! The work per frame is bounded. Memory grows with the number of buses, up to [`MAX_BUSES`], not with the number of

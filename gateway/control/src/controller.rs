@@ -1,8 +1,8 @@
 //! Controllers, which turn torques into motion, once per tick.
 //!
 //! ```text
-//!   Input { q, qdot, torque, age, valid, .. } ─> Controller::step ─┬─> Move(joint velocities)
-//!                                                                  └─> Bad(reason)
+//!   ControllerInput { q, qdot, torque, age, valid, .. } ─> Controller::step ─┬─> Move(joint velocities)
+//!                                                                            └─> Bad(reason)
 //! ```
 //!
 //! [`KinestheticController`] moves the arm with the torque of a push. [`PlannedController`] follows a motion that is

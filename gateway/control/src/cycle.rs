@@ -2,9 +2,9 @@
 //! messages to send and the record of the tick.
 //!
 //! ```text
-//!   Tick, BusInput ──> Cycle::tick ─┬─> TickOutcome::broadcast ──> a new epoch for every bus
-//!                                   ├─> TickOutcome::command ────> a halt or a resume for every bus
-//!                                   └─> TickOutcome::record ─────> the record of this tick
+//!   Tick, BusInput ──> ControlCycle::tick ─┬─> TickOutcome::broadcast ──> a new epoch for every bus
+//!                                          ├─> TickOutcome::command ────> a halt or a resume for every bus
+//!                                          └─> TickOutcome::record ─────> the record of this tick
 //! ```
 //!
 //! The loss of a bus does not affect the other buses: the last torques of the lost bus's cells decay to zero

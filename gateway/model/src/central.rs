@@ -3,9 +3,9 @@
 //! it, and its running time is the time that the distributed computation saves the gateway.
 //!
 //! ```text
-//!   joint words ─> Central::frames ─> Frames ─┐
-//!                                             ├─> Central::torque ─> Nm
-//!  sensor words ─> Central::force  ─> F_z ────┘
+//!   joint words ─> CentralComputation::link_frames ───> LinkFrames ─┐
+//!                                                                   ├─> CentralComputation::cell_torque ─> Nm
+//!  sensor words ─> CentralComputation::contact_force ─> F_z ────────┘
 //! ```
 //!
 //! [`CentralComputation::new`] computes with the quantised parameters, as the cells do, so that a difference is the

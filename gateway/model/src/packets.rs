@@ -1,9 +1,9 @@
 //! The packets of one bus. Each frame is reassembled and decoded here once, for all consumers of the bus.
 //!
 //! ```text
-//!   frame, time ──> PacketReader ──> Received ─┬─> table (state of the cells)
-//!                     └ pending segments       ├─> Classifier (text, JSON)
-//!                                              └─> latched packets, sorted traffic
+//!   frame, time ──> PacketReader ──> FrameWithPacket ─┬─> table (state of the cells)
+//!                     └ pending segments              ├─> Classifier (text, JSON)
+//!                                                     └─> latched packets, sorted traffic
 //! ```
 //!
 //! Cells have their own receiver, which fits a microcontroller, and `conformance` has another one to test them

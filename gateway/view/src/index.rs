@@ -15,7 +15,7 @@ use crate::tape::{Event, EventDetector, EventKind, PlaybackState, PlaybackStep};
 
 /// The approximate maximum memory for all stored states, in bytes.
 const MEMORY_LIMIT_BYTES: usize = 256 << 20;
-/// The approximate size of a stored state in bytes: this much for each bus, and `CELL_BYTES` for each cell.
+/// The approximate size of a stored state in bytes: this much for each bus, and `STATE_BYTES_PER_CELL` for each cell.
 const STATE_BYTES_PER_BUS: usize = 1 << 20;
 const STATE_BYTES_PER_CELL: usize = 4 << 10;
 /// The interval between stored states at first, in ns. It doubles whenever the memory limit is reached.

@@ -82,7 +82,7 @@ fn frame(id: u32, number: u32) -> Frame {
     Frame::fd(id, 1, &number.to_le_bytes()).unwrap()
 }
 
-/// Returns all frames before [`LAST`], except [`MEANWHILE`].
+/// Returns all frames before [`END_MARKER_ID`], except [`FILLER_ID`].
 fn read(bus: &Bus, inbox: &mut Inbox) -> Vec<Frame> {
     let mut frames = Vec::new();
     loop {

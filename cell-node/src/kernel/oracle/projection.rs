@@ -223,7 +223,7 @@ impl<S: Scalar> Projection<S> {
         }
     }
 
-    /// Like `down`, with saturation, for chains in which numbers may leave the range of a word.
+    /// Like `write_jacobian_from_axes`, with saturation, for chains in which numbers may leave the range of a word.
     #[inline(never)]
     fn write_jacobian_saturating(
         &self,

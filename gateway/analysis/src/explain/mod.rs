@@ -1,9 +1,9 @@
 //! Derives a torque step by step: `skinbus explain`.
 //!
 //! ```text
-//!   frames up to the joints ───> Watch ──> contact state and answer of each cell ─┐
-//!                                                                                 ├──> Explanation
-//!   Skin ──> Central, f64 ────────────> force, Jacobian, product, step ───────────┘
+//!   frames up to the joints ──> JointsWatcher ──> contact state and answer of each cell ─┐
+//!                                                                                        ├──> TorqueExplanation
+//!   Skin ──> CentralComputation, f64 ──> force, Jacobian, product, step ─────────────────┘
 //! ```
 //!
 //! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of its contact state, so a word

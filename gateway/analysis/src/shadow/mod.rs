@@ -2,8 +2,8 @@
 //! and the loads and delays that result.
 //!
 //! ```text
-//!   capture or live bus ──> frame ──> [ window ] ──> [ BusModel ] ──┬──> poll: Shaded, one a frame, in the file's order
-//!                           for each bus:  sorts,   arbitrates       └──> report: load, delays, late replies, queues
+//!   capture or live bus ──> receive ──> [ window ] ──> [ BusModel ] ──┬──> poll: FrameTiming, in the order of the frames
+//!                           for each bus:  sorts,      arbitrates     └──> report: load, delays, late replies, queues
 //! ```
 //!
 //! A frame's time stamp is taken as the time of its sender's request, which is correct on a bus without bit rate (vcan,

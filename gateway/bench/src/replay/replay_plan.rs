@@ -1,8 +1,8 @@
 //! Replay plan: turns the frames of a capture into steps with their times.
 //!
 //! ```text
-//!   frames ──> add_frame ──> [ order by time ] ──> [ classify ] ──> selected? ──> steps ──> player
-//!                                                       └── joints, replies ──> comparator
+//!   frames ──> add_frame ──> [ order by time ] ──> [ classify_frame ] ──> selected? ──> steps ──> player
+//!                                                         └── joints, replies ──> comparator
 //! ```
 
 use std::collections::{BTreeMap, VecDeque};

@@ -1,8 +1,8 @@
 //! Classifies frames in order of arrival, each as soon as its class is certain.
 //!
 //! ```text
-//!   frames ──> Settler ──> the same frames in the same order, each with its class
-//!                └ pending frames, from the oldest segment of an open packet
+//!   frames ──> OrderedDecoder ──> the same frames in the same order, each with its class
+//!                    └ pending frames, from the oldest segment of an open packet
 //! ```
 //!
 //! A classic frame is a segment of a packet or foreign. The next frame of its identifier, or the timeout of its packet,

@@ -1,7 +1,7 @@
 //! The state of a bus at some point of a capture, and the messages that restore it.
 //!
 //! ```text
-//!   messages up to there ──> take ──> [ State ] ──> restoring ──> messages before the first replayed one
+//!   messages up to there ──> apply_message ──> [ LatchedState ] ──> restoring_messages, before the first replayed one
 //! ```
 //!
 //! A torque is a function of the cell's parameters, one joints packet and the stimuli latched at it; and the end of a

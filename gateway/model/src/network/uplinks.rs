@@ -1,9 +1,9 @@
 //! The gateway's end of the wires to the roots: the end of all routes, and the source of node ids.
 //!
 //! ```text
-//!    message of a root ─> handle ──────┐             ┌─> poll_transmit ─> message for a root
-//!                 now ──> handle_time ─┼─ [Uplinks] ─┘
-//!   node id in use ─────> claimed ─────┘
+//!    message of a root ─> handle_message ────┐             ┌─> poll_transmit ─> message for a root
+//!                 now ──> handle_time ───────┼─ [Uplinks] ─┘
+//!   node id in use ─────> mark_node_id_used ─┘
 //! ```
 
 use std::collections::{BTreeSet, VecDeque};

@@ -19,7 +19,7 @@ use crate::tracker::{CellUpdate, HeartbeatKind};
 const REPLY_PARAMETERS: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
 impl BusTable {
-    /// Reassembles and decodes a frame of this bus, for [`receive`](Self::handle_read_frame) and other consumers.
+    /// Reassembles and decodes a frame of this bus, for [`handle_read_frame`](Self::handle_read_frame) and other consumers.
     pub fn read_frame<'f>(&mut self, at: Micros, frame: &'f Frame) -> FrameWithPacket<'f> {
         self.packets.read(at, frame)
     }

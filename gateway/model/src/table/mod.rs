@@ -1,8 +1,8 @@
 //! A gateway's state of one bus: the newest data of every cell, and the running sum of their torques.
 //!
 //! ```text
-//!   frame, time, own ─> handle_frame ─┐           ┌─> Snapshot (for a tick; of constant size)
-//!               time ─> handle_time ──┴─ [Table] ─┴─> counters, accounts, accuracy (for the table at the end)
+//!   frame, time, own ─> handle_frame ─┐              ┌─> Snapshot (for a tick; of constant size)
+//!               time ─> handle_time ──┴─ [BusTable] ─┴─> counters, accounts, accuracy (for the table at the end)
 //! ```
 //!
 //! The gateway's own frames are read back from the bus, so that joints open an epoch in order with the other frames and

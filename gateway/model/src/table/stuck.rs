@@ -1,9 +1,9 @@
 //! Detects cells that keep sending the same words while the expected words change.
 //!
 //! ```text
-//!   due torque, and the central one ───────────────────┐
-//!                                                      ├─> Words ─> runs of equal words
-//!   sensors page, and the page that stimuli set ───────┘
+//!   due torque, and the central one ──────────────┐
+//!                                                 ├─> StuckDetector ─> runs of equal words
+//!   sensors page, and the page that stimuli set ──┘
 //! ```
 //!
 //! Equal words are correct while nothing changes: a force may be constant, an arm may stand still, and a small torque

@@ -1,9 +1,9 @@
 //! Captures: frames of one or more buses with their times, from a candump log or an MCAP recording.
 //!
 //! ```text
-//!   candump log ──┐                      ┌── candump log
-//!                 ├──> Entry, Entry, … ──┼── MCAP recording
-//!   MCAP ─────────┘                      └── dump, replay, explain
+//!   candump log ──┐                            ┌── candump log
+//!                 ├──> CaptureEntry, again … ──┼── MCAP recording
+//!   MCAP ─────────┘                            └── dump, replay, explain
 //! ```
 //!
 //! An [`CaptureEntry`] keeps all information that either format holds of a frame, so that a capture survives the round

@@ -2,8 +2,8 @@
 //! channels outside of chunks, can be inserted between those of the crate.
 //!
 //! ```text
-//!   crate's writer ── bytes ──┐
-//!                             ├──> Output: offset and checksum of all bytes ──> file
+//!   `mcap` writer ── bytes ───┐
+//!                             ├──> SharedOutput: offset and checksum of all bytes ──> file
 //!   descriptions ── records ──┘
 //! ```
 

@@ -1,7 +1,7 @@
 //! Sorts messages by time: each message waits a short time for older ones before it is written.
 //!
 //! ```text
-//! topics ──> write ──> [ waiting ] ──> release ──> file, in order of log_time
+//! topics ──> write ──> [ waiting ] ──> write_due ──> file, in order of log_time
 //! ```
 //!
 //! The receivers of the buses and the loop deliver messages in turn, so only the messages of one topic arrive in order.

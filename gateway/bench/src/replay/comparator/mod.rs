@@ -2,9 +2,9 @@
 //! whether their replies are those of the capture.
 //!
 //! ```text
-//!   recorded joints, replies ─> expect_joints, expect ─┐                  ┌─> is_done, unanswered ─> lockstep
-//!          joints to be sent ─> sent_joints ───────────┼─ [ Comparator ] ─┼─> present_cells, other_gateway
-//!        frames on the buses ─> observe ───────────────┘                  └─> tally, first difference
+//!   recorded joints, replies ─> expect_joints, expect_message ─┐                  ┌─> are_joints_processed ─> lockstep
+//!          joints to be sent ─> announce_joints ───────────────┼─ [ Comparator ] ─┼─> present_cells, other_gateway_bus
+//!        frames on the buses ─> observe_message ───────────────┘                  └─> tally, first_difference
 //! ```
 //!
 //! A reply belongs to the joints that it answers: the latest joints of its epoch, in the capture and on the bus

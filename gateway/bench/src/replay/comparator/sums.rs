@@ -1,9 +1,9 @@
 //! A cell's own contribution to a sum: the sum minus the sums of the cell's children, which is independent of the tree.
 //!
 //! ```text
-//!   tree pages, joints by joints ──> [Trees] ─┐
-//!                                             ├─> EpochSums: own = sum - sums of the children
-//!   sums of one epoch, the last of each ──────┘        recorded and now: compare
+//!   tree pages, joints by joints ──> [ParentHistory] ─┐
+//!                                                     ├─> EpochSums: own = sum - sums of the children
+//!   sums of one epoch, the last of each ──────────────┘        recorded and now: compare
 //! ```
 //!
 //! A sum adds whole steps, so the difference is exact and does not depend on the tree. Two cells in the same contact
